@@ -232,7 +232,7 @@ def test_redwood_with_damaged_log_or_camera(tmp_path: Path) -> None:
             open_recording(tmp_path)
     (tmp_path / "trajectory.log").write_text(log)
     (tmp_path / "camera.json").write_text('{"intrinsic_matrix": [1, 2, 3], "width": 640}')
-    with pytest.raises(InputError, match="3x3 intrinsic_matrix"):
+    with pytest.raises(InputError, match="intrinsic_matrix: is not 3 x 3"):
         open_recording(tmp_path)
 
 

@@ -59,7 +59,7 @@ def test_incomplete_arducam(tmp_path: Path) -> None:
     (folder / other).write_bytes(bytes(4 * (WIDTH + 1) * HEIGHT))
     recording = open_recording(folder)
     items = list(recording.read_all())
-    for k, message in ((0, "bytes, not 4 for each of"), (2, "has 0 bytes"), (3, "is of 33 x 24")):
+    for k, message in ((0, "bytes, not 4 for each of"), (2, "has 0 bytes"), (3, "is 33 x 24")):
         assert isinstance(items[k], UnreadableFrameError)
         assert message in str(items[k])
     assert isinstance(items[1], RangeFrame)

@@ -19,7 +19,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
-from tofuse.files.images import MAX_PIXELS
+from tofuse.files.images import check_pixels
 
 MAGIC = b"\x76\x2f\x31\x01"
 _SINGLE_SCAN_LINES = 2  # the version, with none of the flags for tiles, parts or deep data
@@ -138,12 +138,7 @@ def _header(data: bytes, path: str | Path) -> _Header:
         )
     left, top, right, bottom = _unpack("<4i", attributes["dataWindow"], 0, path)
     width, height = right - left + 1, bottom - top + 1
-    if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise InputError(
-            f"declares {width} x {height} pixels",
-            where=path,
-            remedy=f"use an image of 1 to {MAX_PIXELS} pixels",
-        )
+    check_pixels(width, height, path)
     return _Header(width, height, top, compression, _channels(attributes["channels"], path), offset)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,14 @@ _AMPLITUDES = (
     "scalar_intensity",
     "scalar_Intensity",
 )
+
+
+def stacked(columns: dict[str, NDArray[Any]], names: Sequence[str]) -> NDArray[np.floating]:
+    """Remove named columns (N,), and return them as (N, C) float32 or float64."""
+    removed = [columns.pop(name) for name in names]
+    dtype = np.result_type(np.float32, *(column.dtype for column in removed))
+    with np.errstate(invalid="ignore"):  # damaged data can contain signalling NaNs
+        return np.stack(removed, -1).astype(dtype, copy=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""PNG and JPEG images, checked before they are decoded.
+"""PNG, JPEG and raw images, checked before they are decoded.
 
 OpenCV fills the missing part of a truncated file with zeros or grey, reports it at most on stderr,
 and allocates any size that a header declares. So the structure of a file is checked first.
@@ -63,13 +63,30 @@ def _header(data: bytes, path: str | Path) -> ImageHeader:
     else:
         problem = "is empty" if not data else "is neither a PNG nor a JPEG image"
         raise InputError(problem, where=path, remedy="check the file")
-    if header.width < 1 or header.height < 1 or header.width * header.height > MAX_PIXELS:
+    check_pixels(header.width, header.height, path)
+    return header
+
+
+def check_pixels(width: int, height: int, path: str | Path) -> None:
+    """Raise InputError, naming `path`, unless an image may have this size."""
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
         raise InputError(
-            f"declares {header.width} x {header.height} pixels",
+            f"declares {width} x {height} pixels",
             where=path,
             remedy=f"use an image of 1 to {MAX_PIXELS} pixels",
         )
-    return header
+
+
+def check_camera_size(
+    width: int, height: int, size: tuple[int, int] | None, path: str | Path
+) -> None:
+    """Raise InputError, naming `path`, unless an image has the size of its camera, if known."""
+    if size is not None and (width, height) != size:
+        raise InputError(
+            f"is {width} x {height} pixels, the camera {size[0]} x {size[1]}",
+            where=path,
+            remedy="use the camera description of these images",
+        )
 
 
 def _png_header(data: bytes, path: str | Path) -> ImageHeader:
@@ -182,12 +199,7 @@ def parse_image(
 ) -> NDArray[Any]:
     """Decode a PNG or JPEG in memory; `path` names it in errors. See `read_image`."""
     header = _header(data, path)
-    if size is not None and (header.width, header.height) != size:
-        raise InputError(
-            f"is {header.width} x {header.height} pixels, the camera {size[0]} x {size[1]}",
-            where=path,
-            remedy="use the camera description of these images",
-        )
+    check_camera_size(header.width, header.height, size, path)
     if dtype is not None and (header.channels != 1 or f"uint{header.bits}" != dtype):
         raise InputError(
             f"has {header.channels} channels of {header.bits} bits",
@@ -211,13 +223,27 @@ def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
         if grey
         else cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     )
+    image = decoded(data, flags, (header.height, header.width), path)
+    return image if grey else np.ascontiguousarray(image[..., ::-1])
+
+
+def decoded(data: bytes, flags: int, shape: tuple[int, int], path: str | Path) -> NDArray[Any]:
+    """Decode an image by OpenCV with its `flags`.
+
+    Raises
+    ------
+    InputError
+        Naming `path`, if that fails, or the image has another (height, width).
+    """
+    import cv2
+
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise InputError("can't be decoded", where=path, remedy="copy the file again") from error
-    if image is None or image.shape[:2] != (header.height, header.width):
+    except cv2.error:
+        image = None
+    if image is None or image.shape[:2] != shape:
         raise InputError("can't be decoded", where=path, remedy="copy the file again")
-    return image if grey else np.ascontiguousarray(image[..., ::-1])
+    return image
 
 
 def read_color(path: str | Path) -> UInt8:
@@ -232,6 +258,36 @@ def as_color(image: NDArray[Any]) -> UInt8:
     if image.ndim == 2:
         image = np.repeat(image[..., None], 3, axis=2)
     return image.astype(np.uint8, copy=False)
+
+
+def read_raw(path: str | Path, dtype: str, size: tuple[int, int], remedy: str) -> NDArray[Any]:
+    """Read a file that consists of the pixels of one image, (H, W, ...).
+
+    Parameters
+    ----------
+    path
+        The file.
+    dtype
+        NumPy's name of the type of a pixel; "3<f4" are three channels of float32.
+    size
+        (width, height).
+    remedy
+        The remedy if the file has another size.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, or has another size.
+    """
+    data = read_bytes(path, limit=MAX_IMAGE_BYTES)
+    pixel, (width, height) = np.dtype(dtype), size
+    if len(data) != pixel.itemsize * width * height:
+        raise InputError(
+            f"has {len(data)} bytes, not {pixel.itemsize} for each of {width} x {height} pixels",
+            where=path,
+            remedy=remedy,
+        )
+    return np.frombuffer(data, pixel).reshape(height, width, *pixel.shape)
 
 
 def png_bytes(image: NDArray[np.generic]) -> bytes:

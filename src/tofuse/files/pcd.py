@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_bytes
-from tofuse.files.geometry_record import GeometryRecord
+from tofuse.files.geometry_record import GeometryRecord, stacked
 from tofuse.files.reading import read_bytes
 
 MAX_POINTS = 1 << 28
@@ -97,20 +97,12 @@ def read_pcd(path: str | Path) -> Pcd:
         if fields[name].ndim != 1:
             raise InputError(f"has several values of {name!r} per point", where=path)
     color = _unpacked_color(fields)
-    points = _pop_stacked(fields, ("x", "y", "z"))
+    points = stacked(fields, ("x", "y", "z"))
     normals: Float32 | None = None
     if all(name in fields for name in _NORMALS):
-        normals = _pop_stacked(fields, _NORMALS).astype(np.float32)
+        normals = stacked(fields, _NORMALS).astype(np.float32)
     cloud = GeometryRecord(points, normals=normals, color=color, scalars=fields)
     return Pcd(cloud, header.width, header.height, np.array(header.viewpoint, float))
-
-
-def _pop_stacked(fields: dict[str, NDArray[Any]], names: tuple[str, ...]) -> NDArray[np.floating]:
-    """Remove columns (N,) from the fields, and return them as (N, C) float32 or float64."""
-    columns = [fields.pop(name) for name in names]
-    dtype = np.result_type(np.float32, *(c.dtype for c in columns))
-    with np.errstate(invalid="ignore"):  # damaged data can contain signalling NaNs
-        return np.stack(columns, -1).astype(dtype, copy=False)
 
 
 def _unpacked_color(fields: dict[str, NDArray[Any]]) -> UInt8 | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.arrays import UInt8, UInt16
 from tofuse.errors import InputError
-from tofuse.files.images import MAX_PIXELS
+from tofuse.files.images import check_pixels
 
 _SPACE = rb"(?:\s+(?:#[^\n]*\n)?)+"
 _HEADER = re.compile(rb"P5" + (_SPACE + rb"(\d{1,5})") * 3 + rb"\s")
@@ -27,8 +27,9 @@ def parse_pgm(data: bytes, where: str | Path) -> UInt8 | UInt16:
     if header is None:
         raise InputError("is not a binary PGM image", where=where, remedy="copy the file again")
     width, height, max_value = (int(text) for text in header.groups())
-    if not 0 < width * height <= MAX_PIXELS or not 0 < max_value < 65536:
-        raise InputError(f"declares {width} x {height} pixels up to {max_value}", where=where)
+    check_pixels(width, height, where)
+    if not 0 < max_value < 65536:
+        raise InputError(f"declares values up to {max_value}", where=where)
     dtype = np.dtype(">u2" if max_value > 255 else "u1")
     size = width * height * dtype.itemsize
     if len(data) < header.end() + size:

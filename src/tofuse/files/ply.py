@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tofuse.arrays import Float32, Int32, UInt8
 from tofuse.errors import InputError
 from tofuse.files.atomic import replacing
-from tofuse.files.geometry_record import GeometryRecord
+from tofuse.files.geometry_record import GeometryRecord, stacked
 from tofuse.files.reading import read_bytes
 
 _TYPES = {
@@ -88,22 +88,15 @@ def read_ply(path: str | Path) -> GeometryRecord:
     indices = next((faces[n] for n in ("vertex_indices", "vertex_index") if n in faces), None)
     if indices is not None:
         indices = _checked_faces(indices, len(vertex["x"]), path)
-    points = _stacked(vertex, _POINTS)
+    points = stacked(vertex, _POINTS)
     normals: Float32 | None = None
     if all(name in vertex for name in _NORMALS):
-        normals = _stacked(vertex, _NORMALS).astype(np.float32)
+        normals = stacked(vertex, _NORMALS).astype(np.float32)
     color = None
     for names in _COLORS:
         if color is None and all(name in vertex for name in names):
             color = _color([vertex.pop(name) for name in names])
     return GeometryRecord(points, indices, normals, color, scalars=vertex, comments=tuple(comments))
-
-
-def _stacked(vertex: _Columns, names: tuple[str, ...]) -> NDArray[np.floating]:
-    """Remove columns (N,), and return them as (N, C) float32 or float64."""
-    columns = [vertex.pop(name) for name in names]
-    dtype = np.result_type(np.float32, *(c.dtype for c in columns))
-    return np.stack(columns, -1).astype(dtype, copy=False)
 
 
 def _color(columns: list[NDArray[Any]]) -> UInt8:

@@ -14,7 +14,7 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import read_text
 from tofuse.files.tables import exact
-from tofuse.geometry.quaternion import length, to_matrix
+from tofuse.geometry.quaternion import length, to_pose
 from tofuse.geometry.se3 import check_pose
 
 FIELD = "T_target_source"
@@ -94,7 +94,4 @@ def _from_numbers(text: str, path: str | Path) -> Float64:
     norm = float(length(row[3:]))
     if abs(norm - 1) > 0.1:
         raise InputError(f"its quaternion has length {norm:.3g}, not 1", where=path, remedy=_REMEDY)
-    T = np.eye(4)
-    T[:3, :3] = to_matrix(row[3:])
-    T[:3, 3] = row[:3]
-    return T
+    return to_pose(row[3:], row[:3])

@@ -6,11 +6,10 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.images import MAX_IMAGE_BYTES, MAX_PIXELS
+from tofuse.files.images import MAX_IMAGE_BYTES, check_camera_size, check_pixels, decoded
 from tofuse.files.reading import read_bytes
 
 # Tags of the TIFF 6.0 specification.
@@ -39,17 +38,9 @@ def read_tiff(path: str | Path, size: tuple[int, int] | None = None) -> NDArray[
 
     data = read_bytes(path, limit=MAX_IMAGE_BYTES)
     width, height = tiff_size(data, path)
-    if size is not None and (width, height) != size:
-        raise InputError(
-            f"is {width} x {height} pixels, the camera {size[0]} x {size[1]}",
-            where=path,
-            remedy="use the camera description of these images",
-        )
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise InputError("can't be decoded", where=path, remedy="copy the file again") from error
-    if image is None or image.shape != (height, width) or image.dtype.kind not in "uf":
+    check_camera_size(width, height, size, path)
+    image = decoded(data, cv2.IMREAD_UNCHANGED, (height, width), path)
+    if image.ndim != 2 or image.dtype.kind not in "uf":
         raise InputError("can't be decoded", where=path, remedy="store one channel as TIFF")
     return image
 
@@ -78,12 +69,7 @@ def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
         )
     except (struct.error, KeyError, IndexError, ValueError) as error:
         raise InputError("is a damaged TIFF", where=path, remedy="copy the file again") from error
-    if not 0 < width * height <= MAX_PIXELS:
-        raise InputError(
-            f"declares {width} x {height} pixels",
-            where=path,
-            remedy=f"use an image of 1 to {MAX_PIXELS} pixels",
-        )
+    check_pixels(width, height, path)
     if channels != 1:
         raise InputError(f"has {channels} channels", where=path, remedy="store one channel")
     if not complete:

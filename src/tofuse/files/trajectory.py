@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
 from tofuse.files.reading import read_text
 from tofuse.files.tables import exact
-from tofuse.geometry.quaternion import from_matrix, length, to_matrix
+from tofuse.geometry.quaternion import from_matrix, length, to_pose
 
 ASSOCIATION_LIMIT_S = 0.02
 
@@ -32,10 +33,8 @@ def read_tum(path: str | Path) -> tuple[Float64, Float64]:
         length.
     """
     rows: list[list[float]] = []
-    for number, line in enumerate(read_text(path).splitlines(), 1):
-        cells = line.split("#", 1)[0].replace(",", " ").split()
-        if not cells:
-            continue
+    numbers: list[int] = []
+    for number, cells in rows_of(read_text(path)):
         where = f"{path}, line {number}"
         try:
             row = [float(cell) for cell in cells]
@@ -45,20 +44,46 @@ def read_tum(path: str | Path) -> tuple[Float64, Float64]:
             raise InputError(f"has {len(row)} numbers", where=where, remedy=_TUM)
         if not np.isfinite(row).all():
             raise InputError("contains a number that is not finite", where=where, remedy=_TUM)
-        if abs(length(row[4:]) - 1) > 0.1:
-            raise InputError(
-                "contains a quaternion that is not of unit length", where=where, remedy=_TUM
-            )
         rows.append(row)
+        numbers.append(number)
     table = np.array(rows, float).reshape(-1, 8)
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, 3] = table[:, 1:4]
-    if len(table):
-        poses[:, :3, :3] = to_matrix(table[:, 4:])
-    return table[:, 0], poses
+    return table[:, 0], poses_of_rows(table[:, 4:], table[:, 1:4], path, numbers)
 
 
 _TUM = "write 'timestamp tx ty tz qx qy qz qw'"
+
+
+def rows_of(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield number and cells of each line that is neither empty nor a comment ('#')."""
+    for number, line in enumerate(text.splitlines(), 1):
+        cells = line.split("#", 1)[0].replace(",", " ").split()
+        if cells:
+            yield number, cells
+
+
+def poses_of_rows(q_xyzw: Float64, t: Float64, path: str | Path, numbers: Sequence[int]) -> Float64:
+    """Return poses (N, 4, 4) of rows of a file.
+
+    Parameters
+    ----------
+    q_xyzw, t
+        (N, 4) quaternions and (N, 3) translations in m.
+    path, numbers
+        The file and the line of each row, for errors.
+
+    Raises
+    ------
+    InputError
+        If a quaternion is not of unit length.
+    """
+    deviation = np.abs(length(q_xyzw) - 1)
+    if (deviation > 0.1).any():
+        raise InputError(
+            "contains a quaternion that is not of unit length",
+            where=f"{path}, line {numbers[int(np.argmax(deviation > 0.1))]}",
+            remedy="normalise it",
+        )
+    return to_pose(q_xyzw, t)
 
 
 def write_tum(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) -> None:

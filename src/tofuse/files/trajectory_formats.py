@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,8 @@ import numpy as np
 from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
 from tofuse.files.reading import input_error, is_file, is_folder, read_text
-from tofuse.files.trajectory import associated_poses, read_tum
+from tofuse.files.trajectory import associated_poses, poses_of_rows, read_tum, rows_of
 from tofuse.geometry import se3
-from tofuse.geometry.quaternion import length, to_matrix
 
 # Files with the poses in a folder; the first that exists is used.
 NAMES = ("trajectory.txt", "groundtruth.txt", "images.txt", "transforms.json", "trajectory.log")
@@ -115,7 +114,7 @@ def read_poses(path: str | Path) -> TimedPoses:
     text = read_text(path)
     if suffix == ".json":
         return _transforms(text, path)
-    rows = list(_rows(text))
+    rows = list(rows_of(text))
     if not rows:
         raise InputError("contains no poses", where=path, remedy=f"use {_SUPPORTED}")
     return _reader(rows, path)(rows, path)
@@ -144,14 +143,6 @@ def _reader(rows: _Rows, path: Path) -> _Reader:
         where=path,
         remedy=f"use {_SUPPORTED}",
     )
-
-
-def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Number and cells of each line that is neither empty nor a comment."""
-    for number, line in enumerate(text.splitlines(), 1):
-        cells = line.split("#", 1)[0].replace(",", " ").split()
-        if cells:
-            yield number, cells
 
 
 def _is_number(cell: str) -> bool:
@@ -190,24 +181,10 @@ def _rigid(T: Float64, where: str) -> Float64:
     return se3.orthonormalise(se3.check_pose(T, where=where))
 
 
-def _from_quaternions(q_xyzw: Float64, t: Float64, path: Path, lines: Sequence[int]) -> Float64:
-    deviation = np.abs(length(q_xyzw) - 1)
-    if (deviation > 0.1).any():
-        raise InputError(
-            "contains a quaternion that is not of unit length",
-            where=f"{path}, line {lines[int(np.argmax(deviation))]}",
-        )
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
-    poses[:, :3, 3] = t
-    if len(t):
-        poses[:, :3, :3] = to_matrix(q_xyzw)
-    return poses
-
-
 def _euroc(rows: _Rows, path: Path) -> TimedPoses:
     """Lines of ns, x y z, qw qx qy qz, and possibly more, as in EuRoC's ground truth."""
     table, lines = _numbers(rows, path, 8)
-    poses = _from_quaternions(table[:, [5, 6, 7, 4]], table[:, 1:4], path, lines)
+    poses = poses_of_rows(table[:, [5, 6, 7, 4]], table[:, 1:4], path, lines)
     return TimedPoses(poses, timestamps=1e-9 * table[:, 0])
 
 
@@ -246,7 +223,7 @@ def _colmap(rows: _Rows, path: Path) -> TimedPoses:
     # The second line of each image lists its points as triples, without a name in column 10.
     images = [(n, c) for n, c in rows if len(c) == 10 and not _is_number(c[9])]
     table, lines = _numbers(images, path, 8)
-    T_camera_world = _from_quaternions(table[:, [2, 3, 4, 1]], table[:, 5:8], path, lines)
+    T_camera_world = poses_of_rows(table[:, [2, 3, 4, 1]], table[:, 5:8], path, lines)
     names = [cells[9] for _, cells in images]
     return TimedPoses(se3.inverse(T_camera_world), frames=_frame_numbers(names, path))
 

@@ -28,6 +28,16 @@ def to_matrix(q: ArrayLike) -> Float64:
     return unnormalised_matrix(q) / (q * q).sum(-1)[..., None, None]
 
 
+def to_pose(q: ArrayLike, t: ArrayLike) -> Float64:
+    """Rigid motions (..., 4, 4) with the rotation of q (..., 4) and translation t (..., 3)."""
+    t = np.asarray(t, float)
+    T = np.zeros((*t.shape[:-1], 4, 4))
+    T[..., :3, :3] = to_matrix(q)
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1
+    return T
+
+
 def length(q: ArrayLike) -> Float64:
     """Norm (...) of quaternions read from files; infinite if float64 can't hold its square."""
     with np.errstate(over="ignore"):

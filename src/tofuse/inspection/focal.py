@@ -14,12 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.errors import UnreadableFrameError
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.geometry import check_kind, wrong_focal
 from tofuse.inspection.pair_motion import Pair, aligned, aligned_pair, field_of_view
 from tofuse.inspection.sample import VIEW_COLUMNS, Sample, part_starts
-from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 
@@ -101,11 +99,8 @@ def _pair_at_gap(sample: Sample, step: Pair, gap: int) -> Pair | None:
     for k in (position + gap, position - gap):
         if not starts[part - 1] <= k < starts[part]:
             continue
-        try:
-            frame = recording[k]
-        except UnreadableFrameError:
-            continue
-        if isinstance(frame, RangeFrame) and frame.valid.any():
+        frame = recording.image(k)
+        if frame is not None and len(frame):
             second = prepare_view(frame, SurfaceOptions(columns=VIEW_COLUMNS))
             return aligned_pair(step.first, second, step.i, k)
     return None

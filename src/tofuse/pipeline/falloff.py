@@ -26,7 +26,6 @@ import numpy as np
 from scipy.special import stdtrit
 
 from tofuse.arrays import Float64
-from tofuse.errors import UnreadableFrameError
 from tofuse.kernels.alignment import POINT, POINT_ALBEDO
 from tofuse.pipeline.pooling import pooled
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -148,12 +147,8 @@ class _Views:
 
     def get(self, k: int) -> PreparedView | None:
         """Return the k-th view; None if there is none, or it has no amplitude."""
-        if k >= len(self._recording):
-            return None
-        try:
-            frame = self._prepare(self._recording[k])
-        except UnreadableFrameError:
-            return None
+        image = self._recording.image(k) if k < len(self._recording) else None
+        frame = None if image is None else self._prepare(image)
         if not isinstance(frame, RangeFrame) or not len(frame):
             return None
         view = prepare_view(frame, self._options)

@@ -23,7 +23,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.arrays import Float64
-from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.errors import InputError
 from tofuse.evaluation.consistency import Consistency, map_consistency
 from tofuse.evaluation.cross_view import CrossViewConsistency, compare_views, prepare_for_comparison
 from tofuse.evaluation.deviation import Deviation, fitted
@@ -42,7 +42,6 @@ from tofuse.pipeline.reconstruct import reconstruct_with_views, view_kind
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.posegraph.pair_measurements import measured_pairs
 from tofuse.posegraph.view_store import PosedView
-from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import read_reference
 from tofuse.recordings.opening import Opening, OpeningOptions
 from tofuse.recordings.phones import POSES_BY
@@ -253,13 +252,8 @@ class _Images:
     def _view(self, k: int) -> PreparedView | None:
         """Return the k-th frame as a prepared view; None if it can't be read."""
         if k not in self._views:
-            try:
-                frame = self._recording[k]
-            except UnreadableFrameError:
-                frame = None
-            self._views[k] = (
-                prepare_for_comparison(frame) if isinstance(frame, RangeFrame) else None
-            )
+            frame = self._recording.image(k)
+            self._views[k] = None if frame is None else prepare_for_comparison(frame)
         return self._views[k]
 
 

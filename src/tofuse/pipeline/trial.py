@@ -22,7 +22,6 @@ import numpy as np
 from scipy.special import stdtrit
 
 from tofuse.arrays import Float32, Float64, Intp
-from tofuse.errors import UnreadableFrameError
 from tofuse.geometry import se3
 from tofuse.normal import robust_sigma
 from tofuse.pipeline.pooling import pooled
@@ -195,11 +194,8 @@ class _AlignedViews:
         return self._views[k]
 
     def _prepared(self, k: int) -> _View | None:
-        if k >= len(self._recording):
-            return None
-        try:
-            frame = self._recording[k]
-        except UnreadableFrameError:
+        frame = self._recording.image(k) if k < len(self._recording) else None
+        if frame is None:
             return None
         uncorrected, corrected = self._uncorrected(frame), self._corrected(frame)
         if not (isinstance(uncorrected, RangeFrame) and isinstance(corrected, RangeFrame)):

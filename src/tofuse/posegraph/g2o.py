@@ -87,9 +87,9 @@ def read_g2o(path: str | Path) -> PoseGraph:
     pairs = np.array([(position[i], position[j]) for i, j in ends], np.intp).reshape(-1, 2)
     return PoseGraph(
         ids=np.array(list(position), np.intp),
-        poses=_matrices(np.array(vertices)),
+        poses=_poses(np.array(vertices)),
         edges=pairs,
-        measurements=_matrices(rows[:, :7]),
+        measurements=_poses(rows),
         information=information,
         loop=np.abs(pairs[:, 1] - pairs[:, 0]) != 1,
     )
@@ -159,12 +159,8 @@ def _check_information(
         )
 
 
-def _matrices(values: Float64) -> Float64:
-    T = np.zeros((len(values), 4, 4))
-    T[:, :3, :3] = quaternion.to_matrix(values[:, 3:7])
-    T[:, :3, 3] = values[:, :3]
-    T[:, 3, 3] = 1
-    return T
+def _poses(values: Float64) -> Float64:
+    return quaternion.to_pose(values[:, 3:7], values[:, :3])
 
 
 def _vectors(T: Float64) -> Float64:

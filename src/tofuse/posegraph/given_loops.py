@@ -63,6 +63,5 @@ def _loop(words: list[str], where: str) -> PriorLoop:
             where=where,
             remedy="use finite numbers and a quaternion qx qy qz qw of length 1",
         )
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = quaternion.to_matrix(values[3:]), values[:3]
+    T = quaternion.to_pose(values[3:], values[:3])
     return PriorLoop(i, j, T) if i < j else PriorLoop(j, i, se3.inverse(T))

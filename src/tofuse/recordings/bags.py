@@ -5,18 +5,25 @@ from __future__ import annotations
 import errno
 import importlib
 import tempfile
+import weakref
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tofuse.arrays import Float32, Float64
+from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.reading import input_error, is_folder, read_text
 from tofuse.geometry.cameras import Camera
-from tofuse.recordings.camera_file import check_size
-from tofuse.recordings.ros_messages import GREY, header_time, image
+from tofuse.recordings.camera_file import ColorCamera, check_size
+from tofuse.recordings.color import sampled_color
+from tofuse.recordings.depth_counts import depth_from_counts
+from tofuse.recordings.frames import DepthKind, Frame, RangeFrame
+from tofuse.recordings.reader import ReaderOptions
+from tofuse.recordings.ros_messages import ENCODINGS, GREY, color_image, header_time, image
+from tofuse.recordings.sources import FileSource
 
 MISSING = "run `pip install 'tofuse[ros]'`, which installs rosbags"
 MAX_GAP_S = 0.02  # between the images of one frame
@@ -179,12 +186,108 @@ class Track:
         return messages
 
 
+class BagSource(FileSource):
+    """A source over depth images of a bag, with amplitude and colour of other topics.
+
+    Attributes
+    ----------
+    camera, unit, kind
+        Of the depth images: metres per count, and "z" or "range".
+    depth, amplitude, color
+        The messages of each topic; None where the bag has none.
+    color_camera
+        None if colour is registered to depth.
+    """
+
+    camera: Camera
+    unit: float
+    kind: DepthKind = "z"
+    depth: Track
+    amplitude: Track | None = None
+    color: Track | None = None
+    color_camera: ColorCamera | None = None
+
+    def __init__(self, path: Path, options: ReaderOptions) -> None:
+        self.path = path
+        self.bag = self.open_bag(path)
+        weakref.finalize(self, self.bag.close)
+        super().__init__(np.zeros(0))
+        try:
+            self.find_streams(options)
+        except InputError:
+            raise
+        except Exception as error:
+            raise damaged(error, path) from error
+
+    @staticmethod
+    def open_bag(path: Path) -> Any:
+        """Open the bag, so that its messages can be decoded."""
+        return open_bag(path)
+
+    def find_streams(self, options: ReaderOptions) -> None:
+        """Set the attributes of the streams, and those of `FileSource`."""
+        raise NotImplementedError
+
+    def set_timestamps(self) -> None:
+        """Take the timestamps of `depth`."""
+        self.timestamps = self.depth.times
+        if (np.diff(self.timestamps) <= 0).any():
+            self.warnings.append("time decreases or repeats; frames stay in the order of the bag")
+
+    def load(self, index: int) -> Frame:
+        """See `FileSource.load`."""
+        where = self.where(index)
+        try:
+            return self.read_frame(index, where)
+        except InputError:
+            raise
+        except Exception as error:
+            raise damaged(error, where) from error
+
+    def where(self, index: int) -> str:
+        """Return the name of a frame for errors."""
+        return f"{self.path}: frame {index}"
+
+    def read_frame(self, index: int, where: str) -> Frame:
+        """Read a frame, which `where` names in errors."""
+        time = float(self.timestamps[index])
+        frame = RangeFrame(
+            index,
+            time,
+            self.camera,
+            self.read_depth(index, where),
+            self.kind,
+            amplitude_at(self.amplitude, time, self.camera, where, self.message),
+            amplitude_kind="ir",
+        )
+        k = None if self.color is None else self.color.nearest(time, MAX_GAP_S)
+        if self.color is None or k is None:
+            return frame
+        where = f"{where}, colour"
+        color = self.read_color(self.color, k, where)
+        return replace(frame, color_image=sampled_color(frame, color, self.color_camera, where))
+
+    def read_depth(self, index: int, where: str) -> Float32:
+        """Return the depth (H, W) of a frame in m."""
+        counts = image(self.message(self.depth, index), where, ENCODINGS)
+        check_size(counts, self.camera, where)
+        return depth_from_counts(counts.astype(np.uint16), self.unit)
+
+    def read_color(self, track: Track, index: int, where: str) -> UInt8:
+        """Return an image (H, W, 3) of a track."""
+        return color_image(self.message(track, index), where)
+
+    def message(self, track: Track, index: int) -> Any:
+        """Return a message of a track."""
+        return track.message(index)
+
+
 def amplitude_at(
     track: Track | None,
     time: float,
     camera: Camera,
     where: str,
-    read: Callable[[Track, int], Any] = Track.message,
+    read: Callable[[Track, int], Any],
 ) -> Float32 | None:
     """Return the amplitude (H, W) at the time of a depth image; zeros if there is none.
 

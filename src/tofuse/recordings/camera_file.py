@@ -98,8 +98,12 @@ class CameraFile:
     @property
     def metadata(self) -> dict[str, Any]:
         """Metadata of a recording's depth and sensor."""
-        sensor = {} if self.sensor is None else {"sensor": self.sensor}
-        return {"depth_kind": self.depth_kind, **sensor}
+        return {"depth_kind": self.depth_kind, **self.stated("sensor")}
+
+    def stated(self, *names: str) -> dict[str, Any]:
+        """Return those of the named attributes that are given."""
+        values = {name: getattr(self, name) for name in names}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
@@ -161,6 +165,52 @@ def number_in(
         return float(value)
     except OverflowError as error:
         raise InputError("is too large", where=f"{where}: {name}", remedy=remedy) from error
+
+
+def numbers_in(
+    data: Mapping[str, Any],
+    name: str,
+    where: str | Path,
+    shape: tuple[int, ...],
+    remedy: str,
+    *,
+    finite: bool = True,
+) -> Float64:
+    """Return an array of numbers of JSON data.
+
+    Parameters
+    ----------
+    data
+        The object.
+    name
+        Its field, which contains lists of numbers, nested or not.
+    where
+        The file, for errors.
+    shape
+        Of the array; -1 in it stands for any length.
+    remedy
+        The remedy.
+    finite
+        Whether all numbers have to be finite.
+
+    Raises
+    ------
+    InputError
+        If it is missing, has another count of numbers, or contains anything else.
+    """
+    place = f"{where}: {name}"
+    if data.get(name) is None:
+        raise InputError("is missing", where=place, remedy=remedy)
+    try:
+        values = np.array(data[name], float).reshape(shape)
+        valid = not finite or np.isfinite(values).all()
+    except (TypeError, ValueError, OverflowError):
+        valid = False
+    if not valid:
+        counts = " x ".join("N" if count < 0 else str(count) for count in shape)
+        noun = "finite numbers" if finite else "numbers"
+        raise InputError(f"is not {counts} {noun}", where=place, remedy=remedy)
+    return values
 
 
 def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
@@ -347,17 +397,9 @@ class _Fields:
         return InputError(problem, where=f"{self.where}: {field}", remedy=remedy)
 
     def number(self, field: str, *, required: bool = False, hint: str = "a number") -> float | None:
-        value = self.data.get(field)
-        if value is None:
-            if required:
-                raise self.error(field, "is missing", f"use {hint}")
+        if self.data.get(field) is None and not required:
             return None
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.error(field, f"is {value!r:.60}", f"use {hint}")
-        try:
-            value = float(value)
-        except OverflowError:
-            value = math.inf
+        value = number_in(self.data, field, self.where, remedy=f"use {hint}")
         if not math.isfinite(value):
             raise self.error(field, f"is {value}", f"use a finite {hint.removeprefix('a ')}")
         return value
@@ -475,6 +517,27 @@ def checked_lens(
         raise InputError(
             error.problem, where=f"{where}: {error.where}", remedy=error.remedy
         ) from error
+
+
+def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pinhole:
+    """Return the camera of a matrix from a file.
+
+    Parameters
+    ----------
+    K
+        (3, 3) of focal lengths and principal point.
+    size
+        (width, height) in pixels.
+    where
+        The file, for errors.
+
+    Raises
+    ------
+    InputError
+        See `checked_lens`.
+    """
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    return checked_lens(Pinhole, size, {name: float(v) for name, v in values.items()}, where)
 
 
 def _color(get: _Fields) -> ColorCamera | None:

@@ -14,12 +14,12 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder
 from tofuse.files.tables import read_numbers
-from tofuse.geometry.quaternion import length, to_matrix
+from tofuse.geometry.quaternion import length, to_pose
 from tofuse.recordings.deprojected import Deprojection, find_deprojection
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.organised import SAMPLES
 from tofuse.recordings.reader import CERTAIN, Sniff
-from tofuse.recordings.sources import FileSource, read_timestamps, tum_poses
+from tofuse.recordings.sources import FileSource
 
 # The resolution of float32 is coarser than half a millimetre beyond.
 MAP_COORDINATES_M = 8192.0
@@ -62,13 +62,9 @@ class CloudFileSource(FileSource):
         self._cached: dict[int, Frame] = {}  # read to determine shift and camera
         self._deprojection: Deprojection | None = None
         if is_folder(path):
-            self._read_timestamps(path / "timestamps.txt")
-            if is_file(path / "groundtruth.txt"):
-                self.reference = tum_poses(self, path / "groundtruth.txt")
-            elif is_file(path / "poses.txt"):
+            self.read_sidecars(path)
+            if self.reference is None and is_file(path / "poses.txt"):
                 self.reference = self._numbered_poses(path / "poses.txt")
-            if is_file(path / "odometry.txt"):
-                self.odometry = tum_poses(self, path / "odometry.txt")
         self._shift = np.zeros(3)
         if load_shifted is not None:
             self._shift, self._cached = find_shift(self._read, len(files))
@@ -121,11 +117,6 @@ class CloudFileSource(FileSource):
                     return None
         return find_deprojection(clouds) if len(clouds) > 1 else candidate
 
-    def _read_timestamps(self, path: Path) -> None:
-        if not is_file(path):
-            return
-        self.timestamps = read_timestamps(path, len(self.files), "cloud", self.warnings)
-
     def _numbered_poses(self, path: Path) -> Float64 | None:
         """Read lines 'index x y z qw qx qy qz' with the number in the file name as index."""
         table = read_numbers(path)
@@ -148,9 +139,7 @@ class CloudFileSource(FileSource):
             digits = re.findall(r"[0-9]+", file.stem)
             row = by_number.get(int(digits[-1])) if digits else None
             if row is not None:
-                out[k] = np.eye(4)
-                out[k, :3, :3] = to_matrix(row[[5, 6, 7, 4]])
-                out[k, :3, 3] = row[1:4]
+                out[k] = to_pose(row[[5, 6, 7, 4]], row[1:4])
         self.warnings.append(f"{path}: read as index x y z qw qx qy qz, used only as reference")
         return out
 
@@ -209,10 +198,7 @@ def cloud_files(path: Path, *suffixes: str) -> list[Path]:
 
 def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
     """Detect a file or a folder of files with one of the suffixes."""
-    try:
-        files = cloud_files(path, *suffixes)
-    except InputError:
-        return None
+    files = cloud_files(path, *suffixes)
     if not files:
         return None
     if is_folder(path) and is_file(path / "run.json"):

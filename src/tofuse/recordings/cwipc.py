@@ -12,7 +12,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry.se3 import check_pose, inverse, orthonormalise
-from tofuse.recordings.camera_file import read_json
+from tofuse.recordings.camera_file import numbers_in, read_json
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig, RigCamera, is_plain_name
 
@@ -161,15 +161,9 @@ def _camera(row: object, k: int, data: dict[str, Any], path: Path) -> CwipcCamer
 
 
 def _trafo(row: dict[str, Any], location: str, path: Path) -> Float64:
-    try:
-        T = np.asarray(row.get("trafo"), np.float64)
-    except (TypeError, ValueError):
-        T = np.zeros(0)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError(
-            f"{location}.trafo is not 4 x 4 finite numbers", where=path, remedy=_REMEDY
-        )
-    return orthonormalise(check_pose(T, where=f"{path}: {location}.trafo"))
+    where = f"{path}: {location}"
+    T = numbers_in(row, "trafo", where, (4, 4), _REMEDY)
+    return orthonormalise(check_pose(T, where=f"{where}.trafo"))
 
 
 def _in_color_frame(kind: str, data: dict[str, Any]) -> bool:

@@ -73,9 +73,7 @@ class DepthImageSource(FileSource):
         self.metadata |= {"depth_unit_m": depth_unit_m, "depth_kind": kind}
         if sensor:
             self.metadata["sensor"] = sensor
-        colored = sum(path is not None for path in self.color or ())
-        if 0 < colored < len(self.files):
-            self.warnings.append(f"only {colored} of {len(self.files)} frames have colour")
+        self.note_missing_color(self.color or ())
         remedy = "pass the camera of these images with --camera"
         check_first_size(self.files, (camera.width, camera.height), where, remedy)
 

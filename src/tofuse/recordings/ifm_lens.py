@@ -1,4 +1,4 @@
-"""The lens of ifm's O3R heads, which is stored with each frame."""
+"""Frames of ifm's O3R heads, with which unit and lens are stored."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import RayTable
 from tofuse.recordings.camera_file import MAX_SLOPE
+from tofuse.recordings.frames import RangeFrame
 
 BOUGUET, FISHEYE = 0, 2
 # version, units of distance and amplitude, 3 factors, 6 of the mounting, model and parameters.
 _INFO = struct.Struct("<I2f3f6fI32f")
 _PARAMETERS = 10
+_INVALID = 1  # bit of the flags
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,59 @@ def checked_info(unit: float, model: int, parameters: tuple[float, ...], where: 
     if not 1e-6 < unit < 1 or len(parameters) != _PARAMETERS or not np.isfinite(parameters).all():
         raise InputError("has implausible calibration values", where=where, remedy="copy it again")
     return HeadInfo(unit, model, parameters)
+
+
+def head_frame(
+    index: int,
+    timestamp: float,
+    info: HeadInfo,
+    where: str,
+    distance: NDArray[Any],
+    *,
+    flags: NDArray[Any] | None = None,
+    noise: NDArray[Any] | None = None,
+    amplitude: NDArray[Any] | None = None,
+) -> RangeFrame:
+    """Return a frame of a head.
+
+    Parameters
+    ----------
+    index, timestamp
+        Of the frame, s.
+    info
+        Unit and lens.
+    where
+        The recording or camera, for errors.
+    distance, noise
+        (H, W) radial distance and its standard deviation, see `HeadInfo.metres`.
+    flags
+        (H, W) bits for each pixel, which mark invalid ones.
+    amplitude
+        (H, W) counts.
+
+    Raises
+    ------
+    InputError
+        If the flags are not integers, or the lens is implausible.
+    """
+    depth = info.metres(distance)
+    if flags is not None:
+        if flags.dtype.kind not in "ui":
+            raise InputError("has flags that are not integers", where=where)
+        depth = np.where(flags & _INVALID, np.float32(0), depth)
+    if amplitude is not None:
+        amplitude = np.nan_to_num(amplitude.astype(np.float32), posinf=0, neginf=0)
+    return RangeFrame(
+        index,
+        timestamp,
+        head_camera(info, distance.shape[1], distance.shape[0], where),
+        depth,
+        "range",
+        amplitude,
+        sigma_image=None
+        if noise is None
+        else np.nan_to_num(info.metres(noise), posinf=0, neginf=0),
+    )
 
 
 @lru_cache(maxsize=16)

@@ -2,34 +2,16 @@
 
 from __future__ import annotations
 
-import weakref
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import Camera
-from tofuse.recordings.bags import (
-    MAX_GAP_S,
-    ROS1_MAGIC,
-    Track,
-    amplitude_at,
-    damaged,
-    open_bag,
-    open_container,
-)
-from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
-from tofuse.recordings.color import sampled_color
-from tofuse.recordings.depth_counts import depth_from_counts
-from tofuse.recordings.frames import DepthKind, RangeFrame
+from tofuse.recordings.bags import ROS1_MAGIC, BagSource, Track, open_bag, open_container
+from tofuse.recordings.camera_file import ColorCamera, load_camera
 from tofuse.recordings.reader import ReaderOptions
-from tofuse.recordings.ros_messages import ENCODINGS, color_image, image
-from tofuse.recordings.sources import FileSource
 
 
 def topics(path: Path) -> frozenset[str]:
@@ -65,52 +47,29 @@ def _topics_of(path: Path, changed_ns: int, size: int) -> frozenset[str]:
         bag.close()
 
 
-class BagSource(FileSource):
-    """A source over depth images of a bag, with amplitude and colour of other topics."""
+class MakerBagSource(BagSource):
+    """A source over a bag whose topics and messages are those of a maker."""
 
-    camera: Camera
-    unit: float
-    kind: DepthKind = "z"
-    depth: Track
-    amplitude: Track | None = None
-    color: Track | None = None
-    color_camera: ColorCamera | None = None
-
-    def __init__(self, path: Path, options: ReaderOptions) -> None:
-        self.path = path
+    def find_streams(self, options: ReaderOptions) -> None:
+        """See `BagSource.find_streams`."""
         if options.topic is not None:
             raise InputError(
                 "does not apply to this maker's bags",
                 where="--topic",
                 remedy="omit it, or use --format ros",
             )
-        self.bag = self.open_bag(path)
-        weakref.finalize(self, self.bag.close)
-        super().__init__(np.zeros(0))
-        try:
-            self.find_streams()
-            if options.camera is None:
-                self.camera = self.lens()
-            else:
-                description, self.camera = load_camera(options.camera)
-                self.unit, self.kind = description.depth_unit_m, description.depth_kind
-                self.color_camera = description.color
-            self._find_color()
-        except InputError:
-            raise
-        except Exception as error:
-            raise damaged(error, path) from error
-        self.timestamps = self.depth.times
-        if (np.diff(self.timestamps) <= 0).any():
-            self.warnings.append("time decreases or repeats; frames stay in the order of the bag")
+        self.find_tracks()
+        if options.camera is None:
+            self.camera = self.lens()
+        else:
+            description, self.camera = load_camera(options.camera)
+            self.unit, self.kind = description.depth_unit_m, description.depth_kind
+            self.color_camera = description.color
+        self._find_color()
+        self.set_timestamps()
         self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
 
-    @staticmethod
-    def open_bag(path: Path) -> Any:
-        """Open the bag, so that its messages can be decoded."""
-        return open_bag(path)
-
-    def find_streams(self) -> None:
+    def find_tracks(self) -> None:
         """Set `unit` and `depth`, and `amplitude` and `color` if the bag has them."""
         raise NotImplementedError
 
@@ -135,41 +94,6 @@ class BagSource(FileSource):
     def T_color_depth(self) -> Float64 | None:
         """(4, 4) maps points from the depth to the colour camera's frame; None if unknown."""
         return None if self.color_camera is None else self.color_camera.T_color_depth
-
-    def message(self, track: Track, index: int) -> Any:
-        """Return an image message of a track."""
-        return track.message(index)
-
-    def load(self, index: int) -> RangeFrame:
-        """See `FileSource.load`."""
-        where = f"{self.path}: frame {index}"
-        time = float(self.timestamps[index])
-        try:
-            counts = image(self.message(self.depth, index), where, ENCODINGS)
-            check_size(counts, self.camera, where)
-            frame = RangeFrame(
-                index,
-                time,
-                self.camera,
-                depth_from_counts(counts.astype(np.uint16), self.unit),
-                self.kind,
-                amplitude_at(self.amplitude, time, self.camera, where, self.message),
-                amplitude_kind="ir",
-            )
-            return self._colored(frame, where)
-        except InputError:
-            raise
-        except Exception as error:
-            raise damaged(error, where) from error
-
-    def _colored(self, frame: RangeFrame, where: str) -> RangeFrame:
-        """The frame with the colour image nearest in time, if there is one."""
-        k = None if self.color is None else self.color.nearest(frame.timestamp, MAX_GAP_S)
-        if k is None or self.color is None or self.color_camera is None:
-            return frame
-        where = f"{where}, colour"
-        image = color_image(self.message(self.color, k), where)
-        return replace(frame, color_image=sampled_color(frame, image, self.color_camera, where))
 
     def track(self, topic: str) -> Track | None:
         """Return the messages of a topic; None if there are none."""

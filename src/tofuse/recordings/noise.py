@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.errors import UnreadableFrameError
 from tofuse.files.reading import is_file, is_folder
 from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.recordings.frames import RangeFrame
@@ -87,15 +86,8 @@ def _in_folder(recording: Recording) -> NoiseModel | None:
 
 def _sampled_frames(recording: Recording) -> list[RangeFrame]:
     positions = np.unique(np.linspace(0, len(recording) - 1, _SAMPLED_FRAMES).astype(int))
-    frames = []
-    for k in positions:
-        try:
-            frame = recording[int(k)]
-        except UnreadableFrameError:
-            continue
-        if isinstance(frame, RangeFrame) and len(frame):
-            frames.append(frame)
-    return frames
+    images = (recording.image(int(k)) for k in positions)
+    return [image for image in images if image is not None and len(image)]
 
 
 def _rescaled(model: NoiseModel, law: AmplitudeLaw, frames: list[RangeFrame]) -> NoiseModel:

@@ -185,15 +185,23 @@ def _resolve_as(path: Path, format: str) -> list[_Located]:  # noqa: A002
             remedy=f"use one of {', '.join(choices)}",
         )
     reader = choices[format]
-    if reader.joinable and path.is_dir() and reader.sniff(path) is None:
-        parts = [p for p in list_folder(path) if is_folder(p) and reader.sniff(p) is not None]
+    if reader.joinable and path.is_dir() and _sniff_as(reader, path) is None:
+        parts = [p for p in list_folder(path) if is_folder(p) and _sniff_as(reader, p) is not None]
         if parts:
             return [_Located(p, reader) for p in parts]
     return [_Located(path, reader)]
 
 
+def _sniff_as(reader: Reader, path: Path) -> Sniff | None:
+    """Detect a format; None also if what tells it can't be read."""
+    try:
+        return reader.sniff(path)
+    except InputError:
+        return None
+
+
 def _sniff(path: Path) -> dict[str, Sniff]:
-    sniffs = {name: reader.sniff(path) for name, reader in readers().items()}
+    sniffs = {name: _sniff_as(reader, path) for name, reader in readers().items()}
     return {name: sniff for name, sniff in sniffs.items() if sniff is not None}
 
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from tofuse.arrays import Bool, Float32, UInt8
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera, RayTable
+from tofuse.recordings.depth_counts import MAX_COORDINATE_M
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.sources import MAX_COORDINATE_M
 
 SAMPLES = 8
 # Largest distance of a point from its pixel's ray: errors of rounding to 0.1 mm and float32.

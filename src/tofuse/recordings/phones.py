@@ -11,7 +11,7 @@ from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.images import read_color, read_image
 from tofuse.geometry.cameras import Pinhole, scaled
-from tofuse.recordings.camera_file import checked_lens
+from tofuse.recordings.camera_file import checked_pinhole
 from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.sources import FileSource, read_matrix_pose
@@ -35,8 +35,7 @@ def lens(
     K: Float64, image_size: tuple[int, int], size: tuple[int, int], where: str | Path
 ) -> Pinhole:
     """Return the camera of depth images of `size` from K (3, 3) of larger colour images."""
-    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    full = checked_lens(Pinhole, image_size, {k: float(v) for k, v in values.items()}, where)
+    full = checked_pinhole(K, image_size, where)
     try:
         return scaled(full, *size)
     except InputError as error:
@@ -78,9 +77,7 @@ class PhoneSource(FileSource):
             "depth_unit_m": 0.001,
             "confidence_max": CONFIDENCE_MAX,
         }
-        colored = sum(path is not None for path in self.color)
-        if 0 < colored < len(self.color):
-            self.warnings.append(f"only {colored} of {len(self.color)} frames have colour")
+        self.note_missing_color(self.color)
         present = sum(path is not None for path in self.confidence)
         if present < len(self.confidence):
             self.warnings.append(

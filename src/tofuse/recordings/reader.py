@@ -60,10 +60,13 @@ class Reader(Protocol):
     """
 
     part_kind: ClassVar[str] = "reader"
-    joinable: ClassVar[bool]
+    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
-        """Detect the format from names and first bytes; None if it is another one. Never raises."""
+        """Detect the format from names and first bytes; None if it is another one.
+
+        An InputError, if something can't be read, is taken for None.
+        """
         ...
 
     def open(self, path: Path, options: ReaderOptions) -> Source:

@@ -205,6 +205,14 @@ class Recording:
             out.append(frame)
         return out
 
+    def image(self, k: int) -> RangeFrame | None:
+        """Read frame `k`; None if it can't be read, or is not an image."""
+        try:
+            frame = self[k]
+        except UnreadableFrameError:
+            return None
+        return frame if isinstance(frame, RangeFrame) else None
+
     def first_readable(self) -> Frame | None:
         """Return the first readable frame; None if there is none."""
         for k in range(len(self)):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
 from tofuse.geometry.se3 import check_pose
-from tofuse.recordings.camera_file import read_json
+from tofuse.recordings.camera_file import number_in, numbers_in, read_json
 
 SCHEMA = 1
 FILE_NAME = "rig.json"
@@ -175,24 +174,23 @@ def _camera(row: object, k: int, path: str | Path) -> RigCamera:
         )
     if not isinstance(recording, str):
         raise InputError(f"{location}.recording is not a path", where=path, remedy=_REMEDY)
-    T = check_pose(
-        _numbers(row.get("T_rig_camera"), (4, 4), f"{location}.T_rig_camera", path), where=str(path)
-    )
-    C = _covariance(row.get("covariance", [0.0] * 36), f"{location}.covariance", path)
-    random = row.get("random_covariance")
-    if random is not None:
-        random = _covariance(random, f"{location}.random_covariance", path)
-    time = _number(row.get("time_offset_s", 0.0), _MAX_SECONDS, f"{location}.time_offset_s", path)
-    depth = _number(row.get("depth_offset_m", 0.0), _MAX_METRES, f"{location}.depth_offset_m", path)
+    where = f"{path}: {location}"
+    T = check_pose(numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY), where=str(path))
+    C = _covariance(row, "covariance", where) if "covariance" in row else np.zeros((6, 6))
+    random = None
+    if row.get("random_covariance") is not None:
+        random = _covariance(row, "random_covariance", where)
+    time = _number(row, "time_offset_s", _MAX_SECONDS, where, 0.0)
+    depth = _number(row, "depth_offset_m", _MAX_METRES, where, 0.0)
     return RigCamera(name, recording, T, C, time, depth, random)
 
 
-def _covariance(value: object, name: str, path: str | Path) -> Float64:
-    C = _numbers(value, (6, 6), name, path)
+def _covariance(row: dict[str, Any], name: str, where: str) -> Float64:
+    C = numbers_in(row, name, where, (6, 6), _REMEDY)
     min_eigenvalue = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
     tolerance = 1e-6 * max(np.abs(C).max(), 1e-9)
     if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or min_eigenvalue < -tolerance:
-        raise InputError(f"{name} is not a covariance", where=path, remedy=_REMEDY)
+        raise InputError("is not a covariance", where=f"{where}: {name}", remedy=_REMEDY)
     return np.asarray(0.5 * (C + C.T), np.float64)
 
 
@@ -200,8 +198,9 @@ def _disagreement(row: object, k: int, names: list[str], path: str | Path) -> Di
     location = f"disagreement[{k}]"
     if not isinstance(row, dict) or row.get("a") not in names or row.get("b") not in names:
         raise InputError(f"{location} does not name two cameras", where=path, remedy=_REMEDY)
-    median = _number(row.get("median_m"), 1e6, f"{location}.median_m", path)
-    pixels = _number(row.get("pixels", 0), 1e15, f"{location}.pixels", path)
+    where = f"{path}: {location}"
+    median = _number(row, "median_m", 1e6, where)
+    pixels = _number(row, "pixels", 1e15, where, 0.0)
     return Disagreement(str(row["a"]), str(row["b"]), median, int(pixels))
 
 
@@ -211,20 +210,12 @@ def _unplaced(rows: object, path: str | Path) -> dict[str, str]:
     return {str(row.get("name", "")): str(row.get("reason", "")) for row in rows}
 
 
-def _numbers(value: object, shape: tuple[int, int], name: str, path: str | Path) -> Float64:
-    try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    if array.size != shape[0] * shape[1] or not np.isfinite(array).all():
-        count = shape[0] * shape[1]
-        raise InputError(f"{name} is not {count} finite numbers", where=path, remedy=_REMEDY)
-    return array.reshape(shape)
-
-
-def _number(value: object, limit: float, name: str, path: str | Path) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{name} is {value!r}, not a number", where=path, remedy=_REMEDY)
-    if abs(value) > limit:
-        raise InputError(f"{name} is {value:g}, too large", where=path, remedy=_REMEDY)
-    return float(value)
+def _number(
+    row: dict[str, Any], name: str, limit: float, where: str, default: float | None = None
+) -> float:
+    value = number_in(row, name, where, default, _REMEDY)
+    if not abs(value) <= limit:
+        raise InputError(
+            f"is {value:g}, not at most {limit:g}", where=f"{where}: {name}", remedy=_REMEDY
+        )
+    return value

@@ -131,10 +131,8 @@ def _row(transform: Any) -> tuple[float, str, Float64] | None:
     values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w], float)
     if not np.isfinite(values).all() or abs(quaternion.length(values[3:]) - 1) > 0.01:
         return None
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = quaternion.to_matrix(values[3:]), values[:3]
     try:
-        T = se3.check_pose(T, where="tf")
+        T = se3.check_pose(quaternion.to_pose(values[3:], values[:3]), where="tf")
     except InputError:
         return None
     stamp = transform.header.stamp

@@ -22,11 +22,8 @@ def file_of(path: Path, *suffixes: str) -> Path | None:
 
 
 def begins_with(file: Path | None, head: bytes) -> bool:
-    """Return whether there is a file, can be read, and begins with these bytes."""
-    try:
-        return file is not None and read_head(file, len(head)) == head
-    except InputError:
-        return False
+    """Return whether there is a file that begins with these bytes; errors as `read_head`."""
+    return file is not None and read_head(file, len(head)) == head
 
 
 def required_file(path: Path, *suffixes: str) -> Path:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,11 @@ from tofuse.files.reading import is_file
 from tofuse.files.tables import read_numbers
 from tofuse.files.trajectory import associated_poses, read_tum
 from tofuse.geometry.se3 import check_pose, orthonormalise
+from tofuse.recordings.depth_counts import MAX_COORDINATE_M
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.recording import Source
 
-MAX_COORDINATE_M = 1e9  # larger coordinates are considered damaged
+T = TypeVar("T")
 
 
 class FileSource(ABC):
@@ -54,6 +55,22 @@ class FileSource(ABC):
         """
         return None
 
+    def read_sidecars(self, folder: Path) -> None:
+        """Read timestamps.txt, groundtruth.txt and odometry.txt, as far as the folder has them."""
+        path = folder / "timestamps.txt"
+        if is_file(path):
+            self.timestamps = _read_timestamps(path, len(self.timestamps), self.warnings)
+        if is_file(folder / "groundtruth.txt"):
+            self.reference = tum_poses(self, folder / "groundtruth.txt")
+        if is_file(folder / "odometry.txt"):
+            self.odometry = tum_poses(self, folder / "odometry.txt")
+
+    def note_missing_color(self, color: Sequence[object]) -> None:
+        """Warn if some of the frames have no colour: None in `color`."""
+        colored = sum(item is not None for item in color)
+        if 0 < colored < len(color):
+            self.warnings.append(f"only {colored} of {len(color)} frames have colour")
+
     def read(self, index: int) -> Frame:
         """See `Source.read`."""
         try:
@@ -80,21 +97,38 @@ def tum_poses(source: FileSource, path: Path) -> Float64:
     return out
 
 
-def poses_from_files(
-    source: FileSource, files: Sequence[Path], read: Callable[[Path], Float64]
-) -> Float64:
-    """Return (N, 4, 4) poses from one file per frame; NaN, and a warning, if one can't be read."""
-    poses = np.full((len(files), 4, 4), np.nan)
-    errors = []
-    for k, path in enumerate(files):
-        if is_file(path):
-            try:
-                poses[k] = read(path)
-            except InputError as error:
-                errors.append(error)
+def poses_of(
+    source: FileSource, items: Iterable[T], read: Callable[[T], Float64 | None]
+) -> Float64 | None:
+    """Return the poses (N, 4, 4) of all frames; None if none is known.
+
+    Parameters
+    ----------
+    source
+        Receives a warning if poses can't be read.
+    items
+        One for each frame: what its pose is read from.
+    read
+        Returns the pose (4, 4), NaN or None if unknown; raises InputError if it can't be read.
+    """
+    poses, errors = [], []
+    for item in items:
+        pose = None
+        try:
+            pose = read(item)
+        except InputError as error:
+            errors.append(error)
+        poses.append(np.full((4, 4), np.nan) if pose is None else pose)
     if errors:
         source.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
-    return poses
+    return np.stack(poses) if np.isfinite(poses).any() else None
+
+
+def poses_from_files(
+    source: FileSource, files: Iterable[Path], read: Callable[[Path], Float64]
+) -> Float64 | None:
+    """Return the poses of one file per frame, which may be missing; see `poses_of`."""
+    return poses_of(source, files, lambda path: read(path) if is_file(path) else None)
 
 
 def read_matrix_pose(table: Float64, where: str) -> Float64:
@@ -113,14 +147,14 @@ def read_matrix_pose(table: Float64, where: str) -> Float64:
     return orthonormalise(check_pose(table, where=where))
 
 
-def read_timestamps(path: Path, count: int, noun: str, warnings: list[str]) -> Float64:
-    """Read a timestamps.txt: (N,) seconds for `count` images or clouds (`noun`, for errors)."""
+def _read_timestamps(path: Path, count: int, warnings: list[str]) -> Float64:
+    """Read a timestamps.txt: (N,) seconds for `count` frames."""
     table = read_numbers(path)
     if table.shape != (count, 1):
         raise InputError(
-            f"has {len(table)} lines of {table.shape[-1]} numbers for {count} {noun}s",
+            f"has {len(table)} lines of {table.shape[-1]} numbers for {count} frames",
             where=path,
-            remedy=f"use one time in seconds for each {noun}",
+            remedy="use one time in seconds for each frame, or remove it",
         )
     times = table[:, 0]
     check_timestamps(times, path, warnings)
@@ -141,6 +175,12 @@ def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
     elif (steps == 0).any():
         k = int(np.argmax(steps == 0)) + 1
         warnings.append(f"{path}: frames {k - 1} and {k} have the same timestamp")
+
+
+def interpolated(times: Float64) -> Float64:
+    """Return timestamps (N,) of frames, some of them finite, with the others interpolated."""
+    known, index = np.isfinite(times), np.arange(len(times))
+    return np.where(known, times, np.interp(index, index[known], times[known]))
 
 
 def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:

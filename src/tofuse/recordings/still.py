@@ -189,13 +189,10 @@ class _AveragedSource:
         self, recording: Recording, intervals: Sequence[tuple[int, int]], model: NoiseModel
     ) -> None:
         self._recording, self._intervals, self._model = recording, list(intervals), model
-        middle = np.array([(a + b - 1) // 2 for a, b in intervals], np.intp)
-        self.timestamps: Float64 = recording.timestamps[middle]
-        reference, odometry = recording.reference, recording.odometry
-        gravity = recording.gravity
-        self.reference = None if reference is None else reference[middle]
-        self.odometry = None if odometry is None else odometry[middle]
-        self.gravity = None if gravity is None else gravity[middle]
+        positions = np.array([(a + b - 1) // 2 for a, b in intervals], np.intp)
+        middle = replace(recording, indices=recording.indices[positions])
+        self.timestamps, self.gravity = middle.timestamps, middle.gravity
+        self.reference, self.odometry = middle.reference, middle.odometry
         self.metadata: dict[str, Any] = {
             **recording.metadata,
             "averaged": [b - a for a, b in intervals],

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.errors import InputError
 from tofuse.filters.base import apply_filters
 from tofuse.pipeline.adaptation import with_recording_defaults
 from tofuse.pipeline.config import Config, from_method
@@ -56,11 +56,8 @@ class Camera:
 
     def image(self, k: int) -> RangeFrame | None:
         """Read image `k`; None if it can't be read, or is empty."""
-        try:
-            frame = self.recording[k]
-        except UnreadableFrameError:
-            return None
-        return frame if isinstance(frame, RangeFrame) and len(frame) else None
+        frame = self.recording.image(k)
+        return frame if frame is not None and len(frame) else None
 
     def every_image(self) -> Iterator[RangeFrame]:
         """Read all images that can be read."""

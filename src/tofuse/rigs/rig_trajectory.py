@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.arrays import Float64, Intp
-from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct
@@ -287,11 +287,8 @@ def _spaced_instants(
 
 def _image(recording: Recording, k: int) -> RangeFrame | None:
     """Return image `k` of the recording; None if it can't be read, or is empty."""
-    try:
-        frame = recording[k]
-    except UnreadableFrameError:
-        return None
-    return frame if isinstance(frame, RangeFrame) and len(frame) else None
+    frame = recording.image(k)
+    return frame if frame is not None and len(frame) else None
 
 
 def _weighted_means(rig_estimates: Sequence[_RigEstimate]) -> Float64:

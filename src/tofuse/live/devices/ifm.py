@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from tofuse.live.device import TIMEOUT_S, Settings, Stream, no_frame, not_started, vendor
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.ifm_lens import head_camera, read_info
-
-INVALID = 1  # bit of the confidence
+from tofuse.recordings.ifm_lens import head_camera, head_frame, read_info
 
 
 @part("device", "ifm-o3r")
@@ -83,16 +81,15 @@ class IfmO3rStream(Stream):
     def read(self, index: int) -> RangeFrame:
         """See `Stream.read`."""
         frame = self._wait()
-        distance = self._info.metres(self._buffer(frame, "RADIAL_DISTANCE_IMAGE"))
-        flags = self._buffer(frame, "CONFIDENCE_IMAGE")
-        return RangeFrame(
+        return head_frame(
             index,
             frame.timestamps()[0].timestamp(),
-            self.settings.camera,
-            np.where(flags & INVALID, np.float32(0), distance),
-            "range",
-            self._buffer(frame, "NORM_AMPLITUDE_IMAGE").astype(np.float32),
-            sigma_image=self._info.metres(self._buffer(frame, "RADIAL_DISTANCE_NOISE")),
+            self._info,
+            "ifm O3R",
+            self._buffer(frame, "RADIAL_DISTANCE_IMAGE"),
+            flags=self._buffer(frame, "CONFIDENCE_IMAGE"),
+            noise=self._buffer(frame, "RADIAL_DISTANCE_NOISE"),
+            amplitude=self._buffer(frame, "NORM_AMPLITUDE_IMAGE"),
         )
 
     def close(self) -> None:

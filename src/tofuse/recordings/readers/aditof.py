@@ -6,7 +6,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, ClassVar
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from tofuse.parts import part
 from tofuse.recordings.camera_file import load_camera
 from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.recording import evenly_spaced
 from tofuse.recordings.sources import FileSource
 
@@ -101,18 +101,13 @@ class _Images:
 
 @part("reader", "aditof", label="experimental")
 @dataclass(frozen=True)
-class AdiTof:
+class AdiTof(Reader):
     """A .bin file of frames of Analog Devices' ToF SDK, or a folder of them."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            files = _files(path)
-            frames, complete = _frames_in(files[0]) if files else ([], False)
-        except InputError:
-            return None
+        files = _files(path)
+        frames, complete = _frames_in(files[0]) if files else ([], False)
         if len(frames) > 1 or (frames and complete):
             return Sniff(1.0, "frames of Analog Devices' ToF SDK")
         return None

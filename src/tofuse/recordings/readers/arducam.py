@@ -5,18 +5,19 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
-from tofuse.files.reading import files_named, is_file, read_bytes
+from tofuse.files.images import read_raw
+from tofuse.files.reading import files_named, is_file
 from tofuse.parts import part
-from tofuse.recordings.camera_file import CameraFile, camera_file_of, load_camera
+from tofuse.recordings.camera_file import CameraFile, camera_file_of, check_size, load_camera
+from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
-from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.sources import FileSource
 
 # Width and height in pixels, and the time at which the file was written in ms.
 _NAME = re.compile(r"(depth|confidence)_(\d{1,5})_(\d{1,5})_f32_(\d{1,15})\.raw")
@@ -25,10 +26,8 @@ CONFIDENCE_MAX = 255.0
 
 @part("reader", "arducam", label="experimental")
 @dataclass(frozen=True)
-class Arducam:
+class Arducam(Reader):
     """Folders of depth_W_H_f32_*.raw (Arducam ToF), with the camera in a camera.json."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -78,14 +77,11 @@ class ArducamSource(FileSource):
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
-        values = self._floats(self.depth[index])
-        with np.errstate(over="ignore", invalid="ignore"):
-            depth = values * np.float32(self.description.depth_unit_m)
         return RangeFrame(
             index,
             float(self.timestamps[index]),
             self.camera,
-            np.where((depth > 0) & (depth < MAX_COORDINATE_M), depth, np.float32(0)),
+            depth_from_numbers(self._floats(self.depth[index]), self.description.depth_unit_m),
             self.description.depth_kind,
             confidence_image=self._confidence(self.confidence[index]),
         )
@@ -98,21 +94,9 @@ class ArducamSource(FileSource):
 
     def _floats(self, image: _Image) -> Float32:
         """(H, W) values of a file."""
-        size = (self.camera.width, self.camera.height)
-        if image.size != size:
-            raise InputError(
-                f"is of {image.size[0]} x {image.size[1]} pixels, its camera {size[0]} x {size[1]}",
-                where=image.path,
-                remedy="pass the camera of these images with --camera",
-            )
-        data = read_bytes(image.path, limit=1 << 26)
-        if len(data) != 4 * size[0] * size[1]:
-            raise InputError(
-                f"has {len(data)} bytes, not 4 for each of {size[0]} x {size[1]} pixels",
-                where=image.path,
-                remedy="save it again",
-            )
-        return np.frombuffer(data, "<f4").reshape(size[1], size[0]).astype(np.float32)
+        values = read_raw(image.path, "<f4", image.size, "save it again")
+        check_size(values, self.camera, image.path)
+        return values.astype(np.float32)
 
 
 def _images(path: Path, kind: str) -> list[_Image]:

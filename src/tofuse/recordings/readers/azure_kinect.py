@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +24,7 @@ from tofuse.parts import part
 from tofuse.recordings.camera_file import ColorCamera, load_camera
 from tofuse.recordings.color import sampled_color
 from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.single_files import begins_with, file_of, required_file
 from tofuse.recordings.sources import FileSource
 
@@ -108,10 +108,8 @@ def depth_camera(lens: KinectLens) -> Camera:
 
 @part("reader", "azure-kinect", label="validated")
 @dataclass(frozen=True)
-class AzureKinect:
+class AzureKinect(Reader):
     """A .mkv file of k4arecorder: depth, infrared, and colour if it is MJPG."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
 from tofuse.errors import InputError
-from tofuse.files.images import read_color
-from tofuse.files.reading import files_named, if_file, is_file, read_bytes
+from tofuse.files.images import read_color, read_raw
+from tofuse.files.reading import files_named, if_file, is_file
 from tofuse.parts import part
 from tofuse.recordings.camera_file import CameraFile, camera_file_of, load_camera
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
-from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource
 
 _SUFFIXES = ("_depth16.bin", ".depth16")
@@ -25,10 +24,8 @@ CONFIDENCE_MAX = 7.0
 
 @part("reader", "depth16", label="experimental")
 @dataclass(frozen=True)
-class Depth16:
+class Depth16(Reader):
     """Folders of *_depth16.bin or *.depth16, with the camera in a camera.json."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -67,29 +64,19 @@ class Depth16Source(FileSource):
             "depth_unit_m": self.description.depth_unit_m,
             "confidence_max": CONFIDENCE_MAX,
         }
-        colored = sum(path is not None for path in self.color)
-        if 0 < colored < len(files):
-            self.warnings.append(f"only {colored} of {len(files)} frames have colour")
+        self.note_missing_color(self.color)
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
-        path = self.files[index]
-        width, height = self.camera.width, self.camera.height
-        data = read_bytes(path, limit=1 << 26)
-        if len(data) != 2 * width * height:
-            raise InputError(
-                f"has {len(data)} bytes, not 2 for each of {width} x {height} pixels",
-                where=path,
-                remedy="pass the camera of these images with --camera",
-            )
-        samples = np.frombuffer(data, "<u2").reshape(height, width)
+        size = (self.camera.width, self.camera.height)
+        remedy = "pass the camera of these images with --camera"
+        samples = read_raw(self.files[index], "<u2", size, remedy)
         counts = samples & ((1 << _BITS) - 1)
         depth = counts.astype(np.float32) * np.float32(self.description.depth_unit_m)
         # 0 means unknown and counts as full confidence; 1 is 0 %, 7 is 6/7.
         level = (samples >> _BITS).astype(np.uint8)
         confidence = np.where(level == 0, np.uint8(CONFIDENCE_MAX), level - np.uint8(1))
         color = self.color[index]
-        size = (width, height)
         return RangeFrame(
             index,
             float(self.timestamps[index]),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -13,24 +12,19 @@ from tofuse.files.images import read_header
 from tofuse.files.reading import files_with, is_file
 from tofuse.parts import part
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import CERTAIN, ReaderOptions, Sniff
+from tofuse.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
 
 
 @part("reader", "depth-png")
 @dataclass(frozen=True)
-class DepthPng:
+class DepthPng(Reader):
     """A 16-bit .png, with a camera.json given or in its folder."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            if not (is_file(path) and path.suffix.lower() == ".png"):
-                return None
-            header = read_header(path)
-        except InputError:
+        if not (is_file(path) and path.suffix.lower() == ".png"):
             return None
+        header = read_header(path)
         if header.bits != 16 or header.channels != 1:
             return None
         return Sniff(CERTAIN, "a 16-bit PNG")

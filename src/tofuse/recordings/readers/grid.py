@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from tofuse.files.tables import parse_numbers
 from tofuse.geometry.cameras import Camera
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import CloudFileSource, cloud_files, required_files
+from tofuse.recordings.depth_counts import MAX_COORDINATE_M
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.organised import (
     SAMPLES,
@@ -28,8 +28,8 @@ from tofuse.recordings.organised import (
     organised_frame,
     ray_origin_offset,
 )
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import MAX_COORDINATE_M, to_float32
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.sources import to_float32
 
 _SUFFIXES = (".ply", ".csv", ".pcd")
 _AMPLITUDES = ("intensity", "amplitude", "i")
@@ -42,10 +42,8 @@ _MAX_RAY_DISTANCE_PX, _MIN_ON_RAYS = 0.3, 0.8
 
 @part("reader", "grid")
 @dataclass(frozen=True)
-class Grid:
+class Grid(Reader):
     """A folder of .ply, .csv or .pcd files with one point per pixel, row-major; m or mm."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

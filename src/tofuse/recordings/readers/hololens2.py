@@ -6,15 +6,15 @@ import re
 import tarfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import Float32
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
+from tofuse.files.images import read_raw
 from tofuse.files.pgm import parse_pgm
-from tofuse.files.reading import input_error, is_file, is_folder, list_folder, read_bytes
+from tofuse.files.reading import input_error, is_file, is_folder, list_folder
 from tofuse.files.tables import read_numbers
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import RayTable
@@ -22,8 +22,8 @@ from tofuse.parts import part
 from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import POSES_BY
-from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import FileSource, read_matrix_pose
+from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.sources import FileSource, poses_of, read_matrix_pose
 
 # The streams by preference, with their ambiguity range in m.
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
@@ -35,10 +35,8 @@ _REMEDY = "copy the recording again"
 
 @part("reader", "hololens2", label="experimental")
 @dataclass(frozen=True)
-class HoloLens2:
+class HoloLens2(Reader):
     """Folders with 'Depth Long Throw_lut.bin' and .tar, or those of 'Depth AHaT'."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -120,24 +118,17 @@ class HoloLens2Source(FileSource):
         row_ticks = np.where(np.isfinite(table[:, 0]), table[:, 0], -1).astype(float)
         order = np.argsort(row_ticks, kind="stable")
         nearest = np.searchsorted(row_ticks[order], np.array(self.ticks, float) - 64)
-        poses = np.full((len(self.ticks), 4, 4), np.nan)
-        errors: list[InputError] = []
-        for k, (tick, position) in enumerate(zip(self.ticks, nearest.tolist(), strict=True)):
+
+        def pose(item: tuple[int, int]) -> Float64 | None:
+            tick, position = item
             if position == len(row_ticks) or abs(row_ticks[order[position]] - tick) > 64:
-                continue
+                return None
             row = order[position]
-            try:
-                T_world_rig = read_matrix_pose(
-                    table[row, 1:].reshape(4, 4), f"{trajectory}, row {row}"
-                )
-            except InputError as error:
-                errors.append(error)
-                continue
-            poses[k] = T_world_rig @ se3.inverse(T_camera_rig)
-        if errors:
-            self.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
-        if np.isfinite(poses).any():
-            self.reference = poses
+            table_of_row = table[row, 1:].reshape(4, 4)
+            T_world_rig = read_matrix_pose(table_of_row, f"{trajectory}, row {row}")
+            return T_world_rig @ se3.inverse(T_camera_rig)
+
+        self.reference = poses_of(self, zip(self.ticks, nearest.tolist(), strict=True), pose)
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
@@ -232,15 +223,7 @@ def _images(folder: Path, stream: str) -> tuple[_Images, bool]:
 
 def _rays(path: Path, shape: tuple[int, int]) -> Float32:
     """Rays (H, W, 2) from a table of unit vectors; NaN where undefined."""
-    data = read_bytes(path, limit=_MAX_BYTES)
-    height, width = shape
-    if len(data) != 12 * height * width:
-        raise InputError(
-            f"has {len(data)} bytes, not 12 for each of {width} x {height} pixels",
-            where=path,
-            remedy=_REMEDY,
-        )
-    table = np.frombuffer(data, "<f4").reshape(height, width, 3).astype(float)
+    table = read_raw(path, "3<f4", (shape[1], shape[0]), _REMEDY).astype(float)
     with np.errstate(all="ignore"):
         rays = table[..., :2] / table[..., 2:]
         valid = np.isfinite(rays).all(-1) & (table[..., 2] > 0) & (np.abs(rays) < 1e4).all(-1)

@@ -6,7 +6,7 @@ import threading
 import weakref
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,8 @@ from tofuse.errors import InputError
 from tofuse.files.reading import required_package
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.ifm_lens import HeadInfo, checked_info, head_camera
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.readers.ifm_o3r import INVALID
+from tofuse.recordings.ifm_lens import HeadInfo, checked_info, head_frame
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import begins_with, file_of, required_file
 from tofuse.recordings.sources import FileSource
 
@@ -30,16 +29,15 @@ _REQUIRED = (
     "intrinsicCalibModelID",
     "intrinsicCalibModelParameters",
 )
+_IMAGES = {"flags": "confidence", "noise": "distanceNoise", "amplitude": "amplitude"}
 _MAX_FRAMES, _MAX_BYTES = 1_000_000, 1 << 26  # per file, and per frame
 _LENS_PARAMETERS = 10
 
 
 @part("reader", "ifm-h5", label="experimental")
 @dataclass(frozen=True)
-class IfmH5:
+class IfmH5(Reader):
     """A .h5 file with streams o3r_tof_0, ...: range, noise, amplitude, intrinsics."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -128,28 +126,13 @@ class IfmH5Source(FileSource):
         unit, model = float(row["distanceResolution"]), int(row["intrinsicCalibModelID"])
         parameters = tuple(stored[:_LENS_PARAMETERS].tolist())
         info: HeadInfo = checked_info(unit, model, parameters, where)
-        distance = info.metres(counts)
-        if "confidence" in self.fields:
-            flags = self._image(row, "confidence", where, counts.shape)
-            if flags.dtype.kind not in "ui":
-                raise InputError("has flags that are not integers", where=where)
-            distance = np.where(flags & INVALID, np.float32(0), distance)
-        noise = amplitude = None
-        if "distanceNoise" in self.fields:
-            noise_counts = self._image(row, "distanceNoise", where, counts.shape)
-            noise = np.nan_to_num(info.metres(noise_counts), posinf=0, neginf=0)
-        if "amplitude" in self.fields:
-            amplitude = self._image(row, "amplitude", where, counts.shape).astype(np.float32)
-            amplitude = np.nan_to_num(amplitude, posinf=0, neginf=0)
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            head_camera(info, counts.shape[1], counts.shape[0], str(self.path)),
-            distance,
-            "range",
-            amplitude,
-            sigma_image=noise,
-        )
+        images = {
+            name: self._image(row, field, where, counts.shape)
+            for name, field in _IMAGES.items()
+            if field in self.fields
+        }
+        time = float(self.timestamps[index])
+        return head_frame(index, time, info, str(self.path), counts, **images)
 
     def _image(
         self, row: Any, name: str, where: str, shape: tuple[int, ...] | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,33 +15,26 @@ from tofuse.files.pcic import BEGIN, Chunk, chunk_image, pcic_frames
 from tofuse.files.reading import read_bytes, read_head
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.ifm_lens import HeadInfo, head_camera, read_info
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.ifm_lens import HeadInfo, head_frame, read_info
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import file_of, required_file
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.sources import FileSource, interpolated
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
-INVALID = 1  # bit of the confidence
-
+_IMAGES = {"flags": CONFIDENCE, "noise": NOISE, "amplitude": AMPLITUDE}
 _MAX_BYTES = 2 << 30
 
 
 @part("reader", "ifm-o3r", label="validated")
 @dataclass(frozen=True)
-class IfmO3r:
+class IfmO3r(Reader):
     """A .data or .pcic file of the O3R's frames: range, noise, amplitude, intrinsics."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         file = file_of(path, ".data", ".pcic", ".bin")
-        try:
-            if file is not None and BEGIN in read_head(file, 64):
-                return Sniff(1.0, "a PCIC stream")
-        except InputError:
-            pass
-        return None
+        matches = file is not None and BEGIN in read_head(file, 64)
+        return Sniff(1.0, "a PCIC stream") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> IfmO3rSource:
         """See `Reader.open`."""
@@ -90,28 +83,13 @@ class IfmO3rSource(FileSource):
                 )
         info = _info(self.data, chunks[INFO], where)
         counts = chunk_image(self.data, chunks[DISTANCE], where)
-        distance = info.metres(counts)
-        if CONFIDENCE in chunks:
-            flags = self._image(chunks[CONFIDENCE], counts.shape, where)
-            if flags.dtype.kind not in "ui":
-                raise InputError("has flags that are not integers", where=where)
-            distance = np.where(flags & INVALID, np.float32(0), distance)
-        noise = amplitude = None
-        if NOISE in chunks:
-            noise_counts = self._image(chunks[NOISE], counts.shape, where)
-            noise = np.nan_to_num(info.metres(noise_counts), posinf=0, neginf=0)
-        if AMPLITUDE in chunks:
-            amplitude = self._image(chunks[AMPLITUDE], counts.shape, where).astype(np.float32)
-            amplitude = np.nan_to_num(amplitude, posinf=0, neginf=0)
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            head_camera(info, counts.shape[1], counts.shape[0], str(self.path)),
-            distance,
-            "range",
-            amplitude,
-            sigma_image=noise,
-        )
+        images = {
+            name: self._image(chunks[kind], counts.shape, where)
+            for name, kind in _IMAGES.items()
+            if kind in chunks
+        }
+        time = float(self.timestamps[index])
+        return head_frame(index, time, info, str(self.path), counts, **images)
 
     def _image(self, chunk: Chunk, shape: tuple[int, ...], where: str) -> NDArray[Any]:
         image: NDArray[Any] = chunk_image(self.data, chunk, where)
@@ -134,8 +112,6 @@ def _times(frames: list[dict[int, Chunk] | InputError]) -> Float64:
     for k, chunks in enumerate(frames):
         if not isinstance(chunks, InputError) and chunks:
             times[k] = next(iter(chunks.values())).time
-    valid, index = np.isfinite(times), np.arange(len(times))
-    if not valid.any():
-        return index.astype(float)
-    times[~valid] = np.interp(index[~valid], index[valid], times[valid])
-    return times
+    if not np.isfinite(times).any():
+        return np.arange(len(times), dtype=float)
+    return interpolated(times)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,9 +14,9 @@ from tofuse.files.images import first_size
 from tofuse.files.reading import files_named, is_file, is_folder, list_folder, read_text
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import checked_lens
+from tofuse.recordings.camera_file import checked_pinhole
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
 
 _DEPTH = re.compile(r"([0-9]{1,9})_depth\.png", re.IGNORECASE)
 # Camera of an image, and its scale relative to the calibration, by the image size.
@@ -31,10 +30,8 @@ _MATRIX = re.compile(r"^cameraMatrix:.*?data:\s*\[(.*?)\]", re.DOTALL | re.MULTI
 
 @part("reader", "kinect2", label="experimental")
 @dataclass(frozen=True)
-class Kinect2:
+class Kinect2(Reader):
     """Folders of NNNN_depth.png and NNNN_color.jpg, with kinect2_bridge's calib_*.yaml."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -105,9 +102,7 @@ def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
     numbers = _numbers(match[1]) if match else np.zeros(0)
     if numbers.shape != (9,):
         raise InputError("has no cameraMatrix of 9 numbers", where=path, remedy="copy it again")
-    K = scale * numbers.reshape(3, 3)
-    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    return checked_lens(Pinhole, size, {k: float(v) for k, v in values.items()}, path)
+    return checked_pinhole(scale * numbers.reshape(3, 3), size, path)
 
 
 def _numbers(text: str) -> Float64:

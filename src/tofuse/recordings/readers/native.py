@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.files.images import check_first_size, read_color, read_image
 from tofuse.files.reading import files_with, is_file, is_folder, list_folder, read_text
-from tofuse.files.tables import read_columns, read_numbers
+from tofuse.files.tables import read_columns
 from tofuse.geometry.cameras import Camera, Pinhole, range_from_z, z_from_range
 from tofuse.parts import part
 from tofuse.recordings.camera_file import (
@@ -33,8 +32,8 @@ from tofuse.recordings.frames import (
 )
 from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.native import LENS_COLUMNS
-from tofuse.recordings.reader import CERTAIN, UNCERTAIN, ReaderOptions, Sniff
-from tofuse.recordings.sources import FileSource, check_timestamps, ply_frame, tum_poses
+from tofuse.recordings.reader import CERTAIN, UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.sources import FileSource, ply_frame
 from tofuse.sensor.depth_correction import DepthCorrection
 from tofuse.sensor.frequencies import DISAGREEMENT, SPEED_OF_LIGHT, combined
 
@@ -77,7 +76,7 @@ class NativeSource(FileSource):
         self.description, self.camera = self._read_camera(camera_file)
         rate = self.description.frame_rate_hz
         super().__init__(np.arange(len(self.files)) / (rate or 1.0))
-        self._read_timestamps()
+        self.read_sidecars(folder)
         self.amplitude = self._channel_files("amplitude", ".png")
         self.confidence = self._channel_files("confidence", ".png")
         self.color = self._channel_files("color", *_IMAGES)
@@ -96,10 +95,6 @@ class NativeSource(FileSource):
                 where=f"{self.folder / 'camera.json'}: sigma_unit_m",
                 remedy="set the metres per count of sigma",
             )
-        if is_file(folder / "groundtruth.txt"):
-            self.reference = tum_poses(self, folder / "groundtruth.txt")
-        if is_file(folder / "odometry.txt"):
-            self.odometry = tum_poses(self, folder / "odometry.txt")
         self._read_gravity()
         self._check_sizes()
         self._fill_metadata()
@@ -201,20 +196,6 @@ class NativeSource(FileSource):
         if is_file(path):
             return read_camera_file(path, clouds=True), None
         return CameraFile(None, None), None
-
-    def _read_timestamps(self) -> None:
-        path = self.folder / "timestamps.txt"
-        if not is_file(path):
-            return
-        table = read_numbers(path)
-        if len(table) != len(self.files):
-            raise self._count_error(path, f"{len(table)} lines")
-        if table.shape[1] != 1:
-            raise InputError(
-                f"has {table.shape[1]} numbers per line", where=path, remedy="use one, in seconds"
-            )
-        self.timestamps = table[:, 0]
-        check_timestamps(self.timestamps, path, self.warnings)
 
     def _channel_files(self, name: str, *suffixes: str) -> list[Path]:
         folder = self.folder / name
@@ -330,9 +311,9 @@ class NativeSource(FileSource):
                 f"{self.folder / 'camera.json'}: unknown fields ignored: "
                 f"{', '.join(description.unknown)}"
             )
-        for name in ("sensor", "frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"):
-            if getattr(description, name) is not None:
-                self.metadata[name] = getattr(description, name)
+        self.metadata |= description.stated(
+            "sensor", "frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"
+        )
         if self.camera is not None:
             self.metadata["depth_unit_m"] = description.depth_unit_m
             self.metadata["depth_kind"] = description.depth_kind
@@ -345,10 +326,10 @@ class NativeSource(FileSource):
 
 @part("reader", "native", label="validated")
 @dataclass(frozen=True)
-class Native:
+class Native(Reader):
     """Folders with a camera.json and depth/ (PNG) or cloud/ (PLY)."""
 
-    joinable: ClassVar[bool] = True
+    joinable = True
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -17,11 +17,11 @@ from tofuse.files.trajectory_formats import OPENGL
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, image_size, number_in, read_json
-from tofuse.recordings.depth_counts import depth_from_counts
+from tofuse.recordings.depth_counts import depth_from_counts, depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
-from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource, read_matrix_pose
+from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.sources import FileSource, poses_of, read_matrix_pose
 
 NAME = "transforms.json"
 _DEPTH = ("depth_file_path", "depth_path")
@@ -39,18 +39,13 @@ _REMEDY = "correct it there"
 
 @part("reader", "nerfstudio", label="experimental")
 @dataclass(frozen=True)
-class Nerfstudio:
+class Nerfstudio(Reader):
     """A transforms.json whose frames have depth, or the folder of one."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         file = _file(path)
-        try:
-            head = read_head(file, _HEAD_BYTES) if is_file(file) else b""
-        except InputError:
-            return None
+        head = read_head(file, _HEAD_BYTES) if is_file(file) else b""
         if file.name == NAME and any(f'"{key}"'.encode() in head for key in _DEPTH):
             return Sniff(1.0, f"{NAME} with depth")
         return None
@@ -92,20 +87,7 @@ class NerfstudioSource(FileSource):
             self.warnings.append(f"{file}: {without_depth} frames have no depth: skipped")
         if not timed:
             self.warnings.append(f"{file}: no timestamps: frame numbers serve as seconds")
-        self._read_poses()
-
-    def _read_poses(self) -> None:
-        poses = np.full((len(self.frames), 4, 4), np.nan)
-        errors: list[InputError] = []
-        for k, frame in enumerate(self.frames):
-            try:
-                poses[k] = frame.pose()
-            except InputError as error:
-                errors.append(error)
-        if errors:
-            self.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
-        if np.isfinite(poses).any():
-            self.reference = poses
+        self.reference = poses_of(self, self.frames, _Frame.pose)
 
     def full_resolution_color(self, index: int) -> UInt8 | None:
         """See `FileSource.full_resolution_color`."""
@@ -138,8 +120,7 @@ class NerfstudioSource(FileSource):
 
     def _depth(self, path: Path) -> Float32:
         if path.suffix.lower() == ".npy":
-            table = _array(path) * np.float32(self.unit_m)
-            return np.where(np.abs(table) < MAX_COORDINATE_M, table, np.float32(0))
+            return depth_from_numbers(_array(path), self.unit_m)
         return depth_from_counts(read_image(path, dtype="uint16"), self.unit_m)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +22,11 @@ from tofuse.recordings.camera_file import (
     checked_lens,
     load_camera,
 )
+from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.single_files import file_of, required_file
-from tofuse.recordings.sources import (
-    MAX_COORDINATE_M,
-    FileSource,
-    check_timestamps,
-    read_matrix_pose,
-)
+from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose
 
 MAX_BYTES = 1 << 30
 _IMAGES = {"amplitude": 3, "confidence": 3, "sigma": 3, "color": 4}
@@ -44,10 +40,8 @@ _NAMES = ("depth", *_IMAGES, *_TABLES, *_VALUES)
 
 @part("reader", "npz", label="validated")
 @dataclass(frozen=True)
-class Npz:
+class Npz(Reader):
     """A .npz file with depth (N, H, W), a camera (K or rays), and optional channels."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -109,10 +103,6 @@ class NpzSource(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         with np.errstate(all="ignore"):
-            depth = self.depth[index].astype(np.float32) * np.float32(self.unit)
-            if self.depth.dtype.kind != "f":
-                depth[self.depth[index] == 65535] = 0
-            depth = np.where(np.abs(depth) < MAX_COORDINATE_M, depth, np.float32(0))
             images = {name: stack[index] for name, stack in self.images.items()}
             amplitude, sigma = (
                 np.nan_to_num(images[n].astype(np.float32), posinf=0, neginf=0)
@@ -124,7 +114,7 @@ class NpzSource(FileSource):
             index,
             float(self.timestamps[index]),
             self.camera,
-            depth,
+            depth_from_numbers(self.depth[index], self.unit),
             self.kind,  # type: ignore[arg-type]
             amplitude,
             images.get("confidence"),

@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from tofuse.parts import part
 from tofuse.recordings.bags import Track, open_container
 from tofuse.recordings.camera_file import ColorCamera
 from tofuse.recordings.lenses import simplest_lens
-from tofuse.recordings.maker_bags import BagSource, topics
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.maker_bags import MakerBagSource, topics
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.ros_messages import GREY
 
 # The order in which Orbbec writes them.
@@ -28,10 +28,8 @@ _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 @part("reader", "orbbec-bag")
 @dataclass(frozen=True)
-class OrbbecBag:
+class OrbbecBag(Reader):
     """A .bag of Orbbec's viewer or SDK: depth, pixel-aligned infrared, and colour."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -67,7 +65,7 @@ class _Profile:
         return simplest_lens(self.size, self.values, self.k, where)
 
 
-class OrbbecSource(BagSource):
+class OrbbecSource(MakerBagSource):
     """See `OrbbecBag`; its messages extend those of ROS, and are decoded here."""
 
     @staticmethod
@@ -75,8 +73,8 @@ class OrbbecSource(BagSource):
         """See `BagSource.open_bag`."""
         return open_container(path)
 
-    def find_streams(self) -> None:
-        """See `BagSource.find_streams`."""
+    def find_tracks(self) -> None:
+        """See `MakerBagSource.find_tracks`."""
         self.depth = self.required_track(_ORBBEC_DEPTH, "depth")
         self.profile = self._profile(_ORBBEC_DEPTH_PROFILE)
         self.unit = 0.001
@@ -89,11 +87,11 @@ class OrbbecSource(BagSource):
         self.color = self.track(_ORBBEC_COLOR)
 
     def lens(self) -> Camera:
-        """See `BagSource.lens`."""
+        """See `MakerBagSource.lens`."""
         return self.profile.lens(f"{self.path}: {_ORBBEC_DEPTH_PROFILE}")
 
     def color_lens(self) -> ColorCamera:
-        """See `BagSource.color_lens`."""
+        """See `MakerBagSource.color_lens`."""
         where = f"{self.path}: {_ORBBEC_DEPTH_PROFILE}"
         lens = self._profile(_ORBBEC_COLOR_PROFILE).lens(f"{self.path}: {_ORBBEC_COLOR_PROFILE}")
         R = self.profile.rotation

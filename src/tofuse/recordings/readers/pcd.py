@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
@@ -14,16 +13,14 @@ from tofuse.parts import part
 from tofuse.recordings.cloud_files import CloudFileSource, required_files, sniff_clouds
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import cloud_frame, to_float32
 
 
 @part("reader", "pcd", label="validated")
 @dataclass(frozen=True)
-class PcdClouds:
+class PcdClouds(Reader):
     """A .pcd file, or a folder of them; metres."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

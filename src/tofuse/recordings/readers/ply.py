@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import CloudFileSource, required_files, sniff_clouds
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import ply_frame
 
 
 @part("reader", "ply", label="validated")
 @dataclass(frozen=True)
-class PlyClouds:
+class PlyClouds(Reader):
     """A .ply file, or a folder of them; metres."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from tofuse.recordings.phones import (
     arkit_pose,
     lens,
 )
-from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import poses_from_files
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
@@ -31,10 +31,8 @@ _LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and
 
 @part("reader", "polycam", label="experimental")
 @dataclass(frozen=True)
-class Polycam:
+class Polycam(Reader):
     """Folders with keyframes/depth, images, cameras and maybe confidence, corrected_cameras."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -80,9 +78,7 @@ class PolycamSource(PhoneSource):
             self.metadata[POSES_BY] = "Polycam"
         else:
             paths = [folder / "cameras" / path.name for path in paths]
-        poses = poses_from_files(self, paths, lambda path: _pose(read_json(path), path))
-        if np.isfinite(poses).any():
-            self.reference = poses
+        self.reference = poses_from_files(self, paths, lambda path: _pose(read_json(path), path))
 
     def read_confidence(self, path: Path, size: tuple[int, int]) -> UInt8:
         """See `PhoneSource.read_confidence`."""

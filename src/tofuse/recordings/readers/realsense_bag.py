@@ -5,30 +5,27 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhole, RayTable
-from tofuse.geometry.quaternion import to_matrix
+from tofuse.geometry.quaternion import to_pose
 from tofuse.geometry.se3 import check_pose, inverse, orthonormalise
 from tofuse.parts import part
 from tofuse.recordings.bags import first_message
 from tofuse.recordings.camera_file import ColorCamera, checked_lens
 from tofuse.recordings.lenses import forward_brown, inverse_brown
-from tofuse.recordings.maker_bags import BagSource, topics
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.maker_bags import MakerBagSource, topics
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.ros_messages import Info, camera_info
 
 
 @part("reader", "realsense-bag")
 @dataclass(frozen=True)
-class RealSenseBag:
+class RealSenseBag(Reader):
     """A .bag (or .db3) of RealSense's viewer or SDK: depth, colour, and infrared of the L515."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -44,11 +41,11 @@ class RealSenseBag:
 _REALSENSE_DEPTH = r"/device_\d+/sensor_\d+/Depth_\d+/image/data"
 
 
-class RealSenseSource(BagSource):
+class RealSenseSource(MakerBagSource):
     """See `RealSenseBag`."""
 
-    def find_streams(self) -> None:
-        """See `BagSource.find_streams`."""
+    def find_tracks(self) -> None:
+        """See `MakerBagSource.find_tracks`."""
         matches = sorted(
             c.topic for c in self.bag.connections if re.fullmatch(_REALSENSE_DEPTH, c.topic)
         )
@@ -76,11 +73,11 @@ class RealSenseSource(BagSource):
             self.color = self.track(sorted(matches)[0])
 
     def lens(self) -> Camera:
-        """See `BagSource.lens`."""
+        """See `MakerBagSource.lens`."""
         return self._lens(self.stream)
 
     def color_lens(self) -> ColorCamera:
-        """See `BagSource.color_lens`."""
+        """See `MakerBagSource.color_lens`."""
         assert self.color is not None
         stream = self.color.connection.topic.removesuffix("/image/data")
         lens = self._lens(stream)
@@ -112,8 +109,7 @@ class RealSenseSource(BagSource):
                     T[:3, 3] = _numbers(text["translation"])
                 elif message is not None:
                     q, t = message.rotation, message.translation
-                    T[:3, :3] = to_matrix([q.x, q.y, q.z, q.w])
-                    T[:3, 3] = (t.x, t.y, t.z)
+                    T = to_pose([q.x, q.y, q.z, q.w], [t.x, t.y, t.z])
             except (AttributeError, KeyError, ValueError) as error:
                 raise InputError(f"can't be read ({error})", where=where) from error
             out[connection.topic.rsplit("/", 1)[1]] = orthonormalise(check_pose(T, where=where))

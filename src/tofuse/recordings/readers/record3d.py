@@ -8,7 +8,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +21,8 @@ from tofuse.files.reading import input_error, is_file, is_folder, list_folder, r
 from tofuse.geometry import quaternion
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import image_size, read_json
+from tofuse.recordings.camera_file import image_size, number_in, numbers_in, read_json
+from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import (
     ARKIT_AXES,
@@ -31,21 +32,20 @@ from tofuse.recordings.phones import (
     lens,
     resized,
 )
-from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import begins_with, file_of
-from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource
+from tofuse.recordings.sources import FileSource
 
 MAX_MEMBER_BYTES = 1 << 26
 _MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")
 _EXR = re.compile(r"([0-9]{1,9})\.exr", re.IGNORECASE)
+_REMEDY = "export the recording again"
 
 
 @part("reader", "record3d", label="validated")
 @dataclass(frozen=True)
-class Record3D:
+class Record3D(Reader):
     """Folders with metadata.json, depth/*.exr and rgb/*.jpg; or .r3d files."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -242,59 +242,37 @@ class _Metadata:
         """Return (width, height) of depth; `default` for older versions, which don't state it."""
         if default is not None and not ("dw" in self.data and "dh" in self.data):
             return default
-        width, height = (self._numbers(name, 1)[0] for name in ("dw", "dh"))
-        return image_size(width, height, f"{self.where}: dw")
+        return image_size(self._number("dw"), self._number("dh"), f"{self.where}: dw")
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
-        K = self._numbers("K", 9).reshape(3, 3).T
-        width, height = (self._numbers(name, 1)[0] for name in ("w", "h"))
-        return lens(K, image_size(width, height, f"{self.where}: w"), size, f"{self.where}: K")
+        K = numbers_in(self.data, "K", self.where, (3, 3), _REMEDY).T
+        full_size = image_size(self._number("w"), self._number("h"), f"{self.where}: w")
+        return lens(K, full_size, size, f"{self.where}: K")
 
     def frame_rate(self) -> float:
-        rate = self._numbers("fps", 1)[0] if "fps" in self.data else 60.0
-        return float(rate) if 0.01 <= rate <= 1e4 else 60.0
+        rate = self._number("fps", 60.0)
+        return rate if 0.01 <= rate <= 1e4 else 60.0
 
     def times(self) -> Float64 | None:
         """Return the timestamps in s of all frames, or None if they aren't given."""
         if "frameTimestamps" not in self.data:
             return None
-        times = self._numbers("frameTimestamps", None)
+        times = numbers_in(self.data, "frameTimestamps", self.where, (-1,), _REMEDY)
         return times if len(times) else None
 
     def poses(self) -> Float64 | None:
         """T_world_camera (N, 4, 4) of all frames, NaN where tracking was lost; or None."""
         if "poses" not in self.data:
             return None
-        table = self._numbers("poses", None, columns=7)
+        table = numbers_in(self.data, "poses", self.where, (-1, 7), _REMEDY, finite=False)
         norms = quaternion.length(table[:, :4])
         valid = (np.abs(norms - 1) < 0.01) & (np.abs(table[:, 4:]) < 1e6).all(1)
         poses = np.full((len(table), 4, 4), np.nan)
-        poses[valid] = np.eye(4)
-        poses[valid, :3, :3] = quaternion.to_matrix(table[valid, :4])
-        poses[valid, :3, 3] = table[valid, 4:]
+        poses[valid] = quaternion.to_pose(table[valid, :4], table[valid, 4:])
         return poses @ ARKIT_AXES
 
-    def _numbers(self, field: str, count: int | None, columns: int = 0) -> Float64:
-        if field not in self.data:
-            raise self._error(field, "is missing")
-        try:
-            values = np.array(self.data[field], float)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise self._error(field, "isn't made of numbers") from error
-        if columns:
-            values = values.reshape(-1, columns) if values.size == 0 else values
-            if values.ndim != 2 or values.shape[1] != columns:
-                raise self._error(field, f"isn't rows of {columns} numbers")
-            return values
-        values = values.ravel()
-        if (count is not None and len(values) != count) or not np.isfinite(values).all():
-            raise self._error(field, "isn't the finite numbers that belong there")
-        return values
-
-    def _error(self, field: str, problem: str) -> InputError:
-        return InputError(
-            problem, where=f"{self.where}: {field}", remedy="export the recording again"
-        )
+    def _number(self, field: str, default: float | None = None) -> float:
+        return number_in(self.data, field, self.where, default, _REMEDY)
 
 
 def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
@@ -315,4 +293,4 @@ def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float3
             where=where,
             remedy="export the recording again",
         )
-    return np.where(np.abs(depth) < MAX_COORDINATE_M, depth, np.float32(0))
+    return depth_from_numbers(depth, 1.0)

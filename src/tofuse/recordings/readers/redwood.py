@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,9 +15,15 @@ from tofuse.files.reading import files_with, is_file, is_folder, read_text
 from tofuse.files.trajectory_formats import read_poses
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import checked_lens, read_json
+from tofuse.recordings.camera_file import (
+    checked_pinhole,
+    image_size,
+    number_in,
+    numbers_in,
+    read_json,
+)
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
 
 # Open3D's PinholeCameraIntrinsicParameters.PrimeSenseDefault.
 SENSOR, SIZE = "PrimeSense (structured light)", (640, 480)
@@ -30,10 +35,8 @@ _MICROSECONDS = re.compile(r"[0-9]+-([0-9]{12})")
 
 @part("reader", "redwood", label="validated")
 @dataclass(frozen=True)
-class Redwood:
+class Redwood(Reader):
     """Folders with depth/, color/ (or image/, rgb/), maybe a camera .json and trajectory.log."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -42,12 +45,9 @@ class Redwood:
         color = next((n for n in _COLOR_FOLDERS if is_folder(path / n)), None)
         if color is None:
             return None
-        try:
-            camera = _camera_file(path)
-            if camera is not None:
-                return Sniff(1.0, f"depth/, {color}/ and {camera.name}")
-        except InputError:
-            return None
+        camera = _camera_file(path)
+        if camera is not None:
+            return Sniff(1.0, f"depth/, {color}/ and {camera.name}")
         if is_file(path / "trajectory.log"):
             return Sniff(1.0, f"depth/, {color}/ and trajectory.log")
         if is_file(path / "camera.json"):
@@ -105,17 +105,10 @@ def _camera_file(path: Path) -> Path | None:
 
 def _read_intrinsics(path: Path) -> Pinhole:
     data = read_json(path)
-    try:
-        K = np.array(data["intrinsic_matrix"], float).reshape(3, 3).T
-        size = (int(data["width"]), int(data["height"]))
-    except (KeyError, ValueError, TypeError, OverflowError) as error:
-        raise InputError(
-            "lacks width, height or a 3x3 intrinsic_matrix",
-            where=path,
-            remedy="write it as Open3D does, column by column",
-        ) from error
-    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    return checked_lens(Pinhole, size, {k: float(v) for k, v in values.items()}, path)
+    remedy = "write it as Open3D does, column by column"
+    K = numbers_in(data, "intrinsic_matrix", path, (3, 3), remedy).T
+    width, height = (number_in(data, name, path, remedy=remedy) for name in ("width", "height"))
+    return checked_pinhole(K, image_size(width, height, path), path)
 
 
 def _timestamps(files: list[Path]) -> Float64:

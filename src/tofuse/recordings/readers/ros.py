@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import weakref
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -14,25 +13,17 @@ from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.parts import part
-from tofuse.recordings.bags import (
-    MAGIC,
-    MAX_GAP_S,
-    Track,
-    amplitude_at,
-    damaged,
-    open_bag,
-)
+from tofuse.recordings.bags import MAGIC, MAX_GAP_S, BagSource, Track, damaged
 from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
-from tofuse.recordings.color import sampled_color
-from tofuse.recordings.frames import DepthKind, Frame, RangeFrame
+from tofuse.recordings.depth_counts import depth_from_numbers
+from tofuse.recordings.frames import Frame
 from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.ros_frames import Transforms, frame_name
 from tofuse.recordings.ros_messages import (
     COLORS,
     ENCODINGS,
     GREY,
-    Cloud,
     cloud,
     color_image,
     decompressed,
@@ -40,12 +31,10 @@ from tofuse.recordings.ros_messages import (
     image,
     lens,
 )
-from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource, cloud_frame
+from tofuse.recordings.sources import cloud_frame
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
-# Integer depth is in mm by convention (REP 118).
-_UNIT_M = {"u": 0.001, "f": 1.0}
 _AMPLITUDE_KEYWORDS = ("/ir/", "/infra", "amplitude", "intensity", "reflec")
 _COLOR_KEYWORDS = ("color", "colour", "rgb")
 # Prefix of drifting odometry frames; frames above them are corrected.
@@ -54,21 +43,16 @@ _ODOMETRY = "odom"
 
 @part("reader", "ros")
 @dataclass(frozen=True)
-class Ros:
+class Ros(Reader):
     """A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag, with depth images or clouds."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            if is_folder(path):
-                if is_file(path / "metadata.yaml") and files_with(path, ".db3", ".mcap", ".zstd"):
-                    return Sniff(0.95, "metadata.yaml and a bag")
-                return None
-            head = read_head(path, 16)
-        except InputError:
+        if is_folder(path):
+            if is_file(path / "metadata.yaml") and files_with(path, ".db3", ".mcap", ".zstd"):
+                return Sniff(0.95, "metadata.yaml and a bag")
             return None
+        head = read_head(path, 16)
         if any(head.startswith(magic) for magic in MAGIC):
             return Sniff(0.95, "a bag")
         if path.suffix.lower() == ".db3" and head.startswith(b"SQLite format 3"):
@@ -80,34 +64,25 @@ class Ros:
         return RosSource(path, options)
 
 
-class RosSource(FileSource):
-    """Messages of the chosen topic, or of the one most likely to contain depth."""
+class RosSource(BagSource):
+    """Messages of the chosen topic, or of the one most likely to contain depth.
 
-    def __init__(self, path: Path, options: ReaderOptions) -> None:
-        self.path = path
-        self.bag = open_bag(path)
-        weakref.finalize(self, self.bag.close)
-        try:
-            self._read(options)
-        except InputError:
-            raise
-        except Exception as error:
-            raise damaged(error, path) from error
+    Attributes
+    ----------
+    raster
+        The camera of clouds that are images of one; else None.
+    """
 
-    def _read(self, options: ReaderOptions) -> None:
+    unit = 0.001  # integer depth is in mm by convention (REP 118)
+    raster: Camera | None = None
+
+    def find_streams(self, options: ReaderOptions) -> None:
+        """See `BagSource.find_streams`."""
         self.connection = self._choose(options.topic)
-        self.track = Track(self.bag, self.connection)
-        if not len(self.track):
+        self.depth = Track(self.bag, self.connection)
+        if not len(self.depth):
             raise InputError(f"has no message of {self.connection.topic}", where=self.path)
-        super().__init__(self.track.times)
-        if (np.diff(self.timestamps) <= 0).any():
-            self.warnings.append("time decreases or repeats; frames stay in the order of the bag")
-        self.kind: DepthKind = "z"
-        self.unit: float | None = None
-        self.camera: Camera | None = None
-        self.amplitude: Track | None = None
-        self.color: Track | None = None
-        self.color_camera: ColorCamera | None = None
+        self.set_timestamps()
         transforms = self._transforms()
         if self.connection.msgtype != CLOUD:
             self._read_camera(options)
@@ -122,7 +97,7 @@ class RosSource(FileSource):
                 raise InputError(
                     "does not apply to clouds", where="--camera", remedy="leave it out"
                 )
-            self.camera = self._organised()
+            self.raster = self._organised()
         self._read_poses(transforms)
         self.metadata |= {"topic": self.connection.topic}
         others = sorted({c.topic for c in self._candidates()} - {self.connection.topic})
@@ -132,32 +107,31 @@ class RosSource(FileSource):
                 " choose with --topic"
             )
 
-    def load(self, index: int) -> Frame:
-        """See `FileSource.load`."""
-        where = self._where(index)
-        try:
-            message = self.track.message(index)
-            time = float(self.timestamps[index])
-            if self.connection.msgtype == CLOUD:
-                return self._cloud(cloud(message, where), index, time)
-            assert self.camera is not None
-            frame = RangeFrame(
-                index,
-                time,
-                self.camera,
-                self._depth(message, where),
-                self.kind,
-                amplitude_at(self.amplitude, time, self.camera, where),
-                amplitude_kind="ir",
-            )
-            return self._colored(frame, f"{where}, colour")
-        except InputError:
-            raise
-        except Exception as error:
-            raise damaged(error, where) from error
-
-    def _where(self, index: int) -> str:
+    def where(self, index: int) -> str:
+        """See `BagSource.where`."""
         return f"{self.path}: {self.connection.topic}, message {index}"
+
+    def read_frame(self, index: int, where: str) -> Frame:
+        """See `BagSource.read_frame`."""
+        if self.connection.msgtype != CLOUD:
+            return super().read_frame(index, where)
+        content, time = cloud(self.depth.message(index), where), float(self.timestamps[index])
+        if self.raster is None:
+            return cloud_frame(index, time, content.points, amplitude=content.amplitude)
+        points = content.points.reshape(content.height, content.width, 3)
+        return organised_frame(points, self.raster, index, time, where, amplitude=content.amplitude)
+
+    def read_depth(self, index: int, where: str) -> Float32:
+        """See `BagSource.read_depth`."""
+        decode = decompressed if self.connection.msgtype == COMPRESSED else image
+        counts = decode(self.depth.message(index), where)
+        check_size(counts, self.camera, where)
+        return depth_from_numbers(counts, self._unit(counts.dtype.kind))
+
+    def read_color(self, track: Track, index: int, where: str) -> UInt8:
+        """See `BagSource.read_color`."""
+        decode = decompressed_color if track.connection.msgtype == COMPRESSED else color_image
+        return decode(track.message(index), where)
 
     def _candidates(self) -> list[Any]:
         """The connections that may contain depth, most likely first."""
@@ -234,9 +208,9 @@ class RosSource(FileSource):
         if not transforms:
             return
         try:
-            frame = self._frame_of(self.track)
+            frame = self._frame_of(self.depth)
         except Exception as error:  # a damaged message affects only its frame
-            self.warnings.append(f"tf is ignored: {damaged(error, self._where(0))}")
+            self.warnings.append(f"tf is ignored: {damaged(error, self.where(0))}")
             return
         ancestors = transforms.ancestors(frame)
         odometry = next((name for name in ancestors if _ODOMETRY in name.lower()), None)
@@ -251,7 +225,6 @@ class RosSource(FileSource):
 
     def _find_color(self, transforms: Transforms) -> None:
         """Find a colour camera with known intrinsics and pose relative to depth."""
-        assert self.camera is not None
         missing: list[str] = []
         for connection in sorted(self.bag.connections, key=lambda c: (c.msgtype, c.topic)):
             if not self._is_color(connection):
@@ -260,8 +233,8 @@ class RosSource(FileSource):
             if not len(track):
                 continue
             try:
-                first = self._color_image(track, 0, f"{self.path}: {connection.topic}")
-                depth_frame, color_frame = self._frame_of(self.track), self._frame_of(track)
+                first = self.read_color(track, 0, f"{self.path}: {connection.topic}")
+                depth_frame, color_frame = self._frame_of(self.depth), self._frame_of(track)
                 registered = _rank(self.connection) == 1  # depth is registered to colour
                 same_size = first.shape[:2] == (self.camera.height, self.camera.width)
                 T = transforms.static_transform(color_frame, depth_frame)
@@ -300,20 +273,8 @@ class RosSource(FileSource):
             return lens(self.bag.deserialize(raw, info.msgtype), where)
         raise InputError("has no message", where=where, remedy="use --camera camera.json")
 
-    def _color_image(self, track: Track, index: int, where: str) -> UInt8:
-        decode = decompressed_color if track.connection.msgtype == COMPRESSED else color_image
-        return decode(track.message(index), where)
-
-    def _colored(self, frame: RangeFrame, where: str) -> RangeFrame:
-        k = None if self.color is None else self.color.nearest(frame.timestamp, MAX_GAP_S)
-        if self.color is None or k is None:
-            return frame
-        color = self._color_image(self.color, k, where)
-        return replace(frame, color_image=sampled_color(frame, color, self.color_camera, where))
-
     def _find_amplitude(self) -> Track | None:
         """The amplitude track of the same sensor: its images match the depth's size and times."""
-        assert self.camera is not None
         for connection in sorted(self.bag.connections, key=lambda c: c.topic):
             is_named = any(keyword in connection.topic.lower() for keyword in _AMPLITUDE_KEYWORDS)
             if connection.msgtype != IMAGE or connection.topic == self.connection.topic:
@@ -330,42 +291,23 @@ class RosSource(FileSource):
                 return track
         return None
 
-    def _depth(self, message: Any, where: str) -> Float32:
-        decode = decompressed if self.connection.msgtype == COMPRESSED else image
-        counts = decode(message, where)
-        assert self.camera is not None
-        check_size(counts, self.camera, where)
-        with np.errstate(all="ignore"):
-            depth = counts.astype(np.float32) * np.float32(self._unit(counts.dtype.kind))
-        if counts.dtype.kind == "u":
-            depth[counts == 65535] = 0
-        return np.where(np.abs(depth) < MAX_COORDINATE_M, depth, np.float32(0))
-
     def _unit(self, kind: str) -> float:
         """Metres per count; floats are always in metres."""
-        return self.unit if self.unit and kind == "u" else _UNIT_M[kind]
+        return self.unit if kind == "u" else 1.0
 
     def _organised(self) -> Camera | None:
         """The camera of organised clouds, if they are in x right, y down, z forward; else None."""
         images = []
-        step = max(1, len(self.track) // SAMPLES)
-        for k in range(0, len(self.track), step)[:SAMPLES]:
+        step = max(1, len(self.depth) // SAMPLES)
+        for k in range(0, len(self.depth), step)[:SAMPLES]:
             try:
-                content = cloud(self.track.message(k), self._where(k))
+                content = cloud(self.depth.message(k), self.where(k))
             except InputError:
                 continue
             if min(content.width, content.height) < 2:
                 return None
             images.append(content.points.reshape(content.height, content.width, 3))
         return common_camera(images)
-
-    def _cloud(self, content: Cloud, index: int, time: float) -> Frame:
-        if self.camera is None:
-            return cloud_frame(index, time, content.points, amplitude=content.amplitude)
-        points = content.points.reshape(content.height, content.width, 3)
-        return organised_frame(
-            points, self.camera, index, time, self._where(index), amplitude=content.amplitude
-        )
 
 
 def _rank(connection: Any) -> int | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -15,24 +15,24 @@ from tofuse.files.images import first_size
 from tofuse.files.reading import files_named, if_file, is_file
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import read_json
+from tofuse.recordings.camera_file import numbers_in, read_json
 from tofuse.recordings.phones import (
     IMAGE_SIZE,
     PhoneSource,
     arkit_pose,
     lens,
 )
-from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.sources import interpolated, poses_of
 
 _DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
+_REMEDY = "export the recording again"
 
 
 @part("reader", "3dscannerapp", label="validated")
 @dataclass(frozen=True)
-class ScannerApp:
+class ScannerApp(Reader):
     """Folders of depth_NNNNN.png, conf_NNNNN.png, frame_NNNNN.json and some .jpg."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -54,26 +54,24 @@ class ScannerApp:
             confidence=[if_file(_file_of_frame(file, "conf", ".png")) for file in files],
             color=[if_file(_file_of_frame(file, "frame", ".jpg")) for file in files],
         )
-        poses = np.full((len(files), 4, 4), np.nan)
-        errors: list[InputError] = []
+        entries: list[_FrameMetadata | None] = []
         for k, file in enumerate(files):
+            entry = None
             try:
                 metadata = _FrameMetadata.read(_file_of_frame(file, "frame", ".json"))
                 source.timestamps[k] = metadata.time
                 source.cameras.append(metadata.lens(size))
+                entry = metadata
             except InputError as error:
                 # Only this frame is unusable without its camera.
                 source.cameras.append(error)
-                continue
-            try:
-                poses[k] = metadata.pose()
-            except InputError as error:
-                errors.append(error)
-        if errors:
-            source.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
-        _fill_times(source)
-        if np.isfinite(poses).any():
-            source.reference = poses
+            entries.append(entry)
+        if not np.isfinite(source.timestamps).any():
+            raise next(c for c in source.cameras if isinstance(c, InputError))
+        source.timestamps = interpolated(source.timestamps)
+        source.reference = poses_of(
+            source, entries, lambda entry: None if entry is None else entry.pose()
+        )
         return source
 
 
@@ -88,50 +86,25 @@ class _FrameMetadata:
     @classmethod
     def read(cls, path: Path) -> _FrameMetadata:
         data = read_json(path)
-        return cls(path, data, float(_numbers(path, data, "time", 1)[0]))
+        return cls(path, data, float(numbers_in(data, "time", path, (1,), _REMEDY)[0]))
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
-        K = _numbers(self.path, self.data, "intrinsics", 9).reshape(3, 3)
+        K = numbers_in(self.data, "intrinsics", self.path, (3, 3), _REMEDY)
         image = IMAGE_SIZE
         if "projectionMatrix" in self.data:
             # Its diagonal is 2 * focal length / image size.
-            P = _numbers(self.path, self.data, "projectionMatrix", 16).reshape(4, 4)
+            P = numbers_in(self.data, "projectionMatrix", self.path, (4, 4), _REMEDY)
             with np.errstate(all="ignore"):
                 width, height = 2 * np.diag(K)[:2] / np.diag(P)[:2]
             if 100 < width < 16384 and 100 < height < 16384:
                 image = (round(float(width)), round(float(height)))
         return lens(K, image, size, f"{self.path}: intrinsics")
 
-    def pose(self) -> Float64:
+    def pose(self) -> Float64 | None:
         if "cameraPoseARFrame" not in self.data:
-            return np.full((4, 4), np.nan)
-        table = _numbers(self.path, self.data, "cameraPoseARFrame", 16, finite=False).reshape(4, 4)
+            return None
+        table = numbers_in(self.data, "cameraPoseARFrame", self.path, (4, 4), _REMEDY, finite=False)
         return arkit_pose(table, f"{self.path}: cameraPoseARFrame")
-
-
-def _numbers(
-    path: Path, data: dict[str, Any], field: str, count: int, *, finite: bool = True
-) -> Float64:
-    where = f"{path}: {field}"
-    if field not in data:
-        raise InputError("is missing", where=where, remedy="export the recording again")
-    try:
-        values = np.atleast_1d(np.array(data[field], float)).ravel()
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError("isn't made of numbers", where=where, remedy="export it again") from error
-    if len(values) != count or (finite and not np.isfinite(values).all()):
-        raise InputError(
-            f"isn't {count} finite numbers", where=where, remedy="export the recording again"
-        )
-    return values
-
-
-def _fill_times(source: PhoneSource) -> None:
-    valid = np.isfinite(source.timestamps)
-    index = np.arange(len(valid))
-    if not valid.any():
-        raise next(c for c in source.cameras if isinstance(c, InputError))
-    source.timestamps[~valid] = np.interp(index[~valid], index[valid], source.timestamps[valid])
 
 
 def _file_of_frame(file: Path, name: str, suffix: str) -> Path:

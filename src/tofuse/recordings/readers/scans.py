@@ -7,14 +7,14 @@ import struct
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import read_head, required_package
-from tofuse.geometry.quaternion import to_matrix
+from tofuse.geometry.quaternion import to_pose
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import (
     CloudFileSource,
@@ -25,9 +25,9 @@ from tofuse.recordings.cloud_files import (
     sniff_clouds,
 )
 from tofuse.recordings.frames import CloudFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import begins_with, file_of, required_file
-from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
+from tofuse.recordings.sources import FileSource, cloud_frame, poses_of, read_matrix_pose
 
 MAX_POINTS = 100_000_000
 _E57 = b"ASTM-E57"
@@ -37,10 +37,8 @@ _COPY = "copy the file again, or export it again"
 
 @part("reader", "las")
 @dataclass(frozen=True)
-class LasScans:
+class LasScans(Reader):
     """A .las or .laz file, or a folder of them; metres."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -183,10 +181,8 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
 
 @part("reader", "e57")
 @dataclass(frozen=True)
-class E57Scans:
+class E57Scans(Reader):
     """A .e57 file: one view per scan, in the scanner's frame; its poses as reference."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -221,12 +217,9 @@ class E57Source(FileSource):
                 "contains no scan", where=path, remedy="export scans, not only pictures"
             )
         super().__init__(np.arange(len(self.counts), dtype=float))
-        self.reference = np.full((len(poses), 4, 4), np.nan)
-        for k, pose in enumerate(poses):
-            try:
-                self.reference[k] = read_matrix_pose(pose, f"{path}: scan {k}")
-            except InputError as error:
-                self.warnings.append(f"{error}; ignored")
+        self.reference = poses_of(
+            self, range(len(poses)), lambda k: read_matrix_pose(poses[k], f"{path}: scan {k}")
+        )
         read_unshifted = partial(self._read, shift=np.zeros(3))
         self._shift, self._cached = find_shift(read_unshifted, len(self.counts))
         note_shift(self, path, self._shift)
@@ -270,12 +263,10 @@ class E57Source(FileSource):
         )
 
     def _pose(self, header: Any) -> Float64:
-        pose = np.eye(4)
-        if header.has_pose():
-            w, x, y, z = (float(value) for value in header.rotation)
-            pose[:3, :3] = to_matrix(np.array([x, y, z, w]))
-            pose[:3, 3] = header.translation
-        return pose
+        if not header.has_pose():
+            return np.eye(4)
+        w, x, y, z = (float(value) for value in header.rotation)
+        return to_pose([x, y, z, w], header.translation)
 
 
 def _damaged(error: Exception, where: str | Path) -> InputError:

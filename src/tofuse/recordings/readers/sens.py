@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, ClassVar
+from typing import BinaryIO
 
 import numpy as np
 
@@ -15,16 +15,16 @@ from tofuse.arrays import Float64, UInt8, UInt16
 from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.reading import input_error
-from tofuse.geometry.cameras import Camera, Pinhole
+from tofuse.geometry.cameras import Camera
 from tofuse.geometry.se3 import inverse
 from tofuse.parts import part
-from tofuse.recordings.camera_file import ColorCamera, checked_lens, load_camera
+from tofuse.recordings.camera_file import ColorCamera, checked_pinhole, load_camera
 from tofuse.recordings.color import sampled_color
 from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.single_files import begins_with, file_of, required_file
-from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose
+from tofuse.recordings.sources import FileSource, check_timestamps, poses_of, read_matrix_pose
 
 VERSION = 4
 RAW, ZLIB, OCCI = 0, 1, 2  # compression of depth
@@ -39,10 +39,8 @@ _RATE_HZ = 30.0
 
 @part("reader", "sens")
 @dataclass(frozen=True)
-class Sens:
+class Sens(Reader):
     """A .sens file: depth, colour, both intrinsics, and ScanNet's poses as reference."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -90,7 +88,12 @@ class SensSource(FileSource):
         check_timestamps(self.timestamps, path, self.warnings)
         if len(frames) < count:
             self.warnings.append(f"{path}: cut off after {len(frames)} of {count} frames")
-        self.reference = self._poses([pose for _, _, pose in frames])
+        # The format stores minus infinity where tracking was lost.
+        self.reference = poses_of(
+            self,
+            range(len(frames)),
+            lambda k: read_matrix_pose(frames[k][2], f"{path}: pose of frame {k}"),
+        )
         if options.camera is not None:
             description, self.camera = load_camera(options.camera, self.depth_size)
             self.unit, self.kind = description.depth_unit_m, description.depth_kind
@@ -140,10 +143,10 @@ class SensSource(FileSource):
             raise self._error(f"has {counts_per_metre} counts to a metre", "export it again")
         self.unit = 1.0 / counts_per_metre
         color_lens, T_device_color, depth_lens, T_device_depth = matrices
-        self.camera = self._lens(depth_lens, self.depth_size, "depth")
+        self.camera = checked_pinhole(depth_lens, self.depth_size, f"{self.path}: depth lens")
         if all(1 < side <= _MAX_SIDE for side in color_size) and self.color_packing in _COLORS:
             self.color = ColorCamera(
-                self._lens(color_lens, color_size, "color"),
+                checked_pinhole(color_lens, color_size, f"{self.path}: color lens"),
                 self._T_color_depth(T_device_color, T_device_depth),
             )
         return count
@@ -162,11 +165,6 @@ class SensSource(FileSource):
             return np.eye(4)
         return inverse(poses[0]) @ poses[1]
 
-    def _lens(self, matrix: Float64, size: tuple[int, int], name: str) -> Pinhole:
-        values = {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
-        numbers = {key: float(value) for key, value in values.items()}
-        return checked_lens(Pinhole, size, numbers, f"{self.path}: {name} lens")
-
     def _locate_frames(self, file: BinaryIO, count: int) -> Iterator[tuple[_Entry, int, Float64]]:
         """Locate frames until the end of the file; a truncated one is skipped."""
         offset = file.tell()
@@ -181,19 +179,6 @@ class SensSource(FileSource):
             if offset > self._size:
                 return
             yield _Entry(start, color, depth), time, np.array(pose).reshape(4, 4)
-
-    def _poses(self, tables: list[Float64]) -> Float64 | None:
-        """T_world_camera (N, 4, 4); the format stores minus infinity where tracking was lost."""
-        poses = np.full((len(tables), 4, 4), np.nan)
-        invalid = 0
-        for k, table in enumerate(tables):
-            try:
-                poses[k] = read_matrix_pose(table, f"{self.path}: pose of frame {k}")
-            except InputError:
-                invalid += 1
-        if invalid:
-            self.warnings.append(f"{self.path}: {invalid} poses are not rigid motions, and ignored")
-        return poses if np.isfinite(poses[:, 0, 0]).any() else None
 
     def _depth(self, data: bytes, where: str) -> UInt16:
         width, height = self.depth_size

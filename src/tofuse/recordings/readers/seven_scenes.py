@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -17,9 +16,9 @@ from tofuse.files.reading import is_file, is_folder, list_folder
 from tofuse.files.tables import read_numbers
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import checked_lens
+from tofuse.recordings.camera_file import checked_pinhole
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.sources import poses_from_files, read_matrix_pose
 
 FRAME_RATE_HZ = 30.0
@@ -31,10 +30,8 @@ _DEPTH = re.compile(r"frame-([0-9]{1,9})\.depth\.png", re.IGNORECASE)
 
 @part("reader", "7scenes", label="validated")
 @dataclass(frozen=True)
-class SevenScenes:
+class SevenScenes(Reader):
     """Folders of frame-NNNNNN.depth.png, .pose.txt and .color.png or .jpg."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -68,9 +65,9 @@ class SevenScenes:
         elif color:
             source.warnings.append("colour is not registered to depth in 7-Scenes: used unchanged")
         stems = [file.name[: -len(".depth.png")] for file in files]
-        poses = poses_from_files(source, [path / f"{stem}.pose.txt" for stem in stems], read_pose)
-        if np.isfinite(poses).any():
-            source.reference = poses
+        source.reference = poses_from_files(
+            source, [path / f"{stem}.pose.txt" for stem in stems], read_pose
+        )
         source.metadata["frame_rate_hz"] = FRAME_RATE_HZ
         return source
 
@@ -105,5 +102,4 @@ def _camera(folder: Path, files: Sequence[Path]) -> Pinhole:
     K = read_numbers(path)
     if K.shape != (3, 3):
         raise InputError("is not a 3x3 matrix", where=path, remedy="write three rows of three")
-    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    return checked_lens(Pinhole, first_size(files), {k: float(v) for k, v in values.items()}, path)
+    return checked_pinhole(K, first_size(files), path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from tofuse.files.tables import parse_numbers, read_numbers
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import CloudFileSource, required_files, sniff_clouds
 from tofuse.recordings.frames import CloudFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import cloud_frame, poses_from_files
 
 # x right, y up, z forward, left-handed, cm; negating y gives the camera's convention.
@@ -25,10 +24,8 @@ CENTIMETRE = 0.01
 
 @part("reader", "slam6d", label="validated")
 @dataclass(frozen=True)
-class Slam6d:
+class Slam6d(Reader):
     """A folder of scanNNN.3d with scanNNN.pose."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -40,7 +37,7 @@ class Slam6d:
         files = required_files(path, ".3d")
         source = CloudFileSource(path, files, scan_frame)
         poses = poses_from_files(source, [file.with_suffix(".pose") for file in files], read_pose)
-        if np.isfinite(poses).any():
+        if poses is not None:
             source.odometry = poses
             if source.reference is None:
                 source.reference = poses

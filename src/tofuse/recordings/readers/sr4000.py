@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,8 +14,8 @@ from tofuse.files.reading import files_with, is_file, is_folder, read_head, read
 from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.sources import FileSource, interpolated
 
 FRAME_RATE_HZ = 32.0
 # Modulated at 30 MHz, the factory default.
@@ -38,19 +37,16 @@ _TIME = re.compile(rb"%[^\n]*time stamp \[ms\][^\n]*\n\s*([0-9.eE+-]+)", re.IGNO
 
 @part("reader", "sr4000", label="validated")
 @dataclass(frozen=True)
-class Sr4000:
+class Sr4000(Reader):
     """Folders of .dat files with blocks of Z, x and y vectors, amplitude and confidence."""
 
-    joinable: ClassVar[bool] = True
+    joinable = True
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            files = _files(path)
-            if any(b"calibrated distance" in read_head(f, 256).lower() for f in files[:3]):
-                return Sniff(1.0, f"{len(files)} .dat files of a SwissRanger")
-        except InputError:
-            pass
+        files = _files(path)
+        if any(b"calibrated distance" in read_head(f, 256).lower() for f in files[:3]):
+            return Sniff(1.0, f"{len(files)} .dat files of a SwissRanger")
         return None
 
     def open(self, path: Path, options: ReaderOptions) -> Sr4000Source:
@@ -91,15 +87,14 @@ class Sr4000Source(FileSource):
 
     def _read_timestamps(self) -> None:
         times = np.array([_time_stamp(path) for path in self.files])
-        valid = np.isfinite(times)
-        index = np.arange(len(times))
-        if not valid.any():
+        missing = int((~np.isfinite(times)).sum())
+        if missing == len(times):
             self.warnings.append(f"no timestamps: a frame rate of {FRAME_RATE_HZ} Hz is assumed")
-            self.timestamps = index / FRAME_RATE_HZ
+            self.timestamps = np.arange(len(times)) / FRAME_RATE_HZ
             return
-        if not valid.all():
-            self.warnings.append(f"{int((~valid).sum())} frames have no timestamp: interpolated")
-        times[~valid] = np.interp(index[~valid], index[valid], times[valid])
+        if missing:
+            self.warnings.append(f"{missing} frames have no timestamp: interpolated")
+        times = interpolated(times)
         # Frames stay in sequence where the camera's counter restarts.
         step = np.diff(times, prepend=times[0])
         if (step < 0).any():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -22,7 +21,8 @@ from tofuse.recordings.phones import (
     PhoneSource,
     lens,
 )
-from tofuse.recordings.reader import PER_FRAME, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.sources import interpolated
 
 FRAME_RATE_HZ = 60.0
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -41,10 +41,8 @@ _IMU = {
 
 @part("reader", "stray", label="validated")
 @dataclass(frozen=True)
-class Stray:
+class Stray(Reader):
     """Folders with depth/, confidence/, odometry.csv, camera_matrix.csv, imu.csv and rgb.mp4."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -145,16 +143,12 @@ class StraySource(PhoneSource):
             )
         if not valid.all():
             self.warnings.append(f"{path}: {int((~valid).sum())} frames have no row: interpolated")
-        index = np.arange(len(times))
-        times[~valid] = np.interp(index[~valid], index[valid], times[valid])
-        self.timestamps = times
+        self.timestamps = interpolated(times)
         poses = np.full((len(row), 4, 4), np.nan)
         table = np.stack([columns[name] for name in _POSE], 1)[row]
         posed = (row >= 0) & np.isfinite(table).all(1) & (np.abs(table) < 1e6).all(1)
         posed &= np.abs(quaternion.length(np.where(posed[:, None], table, 0)[:, 3:]) - 1) < 0.01
-        poses[posed] = np.eye(4)
-        poses[posed, :3, :3] = quaternion.to_matrix(table[posed, 3:])
-        poses[posed, :3, 3] = table[posed, :3]
+        poses[posed] = quaternion.to_pose(table[posed, 3:], table[posed, :3])
         self.reference = poses if posed.any() else None
         self._read_lenses(folder, columns, row)
 

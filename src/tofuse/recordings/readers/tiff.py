@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_file, is_folder
+from tofuse.files.reading import files_with, is_folder
 from tofuse.files.tiff import read_tiff
 from tofuse.parts import part
 from tofuse.recordings.camera_file import load_camera
+from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import UNCERTAIN, ReaderOptions, Sniff
-from tofuse.recordings.sources import MAX_COORDINATE_M, FileSource, read_timestamps, tum_poses
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.sources import FileSource
 
 _SUFFIXES = (".tif", ".tiff")
 _RANGE = ".range"
@@ -26,17 +26,12 @@ _NOT_DEPTH = (*_AMPLITUDE_KEYWORDS, "conf")
 
 @part("reader", "tiff")
 @dataclass(frozen=True)
-class Tiff:
+class Tiff(Reader):
     """A folder of depth images as TIFF, with a camera.json given; amplitude in *intens*.tif."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            files = files_with(path, *_SUFFIXES) if is_folder(path) else []
-        except InputError:
-            return None
+        files = files_with(path, *_SUFFIXES) if is_folder(path) else []
         if any(_is_range(file) for file in files):
             return Sniff(1.0, f"{len(files)} .tif files, *.range.tif among them")
         if not files:
@@ -85,30 +80,13 @@ class TiffSource(FileSource):
                 "left out"
             )
             self.amplitude = []
-        times = folder / "timestamps.txt"
-        if is_file(times):
-            self.timestamps = read_timestamps(times, len(self.depth), "image", self.warnings)
-        if is_file(folder / "groundtruth.txt"):
-            self.reference = tum_poses(self, folder / "groundtruth.txt")
-        if is_file(folder / "odometry.txt"):
-            self.odometry = tum_poses(self, folder / "odometry.txt")
+        self.read_sidecars(folder)
         self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
-        declared = {
-            "sensor": description.sensor,
-            "frame_rate_hz": rate,
-            "ambiguity_m": self.ambiguity_m,
-        }
-        self.metadata |= {key: value for key, value in declared.items() if value is not None}
+        self.metadata |= description.stated("sensor", "frame_rate_hz", "ambiguity_m")
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         size = (self.camera.width, self.camera.height)
-        values = read_tiff(self.depth[index], size)
-        with np.errstate(all="ignore"):
-            depth = values.astype(np.float32) * np.float32(self.unit)
-            if values.dtype == np.uint16:
-                depth[values == 65535] = 0
-            depth = np.where(np.abs(depth) < MAX_COORDINATE_M, depth, np.float32(0))
         amplitude = None
         if self.amplitude:
             with np.errstate(all="ignore"):
@@ -118,7 +96,7 @@ class TiffSource(FileSource):
             index,
             float(self.timestamps[index]),
             self.camera,
-            depth,
+            depth_from_numbers(read_tiff(self.depth[index], size), self.unit),
             self.kind,
             amplitude,
             amplitude_kind=self.amplitude_kind,

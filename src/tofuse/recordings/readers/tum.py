@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from tofuse.files.trajectory import associate
 from tofuse.geometry.cameras import BrownConrady
 from tofuse.parts import part
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.sources import check_timestamps, tum_poses
 
 DEPTH_UNIT_M = 1 / 5000
@@ -39,10 +38,8 @@ CAMERAS = {
 
 @part("reader", "tum")
 @dataclass(frozen=True)
-class Tum:
+class Tum(Reader):
     """Folders with depth.txt (timestamp and file name), depth/, and maybe rgb.txt, rgb/."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from tofuse.files.tables import read_numbers
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import CloudFileSource, required_files, sniff_clouds
 from tofuse.recordings.frames import CloudFrame
-from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import cloud_frame
 
 _SUFFIXES = (".xyz", ".xyzn", ".xyzrgb")
@@ -22,15 +21,13 @@ _SUFFIXES = (".xyz", ".xyzn", ".xyzrgb")
 
 @part("reader", "xyz")
 @dataclass(frozen=True)
-class XyzClouds:
+class XyzClouds(Reader):
     """A .xyz, .xyzn or .xyzrgb file, or a folder of them; metres.
 
     The fourth column of four is an amplitude. Columns four to six are normals in .xyzn, and where
     all have length 1; colours in .xyzrgb (0 to 1), and where all are integers up to 255. Other
     columns are ignored.
     """
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, image_size, number_in
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 
 FRAME_RATE_HZ = 30.0
 _LENS = {"fx": "camera_fx", "fy": "camera_fy", "cx": "camera_cx", "cy": "camera_cy"}
@@ -23,19 +23,14 @@ _LENS = {"fx": "camera_fx", "fy": "camera_fy", "cx": "camera_cx", "cy": "camera_
 
 @part("reader", "zense", label="validated")
 @dataclass(frozen=True)
-class Zense:
+class Zense(Reader):
     """Folders of depth*.png in mm and a .toml with camera_fx, _fy, _cx and _cy."""
-
-    joinable: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        try:
-            settings = _settings(path)
-            if settings is not None and (files := _depth_files(path)):
-                return Sniff(1.0, f"{len(files)} depth*.png and {settings.name}")
-        except InputError:
-            pass
+        settings = _settings(path)
+        if settings is not None and (files := _depth_files(path)):
+            return Sniff(1.0, f"{len(files)} depth*.png and {settings.name}")
         return None
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
