@@ -1,4 +1,4 @@
-"""Neighbourhood operations of the spatial filters, by rows."""
+"""Neighbourhood operations of the spatial filters, row by row."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tofuse.kernels.jit import kernel
 
 @kernel
 def window_median(z: Float32, half: int, start: int, stop: int, out: Float32) -> None:
-    """Write the median of the positive values in the window around each pixel; 0 without any.
+    """Write the median of the positive values in the window around each pixel; 0 if there is none.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def largest_angle(
     stop: int,
     out: Float32,
 ) -> None:
-    """Write the largest angle at each point between the camera and one of its 8 neighbours.
+    """Write the largest angle at each point between the camera and any of its 8 neighbours.
 
     Parameters
     ----------
@@ -77,9 +77,9 @@ def largest_angle(
                 np.float64(points[i, j, 1]),
                 np.float64(points[i, j, 2]),
             )
-            # Smallest cosine, squared with its sign, so that one root is enough.
-            least = 2.0
-            square = x * x + y * y + z * z
+            # Smallest signed square of the cosine, so that one root is enough.
+            min_cosine2 = 2.0
+            range2 = x * x + y * y + z * z
             for v in range(max(0, i - 1), min(height, i + 2)):
                 for u in range(max(0, j - 1), min(width, j + 2)):
                     if (v == i and u == j) or not valid[v, u]:
@@ -87,14 +87,14 @@ def largest_angle(
                     dx = np.float64(points[v, u, 0]) - x
                     dy = np.float64(points[v, u, 1]) - y
                     dz = np.float64(points[v, u, 2]) - z
-                    away2 = dx * dx + dy * dy + dz * dz
-                    if away2 == 0:
+                    distance2 = dx * dx + dy * dy + dz * dz
+                    if distance2 == 0:
                         continue
                     toward = -(x * dx + y * dy + z * dz)
-                    least = min(least, toward * abs(toward) / (away2 * square))
-            if least <= 1.0 + 1e-9:
-                least = min(max(least, -1.0), 1.0)
-                out[i, j] = math.acos(math.copysign(math.sqrt(abs(least)), least))
+                    min_cosine2 = min(min_cosine2, toward * abs(toward) / (distance2 * range2))
+            if min_cosine2 <= 1.0 + 1e-9:
+                min_cosine2 = min(max(min_cosine2, -1.0), 1.0)
+                out[i, j] = math.acos(math.copysign(math.sqrt(abs(min_cosine2)), min_cosine2))
 
 
 @kernel
@@ -108,7 +108,7 @@ def is_steeper(
 ) -> None:
     """Write where the angle of `largest_angle` exceeds an obtuse threshold.
 
-    Without roots, quotients or branches in the inner loop, so that it is vectorised.
+    The inner loop has no roots, quotients or branches, so that it is vectorised.
 
     Parameters
     ----------
@@ -122,8 +122,8 @@ def is_steeper(
         Rows of `out` (H, W) to write: False where the point or all neighbours are invalid.
     """
     height, width = z.shape
-    # Points of these rows and of the adjacent ones, padded by the origin, as are invalid points: it
-    # is in front of all others, so that no angle there is obtuse.
+    # Points of these rows and of the adjacent ones. Padding and invalid points are at the origin,
+    # which is in front of all other points, so that the angle to it is never obtuse.
     points = np.zeros((3, stop - start + 2, width + 2), np.float32)
     for i in range(max(0, start - 1), min(height, stop + 1)):
         for j in range(width):
@@ -131,12 +131,12 @@ def is_steeper(
                 points[0, i - start + 1, j + 1] = rays[i, j, 0] * z[i, j]
                 points[1, i - start + 1, j + 1] = rays[i, j, 1] * z[i, j]
                 points[2, i - start + 1, j + 1] = z[i, j]
-    bound = np.empty(width, np.float32)
+    threshold = np.empty(width, np.float32)
     steep = np.empty(width, np.bool_)
     for i in range(1, stop - start + 1):
         x, y, depth = points[0, i, 1:-1], points[1, i, 1:-1], points[2, i, 1:-1]
         for j in range(width):
-            bound[j] = cosine2 * (x[j] * x[j] + y[j] * y[j] + depth[j] * depth[j])
+            threshold[j] = cosine2 * (x[j] * x[j] + y[j] * y[j] + depth[j] * depth[j])
             steep[j] = False
         for v in range(i - 1, i + 2):
             for u in range(3):
@@ -147,8 +147,8 @@ def is_steeper(
                 c = points[2, v, u : u + width]
                 for j in range(width):
                     dx, dy, dz = a[j] - x[j], b[j] - y[j], c[j] - depth[j]
-                    behind = x[j] * dx + y[j] * dy + depth[j] * dz
-                    away2 = dx * dx + dy * dy + dz * dz
-                    steep[j] |= (behind > 0) & (behind * behind > bound[j] * away2)
+                    dot = x[j] * dx + y[j] * dy + depth[j] * dz
+                    distance2 = dx * dx + dy * dy + dz * dz
+                    steep[j] |= (dot > 0) & (dot * dot > threshold[j] * distance2)
         for j in range(width):
             out[start + i - 1, j] = steep[j]
