@@ -198,9 +198,9 @@ def test_view_counts_saturate() -> None:
     volume = volume_around([view], EYE[None], 0.05)
     volume.add([view], EYE[None])
     near = volume.seen > 0
-    volume.seen[near] = tsdf.MAX_SEEN
+    volume.seen[near] = tsdf.MAX_VIEWS
     volume.add([view], EYE[None])
-    assert (volume.seen[near] == tsdf.MAX_SEEN).all()
+    assert (volume.seen[near] == tsdf.MAX_VIEWS).all()
 
 
 @pytest.mark.slow

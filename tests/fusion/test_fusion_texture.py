@@ -22,7 +22,7 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import TextureView, baked, exposures, textured
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
-from tofuse.kernels.atlas import UNOWNED, draw_triangles
+from tofuse.kernels.atlas import NO_TRIANGLE, draw_triangles
 from tofuse.pipeline import paint
 from tofuse.pipeline import run as run_module
 from tofuse.pipeline import run_options as options_module
@@ -87,7 +87,7 @@ POSES = np.stack(
 def test_triangles_are_rasterized_in_place() -> None:
     rng = np.random.default_rng(0)
     corners = rng.uniform(-3, 33, (12, 3, 2)).astype(np.float32)
-    owner = np.full((30, 30), UNOWNED, np.int32)
+    owner = np.full((30, 30), NO_TRIANGLE, np.int32)
     places = np.zeros((30, 30, 2), np.float32)
     draw_triangles(corners, 1.4, owner, places)
     for v in range(30):
@@ -108,7 +108,7 @@ def test_triangles_are_rasterized_in_place() -> None:
             if inside:
                 assert owner[v, u] >= max(inside)
             elif near:
-                assert owner[v, u] != UNOWNED
+                assert owner[v, u] != NO_TRIANGLE
 
 
 @pytest.mark.parametrize("plain", [False, True])
@@ -133,13 +133,13 @@ def test_atlas_holds_every_triangle_once(plain: bool, monkeypatch) -> None:
     assert corners.min() >= 0
     assert corners.max() <= atlas.size - 1
     # No texel within one triangle is taken by another.
-    owner = np.full((atlas.size, atlas.size), UNOWNED, np.int32)
+    owner = np.full((atlas.size, atlas.size), NO_TRIANGLE, np.int32)
     places = np.zeros((atlas.size, atlas.size, 2), np.float32)
     for order in (slice(None), slice(None, None, -1)):
-        owner[:] = UNOWNED
+        owner[:] = NO_TRIANGLE
         draw_triangles(np.ascontiguousarray(corners[order]), 0.0, owner, places)
         number = np.arange(len(corners))[order]
-        found = np.where(owner == UNOWNED, -1, number[owner])
+        found = np.where(owner == NO_TRIANGLE, -1, number[owner])
         if order == slice(None):
             first = found
     shared = (places.min(-1) > 1e-3) & (places.sum(-1) < 1 - 1e-3)
@@ -160,10 +160,10 @@ def test_texture_has_uniform_exposure() -> None:
     made = textured(mesh, views, POSES, 256)
     assert made.coverage > 0.99
     atlas = made.atlas
-    owner = np.full((atlas.size, atlas.size), UNOWNED, np.int32)
+    owner = np.full((atlas.size, atlas.size), NO_TRIANGLE, np.int32)
     places = np.zeros((atlas.size, atlas.size, 2), np.float32)
     draw_triangles(atlas.texels[atlas.faces], MARGIN, owner, places)
-    inside = (owner != UNOWNED) & (places.min(-1) >= 0) & (places.sum(-1) <= 1)
+    inside = (owner != NO_TRIANGLE) & (places.min(-1) >= 0) & (places.sum(-1) <= 1)
     p = mesh.vertices[atlas.vertices[atlas.faces[owner[inside]]]]
     b, c = places[inside].T[:, :, None]
     at = p[:, 0] * (1 - b - c) + p[:, 1] * b + p[:, 2] * c
@@ -225,12 +225,12 @@ def test_batched_atlas_holds_every_triangle_once(monkeypatch) -> None:
     atlas = unwrap(wall, 512)
     np.testing.assert_array_equal(atlas.vertices[atlas.faces], wall.faces)
     assert len(np.unique(atlas.vertices)) == len(wall)
-    owner = np.full((atlas.size, atlas.size), UNOWNED, np.int32)
+    owner = np.full((atlas.size, atlas.size), NO_TRIANGLE, np.int32)
     draw_triangles(atlas.texels[atlas.faces], 0.0, owner, np.zeros((*owner.shape, 2), np.float32))
     p = atlas.texels[atlas.faces].astype(float)
     b, c = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     area = 0.5 * np.abs(b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
-    own = np.bincount(owner[owner != UNOWNED], minlength=len(p))
+    own = np.bincount(owner[owner != NO_TRIANGLE], minlength=len(p))
     assert own.sum() == pytest.approx(area.sum(), rel=0.1)  # triangles do not overlap
 
 

@@ -23,7 +23,7 @@ from tofuse.kernels.blocks import (
     block_key,
     block_of,
     index_of,
-    mark_eighths,
+    mark_octants,
     parent_of,
     voxel_of,
 )
@@ -652,10 +652,10 @@ def test_near_cubes_match_slow_twin(stride) -> None:
     assert len(both) > 0.998 * max(len(expected), len(set(keys.tolist())))  # except for rounding
     marks = np.zeros(2, np.uint8)
     parents = np.array(sorted({parent_of(k)[0] for k in expected}))[:2]
-    mark_eighths(keys, *index_of(parents), marks)
+    mark_octants(keys, *index_of(parents), marks)
     for parent, mark in zip(parents, marks, strict=True):
-        eighths = {parent_of(k)[1] for k in set(keys.tolist()) if parent_of(k)[0] == parent}
-        assert mark == sum(1 << e for e in eighths)
+        octants = {parent_of(k)[1] for k in set(keys.tolist()) if parent_of(k)[0] == parent}
+        assert mark == sum(1 << e for e in octants)
 
 
 def test_sparse_image_has_surface() -> None:

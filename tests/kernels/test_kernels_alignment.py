@@ -365,7 +365,7 @@ def test_gather_samples_pixels_with_plane_at_stride(stride):
     planes[3:9, 5:11] = 0
     variance[...] = np.random.default_rng(8).uniform(1e-6, 4e-6, variance.shape)
     rays = CAMERA.rays()
-    points = kernels.gather(kernels.ViewImages(rays, planes, variance, albedo), stride)
+    points = kernels.sample_points(kernels.ViewImages(rays, planes, variance, albedo), stride)
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     w = planes[pick][..., 3]
     good = w > 0

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from tofuse.kernels.clustering import flatten_groups, number_keys, plane_sums, union_faces
+from tofuse.kernels.clustering import flatten_groups, number_keys, quadric_sums, union_faces
 
 
 def test_keys_are_numbered_in_order_of_appearance() -> None:
@@ -29,7 +29,7 @@ def test_plane_sums_match_slow_sums() -> None:
     group = rng.integers(0, 6, 30)
     middles = rng.normal(size=(6, 3))
     A, b = np.zeros((7, 3, 3)), np.zeros((7, 3))
-    plane_sums(vertices, faces, group, middles, A, b)
+    quadric_sums(vertices, faces, group, middles, A, b)
     wanted_A, wanted_b = np.zeros((7, 3, 3)), np.zeros((7, 3))
     for face in faces:
         corners = vertices[face].astype(float)

@@ -46,7 +46,9 @@ def test_exchange_sums_disc_form_factors_with_delays() -> None:
     receivers[3:] /= np.linalg.norm(receivers[3:], axis=0)
     out = np.zeros((2, 200), np.float32)
     for a, b in ((0, 7), (7, 30)):
-        kernels.exchange(sources.astype(np.float32), a, b, receivers.astype(np.float32), 10.0, out)
+        kernels.add_irradiance(
+            sources.astype(np.float32), a, b, receivers.astype(np.float32), 10.0, out
+        )
 
     step = receivers[:3].T[None] - sources[:, None, :3]
     d = np.linalg.norm(step, axis=-1)
@@ -64,7 +66,7 @@ def test_touching_disc_sends_at_most_all_its_light() -> None:
     sources = np.float32([[0, 0, 1, 0, 0, -1, 0.1, 1, 0]])
     receivers = np.float32([[0], [0], [1 - 1e-4], [0], [0], [1]])
     out = np.zeros((2, 1), np.float32)
-    kernels.exchange(sources, 0, 1, receivers, 10.0, out)
+    kernels.add_irradiance(sources, 0, 1, receivers, 10.0, out)
     assert 0.99 < out[0, 0] <= 1.0
 
 

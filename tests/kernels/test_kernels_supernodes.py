@@ -27,7 +27,7 @@ class Sparse:
         self.rows = np.concatenate(columns).astype(np.int64)
         self.columns = np.repeat(np.arange(n), np.diff(self.start))
         self.panels = kernels.layout(*kernels.fill_in(self.start, self.rows), k)
-        self.places = kernels.places(self.panels, self.rows, self.columns)
+        self.places = kernels.entry_indices(self.panels, self.rows, self.columns)
 
     def blocks(self, dense: Float64) -> Float64:
         k = self.k

@@ -10,7 +10,7 @@ import pytest
 from tofuse.evaluation.consistency import SurfaceImage
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
-from tofuse.kernels.view_agreement import agreement_sums, move_points
+from tofuse.kernels.view_agreement import agreement_sums, transform_points
 from tofuse.recordings.frames import RangeFrame
 
 SIZE = (64, 48, 50.0, 51.0, 31.0, 24.0)
@@ -46,7 +46,7 @@ def test_moved_points_keep_invalid_ones_at_origin() -> None:
     points = np.array([[0.0, 0, 0], [1, 2, 3]])
     T = se3.exp([1, 2, 3, 0.1, 0.2, 0.3])
     out = np.full((2, 3), np.nan)
-    move_points(points, T, out)
+    transform_points(points, T, out)
     assert out[0].tolist() == [0, 0, 0]
     assert out[1] == pytest.approx(se3.transform(T, points)[1])
 

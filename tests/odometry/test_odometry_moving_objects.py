@@ -447,7 +447,7 @@ def test_compare_matches_reference():
             if flagged[i[a, b] // STRIDE, j[a, b] // STRIDE]:
                 llr[a, b] *= WEIGHT
             continue
-        outcome[a, b] = kernels.UNCLEAR
+        outcome[a, b] = kernels.AMBIGUOUS
         low, high, missing = window(other.z, i[a, b], j[a, b], RADIUS)
         outside = min(here[a, b] - low, 0) if d < 0 else max(here[a, b] - high, 0)
         if not outside**2 > gap * v or 2 * missing > (2 * RADIUS + 1) ** 2:

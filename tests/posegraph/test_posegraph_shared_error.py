@@ -12,7 +12,7 @@ from corner_views import SHARP, corner, unpack
 from pair_equations import pair_equations
 from tofuse.geometry import se3
 from tofuse.kernels import pair_equations as kernels
-from tofuse.kernels.shared_error import discount_shared_errors
+from tofuse.kernels.shared_error import marginalise_shared_errors
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.joint_alignment import refine
 from tofuse.posegraph.pair_equations import RefineOptions
@@ -93,7 +93,7 @@ def test_sums_of_patches_match_normal_equations(pair):
 
 def discount(sums, correlation, variance, row):
     which = np.array([0])
-    discount_shared_errors(sums[None], correlation, np.array([variance]), which, row[None])
+    marginalise_shared_errors(sums[None], correlation, np.array([variance]), which, row[None])
 
 
 def test_kernel_eliminates_one_unknown_per_patch(pair):

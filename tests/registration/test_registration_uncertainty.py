@@ -256,17 +256,17 @@ def test_tile_sums_match_numpy():
             weighed += w * both
             cross += slope * both
             out = expected[i * 3 // CAMERA.height, j * 4 // CAMERA.width]
-            out[tile_sums.A : tile_sums.A + 7] += w * mean
+            out[tile_sums.RESPONSE : tile_sums.RESPONSE + 7] += w * mean
             out[tile_sums.WEIGHT] += w
             out[tile_sums.RESIDUAL] += w * r
             out[tile_sums.COUNT] += 1
     for sums, wanted in (
-        (whole[tile_sums.GEOMETRY], products),
-        (whole[tile_sums.WEIGHED], weighed),
+        (whole[tile_sums.GEOMETRIC], products),
+        (whole[tile_sums.WEIGHTED], weighed),
         (whole[tile_sums.CROSS], cross),
     ):
         np.testing.assert_allclose(sums, wanted, rtol=0.02, atol=0.002 * np.abs(wanted).max())
-    np.testing.assert_array_equal(whole[tile_sums.PHOTO], 0)
+    np.testing.assert_array_equal(whole[tile_sums.PHOTOMETRIC], 0)
     assert expected[..., tile_sums.COUNT].sum() > 500
     # A pixel that projects onto the border of two may be assigned to either.
     assert np.abs(found[..., tile_sums.COUNT] - expected[..., tile_sums.COUNT]).sum() <= 4

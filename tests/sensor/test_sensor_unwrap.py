@@ -15,7 +15,7 @@ from tofuse.errors import InputError
 from tofuse.files.images import write_png
 from tofuse.geometry.cameras import Pinhole, range_from_z
 from tofuse.kernels.threads import threads
-from tofuse.kernels.unwrap import STEPS, pass_messages
+from tofuse.kernels.unwrap import NEIGHBOURS, pass_messages
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 from tofuse.recordings.frames import RangeFrame
@@ -134,7 +134,7 @@ def test_messages_find_minimum_of_a_chain() -> None:
         along = range_m[0] + states * PERIOD
         cost += np.minimum(np.abs(np.diff(along, axis=1)) / 0.5, 3.0).sum(1)
         assert np.array_equal(found, states[np.argmin(cost)])
-    assert len(STEPS) == 4
+    assert len(NEIGHBOURS) == 4
 
 
 def test_surface_part_off_by_one_period_is_corrected() -> None:

@@ -34,7 +34,7 @@ from tofuse.evaluation.trajectory import finite_or_none
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Camera, Fisheye, Pinhole
 from tofuse.kernels.threads import run_chunks
-from tofuse.kernels.view_agreement import agreement_sums, move_points, project_by_lens
+from tofuse.kernels.view_agreement import agreement_sums, project_by_lens, transform_points
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording, evenly_spaced
 
@@ -354,7 +354,7 @@ def _compare(a: SurfaceImage, b: SurfaceImage, T_a_b: Float64) -> tuple[int, int
     """Compare b's points, in a's frame, with the pixels of a that they project to."""
     points = b.points.reshape(-1, 3)
     transformed = np.empty_like(points)
-    move_points(points, np.ascontiguousarray(T_a_b), transformed)
+    transform_points(points, np.ascontiguousarray(T_a_b), transformed)
     return agreement_sums(
         transformed, a.pixels(transformed), a.points, a.normals, SAME_SURFACE, INLIER_DISTANCE
     )

@@ -15,7 +15,7 @@ import numpy as np
 from tofuse.arrays import Float64, Int32, Int64
 from tofuse.fusion.range_view import RangeView
 from tofuse.fusion.stored_views import Views, summaries
-from tofuse.kernels.blocks import EDGE, EMPTY, HALF, VOXELS, enter
+from tofuse.kernels.blocks import EDGE, EMPTY, HALF, VOXELS, insert_keys
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.tsdf import near_cubes
 
@@ -23,7 +23,7 @@ _CHUNKS = 16
 # Far from surfaces, free space is integrated of at most every 4th view, with a weight of 4, as
 # hundreds of views through the same free space are redundant. The stride grows by 1 per 32 views.
 _MAX_STRIDE, _VIEWS_PER_STRIDE = 4, 32
-# Spacing of samples along a normal: as a fraction of a block's edge, and of an eighth's.
+# Spacing of samples along a normal: as a fraction of a block's edge, and of an octant's.
 _BLOCK_SPACING, CUBE_SPACING = 0.34, 0.6
 # A smaller truncation would cut off the noise on one side of a surface more than on the other.
 REACH_SIGMAS = 3.0
@@ -32,7 +32,7 @@ REACH_SIGMAS = 3.0
 _MIN_REACH, _MAX_REACH = 3.0, 8.0
 # Bytes of a voxel besides its colour: distance, weight, views, and the number of its cell.
 _VOXEL_BYTES = 4 + 4 + 2 + 4
-_BLOCK_BYTES = 27 * 4 + 8 * 4 + 3 * 8  # of a block: its neighbours, its eighths, its keys
+_BLOCK_BYTES = 27 * 4 + 8 * 4 + 3 * 8  # of a block: its neighbours, its octants, its keys
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +173,7 @@ def _surface_blocks(
             keys = cubes_near(
                 views[k], poses[k], block_m, reach_m, _BLOCK_SPACING, k, min(free_space_stride, 2)
             )
-            table, count = enter(table, count, keys)
+            table, count = insert_keys(table, count, keys)
         return table[table != EMPTY]
 
     if len(views) == 0:

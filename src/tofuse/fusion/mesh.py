@@ -15,7 +15,13 @@ from tofuse.fusion import exchange
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.colors import has_color
 from tofuse.fusion.edge_collapse import collapse_edges, with_distinct_corners
-from tofuse.kernels.clustering import flatten_groups, has_area, number_keys, plane_sums, union_faces
+from tofuse.kernels.clustering import (
+    flatten_groups,
+    has_area,
+    number_keys,
+    quadric_sums,
+    union_faces,
+)
 
 # Damping of a merged vertex towards the centroid, relative to the planes around it.
 _DAMPING = 0.02
@@ -303,7 +309,7 @@ class Mesh:
         centroids = _means(self.vertices, group, count)
         A = np.zeros((len(centroids), 3, 3))
         b = np.zeros((len(centroids), 3))
-        plane_sums(self.vertices, self.faces, group, centroids, A, b)
+        quadric_sums(self.vertices, self.faces, group, centroids, A, b)
         A += np.triu(A, 1).transpose(0, 2, 1)
         trace = np.maximum(np.trace(A, axis1=1, axis2=2), 1e-12)
         step = np.linalg.solve(A + _DAMPING * trace[:, None, None] * np.eye(3), b[..., None])[

@@ -16,7 +16,7 @@ from tofuse.fusion.colors import NO_COLOR, display_colors, has_color
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
-from tofuse.kernels.atlas import UNOWNED, Blending, ColoredView, add_view, draw_triangles
+from tofuse.kernels.atlas import NO_TRIANGLE, Blending, ColoredView, add_view, draw_triangles
 from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
@@ -201,10 +201,10 @@ class _Texels:
     @classmethod
     def of(cls, mesh: Mesh, size: int) -> _Texels:
         atlas = unwrap(mesh, size)
-        owner = np.full((atlas.size, atlas.size), UNOWNED, np.int32)
+        owner = np.full((atlas.size, atlas.size), NO_TRIANGLE, np.int32)
         coordinates = np.zeros((atlas.size, atlas.size, 2), np.float32)
         draw_triangles(atlas.texels[atlas.faces], MARGIN, owner, coordinates)
-        mask = owner != UNOWNED
+        mask = owner != NO_TRIANGLE
         corners = atlas.vertices[atlas.faces[owner[mask]]]
         barycentric = coordinates[mask]
         points = _interpolated(mesh.vertices, corners, barycentric)

@@ -19,7 +19,7 @@ from tofuse.fusion.range_view import DECODED, RangeView
 from tofuse.fusion.stitching import Piece, stitch, to_rgb
 from tofuse.fusion.stored_views import Views, summaries
 from tofuse.geometry import se3
-from tofuse.kernels.blocks import EDGE, VOXELS, Blocks, index_of, mark_eighths, neighbours_of
+from tofuse.kernels.blocks import EDGE, VOXELS, Blocks, index_of, mark_octants, neighbours_of
 from tofuse.kernels.surface_nets import Vertices, make_faces, make_vertices, mark_cells
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.tsdf import (
@@ -180,7 +180,7 @@ class Volume:
                     cubes = cubes_near(
                         view, poses[s], cube_m, self.reach_m, CUBE_SPACING, number, 2
                     )
-                    mark_eighths(cubes, *self.index, near_surface[s])
+                    mark_octants(cubes, *self.index, near_surface[s])
                 # Albedo is ignored if other views have colour.
                 if view.intensity is not None and channels == view.channels:
                     batch.intensity[s] = view.intensity.reshape(-1, channels)

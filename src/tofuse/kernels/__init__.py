@@ -1,5 +1,5 @@
-"""What Numba compiles: plain functions over arrays, below every other room.
+"""Kernels compiled by Numba: plain functions over arrays, on which all other packages build.
 
-A kernel takes and returns arrays, knows nothing of the package's types, releases the GIL, and
-has a slow NumPy twin in the tests.
+A kernel takes and returns arrays, does not depend on types of other packages, releases the GIL,
+and is compared with a slow NumPy reference in the tests.
 """

@@ -1,9 +1,9 @@
 """Compilation of kernels ahead of their first call, by other processes during the first run.
 
-The first run on a machine compiles every kernel that it calls. Meanwhile other processes compile
-the same kernels in reverse order into the same cache, each from another place of the list on, and
-load what is there already. The list of kernels and argument types was recorded in runs of the
-default method; `python benchmarks/compilation.py --list` records it again.
+The first run on a machine compiles every kernel that it calls. Meanwhile, helper processes compile
+the same kernels in reverse order into the same cache, each starting at a different position in the
+list, and load those that are already cached. The list of kernels and argument types was recorded in
+runs of the default method; `python benchmarks/compilation.py --list` records it again.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ import numba
 from tofuse.kernels import jit
 from tofuse.kernels.cores import usable_cores
 
-# Processes, of which each takes about 0.5 GB of memory; no more than half of the cores.
+# Helper processes, each of which takes about 0.5 GB of memory; at most half of the cores.
 _MAX_HELPERS = 3
-# Net number of new objects after which Python collects garbage.
-_COLLECT_AFTER = 100_000
+# Net number of allocated objects after which Python collects garbage during compilation.
+_GC_THRESHOLD = 100_000
 _LIST = Path(__file__).with_name("signatures.txt")
 # Names of element types in the list.
 DTYPES = {
@@ -47,13 +47,13 @@ DTYPES = {
 def compiling_in_background() -> Iterator[None]:
     """Compile kernels in other processes during the block, unless they are in the cache.
 
-    The processes are terminated with the block. What they have not compiled is compiled when
-    called.
+    The processes are terminated at the end of the block. Kernels that they have not compiled are
+    compiled when called.
     """
     with ExitStack() as stack:
-        helpers = list(_start())
+        helpers = list(_start_helpers())
         if helpers:
-            stack.enter_context(collecting_rarely())
+            stack.enter_context(rare_garbage_collection())
         for helper in helpers:
             stack.callback(helper.wait)
             stack.callback(helper.terminate)
@@ -61,17 +61,17 @@ def compiling_in_background() -> Iterator[None]:
 
 
 @contextmanager
-def collecting_rarely() -> Iterator[None]:
-    """Collect garbage rarely during the block: the compiler makes many objects that stay."""
-    before = gc.get_threshold()
-    gc.set_threshold(_COLLECT_AFTER, *before[1:])
+def rare_garbage_collection() -> Iterator[None]:
+    """Collect garbage rarely during the block, as the compiler creates many long-lived objects."""
+    thresholds = gc.get_threshold()
+    gc.set_threshold(_GC_THRESHOLD, *thresholds[1:])
     try:
         yield
     finally:
-        gc.set_threshold(*before)
+        gc.set_threshold(*thresholds)
 
 
-def _start() -> Iterator[subprocess.Popen[bytes]]:
+def _start_helpers() -> Iterator[subprocess.Popen[bytes]]:
     if compiled_marker().exists():
         return
     count = min(usable_cores() // 2, _MAX_HELPERS)
@@ -82,7 +82,7 @@ def _start() -> Iterator[subprocess.Popen[bytes]]:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C is for the run, which ends this process
+                start_new_session=True,  # Ctrl-C is for the run, which terminates this process
             )
         except OSError:  # no more processes
             return
@@ -90,17 +90,18 @@ def _start() -> Iterator[subprocess.Popen[bytes]]:
 
 def signatures() -> list[tuple[str, tuple[Any, ...]]]:
     """Return the kernels that runs call and their argument types, in the order of first use."""
-    found = []
+    kernels = []
     for line in _LIST.read_text(encoding="ascii").splitlines():
         name, *types = line.split()
-        found.append((name, tuple(_type_of(text) for text in types)))
-    return found
+        kernels.append((name, tuple(_type_of(text) for text in types)))
+    return kernels
 
 
 def compile_listed(helper: int = 0, helpers: int = 1) -> None:
     """Compile all of `signatures` in reverse order, or load them from the cache.
 
-    Of several `helpers` each begins at another place of the list, and continues at its end.
+    Each of several `helpers` starts at a different position in the list, and wraps around at its
+    end.
     """
     listed = signatures()[::-1]
     first = len(listed) * helper // helpers
@@ -123,19 +124,19 @@ def compiled_marker() -> Path:
 
 
 def _type_of(text: str) -> Any:
-    kinds: Any = numba.types
-    if found := re.fullmatch(r"(\d+)x(.+)", text):
-        return kinds.UniTuple(_type_of(found[2]), int(found[1]))
-    if found := re.fullmatch(r"(\w+)\.(\w+)\((.+)\)", text):
-        named = getattr(import_module(f"tofuse.kernels.{found[1]}"), found[2])
-        return kinds.BaseTuple.from_types([_type_of(field) for field in found[3].split(",")], named)
+    types: Any = numba.types
+    if match := re.fullmatch(r"(\d+)x(.+)", text):
+        return types.UniTuple(_type_of(match[2]), int(match[1]))
+    if match := re.fullmatch(r"(\w+)\.(\w+)\((.+)\)", text):
+        cls = getattr(import_module(f"tofuse.kernels.{match[1]}"), match[2])
+        return types.BaseTuple.from_types([_type_of(field) for field in match[3].split(",")], cls)
     short, _, shape = text.lstrip("!").partition(":")
-    dtype = getattr(kinds, DTYPES[short])
+    dtype = getattr(types, DTYPES[short])
     if not shape:
         return dtype
-    return kinds.Array(dtype, int(shape[0]), shape[1], readonly=text.startswith("!"))
+    return types.Array(dtype, int(shape[0]), shape[1], readonly=text.startswith("!"))
 
 
 if __name__ == "__main__":
-    with collecting_rarely():
+    with rare_garbage_collection():
         compile_listed(*map(int, sys.argv[1:]))

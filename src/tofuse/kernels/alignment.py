@@ -44,7 +44,7 @@ H = 0  # 36: upper triangle of the 8x8 sum of w (J, r) (J, r)^T; J[6] is that of
 D = 36  # 21: upper triangle of the 6x6 sum of w D D^T
 PROJECTED = 57  # points that project to a pixel of the target
 COMPARED = 58  # of those, points at which the target has a plane
-INLIERS = 59  # of those, points within the reach and with a compatible normal
+INLIERS = 59  # of those, points within the robust cut-off and with a compatible normal
 IN_FRONT = 60  # points in free space of the target
 WEIGHT_G = 61  # sums of the robust weights and of weighted squared residuals, in sigmas
 SQUARES_G = 62
@@ -52,8 +52,8 @@ WEIGHT_P = 63
 SQUARES_P = 64
 COUNT_P = 65
 SQUARES_M = 66  # of the inliers' distances from planes, m^2
-# Histogram of the squared distances of all compared points, in unscaled variances: four equally
-# wide bins per octave, the first from 0 to 2^-8.
+# Histogram of chi2, the squared distances of all compared points divided by their unscaled
+# variances: four equally wide bins per octave, the first from 0 to 2^-8.
 HISTOGRAM = 67
 BINS = 96
 SIZE = HISTOGRAM + BINS
@@ -61,20 +61,20 @@ SIZE = HISTOGRAM + BINS
 # Points are compared in structure-of-arrays blocks, one point per column, so that loops over a row
 # are vectorised. Rows of a block: the point, its projection (x/z, y/z and z in the target), the
 # target pixel, whether it has a plane, and whether the point is an inlier; then J (7), r, and D
-# (6), each weighted by the root of w; the statistics to be summed; the squared distance in unscaled
-# variances; and the root of w of the distance.
+# (6), each multiplied by the square root of w; the statistics to be summed; chi2; and the square
+# root of the distance's w.
 LANES = 128
 MIN_DEPTH = 0.02  # m; points nearer to the target's camera are not compared
 XN, YN, Z, _PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3
-SEEN = _PIXEL + PIXEL_SIZE
-FITS = SEEN + 1
-JACOBIAN = FITS + 1
-MISFIT, DIFFERENCE = JACOBIAN + 7, JACOBIAN + 8
+HAS_PLANE = _PIXEL + PIXEL_SIZE
+IS_INLIER = HAS_PLANE + 1
+JACOBIAN = IS_INLIER + 1
+WEIGHTED_RESIDUAL, DIFFERENCE = JACOBIAN + 7, JACOBIAN + 8
 STAT = DIFFERENCE + 6  # as from INLIERS to SQUARES_M
 _STATS = SQUARES_M + 1 - INLIERS
-RATIO = STAT + _STATS
-ROOT = RATIO + 1
-ROWS = ROOT + 1
+CHI2 = STAT + _STATS
+SQRT_WEIGHT = CHI2 + 1
+ROWS = SQRT_WEIGHT + 1
 
 
 class TargetImage(NamedTuple):
@@ -109,7 +109,7 @@ class ViewImages(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """How residuals are computed and weighted.
+    """Parameters of residuals and of their weights.
 
     Attributes
     ----------
@@ -142,8 +142,10 @@ def accumulate(points: Float32, target: TargetImage, T: Float64, residuals: Resi
     ----------
     points
         (N, POINT_SIZE) source points, see above.
-    target, residuals
-        What they are compared with, and how.
+    target
+        The view that they are compared with.
+    residuals
+        Computation and weights of the residuals.
     T
         (4, 4) T_target_source.
 
@@ -171,9 +173,9 @@ def accumulate(points: Float32, target: TargetImage, T: Float64, residuals: Resi
             for k in range(LANES):
                 total[k] += row[k]
         for k in range(count):
-            if block[SEEN * LANES + k] > 0:
+            if block[HAS_PLANE * LANES + k] > 0:
                 out[COMPARED] += 1
-                out[HISTOGRAM + histogram_bin(block[RATIO * LANES + k])] += 1
+                out[HISTOGRAM + histogram_bin(block[CHI2 * LANES + k])] += 1
     width = LANES
     while width > 1:
         width //= 2
@@ -205,9 +207,9 @@ def transform_block(block: Float32, T: Float64) -> None:
         py = block[(POINT + 1) * LANES + k]
         pz = block[(POINT + 2) * LANES + k]
         z = r20 * px + r21 * py + r22 * pz + t2
-        per_z = 1 / z if z > MIN_DEPTH else 0.0
-        block[XN * LANES + k] = (r00 * px + r01 * py + r02 * pz + t0) * per_z
-        block[YN * LANES + k] = (r10 * px + r11 * py + r12 * pz + t1) * per_z
+        inv_z = 1 / z if z > MIN_DEPTH else 0.0
+        block[XN * LANES + k] = (r00 * px + r01 * py + r02 * pz + t0) * inv_z
+        block[YN * LANES + k] = (r10 * px + r11 * py + r12 * pz + t1) * inv_z
         block[Z * LANES + k] = z
 
 
@@ -215,26 +217,26 @@ def transform_block(block: Float32, T: Float64) -> None:
 def project_block(
     block: Float32, count: int, target: Float32, lookup: Float32, lookup_frame: Float64
 ) -> int:
-    """Fetch the target pixels that the points of a block project to; returns how many have one."""
+    """Fetch the target pixels that a block's points project to; return their number."""
     rows, columns = target.shape[0], target.shape[1]
     u, v = np.empty(LANES), np.empty(LANES)
     xn, yn = block[XN * LANES : (XN + 1) * LANES], block[YN * LANES : (YN + 1) * LANES]
     project_rays(xn, yn, lookup, lookup_frame, u, v)
-    landed = 0
+    projected = 0
     for k in range(LANES):
-        block[SEEN * LANES + k] = 0
+        block[HAS_PLANE * LANES + k] = 0
     for k in range(count):
         if not block[Z * LANES + k] > MIN_DEPTH:
             continue
         if not (u[k] > -0.5 and v[k] > -0.5 and u[k] < columns - 0.5 and v[k] < rows - 0.5):
             continue
-        landed += 1
+        projected += 1
         pixel = target[np.uint32(v[k] + 0.5), np.uint32(u[k] + 0.5)]
         if pixel[DISTANCE] > 0:
-            block[SEEN * LANES + k] = 1
+            block[HAS_PLANE * LANES + k] = 1
             for c in range(PIXEL_SIZE):
                 block[(_PIXEL + c) * LANES + k] = pixel[c]
-    return landed
+    return projected
 
 
 @kernel
@@ -250,9 +252,9 @@ def compare_planes(
     r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
     r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
     r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
-    scale_g2, slack2 = np.float32(scale_g * scale_g), np.float32(inflation * inflation)
-    per_limit2, least = np.float32(1 / (robust * robust)), np.float32(min_cosine)
-    one, none = np.float32(1), np.float32(0)
+    scale_g2, inflation2 = np.float32(scale_g * scale_g), np.float32(inflation * inflation)
+    inv_limit2, min_cosine32 = np.float32(1 / (robust * robust)), np.float32(min_cosine)
+    one, zero = np.float32(1), np.float32(0)
     for k in range(LANES):
         px = block[POINT * LANES + k]
         py = block[(POINT + 1) * LANES + k]
@@ -270,29 +272,29 @@ def compare_planes(
         m0 = r00 * n0 + r10 * n1 + r20 * n2
         m1 = r01 * n0 + r11 * n1 + r21 * n2
         m2 = r02 * n0 + r12 * n1 + r22 * n2
-        # An error along the source's ray, relative to z, moves the point this far off the plane.
-        along = (m0 * px + m1 * py + m2 * pz) * block[SIGMA * LANES + k]
-        own = along * along + block[(_PIXEL + VARIANCE) * LANES + k]
+        # Sigma of the distance due to the source's error, which is along the ray and relative to z.
+        source_sigma = (m0 * px + m1 * py + m2 * pz) * block[SIGMA * LANES + k]
+        variance = source_sigma * source_sigma + block[(_PIXEL + VARIANCE) * LANES + k]
         r2 = r * r
-        block[RATIO * LANES + k] = r2 / own
-        per_variance = one / (scale_g2 * own + slack2)
-        e2 = r2 * per_variance * per_limit2
-        seen = block[SEEN * LANES + k] > none
-        fits = seen & (e2 < one) & (s0 * m0 + s1 * m1 + s2 * m2 >= least)
+        block[CHI2 * LANES + k] = r2 / variance
+        information = one / (scale_g2 * variance + inflation2)
+        e2 = r2 * information * inv_limit2
+        has_plane = block[HAS_PLANE * LANES + k] > zero
+        inlier = has_plane & (e2 < one) & (s0 * m0 + s1 * m1 + s2 * m2 >= min_cosine32)
         # Nearer than the target's surface: in its free space.
-        in_front = seen & (r < none) & (e2 > np.float32(4))
-        weight = (one - e2) * (one - e2) if fits else none
-        root = (one - e2) * np.sqrt(per_variance) if fits else none
-        block[ROOT * LANES + k] = root
-        block[FITS * LANES + k] = one if fits else none
-        block[STAT * LANES + k] = one if fits else none
-        block[(STAT + IN_FRONT - INLIERS) * LANES + k] = one if in_front else none
+        in_front = has_plane & (r < zero) & (e2 > np.float32(4))
+        weight = (one - e2) * (one - e2) if inlier else zero
+        sqrt_weight = (one - e2) * np.sqrt(information) if inlier else zero
+        block[SQRT_WEIGHT * LANES + k] = sqrt_weight
+        block[IS_INLIER * LANES + k] = one if inlier else zero
+        block[STAT * LANES + k] = one if inlier else zero
+        block[(STAT + IN_FRONT - INLIERS) * LANES + k] = one if in_front else zero
         block[(STAT + WEIGHT_G - INLIERS) * LANES + k] = weight
-        block[(STAT + SQUARES_G - INLIERS) * LANES + k] = r2 * root * root
-        block[(STAT + SQUARES_M - INLIERS) * LANES + k] = r2 if fits else none
-        block[(JACOBIAN + 6) * LANES + k] = none
-        block[MISFIT * LANES + k] = root * r if fits else none
-        _put(block, k, root, px, py, pz, m0, m1, m2, s0, s1, s2)
+        block[(STAT + SQUARES_G - INLIERS) * LANES + k] = r2 * sqrt_weight * sqrt_weight
+        block[(STAT + SQUARES_M - INLIERS) * LANES + k] = r2 if inlier else zero
+        block[(JACOBIAN + 6) * LANES + k] = zero
+        block[WEIGHTED_RESIDUAL * LANES + k] = sqrt_weight * r if inlier else zero
+        _write_jacobians(block, k, sqrt_weight, px, py, pz, m0, m1, m2, s0, s1, s2)
 
 
 @kernel
@@ -303,9 +305,9 @@ def compare_albedos(
     r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
     r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
     r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
-    per_p, change = np.float32(1 / scale_p), np.float32(exposure)
-    per_limit2 = np.float32(1 / (scale_p * scale_p * robust * robust))
-    one, none = np.float32(1), np.float32(0)
+    inv_scale_p, exposure32 = np.float32(1 / scale_p), np.float32(exposure)
+    inv_limit2 = np.float32(1 / (scale_p * scale_p * robust * robust))
+    one, zero = np.float32(1), np.float32(0)
     for k in range(LANES):
         px = block[POINT * LANES + k]
         py = block[(POINT + 1) * LANES + k]
@@ -314,37 +316,37 @@ def compare_albedos(
         tx = block[(_PIXEL + ALBEDO_SLOPE) * LANES + k]
         ty = block[(_PIXEL + ALBEDO_SLOPE + 1) * LANES + k]
         r = block[(_PIXEL + ALBEDO) * LANES + k] + tx * xn + ty * yn
-        r -= block[POINT_ALBEDO * LANES + k] + change
+        r -= block[POINT_ALBEDO * LANES + k] + exposure32
         # If either is unknown, r is NaN, and the comparison is false.
-        known = (block[FITS * LANES + k] > none) & (r * r < np.float32(np.inf))
-        e2 = r * r * per_limit2
-        fits = known & (e2 < one)
-        weight = (one - e2) * (one - e2) if fits else none
-        root = (one - e2) * per_p if fits else none
-        r = r if fits else none
-        tx, ty = tx if fits else none, ty if fits else none
-        s0 = block[POINT_ALBEDO_SLOPE * LANES + k] if fits else none
-        s1 = block[(POINT_ALBEDO_SLOPE + 1) * LANES + k] if fits else none
-        s2 = block[(POINT_ALBEDO_SLOPE + 2) * LANES + k] if fits else none
-        block[(STAT + COUNT_P - INLIERS) * LANES + k] = one if known else none
+        known = (block[IS_INLIER * LANES + k] > zero) & (r * r < np.float32(np.inf))
+        e2 = r * r * inv_limit2
+        inlier = known & (e2 < one)
+        weight = (one - e2) * (one - e2) if inlier else zero
+        sqrt_weight = (one - e2) * inv_scale_p if inlier else zero
+        r = r if inlier else zero
+        tx, ty = tx if inlier else zero, ty if inlier else zero
+        s0 = block[POINT_ALBEDO_SLOPE * LANES + k] if inlier else zero
+        s1 = block[(POINT_ALBEDO_SLOPE + 1) * LANES + k] if inlier else zero
+        s2 = block[(POINT_ALBEDO_SLOPE + 2) * LANES + k] if inlier else zero
+        block[(STAT + COUNT_P - INLIERS) * LANES + k] = one if known else zero
         block[(STAT + WEIGHT_P - INLIERS) * LANES + k] = weight
         block[(STAT + SQUARES_P - INLIERS) * LANES + k] = weight * r * r
-        # Derivative of (x/z, y/z) by the transformed point, rotated back into the source frame.
-        per_z = one / block[Z * LANES + k] if fits else none
-        d0, d1, d2 = tx * per_z, ty * per_z, -(tx * xn + ty * yn) * per_z
+        # Gradient with respect to the transformed point, rotated back into the source frame.
+        inv_z = one / block[Z * LANES + k] if inlier else zero
+        d0, d1, d2 = tx * inv_z, ty * inv_z, -(tx * xn + ty * yn) * inv_z
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2
         m2 = r02 * d0 + r12 * d1 + r22 * d2
-        block[(JACOBIAN + 6) * LANES + k] = -root
-        block[MISFIT * LANES + k] = root * r
-        _put(block, k, root, px, py, pz, m0, m1, m2, s0, s1, s2)
+        block[(JACOBIAN + 6) * LANES + k] = -sqrt_weight
+        block[WEIGHTED_RESIDUAL * LANES + k] = sqrt_weight * r
+        _write_jacobians(block, k, sqrt_weight, px, py, pz, m0, m1, m2, s0, s1, s2)
 
 
 @kernel
-def _put(
+def _write_jacobians(
     block: Float32,
     k: int,
-    root: np.float32,
+    sqrt_weight: np.float32,
     px: np.float32,
     py: np.float32,
     pz: np.float32,
@@ -355,8 +357,8 @@ def _put(
     s1: np.float32,
     s2: np.float32,
 ) -> None:
-    """Write J and D, weighted by `root`, into column k; m and s are the target's and source's."""
-    half = np.float32(0.5) * root
+    """Write J and D times `sqrt_weight` into column k; m and s are those of target and source."""
+    half = np.float32(0.5) * sqrt_weight
     a0, a1, a2 = half * (m0 + s0), half * (m1 + s1), half * (m2 + s2)
     block[JACOBIAN * LANES + k] = a0
     block[(JACOBIAN + 1) * LANES + k] = a1
@@ -375,7 +377,7 @@ def _put(
 
 @kernel
 def add_products(sums: Float64, block: Float32, rows: int) -> None:
-    """Add the products of the rows of J and r, and with 14 `rows` of those of D, by column."""
+    """Add the products of the rows of J and r, and with 14 `rows` also those of D, per column."""
     q = 0
     for p in range(rows):
         a = block[(JACOBIAN + p) * LANES : (JACOBIAN + p + 1) * LANES]
@@ -388,17 +390,17 @@ def add_products(sums: Float64, block: Float32, rows: int) -> None:
 
 
 @kernel
-def histogram_bin(ratio: float) -> int:
-    """Return the bin of a squared distance: its exponent and two bits of its mantissa."""
-    bits = np.float32(ratio).view(np.int32)
-    place = int(bits >> 21) - ((127 - 8) << 2)
-    return min(max(place, 0), BINS - 1)
+def histogram_bin(chi2: float) -> int:
+    """Return the histogram bin of chi2: its exponent and two bits of its mantissa."""
+    bits = np.float32(chi2).view(np.int32)
+    index = int(bits >> 21) - ((127 - 8) << 2)
+    return min(max(index, 0), BINS - 1)
 
 
 @kernel
-def bin_edge(place: int) -> float:
-    """Return the lower edge of a histogram bin: a squared distance in unscaled variances."""
-    return 2.0 ** ((place >> 2) - 8) * (1 + (place & 3) / 4) if place > 0 else 0.0
+def bin_edge(index: int) -> float:
+    """Return the chi2 at the lower edge of a histogram bin."""
+    return 2.0 ** ((index >> 2) - 8) * (1 + (index & 3) / 4) if index > 0 else 0.0
 
 
 @kernel
@@ -406,7 +408,7 @@ def normal_equations(total: Float64) -> tuple[Float64, Float64, Float64]:
     """Unpack the sums of `accumulate`: H (7, 7), g (7,) and the cross-information (7, 7).
 
     The seventh unknown is the exposure. Without the photometric term its row is that of the
-    identity in H and 0 in the cross-information.
+    identity in H, and 0 in the cross-information.
     """
     A = np.zeros((7, 7))
     C = np.zeros((7, 7))
@@ -434,7 +436,7 @@ def normal_equations(total: Float64) -> tuple[Float64, Float64, Float64]:
 
 
 @kernel
-def gather(view: ViewImages, stride: int) -> Float32:
+def sample_points(view: ViewImages, stride: int) -> Float32:
     """Return source points (N, POINT_SIZE) on the fitted planes of every `stride`-th pixel.
 
     Parameters
@@ -446,20 +448,20 @@ def gather(view: ViewImages, stride: int) -> Float32:
     """
     rays, planes, plane_variance, albedo = view
     rows, columns = planes.shape[0], planes.shape[1]
-    most = ((rows + stride - 1) // stride) * ((columns + stride - 1) // stride)
-    out = np.empty((most, POINT_SIZE), np.float32)
+    max_count = ((rows + stride - 1) // stride) * ((columns + stride - 1) // stride)
+    out = np.empty((max_count, POINT_SIZE), np.float32)
     n = 0
     for i in range(stride // 2, rows, stride):
         for j in range(stride // 2, columns, stride):
             if planes[i, j, 3] <= 0:
                 continue
-            put_point(out[n], rays[i, j], planes[i, j], plane_variance[i, j], albedo[i, j])
+            write_point(out[n], rays[i, j], planes[i, j], plane_variance[i, j], albedo[i, j])
             n += 1
     return out[:n]
 
 
 @kernel
-def put_point(
+def write_point(
     point: Float32, ray: Float32, plane: Float32, variance: np.float32, albedo: Float32
 ) -> None:
     """Write the source point (POINT_SIZE,) of a pixel that has a plane."""
@@ -500,15 +502,15 @@ def make_target(view: ViewImages) -> Float32:
 
 
 @kernel
-def exposure_differences(points: Float32, every: int, target: TargetImage, T: Float64) -> Float64:
-    """Return log albedo differences, target minus source, at every `every`-th point's projection.
+def exposure_differences(points: Float32, stride: int, target: TargetImage, T: Float64) -> Float64:
+    """Return log albedo differences (n,), target minus source, of every `stride`-th point.
 
-    The other parameters are those of `accumulate`. Returns (n,), without unknown ones.
+    Points without a known difference are left out. The other parameters are those of `accumulate`.
     """
     image, lookup, lookup_frame = target
-    out = np.empty(points.shape[0] // every + 1)
+    out = np.empty(points.shape[0] // stride + 1)
     n = 0
-    for k in range(0, points.shape[0], every):
+    for k in range(0, points.shape[0], stride):
         px, py, pz = points[k, POINT], points[k, POINT + 1], points[k, POINT + 2]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
         if z <= 0.02:

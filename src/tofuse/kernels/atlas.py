@@ -1,4 +1,4 @@
-"""Texture atlases: rasterising triangles, and blending the views' colours."""
+"""Texture atlases: rasterisation of triangles, and blending of the views' colours."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tofuse.arrays import Float32, Float64, Int32
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import project_ray
 
-UNOWNED = -1
+NO_TRIANGLE = -1
 
 
 class ColoredView(NamedTuple):
@@ -33,7 +33,7 @@ class ColoredView(NamedTuple):
 
 
 class Blending(NamedTuple):
-    """Which views count, and how much.
+    """Selection and weights of the views that colour a point.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Blending(NamedTuple):
     border
         Width in pixels of the image border in which the weight decreases.
     power
-        Exponent by which near and perpendicular views are preferred.
+        Exponent of the preference for near and perpendicular views.
     """
 
     tolerance: float
@@ -53,7 +53,7 @@ class Blending(NamedTuple):
 
 
 @kernel
-def draw_triangles(corners: Float32, margin: float, owner: Int32, places: Float32) -> None:
+def draw_triangles(corners: Float32, margin: float, triangle: Int32, barycentric: Float32) -> None:
     """Rasterise triangles: write the triangle and barycentric coordinates of each texel.
 
     Parameters
@@ -61,14 +61,15 @@ def draw_triangles(corners: Float32, margin: float, owner: Int32, places: Float3
     corners
         (M, 3, 2) column and row of the corners; texel centres are at integers.
     margin
-        Distance in texels up to which texels outside a triangle belong to it, if to no other.
-    owner
-        (H, W) of `UNOWNED`; the triangle of each texel is written.
-    places
+        Distance in texels up to which texels outside a triangle belong to it, unless they lie in
+        another one.
+    triangle
+        (H, W) of `NO_TRIANGLE`; the index of each texel's triangle is written.
+    barycentric
         (H, W, 2) written: barycentric coordinates of the second and third corner, below 0 or above
         1 outside the triangle.
     """
-    height, width = owner.shape
+    height, width = triangle.shape
     for m in range(len(corners)):
         ax, ay = corners[m, 0, 0], corners[m, 0, 1]
         bx, by = corners[m, 1, 0] - ax, corners[m, 1, 1] - ay
@@ -76,10 +77,10 @@ def draw_triangles(corners: Float32, margin: float, owner: Int32, places: Float3
         area = bx * cy - by * cx
         if abs(area) < 1e-9:
             continue
-        # Distance of a point from an edge: its barycentric coordinate times the height over it.
-        over_b = abs(area) / max(np.sqrt(cx * cx + cy * cy), 1e-9)
-        over_c = abs(area) / max(np.sqrt(bx * bx + by * by), 1e-9)
-        over_a = abs(area) / max(np.sqrt((bx - cx) ** 2 + (by - cy) ** 2), 1e-9)
+        # Distance of a point from an edge: barycentric coordinate times height of the corner.
+        height_b = abs(area) / max(np.sqrt(cx * cx + cy * cy), 1e-9)
+        height_c = abs(area) / max(np.sqrt(bx * bx + by * by), 1e-9)
+        height_a = abs(area) / max(np.sqrt((bx - cx) ** 2 + (by - cy) ** 2), 1e-9)
         left = max(int(np.floor(ax + min(0.0, bx, cx) - margin)), 0)
         right = min(int(np.ceil(ax + max(0.0, bx, cx) + margin)), width - 1)
         top = max(int(np.floor(ay + min(0.0, by, cy) - margin)), 0)
@@ -89,12 +90,12 @@ def draw_triangles(corners: Float32, margin: float, owner: Int32, places: Float3
                 x, y = u - ax, v - ay
                 b = (x * cy - y * cx) / area
                 c = (y * bx - x * by) / area
-                out = max(-b * over_b, -c * over_c, -(1 - b - c) * over_a)
-                if out > margin or (out > 1e-6 and owner[v, u] != UNOWNED):
+                outside = max(-b * height_b, -c * height_c, -(1 - b - c) * height_a)
+                if outside > margin or (outside > 1e-6 and triangle[v, u] != NO_TRIANGLE):
                     continue
-                owner[v, u] = m
-                places[v, u, 0] = b
-                places[v, u, 1] = c
+                triangle[v, u] = m
+                barycentric[v, u, 0] = b
+                barycentric[v, u, 1] = c
 
 
 @kernel
@@ -116,7 +117,7 @@ def add_view(
     points, normals
         (N, 3) in the world.
     view, T_camera_world, blending
-        The view, its (4, 4) pose, and its weight.
+        The view, its (4, 4) pose, and its selection and weight.
     sums, weights
         (N, C) and (N,), added to.
     start, end
@@ -136,28 +137,28 @@ def add_view(
         if i < 0 or not (u >= 1 and v >= 1 and u < width - 2 and v < height - 2):
             continue
         length = np.sqrt(x * x + y * y + d * d)
-        facing = 0.0
+        cosine = 0.0
         for k in range(3):
-            toward = -(R[0, k] * x + R[1, k] * y + R[2, k] * d) / length
-            facing += toward * normals[n, k]
-        if facing < 0.15:
+            to_camera = -(R[0, k] * x + R[1, k] * y + R[2, k] * d) / length
+            cosine += to_camera * normals[n, k]
+        if cosine < 0.15:
             continue
-        # All pixels around must show this surface: colours mix at edges, and poses have errors.
+        # All pixels around it must show this surface: colours mix at edges, and poses have errors.
         iu, iv = int(u), int(v)
-        allowed = tolerance + tolerance_ratio * d
-        clear = True
+        max_dz = tolerance + tolerance_ratio * d
+        visible = True
         for dv in range(-1, 3):
             for du in range(-1, 3):
-                seen = z[iv + dv, iu + du]
-                if seen > 0 and seen < d - allowed:
-                    clear = False
-                inner = 0 <= dv <= 1 and 0 <= du <= 1
-                if inner and (abs(seen - d) > allowed or image[iv + dv, iu + du, 0] < 0):
-                    clear = False
-        if not clear:
+                depth = z[iv + dv, iu + du]
+                if depth > 0 and depth < d - max_dz:
+                    visible = False
+                interpolated = 0 <= dv <= 1 and 0 <= du <= 1
+                if interpolated and (abs(depth - d) > max_dz or image[iv + dv, iu + du, 0] < 0):
+                    visible = False
+        if not visible:
             continue
-        near = min(u, v, width - 1 - u, height - 1 - v) / border
-        weight = min(1.0, near) * (facing / (length * length)) ** power
+        border_weight = min(u, v, width - 1 - u, height - 1 - v) / border
+        weight = min(1.0, border_weight) * (cosine / (length * length)) ** power
         au, av = u - iu, v - iv
         for k in range(image.shape[2]):
             above = (1 - au) * image[iv, iu, k] + au * image[iv, iu + 1, k]

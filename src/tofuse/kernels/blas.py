@@ -1,7 +1,7 @@
-"""One thread for BLAS: its sums differ with the number of threads, and small matrices gain nothing.
+"""One thread for BLAS: sums depend on the number of threads, and small matrices gain nothing.
 
 On two busy cores an eigendecomposition of 120 x 120 took 60 times as long with two threads as with
-one, as they wait for each other without sleeping.
+one, as threads wait for each other by spinning.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import scipy.linalg  # noqa: F401, brings its own BLAS, which the controller mus
 from threadpoolctl import ThreadpoolController
 
 _lock = Lock()
-_blocks = 0
+_active_blocks = 0
 _limit: Any = None
 
 
@@ -24,19 +24,20 @@ _limit: Any = None
 def one_blas_thread() -> Iterator[None]:
     """Limit BLAS to one thread inside the block.
 
-    The limit is global to the process, and ends with the last of several overlapping blocks.
+    The limit applies to the whole process, and is lifted at the end of the last of several
+    overlapping blocks.
     """
-    global _blocks, _limit
+    global _active_blocks, _limit
     with _lock:
-        if not _blocks:
+        if not _active_blocks:
             _limit = _controller().limit(limits=1, user_api="blas")
-        _blocks += 1
+        _active_blocks += 1
     try:
         yield
     finally:
         with _lock:
-            _blocks -= 1
-            if not _blocks:
+            _active_blocks -= 1
+            if not _active_blocks:
                 _limit.restore_original_limits()
 
 

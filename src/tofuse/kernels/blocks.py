@@ -1,7 +1,7 @@
 """Sparse blocks of voxels, identified by keys in open-addressed hash tables (Nießner et al. 2013).
 
 Space is divided into blocks of 8 x 8 x 8 voxels, of which only those near surfaces are stored. A
-block has a 63-bit key; tables use linear probing. The voxels of each eighth (4 x 4 x 4) of a block
+block has a 63-bit key; tables use linear probing. The voxels of each octant (4 x 4 x 4) of a block
 are contiguous in memory.
 """
 
@@ -27,25 +27,24 @@ class Blocks(NamedTuple):
     Attributes
     ----------
     keys, numbers
-        (B,) of the blocks, and their global numbers, which are the same whichever other blocks are
-        in memory.
+        (B,) of the blocks, and their global numbers, which do not depend on the blocks in memory.
     distance, weight
         (B, VOXELS) mean distance in m, and sum of the weights in 1/m^2.
-    seen
-        (B, VOXELS) number of views with a surface within reach.
+    view_count
+        (B, VOXELS) number of views whose surface is within the truncation distance.
     color
         (B, VOXELS, C) mean colour or amplitude over those views; C may be 0.
-    free
-        (B, 8) weight of free-space observations of whole eighths, not yet in `distance`.
+    free_weight
+        (B, 8) weight of free-space observations of whole octants, not yet in `distance`.
     """
 
     keys: Int64
     numbers: Int64
     distance: Float32
     weight: Float32
-    seen: UInt16
+    view_count: UInt16
     color: Float32
-    free: Float32
+    free_weight: Float32
 
 
 @kernel
@@ -62,18 +61,18 @@ def block_of(key: int) -> tuple[int, int, int]:
 
 @kernel
 def slot_of(table: Int64, key: int) -> int:
-    """Return the slot of `key` in the table (2^n,), or the empty slot where it belongs."""
+    """Return the slot of `key` in the table (2^n,), or the empty slot for it."""
     # Fibonacci hashing: the upper bits of the product depend on all bits of the key.
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    hashed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     mask = len(table) - 1
-    slot = np.int64(mixed >> np.uint64(32)) & mask
+    slot = np.int64(hashed >> np.uint64(32)) & mask
     while table[slot] != EMPTY and table[slot] != key:
         slot = (slot + 1) & mask
     return int(slot)
 
 
 @kernel
-def _grown(table: Int64) -> Int64:
+def _enlarged(table: Int64) -> Int64:
     larger = np.full(2 * len(table), EMPTY, np.int64)
     for key in table:
         if key != EMPTY:
@@ -82,15 +81,15 @@ def _grown(table: Int64) -> Int64:
 
 
 @kernel
-def voxel_at(i: int, j: int, k: int) -> int:
-    """Return the number within its block of the voxel (i, j, k), each from 0 to 7."""
-    eighth = (i & 4) << 6 | (j & 4) << 5 | (k & 4) << 4
-    return int(eighth | (i & 3) << 4 | (j & 3) << 2 | (k & 3))
+def voxel_index(i: int, j: int, k: int) -> int:
+    """Return the index within its block of the voxel (i, j, k), each from 0 to 7."""
+    octant = (i & 4) << 6 | (j & 4) << 5 | (k & 4) << 4
+    return int(octant | (i & 3) << 4 | (j & 3) << 2 | (k & 3))
 
 
 @kernel
 def voxel_of(number: int) -> tuple[int, int, int]:
-    """Return the voxel (i, j, k) of a number within its block."""
+    """Return the voxel (i, j, k) of an index within its block."""
     i = (number >> 6) & 4 | (number >> 4) & 3
     j = (number >> 5) & 4 | (number >> 2) & 3
     k = (number >> 4) & 4 | number & 3
@@ -98,21 +97,21 @@ def voxel_of(number: int) -> tuple[int, int, int]:
 
 
 @kernel
-def enter(table: Int64, count: int, keys: Int64) -> tuple[Int64, int]:
-    """Insert keys; returns the table, replaced by a larger one if necessary, and its new count."""
+def insert_keys(table: Int64, count: int, keys: Int64) -> tuple[Int64, int]:
+    """Insert keys; return the table, replaced by a larger one if necessary, and its new count."""
     for key in keys:
         slot = slot_of(table, key)
         if table[slot] == EMPTY:
             table[slot] = key
             count += 1
             if 2 * count > len(table):
-                table = _grown(table)
+                table = _enlarged(table)
     return table, count
 
 
 @kernel
 def parent_of(key: int) -> tuple[int, int]:
-    """Return the key of the block that contains a cube of half its size, and its eighth."""
+    """Return the key of the block that contains a cube of half its size, and the cube's octant."""
     i, j, k = block_of(key)
     return block_key(i >> 1, j >> 1, k >> 1), (i & 1) << 2 | (j & 1) << 1 | (k & 1)
 
@@ -133,16 +132,16 @@ def index_of(keys: Int64) -> tuple[Int64, Int32]:
 
 
 @kernel
-def mark_eighths(cubes: Int64, table: Int64, rows: Int32, marks: UInt8) -> None:
-    """Set the bits in `marks` (B,) of the eighths of blocks that are among the given cubes.
+def mark_octants(cubes: Int64, table: Int64, rows: Int32, masks: UInt8) -> None:
+    """Set the bits in `masks` (B,) of the octants of blocks that are among the given cubes.
 
     `table` and `rows` are those of `index_of`; cubes of other blocks are ignored.
     """
     for cube in cubes:
-        key, eighth = parent_of(cube)
+        key, octant = parent_of(cube)
         slot = slot_of(table, key)
         if table[slot] == key:
-            marks[rows[slot]] |= np.uint8(1 << eighth)
+            masks[rows[slot]] |= np.uint8(1 << octant)
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""The shape of a surface round each point of a cloud: plane fits, curvature, edges, moments."""
+"""The shape of a surface around each point of a cloud: plane fits, curvature, edges, moments."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import numpy as np
 from tofuse.arrays import Float64, Int64
 from tofuse.kernels.jit import kernel
 
-# A neighbourhood thinner than this fraction of its length is a line and has no normal.
-_LINE = 1e-8
+# Neighbourhoods with a smaller ratio of their two largest variances are lines without a normal.
+_LINE_RATIO = 1e-8
 
 
 @kernel
 def symmetric_eigen(A: Float64, values: Float64, vectors: Float64) -> None:
-    """Eigenvalues (3,), rising, and eigenvectors, in columns (3, 3), of a symmetric A (3, 3).
+    """Eigenvalues (3,), ascending, and eigenvectors, in columns (3, 3), of a symmetric A (3, 3).
 
-    By Jacobi's rotations, which keep small eigenvalues accurate. A is overwritten.
+    Jacobi rotations compute small eigenvalues accurately. A is overwritten.
     """
     for a in range(3):
         for b in range(3):
             vectors[a, b] = 1.0 if a == b else 0.0
     for _ in range(20):
-        off = abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2])
-        if off <= 1e-18 * (abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])):
+        off_diagonal = abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2])
+        if off_diagonal <= 1e-18 * (abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])):
             break
         for p in range(2):
             for q in range(p + 1, 3):
@@ -53,19 +53,19 @@ def symmetric_eigen(A: Float64, values: Float64, vectors: Float64) -> None:
     for a in range(3):
         values[a] = A[a, a]
     for a in range(2):
-        low = a
+        smallest = a
         for b in range(a + 1, 3):
-            if values[b] < values[low]:
-                low = b
-        if low != a:
-            values[a], values[low] = values[low], values[a]
+            if values[b] < values[smallest]:
+                smallest = b
+        if smallest != a:
+            values[a], values[smallest] = values[smallest], values[a]
             for k in range(3):
-                vectors[k, a], vectors[k, low] = vectors[k, low], vectors[k, a]
+                vectors[k, a], vectors[k, smallest] = vectors[k, smallest], vectors[k, a]
 
 
 @kernel
 def _moments(points: Float64, index: Int64, mean: Float64, C: Float64) -> int:
-    """Centroid (3,) and covariance (3, 3) of the points `index`, up to the first -1."""
+    """Centroid (3,), covariance (3, 3) and number of the points `index`, up to the first -1."""
     count = 0
     mean[:] = 0.0
     C[:, :] = 0.0
@@ -95,7 +95,7 @@ def _moments(points: Float64, index: Int64, mean: Float64, C: Float64) -> int:
 def _mean_curvature(
     points: Float64, index: Int64, count: int, centre: Float64, u: Float64, v: Float64, n: Float64
 ) -> float:
-    """Mean curvature of ``h = (a x^2 + 2 b x y + c y^2) / 2 + d x + e y + f``, fitted there."""
+    """Mean curvature of ``h = (a x^2 + 2 b x y + c y^2) / 2 + d x + e y + f`` fitted to points."""
     M = np.zeros((6, 7))
     f = np.ones(6)
     for k in range(count):
@@ -103,10 +103,10 @@ def _mean_curvature(
         y = 0.0
         h = 0.0
         for a in range(3):
-            gap = points[index[k], a] - centre[a]
-            x += gap * u[a]
-            y += gap * v[a]
-            h += gap * n[a]
+            offset = points[index[k], a] - centre[a]
+            x += offset * u[a]
+            y += offset * v[a]
+            h += offset * n[a]
         f[0] = x * x / 2
         f[1] = x * y
         f[2] = y * y / 2
@@ -116,7 +116,7 @@ def _mean_curvature(
             for b in range(6):
                 M[a, b] += f[a] * f[b]
             M[a, 6] += f[a] * h
-    # Gaussian elimination; units of length differ, so each pivot has its own scale.
+    # Gaussian elimination; units differ, so each pivot has its own scale.
     scale = np.empty(6)
     for a in range(6):
         scale[a] = M[a, a]
@@ -133,28 +133,28 @@ def _mean_curvature(
         M[a, 6] /= M[a, a]
     p = M[3, 6]
     q = M[4, 6]
-    bend = (1 + q * q) * M[0, 6] - 2 * p * q * M[1, 6] + (1 + p * p) * M[2, 6]
-    # Bulging towards the side that the normal points to counts as positive.
-    return -bend / (2 * (1 + p * p + q * q) ** 1.5)
+    numerator = (1 + q * q) * M[0, 6] - 2 * p * q * M[1, 6] + (1 + p * p) * M[2, 6]
+    # Positive if the surface bulges towards the side that the normal points to.
+    return -numerator / (2 * (1 + p * p + q * q) ** 1.5)
 
 
 @kernel
 def _widest_gap(
     points: Float64, index: Int64, count: int, centre: Float64, u: Float64, v: Float64
 ) -> float:
-    """Widest angle (rad) in the tangent plane without a neighbour in it; 2 pi if there are none."""
+    """Widest angle (rad) without a neighbour in the tangent plane; 2 pi if there are none."""
     angles = np.empty(count)
     m = 0
     for k in range(count):
         x = 0.0
         y = 0.0
         for a in range(3):
-            gap = points[index[k], a] - centre[a]
-            x += gap * u[a]
-            y += gap * v[a]
+            offset = points[index[k], a] - centre[a]
+            x += offset * u[a]
+            y += offset * v[a]
         if x != 0 or y != 0:
             angle = math.atan2(y, x)
-            # Insertion: there are few, and NumPy's sort takes long to compile.
+            # Insertion sort: there are few, and NumPy's sort takes long to compile.
             j = m
             while j > 0 and angles[j - 1] > angle:
                 angles[j] = angles[j - 1]
@@ -180,12 +180,12 @@ def local_shapes(
     gap: Float64,
     roughness: Float64,
 ) -> None:
-    """Fit the surface round each of the `centres` (m, 3) to its neighbours ``points[index[i]]``.
+    """Fit the surface around each of the `centres` (m, 3) to its neighbours ``points[index[i]]``.
 
-    `index` (m, k) holds -1 after the last neighbour. Writes unit normals (m, 3) on the side of
-    `origin` (3,), NaN where the neighbours lie on a line; the mean curvature (m,) in 1/m, positive
-    where the surface bulges towards `origin`, NaN where it is not fixed; the widest angle (m,) in
-    rad round the centre that holds no neighbour; and the ratio (m,) of the neighbours' rms extents
+    `index` (m, k) is -1 after the last neighbour. Writes unit normals (m, 3) towards `origin` (3,),
+    NaN where the neighbours lie on a line; the mean curvature (m,) in 1/m, positive where the
+    surface bulges towards `origin`, NaN where it is not determined; the widest angle `gap` (m,) in
+    rad around the centre without a neighbour; and the ratio (m,) of the neighbours' rms extents
     across the plane and along its shorter side.
     """
     mean = np.empty(3)
@@ -195,17 +195,17 @@ def local_shapes(
     for i in range(len(centres)):
         count = _moments(points, index[i], mean, C)
         symmetric_eigen(C, values, vectors)
-        if count < 3 or not values[1] > _LINE * values[2]:
+        if count < 3 or not values[1] > _LINE_RATIO * values[2]:
             normals[i, :] = np.nan
             curvature[i] = np.nan
             gap[i] = 2 * math.pi
             roughness[i] = np.nan
             continue
         roughness[i] = math.sqrt(max(values[0], 0.0) / values[1])
-        side = 0.0
+        facing = 0.0
         for a in range(3):
-            side += vectors[a, 0] * (origin[a] - centres[i, a])
-        sign = 1.0 if side >= 0 else -1.0
+            facing += vectors[a, 0] * (origin[a] - centres[i, a])
+        sign = 1.0 if facing >= 0 else -1.0
         for a in range(3):
             normals[i, a] = sign * vectors[a, 0]
         u = vectors[:, 2].copy()

@@ -1,7 +1,7 @@
 """Normal equations of registration metrics over pairs of points, summed in a fixed order.
 
 Motions are right perturbations ``T exp(xi)``, xi = (tx ty tz rx ry rz), and everything is given in
-the source's frame: p a source point, and r the residual turned into that frame,
+the source's frame: p is a source point, and r the residual rotated into that frame,
 ``r = R^T (T p - q)``. The derivative of r is ``[I, -hat(p)]``.
 """
 
@@ -19,12 +19,12 @@ def plane_sums(
 ) -> tuple[Float64, Float64, float]:
     """Sum ``w Ja^T Jb`` (6, 6), ``w Ja^T r`` (6,) and ``w r^2`` over pairs.
 
-    ``Ja = [a, p x a]`` is the derivative of the distance along the unit vector a, (m, 3); so for
-    b. With both the same these are the normal equations of point-to-plane.
+    ``Ja = [a, p x a]`` is the derivative of the distance along the unit vector a, (m, 3), and Jb
+    that along b. If a and b are equal, these are the normal equations of point-to-plane.
     """
     H = np.zeros((6, 6))
     g = np.zeros(6)
-    square = 0.0
+    cost = 0.0
     Ja = np.empty(6)
     Jb = np.empty(6)
     for k in range(len(p)):
@@ -42,8 +42,8 @@ def plane_sums(
             g[c] += x * r
             for d in range(6):
                 H[c, d] += x * Jb[d]
-        square += w * r * r
-    return H, g, square
+        cost += w * r * r
+    return H, g, cost
 
 
 @kernel
@@ -52,11 +52,11 @@ def matrix_sums(
 ) -> tuple[Float64, Float64, float]:
     """Sum ``w J^T W J`` (6, 6), ``w J^T W r`` (6,) and ``w r^T W r`` over pairs.
 
-    ``J = [I, -hat(p)]``; residual r is (m, 3), W is (m, 3, 3) and symmetric.
+    ``J = [I, -hat(p)]``; the residual r is (m, 3); W is (m, 3, 3) and symmetric.
     """
     H = np.zeros((6, 6))
     g = np.zeros(6)
-    square = 0.0
+    cost = 0.0
     J = np.zeros((3, 6))
     WJ = np.empty((3, 6))
     for k in range(len(p)):
@@ -81,8 +81,8 @@ def matrix_sums(
                 g[c] += WJ[e, c] * residual[k, e]
         for c in range(3):
             for d in range(3):
-                square += w * residual[k, c] * W[k, c, d] * residual[k, d]
-    return H, g, square
+                cost += w * residual[k, c] * W[k, c, d] * residual[k, d]
+    return H, g, cost
 
 
 @kernel
@@ -120,10 +120,10 @@ def direction_products(
 ) -> tuple[Float64, Float64]:
     """For each direction u (k, 6): sums of ``w Ja u Jb u`` and ``w ((Ja u)^2 + (Jb u)^2) / 2``.
 
-    ``Ja = [a, p x a]`` and so for b, as in `plane_sums`.
+    ``Ja = [a, p x a]`` and ``Jb = [b, p x b]``, as in `plane_sums`.
     """
-    both = np.zeros(len(directions))
-    plain = np.zeros(len(directions))
+    cross = np.zeros(len(directions))
+    squares = np.zeros(len(directions))
     Ja = np.empty(6)
     Jb = np.empty(6)
     for k in range(len(p)):
@@ -140,6 +140,6 @@ def direction_products(
             for c in range(6):
                 x += Ja[c] * directions[u, c]
                 y += Jb[c] * directions[u, c]
-            both[u] += weight[k] * x * y
-            plain[u] += weight[k] * (x * x + y * y) / 2
-    return both, plain
+            cross[u] += weight[k] * x * y
+            squares[u] += weight[k] * (x * x + y * y) / 2
+    return cross, squares

@@ -1,4 +1,4 @@
-"""Simplification: connected components, unique keys, quadrics and areas of triangles."""
+"""Mesh simplification: connected components, unique keys, quadrics and areas of triangles."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def union_faces(faces: Int32, group: Int32) -> None:
         (M, 3) vertex indices.
     group
         (N,) parent of each vertex, initially itself; updated. Roots are the lowest index of a
-        component. Paths are halved on the way (Tarjan and van Leeuwen 1984).
+        component. Find operations halve the paths (Tarjan and van Leeuwen 1984).
     """
     for m in range(len(faces)):
         for k in range(1, 3):
@@ -79,19 +79,19 @@ def flatten_groups(group: Int32) -> None:
 
 
 @kernel
-def plane_sums(
+def quadric_sums(
     vertices: Float32,
     faces: Int32,
     group: Int64,
-    middles: Float64,
+    centres: Float64,
     A: Float64,
     b: Float64,
 ) -> None:
     """Sum the quadrics of the triangles around each group of vertices (Lindstrom 2000).
 
-    Each corner of a triangle adds its plane to its group, weighted by twice the triangle's area:
-    n n^T to the upper triangle of A, and n times the distance of the group's centre below the plane
-    to b.
+    Each corner of a triangle adds the triangle's plane to its group, weighted by twice the area:
+    n n^T to the upper triangle of A, and n times the signed distance n . (p - centre) of the plane
+    from the group's centre to b.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def plane_sums(
         (N, 3) m, and (M, 3) rows of them.
     group
         (N,) group of each vertex.
-    middles
+    centres
         (G, 3) centres of the groups, m.
     A, b
         (G, 3, 3) and (G, 3), added to.
@@ -121,7 +121,7 @@ def plane_sums(
             g = group[faces[m, k]]
             height = 0.0
             for i in range(3):
-                height += (p[k, i] - middles[g, i]) * n[i]
+                height += (p[k, i] - centres[g, i]) * n[i]
             for i in range(3):
                 b[g, i] += area * n[i] * height
                 for j in range(i, 3):
@@ -130,7 +130,7 @@ def plane_sums(
 
 @kernel
 def has_area(vertices: Float32, faces: Int32, min_height: float, out: Bool) -> None:
-    """Write which triangles are not degenerate to `out` (M,).
+    """Write to `out` (M,) whether each triangle is not degenerate.
 
     Parameters
     ----------

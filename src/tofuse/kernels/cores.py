@@ -10,12 +10,12 @@ from pathlib import Path
 
 @cache
 def usable_cores() -> int:
-    """Return the number of threads that can run at once: by affinity, limited by the quota."""
+    """Return the number of threads that can run at once, by affinity and quota."""
     allowed = quota()
-    return max(1, _bound() if allowed is None else min(_bound(), math.ceil(allowed)))
+    return max(1, _affinity() if allowed is None else min(_affinity(), math.ceil(allowed)))
 
 
-def _bound() -> int:
+def _affinity() -> int:
     """Return the number of cores that this process may be scheduled on."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
@@ -36,20 +36,20 @@ def quota(root: Path = Path("/")) -> float | None:
 
 def _groups(root: Path) -> list[Path]:
     """Return the folders of this process's control groups (v1 and v2) and of their parents."""
-    mounted = root / "sys/fs/cgroup"
+    mount = root / "sys/fs/cgroup"
     found: list[Path] = []
     for line in _read(root / "proc/self/cgroup").splitlines():
-        number, _, rest = line.partition(":")
+        hierarchy, _, rest = line.partition(":")
         controllers, _, path = rest.partition(":")
-        if number == "0" and not controllers:
-            top = mounted
+        if hierarchy == "0" and not controllers:
+            top = mount
         elif "cpu" in controllers.split(","):
-            top = mounted / "cpu"
+            top = mount / "cpu"
         else:
             continue
-        inside = [part for part in path.split("/") if part not in ("", ".", "..")]
-        # In a container the path may be the host's, while the mount is its own.
-        found += [top.joinpath(*inside[:k]) for k in range(len(inside) + 1)]
+        parts = [part for part in path.split("/") if part not in ("", ".", "..")]
+        # In a container the path may be the host's, while the mount is the container's.
+        found += [top.joinpath(*parts[:k]) for k in range(len(parts) + 1)]
     return found
 
 

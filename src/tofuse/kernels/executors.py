@@ -1,6 +1,6 @@
 """Execution of independent tasks on the threads of this process or on other processes.
 
-The result of a task depends on its arguments alone, so that it does not matter where it runs.
+The result of a task depends on its arguments alone, not on where it runs.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Executor(Protocol):
         Parameters
         ----------
         function
-            At the top level of a module, as other processes import it by its name.
+            Defined at the top level of a module, as other processes import it by name.
         arguments
             Returns the arguments of task k; called when it starts, as they may have to be read from
             disk.
@@ -57,11 +57,11 @@ def executor() -> Executor:
 
 
 @contextmanager
-def using_executor(wanted: Executor) -> Iterator[None]:
+def using_executor(replacement: Executor) -> Iterator[None]:
     """Use an executor inside the block, for all threads."""
     global _executor
-    before, _executor = _executor, wanted
+    previous, _executor = _executor, replacement
     try:
         yield
     finally:
-        _executor = before
+        _executor = previous

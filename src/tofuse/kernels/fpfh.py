@@ -1,4 +1,4 @@
-"""Histograms of fast point features, and the nearest of them."""
+"""Fast point feature histograms, and search for the nearest of them."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from tofuse.kernels.jit import kernel
 
 @kernel
 def nearest_rows(rows: Float32, columns: Float32, out: Int64, start: int, stop: int) -> None:
-    """Write to `out` (n,) which of the columns (d, m) is nearest to each of the rows (n, d).
+    """Write to `out` (n,) the index of the column (d, m) that is nearest to each row (n, d).
 
-    Of the rows `start` to `stop`; of equals the first. The other side is transposed so that the
-    inner loop runs over independent sums.
+    For the rows `start` to `stop`; ties go to the first column. The columns are transposed
+    features, so that the inner loop runs over independent sums.
     """
-    apart = np.empty(columns.shape[1], np.float32)
+    distance2 = np.empty(columns.shape[1], np.float32)
     for i in range(start, stop):
-        apart[:] = 0
+        distance2[:] = 0
         for k in range(rows.shape[1]):
             value = rows[i, k]
             for j in range(columns.shape[1]):
-                gap = value - columns[k, j]
-                apart[j] += gap * gap
+                difference = value - columns[k, j]
+                distance2[j] += difference * difference
         nearest = 0
         for j in range(1, columns.shape[1]):
-            if apart[j] < apart[nearest]:
+            if distance2[j] < distance2[nearest]:
                 nearest = j
         out[i] = nearest
 
@@ -34,9 +34,9 @@ def nearest_rows(rows: Float32, columns: Float32, out: Int64, start: int, stop: 
 def histograms(
     points: Float64,
     normals: Float64,
-    near: Int64,
-    squared: Float64,
-    reach: float,
+    neighbours: Int64,
+    distance2: Float64,
+    radius: float,
     signed: bool,
     out: Float64,
     start: int,
@@ -48,10 +48,10 @@ def histograms(
     ----------
     points, normals
         (n, 3).
-    near, squared
+    neighbours, distance2
         (n, k) neighbours of each point and their squared distances.
-    reach
-        Neighbours that are further away don't count, m.
+    radius
+        Neighbours that are further away than this are ignored, m.
     signed
         See `fpfh`.
     """
@@ -59,31 +59,31 @@ def histograms(
     for i in range(start, stop):
         count = 0
         out[i] = 0
-        for a in range(near.shape[1]):
-            j = near[i, a]
-            length = np.sqrt(squared[i, a])
-            if j == i or length == 0 or length > reach:
+        for a in range(neighbours.shape[1]):
+            j = neighbours[i, a]
+            length = np.sqrt(distance2[i, a])
+            if j == i or length == 0 or length > radius:
                 continue
             dx, dy, dz = (points[j] - points[i]) / length
             ux, uy, uz = normals[i]
             nx, ny, nz = normals[j]
             vx, vy, vz = uy * dz - uz * dy, uz * dx - ux * dz, ux * dy - uy * dx
-            size = max(np.sqrt(vx * vx + vy * vy + vz * vz), 1e-12)
-            vx, vy, vz = vx / size, vy / size, vz / size
+            norm = max(np.sqrt(vx * vx + vy * vy + vz * vz), 1e-12)
+            vx, vy, vz = vx / norm, vy / norm, vz / norm
             wx, wy, wz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
             alpha = vx * nx + vy * ny + vz * nz
             phi = ux * dx + uy * dy + uz * dz
-            across = wx * nx + wy * ny + wz * nz
-            along = ux * nx + uy * ny + uz * nz
+            w_dot_n = wx * nx + wy * ny + wz * nz
+            u_dot_n = ux * nx + uy * ny + uz * nz
             if signed:
-                theta = np.arctan2(across, along) / np.pi
+                theta = np.arctan2(w_dot_n, u_dot_n) / np.pi
             else:
                 alpha, phi = 2 * abs(alpha) - 1, 2 * abs(phi) - 1
-                theta = 4 * np.arctan2(abs(across), abs(along)) / np.pi - 1
+                theta = 4 * np.arctan2(abs(w_dot_n), abs(u_dot_n)) / np.pi - 1
             count += 1
             for k, angle in enumerate((alpha, phi, theta)):
-                place = int((angle + 1) / 2 * bins)
-                out[i, k, min(max(place, 0), bins - 1)] += 1
+                index = int((angle + 1) / 2 * bins)
+                out[i, k, min(max(index, 0), bins - 1)] += 1
         if count:
             out[i] /= count
 
@@ -91,21 +91,21 @@ def histograms(
 @kernel
 def weighted_means(
     values: Float64,
-    near: Int64,
-    squared: Float64,
-    reach: float,
+    neighbours: Int64,
+    distance2: Float64,
+    radius: float,
     out: Float64,
     start: int,
     stop: int,
 ) -> None:
-    """Write to `out` (n, d) the means of neighbours' values (n, d), by the inverse distance."""
+    """Write to `out` (n, d) means of the neighbours' values (n, d), weighted by 1 / distance."""
     for i in range(start, stop):
         total = 0.0
         out[i] = 0
-        for a in range(near.shape[1]):
-            j = near[i, a]
-            length = np.sqrt(squared[i, a])
-            if j == i or length == 0 or length > reach:
+        for a in range(neighbours.shape[1]):
+            j = neighbours[i, a]
+            length = np.sqrt(distance2[i, a])
+            if j == i or length == 0 or length > radius:
                 continue
             total += 1 / length
             out[i] += values[j] / length

@@ -1,8 +1,8 @@
-"""Compilation of kernels, with a cache that can neither go stale nor stop a run.
+"""Compilation of kernels, with a cache that can neither become stale nor abort a run.
 
 Numba's on-disk cache does not notice a changed callee in another file, and fails where it can't
-write. The cache folder is therefore keyed by the hash of all kernel sources, and a private
-temporary folder stands in where the home is read-only.
+write. The cache folder is therefore named by a hash of all kernel sources, and a private temporary
+folder is used where the home folder is read-only.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _HERE = Path(__file__).parent
 
 @cache
 def source_hash(package: Path = _HERE) -> str:
-    """Hash of the versions that compile kernels, and of all sources of this package.
+    """Return a hash of the versions of Numba and Python, and of all sources of this package.
 
-    For kernels of another package (a folder), which may call these, of its sources as well.
+    For kernels of another `package` (a folder), which may call these, also of its sources.
     """
     digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
     for folder in dict.fromkeys((_HERE, package)):
@@ -41,25 +41,25 @@ def source_hash(package: Path = _HERE) -> str:
 
 
 def cache_folder(package: Path = _HERE) -> str:
-    """Return a folder that can be written, the same in every run where the machine allows it."""
-    return _writable(f"kernels-{source_hash(package)}")
+    """Return a writable folder, which is the same in every run if the machine allows it."""
+    return _writable_folder(f"kernels-{source_hash(package)}")
 
 
 @cache
-def _writable(name: str) -> str:
+def _writable_folder(name: str) -> str:
     try:
-        folder = _base() / name
+        folder = _cache_root() / name
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             return str(folder)
     except (OSError, RuntimeError):
-        # Private to this process: compiled code must never be loaded from a folder others own.
+        # Private to this process: code must never be loaded from a folder that others own.
         private = tempfile.mkdtemp(prefix="tofuse-kernels-")
         atexit.register(shutil.rmtree, private, ignore_errors=True)
         return private
 
 
-def _base() -> Path:
+def _cache_root() -> Path:
     if os.environ.get("NUMBA_CACHE_DIR"):
         return Path(os.environ["NUMBA_CACHE_DIR"])
     if sys.platform == "win32":
@@ -68,15 +68,15 @@ def _base() -> Path:
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function over arrays: nogil, cached, IEEE arithmetic (the same every time)."""
+    """Compile a function over arrays: nogil, cached, with reproducible IEEE arithmetic."""
     config: Any = numba.config
     njit: Any = numba.njit  # its type hints lack an option
-    before = config.CACHE_DIR
+    previous = config.CACHE_DIR
     config.CACHE_DIR = cache_folder(Path(function.__code__.co_filename).parent)
     try:
-        # Nothing calls kernels from C, so the wrapper for that would only take time to compile.
-        options = njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)
-        compiled: Callable[P, R] = options(function)
+        # Kernels are not called from C, and the wrapper for it takes time to compile.
+        decorator = njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)
+        compiled: Callable[P, R] = decorator(function)
     finally:
-        config.CACHE_DIR = before
+        config.CACHE_DIR = previous
     return compiled

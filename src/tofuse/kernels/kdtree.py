@@ -2,11 +2,11 @@
 
 The tree is implicit: node j of level l holds the points ``order[n*j >> l : n*(j+1) >> l]``, its
 children are nodes 2j and 2j+1 of the next level, and leaves are the nodes of the last level. Each
-inner node is cut at the median of its longest side.
+inner node is split at the median of its longest side.
 
-Answers are exactly those of a search through all points in double precision, ties going to the
-lowest index: the lower bound of a box is summed in the order in which a distance is, so rounding
-can never put it above the distance of a point inside.
+Results are exactly those of an exhaustive search in double precision, with ties going to the lowest
+index: the lower bound of a box is summed in the same order as a distance, so rounding can never put
+it above the distance of a point inside.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from tofuse.kernels.jit import kernel
 from tofuse.kernels.threads import run_chunks
 
 LEAF_SIZE = 10
-# Below this many queries a second thread costs more than it brings.
-_SMALL_WORK = 4000
+# With fewer queries a second thread costs more than it gains.
+_MIN_PARALLEL = 4000
 
 
 @kernel
 def kdtree_build(points: Float64, depth: int) -> tuple[Int64, Float64, Int64, Float64]:
     """Arrange (n, 3) finite points in a tree of 2**depth leaves, none of them empty.
 
-    Returns ``(order, arranged, axes, cuts)``: the permutation (n,), ``points[order]``, and axis
-    and coordinate of the cut of each of the 2**depth - 1 inner nodes. Points left of a cut are
-    <= it, points right of it >= it.
+    Returns ``(order, sorted_points, axes, splits)``: the permutation (n,), ``points[order]``, and
+    axis and coordinate of the split of each of the 2**depth - 1 inner nodes. Points on the left of
+    a split are <= it, points on the right are >= it.
     """
     n = len(points)
     inner = (1 << depth) - 1
     order = np.arange(n)
     axes = np.zeros(inner, np.int64)
-    cuts = np.zeros(inner)
+    splits = np.zeros(inner)
     for level in range(depth):
         for j in range(1 << level):
             start = n * j >> level
@@ -58,7 +58,7 @@ def kdtree_build(points: Float64, depth: int) -> tuple[Int64, Float64, Int64, Fl
                 if high - low > longest:
                     longest = high - low
                     axis = a
-            # Hoare's selection: the median to `middle`, nothing larger before it.
+            # Hoare's selection algorithm: move the median to `middle`, nothing larger before it.
             left = start
             right = stop - 1
             while left < right:
@@ -85,47 +85,47 @@ def kdtree_build(points: Float64, depth: int) -> tuple[Int64, Float64, Int64, Fl
                     break
             node = (1 << level) - 1 + j
             axes[node] = axis
-            cuts[node] = points[order[middle], axis]
-    return order, points[order], axes, cuts
+            splits[node] = points[order[middle], axis]
+    return order, points[order], axes, splits
 
 
 @kernel
 def kdtree_nearest(
     order: Int64,
-    arranged: Float64,
+    sorted_points: Float64,
     axes: Int64,
-    cuts: Float64,
+    splits: Float64,
     depth: int,
     queries: Float64,
-    limit: float,
+    max_distance2: float,
     index: Int64,
     distance2: Float64,
 ) -> None:
-    """Find the nearest point of each query (m, 3) within the squared distance `limit`.
+    """Find the nearest point of each query (m, 3), within the squared distance `max_distance2`.
 
     Writes into `index` (m,), -1 where there is none, and `distance2` (m,), infinity there.
     A query that is not finite has no neighbour.
     """
-    n = len(arranged)
-    inner = len(cuts)
-    waiting = np.empty(depth + 1, np.int64)
-    boxes = np.empty((depth + 1, 3))
+    n = len(sorted_points)
+    inner = len(splits)
+    stack = np.empty(depth + 1, np.int64)
+    offsets = np.empty((depth + 1, 3))
     for q in range(len(queries)):
         x = queries[q, 0]
         y = queries[q, 1]
         z = queries[q, 2]
-        best = limit
+        best = max_distance2
         found = -1
-        waiting[0] = 0
-        boxes[0, :] = 0.0
+        stack[0] = 0
+        offsets[0, :] = 0.0
         count = 1 if np.isfinite(x + y + z) else 0
         while count > 0:
             count -= 1
-            node = waiting[count]
-            # How far the query lies outside the node's box along each axis.
-            bx = boxes[count, 0]
-            by = boxes[count, 1]
-            bz = boxes[count, 2]
+            node = stack[count]
+            # Distance of the query from the node's box along each axis.
+            bx = offsets[count, 0]
+            by = offsets[count, 1]
+            bz = offsets[count, 2]
             if bx * bx + by * by + bz * bz > best:
                 continue
             while node < inner:
@@ -134,30 +134,30 @@ def kdtree_nearest(
                 fz = bz
                 axis = axes[node]
                 if axis == 0:
-                    gap = x - cuts[node]
-                    fx = gap
+                    offset = x - splits[node]
+                    fx = offset
                 elif axis == 1:
-                    gap = y - cuts[node]
-                    fy = gap
+                    offset = y - splits[node]
+                    fy = offset
                 else:
-                    gap = z - cuts[node]
-                    fz = gap
+                    offset = z - splits[node]
+                    fz = offset
                 near = 2 * node + 1
                 far = near + 1
-                if gap >= 0:
+                if offset >= 0:
                     near, far = far, near
                 if fx * fx + fy * fy + fz * fz <= best:
-                    waiting[count] = far
-                    boxes[count, 0] = fx
-                    boxes[count, 1] = fy
-                    boxes[count, 2] = fz
+                    stack[count] = far
+                    offsets[count, 0] = fx
+                    offsets[count, 1] = fy
+                    offsets[count, 2] = fz
                     count += 1
                 node = near
             leaf = node - inner
             for i in range(n * leaf >> depth, n * (leaf + 1) >> depth):
-                dx = x - arranged[i, 0]
-                dy = y - arranged[i, 1]
-                dz = z - arranged[i, 2]
+                dx = x - sorted_points[i, 0]
+                dy = y - sorted_points[i, 1]
+                dz = z - sorted_points[i, 2]
                 d = dx * dx + dy * dy + dz * dz
                 if d < best or (d == best and (found < 0 or order[i] < found)):
                     best = d
@@ -169,9 +169,9 @@ def kdtree_nearest(
 @kernel
 def kdtree_neighbours(
     order: Int64,
-    arranged: Float64,
+    sorted_points: Float64,
     axes: Int64,
-    cuts: Float64,
+    splits: Float64,
     depth: int,
     queries: Float64,
     index: Int64,
@@ -182,29 +182,29 @@ def kdtree_neighbours(
     Writes into `index` (m, k), -1 where there are fewer than k points, and `distance2` (m, k),
     infinity there. A query that is not finite has no neighbours.
     """
-    n = len(arranged)
-    inner = len(cuts)
+    n = len(sorted_points)
+    inner = len(splits)
     last = index.shape[1] - 1
-    waiting = np.empty(depth + 1, np.int64)
-    boxes = np.empty((depth + 1, 3))
+    stack = np.empty(depth + 1, np.int64)
+    offsets = np.empty((depth + 1, 3))
     for q in range(len(queries)):
         x = queries[q, 0]
         y = queries[q, 1]
         z = queries[q, 2]
-        near_index = index[q]
-        near_distance = distance2[q]
-        near_index[:] = -1
-        near_distance[:] = np.inf
-        waiting[0] = 0
-        boxes[0, :] = 0.0
+        found_index = index[q]
+        found_distance2 = distance2[q]
+        found_index[:] = -1
+        found_distance2[:] = np.inf
+        stack[0] = 0
+        offsets[0, :] = 0.0
         count = 1 if np.isfinite(x + y + z) else 0
         while count > 0:
             count -= 1
-            node = waiting[count]
-            bx = boxes[count, 0]
-            by = boxes[count, 1]
-            bz = boxes[count, 2]
-            if bx * bx + by * by + bz * bz > near_distance[last]:
+            node = stack[count]
+            bx = offsets[count, 0]
+            by = offsets[count, 1]
+            bz = offsets[count, 2]
+            if bx * bx + by * by + bz * bz > found_distance2[last]:
                 continue
             while node < inner:
                 fx = bx
@@ -212,45 +212,45 @@ def kdtree_neighbours(
                 fz = bz
                 axis = axes[node]
                 if axis == 0:
-                    gap = x - cuts[node]
-                    fx = gap
+                    offset = x - splits[node]
+                    fx = offset
                 elif axis == 1:
-                    gap = y - cuts[node]
-                    fy = gap
+                    offset = y - splits[node]
+                    fy = offset
                 else:
-                    gap = z - cuts[node]
-                    fz = gap
+                    offset = z - splits[node]
+                    fz = offset
                 near = 2 * node + 1
                 far = near + 1
-                if gap >= 0:
+                if offset >= 0:
                     near, far = far, near
-                if fx * fx + fy * fy + fz * fz <= near_distance[last]:
-                    waiting[count] = far
-                    boxes[count, 0] = fx
-                    boxes[count, 1] = fy
-                    boxes[count, 2] = fz
+                if fx * fx + fy * fy + fz * fz <= found_distance2[last]:
+                    stack[count] = far
+                    offsets[count, 0] = fx
+                    offsets[count, 1] = fy
+                    offsets[count, 2] = fz
                     count += 1
                 node = near
             leaf = node - inner
             for i in range(n * leaf >> depth, n * (leaf + 1) >> depth):
-                dx = x - arranged[i, 0]
-                dy = y - arranged[i, 1]
-                dz = z - arranged[i, 2]
+                dx = x - sorted_points[i, 0]
+                dy = y - sorted_points[i, 1]
+                dz = z - sorted_points[i, 2]
                 d = dx * dx + dy * dy + dz * dz
-                worst = near_index[last]
-                if d < near_distance[last] or (
-                    d == near_distance[last] and (worst < 0 or order[i] < worst)
+                worst = found_index[last]
+                if d < found_distance2[last] or (
+                    d == found_distance2[last] and (worst < 0 or order[i] < worst)
                 ):
                     k = last
                     while k > 0 and (
-                        d < near_distance[k - 1]
-                        or (d == near_distance[k - 1] and order[i] < near_index[k - 1])
+                        d < found_distance2[k - 1]
+                        or (d == found_distance2[k - 1] and order[i] < found_index[k - 1])
                     ):
-                        near_distance[k] = near_distance[k - 1]
-                        near_index[k] = near_index[k - 1]
+                        found_distance2[k] = found_distance2[k - 1]
+                        found_index[k] = found_index[k - 1]
                         k -= 1
-                    near_distance[k] = d
-                    near_index[k] = order[i]
+                    found_distance2[k] = d
+                    found_index[k] = order[i]
 
 
 class KdTree:
@@ -287,12 +287,12 @@ class KdTree:
         array = checked_points(queries, "queries")
         index = np.empty(len(array), np.int64)
         distance2 = np.empty(len(array))
-        limit = max_distance * max_distance if max_distance >= 0 else -1.0
+        limit2 = max_distance * max_distance if max_distance >= 0 else -1.0
 
         def work(a: int, b: int) -> None:
-            kdtree_nearest(*self._tree, self._depth, array[a:b], limit, index[a:b], distance2[a:b])
+            kdtree_nearest(*self._tree, self._depth, array[a:b], limit2, index[a:b], distance2[a:b])
 
-        spread_queries(work, len(array))
+        run_queries(work, len(array))
         return index, distance2
 
     def neighbours(self, queries: ArrayLike, k: int) -> tuple[Int64, Float64]:
@@ -311,18 +311,18 @@ class KdTree:
         def work(a: int, b: int) -> None:
             kdtree_neighbours(*self._tree, self._depth, array[a:b], index[a:b], distance2[a:b])
 
-        spread_queries(work, len(array))
+        run_queries(work, len(array))
         return index, distance2
 
 
-def spread_queries(work: Callable[[int, int], None], size: int) -> None:
-    """Call `work(start, stop)` for chunks of `size` queries, in parallel if there are many."""
-    run_chunks(work, size, chunks=min(16, 2 * size // _SMALL_WORK) if size > _SMALL_WORK else 1)
+def run_queries(work: Callable[[int, int], None], size: int) -> None:
+    """Call `work(start, stop)` for chunks of `size` queries, in parallel if they are many."""
+    run_chunks(work, size, chunks=min(16, 2 * size // _MIN_PARALLEL) if size > _MIN_PARALLEL else 1)
 
 
-def checked_points(points: ArrayLike, what: str) -> Float64:
-    """Return points as an (N, 3) array; InputError, which names them `what`, if they are not."""
+def checked_points(points: ArrayLike, name: str) -> Float64:
+    """Return points as an (N, 3) array; InputError, which mentions `name`, otherwise."""
     array = np.ascontiguousarray(points, np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"have shape {array.shape}", where=what, remedy="pass an (N, 3) array")
+        raise InputError(f"have shape {array.shape}", where=name, remedy="pass an (N, 3) array")
     return array

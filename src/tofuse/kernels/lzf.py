@@ -13,9 +13,9 @@ def lzf_decompress(source: UInt8, out: UInt8) -> int:
     """Decompress `source` (N,) into `out` (M,).
 
     Returns the number of bytes written, or -1 if the stream is damaged: it ends within a token,
-    points before the beginning, or holds more than M bytes.
+    refers to bytes before the beginning, or contains more than M bytes.
     """
-    size, room = source.size, out.size
+    size, capacity = source.size, out.size
     i = 0
     o = 0
     while i < size:
@@ -23,7 +23,7 @@ def lzf_decompress(source: UInt8, out: UInt8) -> int:
         i += 1
         if control < 32:
             length = control + 1
-            if i + length > size or o + length > room:
+            if i + length > size or o + length > capacity:
                 return -1
             for _ in range(length):
                 out[o] = source[i]
@@ -38,14 +38,14 @@ def lzf_decompress(source: UInt8, out: UInt8) -> int:
             i += 1
         if i >= size:
             return -1
-        back = o - ((control & 31) << 8) - np.int64(source[i]) - 1
+        match = o - ((control & 31) << 8) - np.int64(source[i]) - 1
         i += 1
         length += 2
-        if back < 0 or o + length > room:
+        if match < 0 or o + length > capacity:
             return -1
         # Byte by byte: the copy may overlap what it writes.
         for _ in range(length):
-            out[o] = out[back]
+            out[o] = out[match]
             o += 1
-            back += 1
+            match += 1
     return o

@@ -21,7 +21,7 @@ _NO_BITS = np.zeros(256, np.int64)
 
 
 def _bases(bits: Int64) -> Int64:
-    """Each symbol's values follow those of the symbol before."""
+    """Return the first value of each symbol, which follows the last one of the symbol before."""
     return np.concatenate([[0], np.cumsum(1 << bits)[:-1]]).astype(np.int64)
 
 
@@ -30,46 +30,46 @@ _LITERAL_BASE = np.arange(256, dtype=np.int64)
 
 
 @kernel
-def _table(
+def _fill_table(
     counts: Int64,
-    extra: Int64,
-    base: Int64,
-    shifts: Int64,
+    symbol_bits: Int64,
+    symbol_base: Int64,
+    state_bits: Int64,
     deltas: Int64,
-    more: Int64,
-    least: Int64,
+    value_bits: Int64,
+    value_base: Int64,
 ) -> bool:
-    """Fill a decoder's table from how many of its states each symbol has; False if too many."""
-    states = shifts.size
-    at = 0
+    """Fill a decoding table, given the number of states of each symbol; False if too many."""
+    states = state_bits.size
+    index = 0
     for symbol in range(counts.size):
         count = counts[symbol]
         if count == 0:
             continue
-        if at + count > states:
+        if index + count > states:
             return False
         shift = 0
         while count << shift < states:
             shift += 1
-        low = ((2 * states) >> shift) - count
+        threshold = ((2 * states) >> shift) - count
         for j in range(count):
-            if j < low:
-                shifts[at] = shift
-                deltas[at] = ((count + j) << shift) - states
+            if j < threshold:
+                state_bits[index] = shift
+                deltas[index] = ((count + j) << shift) - states
             else:
-                shifts[at] = shift - 1
-                deltas[at] = (j - low) << (shift - 1)
-            more[at] = extra[symbol]
-            least[at] = base[symbol]
-            at += 1
-    # States that no symbol has are never reached in a sound stream.
-    for k in range(at, states):
-        shifts[k] = -1
+                state_bits[index] = shift - 1
+                deltas[index] = (j - threshold) << (shift - 1)
+            value_bits[index] = symbol_bits[symbol]
+            value_base[index] = symbol_base[symbol]
+            index += 1
+    # States without a symbol are never reached in a valid stream.
+    for k in range(index, states):
+        state_bits[k] = -1
     return True
 
 
 @kernel
-def _bits(source: UInt8, position: int, count: int) -> int:
+def _read_bits(source: UInt8, position: int, count: int) -> int:
     """Return `count` bits below 40 from a bit position on, the least significant first."""
     value = np.int64(0)
     first = position >> 3
@@ -106,71 +106,73 @@ def lzfse_block(
     copy_states
         (3,) first states of literal runs, copy lengths and distances.
     literal_count, copy_count
-        How many literals and copies there are.
+        Numbers of literals and copies.
     counts
-        (360,) states of each symbol: 20 runs, 20 lengths, 64 distances, 256 literals.
+        (360,) number of states of each symbol: 20 runs, 20 lengths, 64 distances, 256 literals.
 
     Returns the position after the last byte written, or -1 if the block is damaged.
     """
-    shifts = np.empty(1024, np.int64)
+    state_bits = np.empty(1024, np.int64)
     deltas = np.empty(1024, np.int64)
-    more = np.empty(1024, np.int64)
-    least = np.empty(1024, np.int64)
-    if not _table(counts[104:], _NO_BITS, _LITERAL_BASE, shifts, deltas, more, least):
+    value_bits = np.empty(1024, np.int64)
+    value_base = np.empty(1024, np.int64)
+    if not _fill_table(
+        counts[104:], _NO_BITS, _LITERAL_BASE, state_bits, deltas, value_bits, value_base
+    ):
         return -1
     literals = np.empty(literal_count + 4, np.uint8)
     states = literal_states.copy()
     position = 8 * literal_stream.size - literal_skip
     for k in range(literal_count):
         state = states[k & 3]
-        shift = shifts[state]
-        if shift < 0 or position < shift:
+        bits = state_bits[state]
+        if bits < 0 or position < bits:
             return -1
-        position -= shift
-        literals[k] = least[state]
-        states[k & 3] = deltas[state] + _bits(literal_stream, position, shift)
+        position -= bits
+        literals[k] = value_base[state]
+        states[k & 3] = deltas[state] + _read_bits(literal_stream, position, bits)
 
     for k in range(3):
         size = 256 if k == 2 else 64
         begin = 256 * k
         symbols = counts[:20] if k == 0 else (counts[20:40] if k == 1 else counts[40:104])
-        extra = _RUN_BITS if k == 0 else (_COPY_BITS if k == 1 else _DISTANCE_BITS)
-        base = _RUN_BASE if k == 0 else (_COPY_BASE if k == 1 else _DISTANCE_BASE)
-        if not _table(
+        symbol_bits = _RUN_BITS if k == 0 else (_COPY_BITS if k == 1 else _DISTANCE_BITS)
+        symbol_base = _RUN_BASE if k == 0 else (_COPY_BASE if k == 1 else _DISTANCE_BASE)
+        if not _fill_table(
             symbols,
-            extra,
-            base,
-            shifts[begin : begin + size],
+            symbol_bits,
+            symbol_base,
+            state_bits[begin : begin + size],
             deltas[begin : begin + size],
-            more[begin : begin + size],
-            least[begin : begin + size],
+            value_bits[begin : begin + size],
+            value_base[begin : begin + size],
         ):
             return -1
-    now = copy_states.copy()
+    copy_state = copy_states.copy()
     values = np.zeros(3, np.int64)
     position = 8 * copy_stream.size - copy_skip
     o = start
-    used = 0
+    literal = 0
     distance = np.int64(0)
     for _ in range(copy_count):
         for k in range(3):
-            at = 256 * k + now[k]
-            shift = shifts[at]
-            if shift < 0 or position < shift + more[at]:
+            index = 256 * k + copy_state[k]
+            bits = state_bits[index]
+            if bits < 0 or position < bits + value_bits[index]:
                 return -1
-            position -= shift + more[at]
-            value = _bits(copy_stream, position, shift + more[at])
-            now[k] = deltas[at] + (value >> more[at])
-            values[k] = least[at] + (value & ((np.int64(1) << more[at]) - 1))
+            position -= bits + value_bits[index]
+            value = _read_bits(copy_stream, position, bits + value_bits[index])
+            copy_state[k] = deltas[index] + (value >> value_bits[index])
+            values[k] = value_base[index] + (value & ((np.int64(1) << value_bits[index]) - 1))
         run, length = values[0], values[1]
         if values[2] > 0:
             distance = values[2]
-        if used + run > literal_count or o + run + length > out.size:
+        if literal + run > literal_count or o + run + length > out.size:
             return -1
         for _ in range(run):
-            out[o] = literals[used]
+            out[o] = literals[literal]
             o += 1
-            used += 1
+            literal += 1
         if length > 0 and (distance <= 0 or distance > o):
             return -1
         # Byte by byte: the copy may overlap what it writes.

@@ -1,4 +1,4 @@
-"""Light that surfaces reflect onto each other (multipath), on a coarse grid of an image.
+"""Interreflections between surfaces (multipath), on a coarse grid of an image.
 
 A grid node stands for a block of pixels. The columns of `nodes` are x and y of the mean ray, mean
 inverse depth w, mean amplitude per pixel, area of the block in the plane z = 1, and the
@@ -57,8 +57,8 @@ def block_means(
     jump
         Pixels within this fraction of the block's median depth are averaged.
     nodes
-        (Hn, Wn, COLUMNS), of which the first five columns are written; w is 0 where less than a
-        quarter of the block is valid.
+        (Hn, Wn, COLUMNS); the first five columns are written. w is 0 where less than a quarter of
+        the block is valid.
     """
     rows, columns = z.shape
     d = np.empty(step * step)
@@ -70,7 +70,7 @@ def block_means(
             for i in range(top, bottom):
                 for j in range(left, right):
                     if z[i, j] > 0:
-                        # Insertion sort: faster for so few values.
+                        # Insertion sort: fastest for so few values.
                         m = n
                         while m > 0 and d[m - 1] > z[i, j]:
                             d[m] = d[m - 1]
@@ -81,46 +81,48 @@ def block_means(
                 nodes[bi, bj, c] = 0.0
             if 4 * n < (bottom - top) * (right - left):
                 continue
-            middle = d[n // 2]
+            median = d[n // 2]
             count = 0
-            lit = 0
-            mapped = 0
-            x = y = w = amount = area = 0.0
+            amplitude_count = 0
+            area_count = 0
+            x = y = w = amplitude_sum = area = 0.0
             for i in range(top, bottom):
                 for j in range(left, right):
-                    if z[i, j] > 0 and abs(z[i, j] - middle) <= jump * middle:
+                    if z[i, j] > 0 and abs(z[i, j] - median) <= jump * median:
                         count += 1
                         x += rays[i, j, 0]
                         y += rays[i, j, 1]
                         w += 1.0 / z[i, j]
                         if amplitude[i, j] > 0:
-                            lit += 1
-                            amount += amplitude[i, j]
+                            amplitude_count += 1
+                            amplitude_sum += amplitude[i, j]
                         i2 = i + 1 if i + 1 < rows else i - 1
                         j2 = j + 1 if j + 1 < columns else j - 1
                         ux = rays[i, j2, 0] - rays[i, j, 0]
                         uy = rays[i, j2, 1] - rays[i, j, 1]
                         vx = rays[i2, j, 0] - rays[i, j, 0]
                         vy = rays[i2, j, 1] - rays[i, j, 1]
-                        pixel = abs(ux * vy - uy * vx)
-                        if np.isfinite(pixel):
-                            mapped += 1
-                            area += pixel
-            if mapped == 0:
+                        pixel_area = abs(ux * vy - uy * vx)
+                        if np.isfinite(pixel_area):
+                            area_count += 1
+                            area += pixel_area
+            if area_count == 0:
                 continue
             nodes[bi, bj, X] = x / count
             nodes[bi, bj, Y] = y / count
             nodes[bi, bj, W] = w / count
-            nodes[bi, bj, AMPLITUDE] = amount / lit if lit > 0 else 0.0
-            nodes[bi, bj, AREA] = area / mapped * count
+            nodes[bi, bj, AMPLITUDE] = (
+                amplitude_sum / amplitude_count if amplitude_count > 0 else 0.0
+            )
+            nodes[bi, bj, AREA] = area / area_count * count
 
 
 @kernel
 def window_planes(nodes: Float64, radius: int, planes: Float64) -> None:
     """Fit 1/z = a x + b y + c to each window of (2 radius + 1)^2 nodes.
 
-    Writes `planes` (Hn, Wn, 4): a, b, c and the rms residual relative to 1/z, which is infinite
-    where less than two thirds of the window are valid.
+    Writes `planes` (Hn, Wn, 4): a, b, c and the rms residual relative to 1/z, infinite where less
+    than two thirds of the window are valid.
     """
     rows, columns = nodes.shape[:2]
     for i in range(rows):
@@ -166,12 +168,12 @@ def window_planes(nodes: Float64, radius: int, planes: Float64) -> None:
 
 @kernel
 def choose_planes(
-    nodes: Float64, planes: Float64, radius: int, limit: float, measured: Float64, shift: Float64
+    nodes: Float64, planes: Float64, radius: int, limit: float, measured: Float64, bias: Float64
 ) -> None:
     """Assign to each node without a plane the best-fitting plane of the windows around it.
 
-    As in the filter of Kuwahara (1976), planes then extend up to an edge without smoothing it.
-    Next to an edge the bias of a node depends on the surface it belongs to, so the node is compared
+    As in the filter of Kuwahara (1976), planes thus extend up to an edge without smoothing it. Next
+    to an edge the bias of a node depends on the surface that it belongs to, so the node is compared
     with each plane after correction by that window's bias.
 
     Parameters
@@ -183,8 +185,8 @@ def choose_planes(
     radius
         In nodes.
     limit
-        Largest relative misfit of a plane; that of the node itself may be twice as large.
-    measured, shift
+        Largest relative misfit of a plane; the node may deviate from it by twice as much.
+    measured, bias
         (Hn, Wn) uncorrected radial range in m, and current estimate of its bias.
     """
     rows, columns = nodes.shape[:2]
@@ -204,12 +206,12 @@ def choose_planes(
                         + planes[p, q, 1] * nodes[i, j, Y]
                         + planes[p, q, 2]
                     )
-                    w = length / (measured[i, j] - shift[p, q])
-                    off = abs(fitted - w) / w
-                    if not w > 0 or off > 2 * limit:
+                    w = length / (measured[i, j] - bias[p, q])
+                    deviation = abs(fitted - w) / w
+                    if not w > 0 or deviation > 2 * limit:
                         continue
-                    away = (p - i) ** 2 + (q - j) ** 2
-                    cost = misfit + off + 0.1 * limit * away
+                    distance2 = (p - i) ** 2 + (q - j) ** 2
+                    cost = misfit + deviation + 0.1 * limit * distance2
                     if cost < best:
                         best = cost
                         nodes[i, j, A] = planes[p, q, 0]
@@ -220,10 +222,10 @@ def choose_planes(
 @kernel
 def surface_radiometry(
     nodes: Float64,
-    factor: Float64,
+    amplitude_factor: Float64,
     falloff: float,
     min_cosine: float,
-    good: Bool,
+    has_plane: Bool,
     points: Float64,
     normals: Float64,
     values: Float64,
@@ -232,15 +234,15 @@ def surface_radiometry(
 
     Parameters
     ----------
-    factor
+    amplitude_factor
         (Hn, Wn) by which indirect light has raised the amplitude.
     falloff
-        Exponent of the cosine to the optical axis with which amplitude falls off, half of it due to
-        the lens and half of it due to the light source.
+        Exponent of the cosine to the optical axis with which amplitude falls off: half of it is due
+        to the lens, and half to the light source.
     min_cosine
         Lower limit of the cosine of incidence.
-    good, points, normals
-        Written: (Hn, Wn) whether a plane fits; (Hn, Wn, 3) in m; unit, towards the camera.
+    has_plane, points, normals
+        Written: (Hn, Wn) whether there is a plane; (Hn, Wn, 3) in m; unit, towards the camera.
     values
         Written: (5, Hn, Wn) radial range in m, area in m^2, direct irradiance, radiosity, and
         albedo in counts, see `Surfaces`; 0 without a plane.
@@ -252,7 +254,7 @@ def surface_radiometry(
             slope = np.sqrt(a * a + b * b + c * c)
             w = a * x + b * y + c
             fits = nodes[i, j, W] > 0 and slope > 0 and w > 0
-            good[i, j] = fits
+            has_plane[i, j] = fits
             if not fits:
                 for n in range(3):
                     points[i, j, n] = normals[i, j, n] = 0.0
@@ -262,45 +264,45 @@ def surface_radiometry(
             length = np.sqrt(1.0 + x * x + y * y)
             cosine = min(max(w / (slope * length), min_cosine), 1.0)
             r = length / w
-            half = length ** (-falloff / 2)
+            lens_falloff = length ** (-falloff / 2)
             points[i, j, 0], points[i, j, 1], points[i, j, 2] = x / w, y / w, 1.0 / w
             normals[i, j, 0], normals[i, j, 1] = -a / slope, -b / slope
             normals[i, j, 2] = -c / slope
             values[0, i, j] = r
             values[1, i, j] = nodes[i, j, AREA] / (w * w * length * cosine)
-            values[2, i, j] = half * cosine / (r * r)
-            values[3, i, j] = nodes[i, j, AMPLITUDE] / half
-            values[4, i, j] = values[3, i, j] / values[2, i, j] / factor[i, j]
+            values[2, i, j] = lens_falloff * cosine / (r * r)
+            values[3, i, j] = nodes[i, j, AMPLITUDE] / lens_falloff
+            values[4, i, j] = values[3, i, j] / values[2, i, j] / amplitude_factor[i, j]
 
 
 @kernel
 def visible_sources(
-    good: Bool,
+    has_plane: Bool,
     points: Float64,
     normals: Float64,
     area: Float64,
     radiosity: Complex128,
     out: Float32,
 ) -> int:
-    """Make light sources of the nodes (Hn, Wn), merging similar ones of each 2 x 2 into one.
+    """Make light sources of the nodes (Hn, Wn), merging similar nodes of each 2 x 2 into one.
 
-    Nodes are merged with the strongest of the four if their normal is within 14 degrees of its
-    normal, and they lie off its plane by less than 2 % of its range.
+    Nodes are merged with the strongest of the four if their normals are within 14 degrees, and the
+    node is off the strongest one's plane by less than 2 % of the latter's range.
 
     Parameters
     ----------
-    good, points, normals, area
+    has_plane, points, normals, area
         (Hn, Wn), (Hn, Wn, 3), (Hn, Wn, 3) and (Hn, Wn) of `surface_radiometry`.
     radiosity
-        (Hn, Wn) complex, with the phase of the modulation on leaving.
+        (Hn, Wn) complex, with the phase of the modulation at the surface.
     out
-        (S, 9) written, as in `exchange`; S is at least the number of nodes.
+        (S, 9) written, as in `add_irradiance`; S is at least the number of nodes.
 
     Returns
     -------
     The number of sources.
     """
-    rows, columns = good.shape
+    rows, columns = has_plane.shape
     count = 0
     power = np.empty(4)
     for top in range(0, rows, 2):
@@ -309,42 +311,46 @@ def visible_sources(
             for n in range(4):
                 i, j = top + n // 2, left + n % 2
                 power[n] = 0.0
-                if i < rows and j < columns and good[i, j]:
+                if i < rows and j < columns and has_plane[i, j]:
                     power[n] = area[i, j] * abs(radiosity[i, j])
                 if power[n] > 0 and (best < 0 or power[n] > power[best]):
                     best = n
             if best < 0:
                 continue
             p, q = top + best // 2, left + best % 2
-            lead, face = points[p, q], normals[p, q]
-            reach = np.sqrt(lead[0] ** 2 + lead[1] ** 2 + lead[2] ** 2)
+            strongest, strongest_normal = points[p, q], normals[p, q]
+            strongest_range = np.sqrt(strongest[0] ** 2 + strongest[1] ** 2 + strongest[2] ** 2)
             weight = total = real = imaginary = 0.0
             x = y = z = u = v = w = 0.0
             for n in range(4):
                 if not power[n] > 0:
                     continue
                 i, j = top + n // 2, left + n % 2
-                at, normal = points[i, j], normals[i, j]
-                turn = normal[0] * face[0] + normal[1] * face[1] + normal[2] * face[2]
-                off = (
-                    (at[0] - lead[0]) * face[0]
-                    + (at[1] - lead[1]) * face[1]
-                    + (at[2] - lead[2]) * face[2]
+                point, normal = points[i, j], normals[i, j]
+                cosine = (
+                    normal[0] * strongest_normal[0]
+                    + normal[1] * strongest_normal[1]
+                    + normal[2] * strongest_normal[2]
                 )
-                if turn > 0.97 and abs(off) < 0.02 * reach:
+                plane_distance = (
+                    (point[0] - strongest[0]) * strongest_normal[0]
+                    + (point[1] - strongest[1]) * strongest_normal[1]
+                    + (point[2] - strongest[2]) * strongest_normal[2]
+                )
+                if cosine > 0.97 and abs(plane_distance) < 0.02 * strongest_range:
                     weight += power[n]
                     total += area[i, j]
                     real += area[i, j] * radiosity[i, j].real
                     imaginary += area[i, j] * radiosity[i, j].imag
-                    x += power[n] * at[0]
-                    y += power[n] * at[1]
-                    z += power[n] * at[2]
+                    x += power[n] * point[0]
+                    y += power[n] * point[1]
+                    z += power[n] * point[2]
                     u += power[n] * normal[0]
                     v += power[n] * normal[1]
                     w += power[n] * normal[2]
                     continue
                 for m in range(3):
-                    out[count, m], out[count, 3 + m] = at[m], normal[m]
+                    out[count, m], out[count, 3 + m] = point[m], normal[m]
                 out[count, 6] = area[i, j]
                 out[count, 7], out[count, 8] = radiosity[i, j].real, radiosity[i, j].imag
                 count += 1
@@ -360,12 +366,12 @@ def visible_sources(
 @kernel
 def offscreen_sources(
     rays: Float64,
-    size: Float64,
+    areas: Float64,
     planes: Float64,
     albedo: Float64,
     border: Float64,
     border_albedo: Float64,
-    growth: Float64,
+    ratio_limits: Float64,
     falloff: float,
     min_cosine: float,
     wave_number: float,
@@ -375,21 +381,22 @@ def offscreen_sources(
 
     Parameters
     ----------
-    rays, size
-        (M, 2) centres of cells around the image in the plane z = 1, and (M,) their lit area there.
+    rays, areas
+        (M, 2) centres of cells around the image in the plane z = 1, and (M,) their illuminated area
+        in that plane.
     planes, albedo
         (M, 3) planes of mapped surfaces in the cells, and (M,) their albedo relative to white;
         where it is 0, the plane of the nearest border node is extrapolated.
     border, border_albedo
         (N, COLUMNS) nodes at the image's border that have planes, and (N,) their albedo.
-    growth
+    ratio_limits
         (2,) smallest and largest ratio of extrapolated to the border node's inverse depth.
     falloff, min_cosine
         As in `surface_radiometry`.
     wave_number
         Phase in rad per m of path.
     out
-        (S, 9) written, as in `exchange`; S is at least M.
+        (S, 9) written, as in `add_irradiance`; S is at least M.
 
     Returns
     -------
@@ -398,21 +405,21 @@ def offscreen_sources(
     count = 0
     for m in range(len(rays)):
         x, y = rays[m, 0], rays[m, 1]
-        a, b, c, light = planes[m, 0], planes[m, 1], planes[m, 2], albedo[m]
-        if not light > 0:
-            least = np.inf
-            near = -1
+        a, b, c, cell_albedo = planes[m, 0], planes[m, 1], planes[m, 2], albedo[m]
+        if not cell_albedo > 0:
+            nearest_distance2 = np.inf
+            nearest = -1
             for n in range(len(border)):
-                away = (x - border[n, X]) ** 2 + (y - border[n, Y]) ** 2
-                if away < least:
-                    least = away
-                    near = n
-            if near < 0:
+                distance2 = (x - border[n, X]) ** 2 + (y - border[n, Y]) ** 2
+                if distance2 < nearest_distance2:
+                    nearest_distance2 = distance2
+                    nearest = n
+            if nearest < 0:
                 continue
-            a, b, c = border[near, A], border[near, B], border[near, C]
-            light = border_albedo[near]
-            ratio = (a * x + b * y + c) / border[near, W]
-            if ratio < growth[0] or ratio > growth[1]:
+            a, b, c = border[nearest, A], border[nearest, B], border[nearest, C]
+            cell_albedo = border_albedo[nearest]
+            ratio = (a * x + b * y + c) / border[nearest, W]
+            if ratio < ratio_limits[0] or ratio > ratio_limits[1]:
                 continue
         w = a * x + b * y + c
         if not w > 0:
@@ -421,10 +428,10 @@ def offscreen_sources(
         length = np.sqrt(1.0 + x * x + y * y)
         r = length / w
         cosine = min(max(w / (slope * length), min_cosine), 1.0)
-        radiosity = light * length ** (-falloff / 2) * cosine / (r * r)
+        radiosity = cell_albedo * length ** (-falloff / 2) * cosine / (r * r)
         out[count, 0], out[count, 1], out[count, 2] = x / w, y / w, 1.0 / w
         out[count, 3], out[count, 4], out[count, 5] = -a / slope, -b / slope, -c / slope
-        out[count, 6] = size[m] / (w * w * length * cosine)
+        out[count, 6] = areas[m] / (w * w * length * cosine)
         out[count, 7] = radiosity * np.cos(wave_number * r)
         out[count, 8] = radiosity * np.sin(wave_number * r)
         count += 1
@@ -442,8 +449,8 @@ def project_patches(
 ) -> None:
     """Project mapped surface patches into cells of the plane z = 1.
 
-    A cell gets the weighted mean of the patches in it that face the camera and are not occluded by
-    nearer ones.
+    A cell gets the weighted mean of those patches in it that face the camera and are not occluded
+    by nearer ones.
 
     Parameters
     ----------
@@ -470,10 +477,10 @@ def project_patches(
         cell[i, int(np.floor((rays[m, 0] - left) / pitch[0] + 0.5))] = m
     nearest = np.zeros(len(rays))
     sums = np.zeros((len(rays), 5))
-    hit = np.empty(len(patches), np.int64)
+    patch_cell = np.empty(len(patches), np.int64)
     depth = np.empty(len(patches))
     for n in range(len(patches)):
-        hit[n] = -1
+        patch_cell[n] = -1
         px, py, pz = patches[n, 0], patches[n, 1], patches[n, 2]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
         if z < 0.05:
@@ -488,13 +495,13 @@ def project_patches(
         a = T[0, 0] * u + T[0, 1] * v + T[0, 2] * w
         b = T[1, 0] * u + T[1, 1] * v + T[1, 2] * w
         c = T[2, 0] * u + T[2, 1] * v + T[2, 2] * w
-        along = a * x + b * y + c
-        if along > -0.05 * np.sqrt(x * x + y * y + 1.0):
+        facing = a * x + b * y + c
+        if facing > -0.05 * np.sqrt(x * x + y * y + 1.0):
             continue
-        hit[n], depth[n] = cell[i, j], z
-        nearest[hit[n]] = max(nearest[hit[n]], 1.0 / z)
+        patch_cell[n], depth[n] = cell[i, j], z
+        nearest[patch_cell[n]] = max(nearest[patch_cell[n]], 1.0 / z)
     for n in range(len(patches)):
-        m = hit[n]
+        m = patch_cell[n]
         if m < 0 or 1.0 / depth[n] < 0.8 * nearest[m]:
             continue
         u, v, w = patches[n, 3], patches[n, 4], patches[n, 5]
@@ -511,20 +518,20 @@ def project_patches(
             continue
         a, b, c = sums[m, 0], sums[m, 1], sums[m, 2]
         # Plane with the mean normal, and the mean inverse depth at the cell's centre.
-        along = a * rays[m, 0] + b * rays[m, 1] + c
-        if along >= 0.0:
+        facing = a * rays[m, 0] + b * rays[m, 1] + c
+        if facing >= 0.0:
             planes[m, 0] = 0.0
             continue
-        scale = sums[m, 3] / weight / along
+        scale = sums[m, 3] / weight / facing
         planes[m, 0], planes[m, 1], planes[m, 2] = a * scale, b * scale, c * scale
         albedo[m] = sums[m, 4] / weight
 
 
 @kernel
-def exchange(
+def add_irradiance(
     sources: Float32, start: int, stop: int, receivers: Float32, wavelength: float, out: Float32
 ) -> None:
-    """Add the irradiance of the receivers by the sources start..stop to `out`.
+    """Add to `out` the irradiance of the receivers by the sources start..stop.
 
     Parameters
     ----------
@@ -535,15 +542,15 @@ def exchange(
     wavelength
         Of the modulation, m.
     out
-        (2, R) real and imaginary part of the irradiance, with the phase on arrival.
+        (2, R) real and imaginary part of the irradiance, with the phase at the receiver.
 
     Notes
     -----
     The form factor of a disc to a point, cos cos area / (pi d^2 + area), stays below 1 at any
-    distance. Occlusion is ignored. The inner loop runs over independent receivers, so it is
+    distance. Occlusion is ignored. The inner loop runs over independent receivers, so that it is
     vectorised without reordering a sum.
     """
-    per_turn = np.float32(1.0 / wavelength)
+    inv_wavelength = np.float32(1.0 / wavelength)
     pi = np.float32(np.pi)
     half, zero = np.float32(0.5), np.float32(0.0)
     x, y, z = receivers[0], receivers[1], receivers[2]
@@ -565,20 +572,20 @@ def exchange(
             leaving = leaving if leaving > zero else zero
             arriving = arriving if arriving > zero else zero
             factor = leaving * arriving / (d2 * (pi * d2 + area))
-            t = np.sqrt(d2) * per_turn
+            t = np.sqrt(d2) * inv_wavelength
             t = t - np.floor(t + half)
-            q = t * t
-            c = _C0 + q * (_C1 + q * (_C2 + q * (_C3 + q * (_C4 + q * _C5))))
-            e = t * (_S0 + q * (_S1 + q * (_S2 + q * (_S3 + q * (_S4 + q * _S5)))))
-            real[r] += factor * (a * c - b * e)
-            imaginary[r] += factor * (a * e + b * c)
+            t2 = t * t
+            cosine = _C0 + t2 * (_C1 + t2 * (_C2 + t2 * (_C3 + t2 * (_C4 + t2 * _C5))))
+            sine = t * (_S0 + t2 * (_S1 + t2 * (_S2 + t2 * (_S3 + t2 * (_S4 + t2 * _S5)))))
+            real[r] += factor * (a * cosine - b * sine)
+            imaginary[r] += factor * (a * sine + b * cosine)
 
 
 @kernel
 def upsample_correction(
     nodes: Float64,
-    shift: Float64,
-    factor: Float64,
+    bias: Float64,
+    amplitude_factor: Float64,
     z: Float32,
     rays: Float32,
     step: int,
@@ -588,14 +595,14 @@ def upsample_correction(
     z_out: Float32,
     factor_out: Float32,
 ) -> None:
-    """Upsample the nodes' correction to the pixels of rows start..stop, edge-preserving.
+    """Upsample the nodes' correction to the pixels of rows start..stop, preserving edges.
 
     A pixel gets the mean of the four surrounding nodes, weighted by their distance in the image and
-    by the distance of the pixel, if corrected like the node, from the node's plane.
+    by the distance of the pixel, corrected like the node, from the node's plane.
 
     Parameters
     ----------
-    nodes, shift, factor
+    nodes, bias, amplitude_factor
         (Hn, Wn, COLUMNS); (Hn, Wn) bias of the radial range in m; (Hn, Wn) factor by which indirect
         light has raised the amplitude.
     z, rays
@@ -622,24 +629,26 @@ def upsample_correction(
             x = np.float64(rays[i, j, 0])
             y = np.float64(rays[i, j, 1])
             length = np.sqrt(1.0 + x * x + y * y)
-            total = move = gain = 0.0
+            weight_sum = bias_sum = factor_sum = 0.0
             for p in range(max(i0, 0), min(i0 + 2, rows)):
                 for q in range(max(j0, 0), min(j0 + 2, columns)):
                     if nodes[p, q, W] <= 0:
                         continue
                     # Depth of the pixel if it belongs to this node's surface.
-                    own = d - shift[p, q] / length
-                    off = (nodes[p, q, A] * x + nodes[p, q, B] * y + nodes[p, q, C]) * own - 1.0
-                    off = off / tolerance
-                    like = 1.0 / (1.0 + off * off)
-                    near = (1.0 - abs(p - fi)) * (1.0 - abs(q - fj)) + 1e-3
-                    weight = near * like * like
-                    total += weight
-                    move += weight * shift[p, q]
-                    gain += weight * factor[p, q]
-            if total > 0:
-                z_out[i, j] = d - move / total / length
-                factor_out[i, j] = gain / total
+                    corrected_z = d - bias[p, q] / length
+                    deviation = (
+                        nodes[p, q, A] * x + nodes[p, q, B] * y + nodes[p, q, C]
+                    ) * corrected_z - 1.0
+                    deviation = deviation / tolerance
+                    similarity = 1.0 / (1.0 + deviation * deviation)
+                    bilinear = (1.0 - abs(p - fi)) * (1.0 - abs(q - fj)) + 1e-3
+                    weight = bilinear * similarity * similarity
+                    weight_sum += weight
+                    bias_sum += weight * bias[p, q]
+                    factor_sum += weight * amplitude_factor[p, q]
+            if weight_sum > 0:
+                z_out[i, j] = d - bias_sum / weight_sum / length
+                factor_out[i, j] = factor_sum / weight_sum
 
 
 @kernel
@@ -653,7 +662,7 @@ def flat_nodes(nodes: Float64, radius: int, limit: float, tolerance: float) -> f
     """
     rows, columns = nodes.shape[:2]
     size = (2 * radius + 1) ** 2
-    pick = np.empty((size, 2), np.int64)
+    members = np.empty((size, 2), np.int64)
     count = 0.0
     for i in range(0, rows, 2):
         for j in range(0, columns, 2):
@@ -667,13 +676,13 @@ def flat_nodes(nodes: Float64, radius: int, limit: float, tolerance: float) -> f
                 for q in range(max(j - radius, 0), min(j + radius + 1, columns)):
                     e, f, g = nodes[p, q, A], nodes[p, q, B], nodes[p, q, C]
                     other2 = e * e + f * f + g * g
-                    along = a * e + b * f + c * g
-                    if along <= 0 or along * along < 0.82 * length2 * other2:
+                    dot = a * e + b * f + c * g
+                    if dot <= 0 or dot * dot < 0.82 * length2 * other2:
                         continue
                     w = nodes[p, q, W]
                     if abs(a * nodes[p, q, X] + b * nodes[p, q, Y] + c - w) > limit * w:
                         continue
-                    pick[n, 0], pick[n, 1] = p, q
+                    members[n, 0], members[n, 1] = p, q
                     n += 1
                     mx += nodes[p, q, X]
                     my += nodes[p, q, Y]
@@ -683,7 +692,7 @@ def flat_nodes(nodes: Float64, radius: int, limit: float, tolerance: float) -> f
             mx, my, mw = mx / n, my / n, mw / n
             xx = xy = yy = xw = yw = 0.0
             for m in range(n):
-                p, q = pick[m, 0], pick[m, 1]
+                p, q = members[m, 0], members[m, 1]
                 x, y, w = nodes[p, q, X] - mx, nodes[p, q, Y] - my, nodes[p, q, W] - mw
                 xx += x * x
                 xy += x * y
@@ -695,8 +704,8 @@ def flat_nodes(nodes: Float64, radius: int, limit: float, tolerance: float) -> f
                 continue
             aw, bw = (yy * xw - xy * yw) / det, (xx * yw - xy * xw) / det
             for m in range(n):
-                p, q = pick[m, 0], pick[m, 1]
+                p, q = members[m, 0], members[m, 1]
                 x, y, w = nodes[p, q, X] - mx, nodes[p, q, Y] - my, nodes[p, q, W] - mw
-                off = (w - aw * x - bw * y) / (mw * tolerance)
-                count += 1.0 / (1.0 + off * off)
+                deviation = (w - aw * x - bw * y) / (mw * tolerance)
+                count += 1.0 / (1.0 + deviation * deviation)
     return count

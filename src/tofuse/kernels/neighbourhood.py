@@ -19,7 +19,7 @@ def is_steeper(
 ) -> None:
     """Write where the angle between the camera and one of 8 neighbours exceeds an obtuse threshold.
 
-    Without roots, quotients or branches in the inner loop, so that it is vectorised.
+    The inner loop has no roots, quotients or branches, so that it is vectorised.
 
     Parameters
     ----------
@@ -33,8 +33,8 @@ def is_steeper(
         Rows of `out` (H, W) to write: False where the point or all neighbours are invalid.
     """
     height, width = z.shape
-    # Points of these rows and of the adjacent ones, padded by the origin, as are invalid points: it
-    # is in front of all others, so that no angle there is obtuse.
+    # Points of these rows and of the adjacent ones. Padding and invalid points are at the origin,
+    # which is in front of all other points, so that the angle to it is never obtuse.
     points = np.zeros((3, stop - start + 2, width + 2), np.float32)
     for i in range(max(0, start - 1), min(height, stop + 1)):
         for j in range(width):
@@ -42,12 +42,12 @@ def is_steeper(
                 points[0, i - start + 1, j + 1] = rays[i, j, 0] * z[i, j]
                 points[1, i - start + 1, j + 1] = rays[i, j, 1] * z[i, j]
                 points[2, i - start + 1, j + 1] = z[i, j]
-    bound = np.empty(width, np.float32)
+    threshold = np.empty(width, np.float32)
     steep = np.empty(width, np.bool_)
     for i in range(1, stop - start + 1):
         x, y, depth = points[0, i, 1:-1], points[1, i, 1:-1], points[2, i, 1:-1]
         for j in range(width):
-            bound[j] = cosine2 * (x[j] * x[j] + y[j] * y[j] + depth[j] * depth[j])
+            threshold[j] = cosine2 * (x[j] * x[j] + y[j] * y[j] + depth[j] * depth[j])
             steep[j] = False
         for v in range(i - 1, i + 2):
             for u in range(3):
@@ -58,8 +58,8 @@ def is_steeper(
                 c = points[2, v, u : u + width]
                 for j in range(width):
                     dx, dy, dz = a[j] - x[j], b[j] - y[j], c[j] - depth[j]
-                    behind = x[j] * dx + y[j] * dy + depth[j] * dz
-                    away2 = dx * dx + dy * dy + dz * dz
-                    steep[j] |= (behind > 0) & (behind * behind > bound[j] * away2)
+                    dot = x[j] * dx + y[j] * dy + depth[j] * dz
+                    distance2 = dx * dx + dy * dy + dz * dz
+                    steep[j] |= (dot > 0) & (dot * dot > threshold[j] * distance2)
         for j in range(width):
             out[start + i - 1, j] = steep[j]

@@ -1,4 +1,4 @@
-"""Standard deviation of the range of each pixel, by rows: one pass over the image."""
+"""Standard deviation of the range of each pixel, in one pass over the rows of an image."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ def range_sigma(
     depth
         (H, W) in m, 0 where invalid; radial range or z.
     is_range
-        Which of the two.
+        Whether `depth` is the radial range, not z.
     rays
         (H, W, 2) x/z and y/z, NaN where unknown.
     law
         `BY_RANGE`, `BY_AMPLITUDE`, `BY_CONFIDENCE`, or `BY_CAMERA`.
     channel
-        (H, W) amplitude, confidence or the camera's own sigma, as the law needs; (0, 0) if none.
+        (H, W) amplitude, confidence or the camera's own sigma, depending on `law`; (0, 0) if none.
     compensated
         Whether the amplitude was multiplied by the squared range and divided by the falloff.
     levels
         (K,) sigma in m at 1 m of each level of confidence.
     cosine
-        (H, W) of the incidence, NaN where unknown; (0, 0) if not known at all.
+        (H, W) of the incidence, NaN where unknown; (0, 0) if unknown everywhere.
     parameters
         ceiling, floor, shot, dark, falloff, a, b, power, footprint: fields of the noise model.
     start, stop
@@ -77,8 +77,8 @@ def range_sigma(
                     elif falloff > 0:
                         amplitude *= length2 ** (-0.5 * falloff)
                 if amplitude > 0:
-                    dimness = 1 / amplitude
-                    variance = floor * floor + (shot * shot + dark * dark * dimness) * dimness
+                    inverse = 1 / amplitude
+                    variance = floor * floor + (shot * shot + dark * dark * inverse) * inverse
                 else:
                     variance = ceiling * ceiling
             elif law == BY_CONFIDENCE:
@@ -87,19 +87,19 @@ def range_sigma(
                 if power > 0:
                     variance *= distance2**power
             elif law == BY_CAMERA:
-                own = float(channel[i, j])
-                variance = own * own if own > 0 else ceiling * ceiling
+                camera_sigma = float(channel[i, j])
+                variance = camera_sigma * camera_sigma if camera_sigma > 0 else ceiling * ceiling
             else:
                 sigma = a + b * distance2
                 variance = sigma * sigma
             variance = min(variance, ceiling * ceiling)
             if slanted and cosine[i, j] == cosine[i, j]:
-                other = j + 1 if j + 1 < width else j - 1
-                step = math.hypot(rays[i, other, 0] - x, rays[i, other, 1] - y)
-                if step == step:
+                neighbour = j + 1 if j + 1 < width else j - 1
+                pitch = math.hypot(rays[i, neighbour, 0] - x, rays[i, neighbour, 1] - y)
+                if pitch == pitch:
                     c = min(max(abs(float(cosine[i, j])), 0.1), 1.0)
-                    change = footprint * step * math.sqrt(distance2 / length2 * (1 - c * c)) / c
-                    variance += change * change
+                    extent = footprint * pitch * math.sqrt(distance2 / length2 * (1 - c * c)) / c
+                    variance += extent * extent
             out[i, j] = math.sqrt(variance)
 
 
@@ -115,7 +115,7 @@ def _by_range(
     stop: int,
     out: Float32,
 ) -> None:
-    """Do the same for `BY_RANGE`, branch-free so that the loop is vectorised."""
+    """Do the same for the law `BY_RANGE`, branch-free so that the loop is vectorised."""
     for i in range(start, stop):
         for j in range(depth.shape[1]):
             x, y = float(rays[i, j, 0]), float(rays[i, j, 1])

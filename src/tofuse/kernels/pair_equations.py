@@ -1,8 +1,8 @@
 """Normal equations of a pair of views: relative pose, exposure, and systematic camera errors.
 
-As in `alignment`, source points are compared with plane and log albedo of the target pixel they
-project to. Every pair has its own system, whose unknowns also include errors that all views of a
-camera share. With p a source point, q = T p, m = R^T n the target's normal in the source's frame,
+As in `alignment`, source points are compared with plane and log albedo of the target pixel that
+they project to. Every pair has its own system, whose unknowns also include errors that all views of
+a camera share. With p a source point, q = T p, m = R^T n the target's normal in the source's frame,
 and b(p) the displacement of p by an error of size 1, the distance changes by m . b(p) - n . b(q).
 """
 
@@ -17,28 +17,28 @@ from tofuse.kernels.alignment import (
     ALBEDO,
     ALBEDO_SLOPE,
     BINS,
+    CHI2,
     COUNT_P,
     DISTANCE,
-    FITS,
+    HAS_PLANE,
     INLIERS,
+    IS_INLIER,
     JACOBIAN,
     LANES,
     MIN_DEPTH,
-    MISFIT,
     NORMAL,
     PLANE,
     POINT,
     POINT_ALBEDO,
     POINT_ALBEDO_SLOPE,
-    RATIO,
-    ROOT,
     ROWS,
-    SEEN,
     SIGMA,
+    SQRT_WEIGHT,
     SQUARES_G,
     STAT,
     VARIANCE,
     WEIGHT_G,
+    WEIGHTED_RESIDUAL,
     XN,
     YN,
     Residuals,
@@ -58,7 +58,7 @@ from tofuse.kernels.alignment import WEIGHT_P as ALBEDO_WEIGHT
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import jacobian_row, project_ray
 
-# Errors of the camera, in the order of their unknowns.
+# Camera errors, in the order of the unknowns.
 OFFSET = 0  # to be added to the range, m
 SCALE = 1  # relative, to be added to the depth
 FOCAL = 2  # relative, to be added to the ray coordinates; measured depth is kept, z or radial
@@ -82,7 +82,7 @@ SUPPORT = TERMS + 1  # sum of (1 - robust cost) of the residuals (Tukey's biweig
 HISTOGRAM = SUPPORT + 1  # as in `alignment`
 SIZE = HISTOGRAM + BINS
 
-_TINY = 1e-6  # m or m^2, instead of 0 in a denominator
+_EPSILON = 1e-6  # m or m^2, instead of 0 in a denominator
 
 # Layout of the sums of a patch: of w, w r and w J.
 PATCH_WEIGHT = 0
@@ -101,7 +101,7 @@ class CameraErrors(NamedTuple):
     known
         (ERRORS,) non-zero for errors that are not estimated.
     radial_source, radial_target
-        Whether the cameras measure radial range, and not z.
+        Whether the cameras measure radial range, not z.
     """
 
     errors: Float64
@@ -111,7 +111,7 @@ class CameraErrors(NamedTuple):
 
 
 class SourcePoints(NamedTuple):
-    """Points of N views, which are compared with those of others.
+    """Points of N views, which are compared with other views.
 
     Attributes
     ----------
@@ -121,9 +121,9 @@ class SourcePoints(NamedTuple):
         (M,) patch of the image that each point belongs to, see `shared_error`; (0,) if no sums over
         patches are computed.
     begin, end
-        (N,) first row of the points of each view, and the row after its last.
+        (N,) first row of the points of each view, and the row after the last.
     measures_range
-        (N,) whether the camera of each view measures radial range, and not z.
+        (N,) whether the camera of each view measures radial range, not z.
     """
 
     points: Float32
@@ -134,7 +134,7 @@ class SourcePoints(NamedTuple):
 
 
 class PairResiduals(NamedTuple):
-    """`Residuals` of K pairs, of which each has its exposure and its scales.
+    """`Residuals` of K pairs, each with its own exposure and scales.
 
     Attributes
     ----------
@@ -156,10 +156,10 @@ class PairResiduals(NamedTuple):
 def displacement(B: Float64, x: float, y: float, z: float, radial: bool) -> None:
     """Write to B (ERRORS, 3) the displacements of the point (x, y, z) by camera errors of size 1.
 
-    `radial` tells whether the camera measures the distance along the ray, and not z.
+    `radial`: whether the camera measures the distance along the ray, not z.
     """
-    side2 = x * x + y * y
-    r2 = side2 + z * z
+    lateral2 = x * x + y * y
+    r2 = lateral2 + z * z
     r = np.sqrt(r2)
     B[OFFSET, 0] = x / r
     B[OFFSET, 1] = y / r
@@ -167,24 +167,24 @@ def displacement(B: Float64, x: float, y: float, z: float, radial: bool) -> None
     B[SCALE, 0] = x
     B[SCALE, 1] = y
     B[SCALE, 2] = z
-    shorter = side2 / r2 if radial else 0.0
-    B[FOCAL, 0] = x - shorter * x
-    B[FOCAL, 1] = y - shorter * y
-    B[FOCAL, 2] = -shorter * z
-    for p, side in ((CENTER_X, x), (CENTER_Y, y)):
-        shorter = side * z / r2 if radial else 0.0
-        B[p, 0] = -shorter * x
-        B[p, 1] = -shorter * y
-        B[p, 2] = -shorter * z
+    shortening = lateral2 / r2 if radial else 0.0
+    B[FOCAL, 0] = x - shortening * x
+    B[FOCAL, 1] = y - shortening * y
+    B[FOCAL, 2] = -shortening * z
+    for p, lateral in ((CENTER_X, x), (CENTER_Y, y)):
+        shortening = lateral * z / r2 if radial else 0.0
+        B[p, 0] = -shortening * x
+        B[p, 1] = -shortening * y
+        B[p, 2] = -shortening * z
     B[CENTER_X, 0] += z
     B[CENTER_Y, 1] += z
-    rho2 = side2 / max(z * z, _TINY)
+    rho2 = lateral2 / max(z * z, _EPSILON)
     for axis in range(3):
         B[DISTORTION, axis] = rho2 * B[FOCAL, axis]
 
 
 @kernel
-def _all_equations(
+def _calibration_equations(
     points: Float32,
     target: TargetImage,
     T: Float64,
@@ -192,12 +192,12 @@ def _all_equations(
     camera: CameraErrors,
     out: Float64,
 ) -> None:
-    """Add the normal equations of one pair, with errors of the camera among its unknowns."""
+    """Add the normal equations of one pair, with camera errors among the unknowns."""
     errors, known, radial_source, radial_target = camera
     unknowns = UNKNOWNS
     while unknowns > 7 and known[unknowns - 8]:
         unknowns -= 1
-    asked = unknowns - 7
+    estimated = unknowns - 7
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     image, lookup, lookup_frame = target
     rows, columns = image.shape[0], image.shape[1]
@@ -228,8 +228,8 @@ def _all_equations(
         # Project with the corrected intrinsics of the target.
         xn, yn = x / z - errors[CENTER_X], y / z - errors[CENTER_Y]
         rho2 = xn * xn + yn * yn
-        wider = 1.0 + errors[FOCAL] + errors[DISTORTION] * rho2
-        xn, yn = xn / wider, yn / wider
+        ray_scale = 1.0 + errors[FOCAL] + errors[DISTORTION] * rho2
+        xn, yn = xn / ray_scale, yn / ray_scale
         u, v, iu, _ = project_ray(xn, yn, lookup, lookup_frame)
         if iu < 0:
             continue
@@ -244,16 +244,16 @@ def _all_equations(
         n0 = np.float64(pixel[PLANE])
         n1 = np.float64(pixel[PLANE + 1])
         n2 = np.float64(pixel[PLANE + 2])
-        across = n0 * x + n1 * y + n2 * z
-        r = across - distance
+        height = n0 * x + n1 * y + n2 * z
+        r = height - distance
         displacement(Bq, x, y, z, radial_target)
         for p in range(ERRORS):
             r -= errors[p] * (n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2])
-        along = (across - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(point[SIGMA])
-        own = along * along + np.float64(pixel[VARIANCE])
-        variance = own * scale_g * scale_g + inflation * inflation
+        source_sigma = (height - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(point[SIGMA])
+        raw_variance = source_sigma * source_sigma + np.float64(pixel[VARIANCE])
+        variance = raw_variance * scale_g * scale_g + inflation * inflation
         r2 = r * r
-        out[HISTOGRAM + histogram_bin(r2 / own)] += 1
+        out[HISTOGRAM + histogram_bin(r2 / raw_variance)] += 1
         e2 = r2 / variance / limit2
         if e2 >= 1:
             # Nearer than the target's surface: in its free space.
@@ -270,29 +270,29 @@ def _all_equations(
             continue
         f = 1 - e2
         out[SUPPORT] += f * f * f
-        # Mean of both views' normals, which halves the noise of either.
+        # Mean of both views' normals, which halves the effect of either's noise.
         m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
         jacobian_row(J, m0, m1, m2, px, py, pz)
         J[EXPOSURE] = 0.0
         # The same mean for the camera errors: otherwise the difference between the normals, which
-        # no motion explains, would be attributed to them.
+        # the pose cannot explain, would be attributed to them.
         n0 = r00 * m0 + r01 * m1 + r02 * m2
         n1 = r10 * m0 + r11 * m1 + r12 * m2
         n2 = r20 * m0 + r21 * m1 + r22 * m2
-        for p in range(asked):
+        for p in range(estimated):
             J[7 + p] = (m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]) - (
                 n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2]
             )
             if known[p]:
                 J[7 + p] = 0.0
-        _add(A, g, J, r, f * f / variance, unknowns)
+        _add_residual(A, g, J, r, f * f / variance, unknowns)
 
         tx = np.float64(pixel[ALBEDO_SLOPE])
-        level = np.float64(point[POINT_ALBEDO])
-        if scale_p <= 0 or np.isnan(tx) or np.isnan(level):
+        source_albedo = np.float64(point[POINT_ALBEDO])
+        if scale_p <= 0 or np.isnan(tx) or np.isnan(source_albedo):
             continue
         ty = np.float64(pixel[ALBEDO_SLOPE + 1])
-        r = np.float64(pixel[ALBEDO]) + tx * xn + ty * yn - level - exposure
+        r = np.float64(pixel[ALBEDO]) + tx * xn + ty * yn - source_albedo - exposure
         out[TERMS] += 1
         r2 = r * r
         e2 = r2 / (scale_p * scale_p) / limit2
@@ -302,9 +302,9 @@ def _all_equations(
         out[WEIGHT_P] += f * f
         out[SQUARES_P] += f * f * r2
         out[SUPPORT] += f * f * f
-        # Derivative of (x/z, y/z) by the transformed point, rotated back into the source frame.
-        d0 = tx / (z * wider)
-        d1 = ty / (z * wider)
+        # Gradient with respect to the transformed point, rotated back into the source frame.
+        d0 = tx / (z * ray_scale)
+        d1 = ty / (z * ray_scale)
         d2 = -(tx * xn + ty * yn) / z
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2
@@ -315,20 +315,20 @@ def _all_equations(
         m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
         jacobian_row(J, m0, m1, m2, px, py, pz)
         J[EXPOSURE] = -1.0
-        for p in range(asked):
+        for p in range(estimated):
             J[7 + p] = 0.0 if known[p] else m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]
-        # Only errors of the intrinsics change the rays of the target's pixels.
+        # Only errors of the intrinsics affect the rays of the target's pixels.
         d0 = r00 * m0 + r01 * m1 + r02 * m2
         d1 = r10 * m0 + r11 * m1 + r12 * m2
-        if asked > FOCAL and not known[FOCAL]:
+        if estimated > FOCAL and not known[FOCAL]:
             J[7 + FOCAL] -= d0 * (x - errors[CENTER_X] * z) + d1 * (y - errors[CENTER_Y] * z)
-        if asked > CENTER_X and not known[CENTER_X]:
+        if estimated > CENTER_X and not known[CENTER_X]:
             J[7 + CENTER_X] -= d0 * z
-        if asked > CENTER_Y and not known[CENTER_Y]:
+        if estimated > CENTER_Y and not known[CENTER_Y]:
             J[7 + CENTER_Y] -= d1 * z
-        if asked > DISTORTION and not known[DISTORTION]:
+        if estimated > DISTORTION and not known[DISTORTION]:
             J[7 + DISTORTION] -= rho2 * z * (d0 * xn + d1 * yn)
-        _add(A, g, J, r, f * f / (scale_p * scale_p), unknowns)
+        _add_residual(A, g, J, r, f * f / (scale_p * scale_p), unknowns)
     q = H
     for p in range(UNKNOWNS):
         out[G + p] = g[p]
@@ -340,7 +340,7 @@ def _all_equations(
 @kernel
 def target_equations(
     sources: SourcePoints,
-    which: Int64,
+    views: Int64,
     target: TargetImage,
     T: Float64,
     residuals: PairResiduals,
@@ -354,8 +354,8 @@ def target_equations(
 
     Parameters
     ----------
-    sources, which
-        Points of all views, and the (K,) views that are compared with the target.
+    sources, views
+        Points of all views, and the (K,) indices of those that are compared with the target.
     target
         The target.
     T
@@ -367,14 +367,14 @@ def target_equations(
     out
         (K, SIZE), is overwritten.
     sums
-        (K, patches, PATCH_SIZE) is overwritten by the sums of the distances' equations over each
-        patch. With 0 patches, and with errors of the camera, they are not computed.
+        (K, patches, PATCH_SIZE), is overwritten by the sums of the distances' equations over each
+        patch. With 0 patches, or if camera errors are estimated, they are not computed.
     """
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     out[:] = 0.0
     sums[:] = 0.0
-    for k in range(len(which)):
-        view = which[k]
+    for k in range(len(views)):
+        view = views[k]
         begin, end = sources.begin[view], sources.end[view]
         points = sources.points[begin:end]
         pair = Residuals(exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine)
@@ -383,7 +383,7 @@ def target_equations(
             patches = sources.patches[begin:end]
             _pose_equations(points, patches, target, T[k], pair, camera, out[k], sums[k])
         else:
-            _all_equations(points, target, T[k], pair, camera, out[k])
+            _calibration_equations(points, target, T[k], pair, camera, out[k])
 
 
 @kernel
@@ -397,9 +397,9 @@ def _pose_equations(
     out: Float64,
     sums: Float64,
 ) -> None:
-    """Do the same with known camera errors, vectorised in blocks as in `alignment`."""
+    """Add those with known camera errors, vectorised in blocks as in `alignment`."""
     errors, _, radial_source, radial_target = camera
-    wrong = (errors != 0).any()
+    has_errors = (errors != 0).any()
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     image, lookup, lookup_frame = target
     block = np.zeros(ROWS * LANES, np.float32)
@@ -409,29 +409,29 @@ def _pose_equations(
     for first in range(0, len(points), LANES):
         count = min(LANES, len(points) - first)
         load_block(block, points[first : first + count])
-        if wrong:
+        if has_errors:
             _correct_points(block, errors, radial_source)
         transform_block(block, T)
-        if wrong:
+        if has_errors:
             _distort_projection(block, errors, radial_target)
         project_block(block, count, image, lookup, lookup_frame)
         compare_planes(block, T, scale_g, inflation, robust, min_cosine)
         for k in range(count):
-            if block[SEEN * LANES + k] > 0:
+            if block[HAS_PLANE * LANES + k] > 0:
                 out[COMPARED] += 1
-                out[HISTOGRAM + histogram_bin(block[RATIO * LANES + k])] += 1
+                out[HISTOGRAM + histogram_bin(block[CHI2 * LANES + k])] += 1
         if len(sums) > 0:
             _add_patches(sums, block, patches[first : first + count])
         add_products(total, block, 8)
-        _add_cubes(total[support], block, WEIGHT_G)
+        _add_support(total[support], block, WEIGHT_G)
         if scale_p > 0:
             compare_albedos(block, T, exposure, scale_p, robust)
             add_products(total, block, 8)
-            _add_cubes(total[support], block, ALBEDO_WEIGHT)
-        for which in (FRONT, ALBEDO_WEIGHT, ALBEDO_SQUARES, COUNT_P):
-            place = which - INLIERS
-            column = total[products + place]
-            row = block[(STAT + place) * LANES : (STAT + place + 1) * LANES]
+            _add_support(total[support], block, ALBEDO_WEIGHT)
+        for statistic in (FRONT, ALBEDO_WEIGHT, ALBEDO_SQUARES, COUNT_P):
+            index = statistic - INLIERS
+            column = total[products + index]
+            row = block[(STAT + index) * LANES : (STAT + index + 1) * LANES]
             for k in range(LANES):
                 column[k] += row[k]
     width = LANES
@@ -441,16 +441,16 @@ def _pose_equations(
             low, high = total[q, :width], total[q, width:]
             for k in range(width):
                 low[k] += high[k]
-    q, place = 0, H
+    q, index = 0, H
     for p in range(8):
         for o in range(p, 8):
             if p < 7 and o < 7:
-                out[place] = total[q, 0]
-                place += 1
+                out[index] = total[q, 0]
+                index += 1
             elif p < 7:
                 out[G + p] = total[q, 0]
             q += 1
-        place += ERRORS  # products with the camera errors, which stay 0
+        index += ERRORS  # products with the camera errors remain 0
     out[IN_FRONT] = total[products + FRONT - INLIERS, 0]
     out[WEIGHT_P] = total[products + ALBEDO_WEIGHT - INLIERS, 0]
     out[SQUARES_P] = total[products + ALBEDO_SQUARES - INLIERS, 0]
@@ -460,29 +460,29 @@ def _pose_equations(
 
 @kernel
 def _correct_points(block: Float32, errors: Float64, radial: bool) -> None:
-    """Displace the points of a block by errors of the camera, see `displacement`."""
+    """Displace the points of a block by camera errors, see `displacement`."""
     x = block[POINT * LANES : (POINT + 1) * LANES]
     y = block[(POINT + 1) * LANES : (POINT + 2) * LANES]
     z = block[(POINT + 2) * LANES : (POINT + 3) * LANES]
     for k in range(LANES):
-        side2 = x[k] * x[k] + y[k] * y[k]
-        r2 = max(side2 + z[k] * z[k], _TINY)  # columns without a point may be 0
-        widening = errors[FOCAL] + errors[DISTORTION] * side2 / max(z[k] * z[k], _TINY)
-        shorter = 0.0
+        lateral2 = x[k] * x[k] + y[k] * y[k]
+        r2 = max(lateral2 + z[k] * z[k], _EPSILON)  # columns without a point may be 0
+        ray_scale_error = errors[FOCAL] + errors[DISTORTION] * lateral2 / max(z[k] * z[k], _EPSILON)
+        shortening = 0.0
         if radial:
-            shift = errors[CENTER_X] * x[k] + errors[CENTER_Y] * y[k]
-            shorter = (widening * side2 + shift * z[k]) / r2
-        along = 1 + errors[OFFSET] / np.sqrt(r2) + errors[SCALE] - shorter
-        x[k] = x[k] * (along + widening) + errors[CENTER_X] * z[k]
-        y[k] = y[k] * (along + widening) + errors[CENTER_Y] * z[k]
-        z[k] *= along
+            center_term = errors[CENTER_X] * x[k] + errors[CENTER_Y] * y[k]
+            shortening = (ray_scale_error * lateral2 + center_term * z[k]) / r2
+        depth_scale = 1 + errors[OFFSET] / np.sqrt(r2) + errors[SCALE] - shortening
+        x[k] = x[k] * (depth_scale + ray_scale_error) + errors[CENTER_X] * z[k]
+        y[k] = y[k] * (depth_scale + ray_scale_error) + errors[CENTER_Y] * z[k]
+        z[k] *= depth_scale
 
 
 @kernel
 def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
-    """Move the transformed points of a block to where the target with its errors measures them.
+    """Move the transformed points of a block to where the erroneous target would measure them.
 
-    To first order in the errors this is the opposite of `_correct_points`.
+    To first order in the errors this is the inverse of `_correct_points`.
     """
     xn = block[XN * LANES : (XN + 1) * LANES]
     yn = block[YN * LANES : (YN + 1) * LANES]
@@ -490,43 +490,45 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
     for k in range(LANES):
         if not z[k] > MIN_DEPTH:  # it is not projected
             continue
-        side2 = xn[k] * xn[k] + yn[k] * yn[k]
-        r2 = side2 + 1
-        widening = errors[FOCAL] + errors[DISTORTION] * side2
-        shorter = 0.0
+        lateral2 = xn[k] * xn[k] + yn[k] * yn[k]
+        r2 = lateral2 + 1
+        ray_scale_error = errors[FOCAL] + errors[DISTORTION] * lateral2
+        shortening = 0.0
         if radial:
-            shift = errors[CENTER_X] * xn[k] + errors[CENTER_Y] * yn[k]
-            shorter = (widening * side2 + shift) / r2
-        along = 1 - errors[OFFSET] / (np.sqrt(r2) * z[k]) - errors[SCALE] + shorter
-        xn[k] = (xn[k] - errors[CENTER_X]) / (1 + widening)
-        yn[k] = (yn[k] - errors[CENTER_Y]) / (1 + widening)
-        z[k] *= along
+            center_term = errors[CENTER_X] * xn[k] + errors[CENTER_Y] * yn[k]
+            shortening = (ray_scale_error * lateral2 + center_term) / r2
+        depth_scale = 1 - errors[OFFSET] / (np.sqrt(r2) * z[k]) - errors[SCALE] + shortening
+        xn[k] = (xn[k] - errors[CENTER_X]) / (1 + ray_scale_error)
+        yn[k] = (yn[k] - errors[CENTER_Y]) / (1 + ray_scale_error)
+        z[k] *= depth_scale
 
 
 @kernel
 def _add_patches(sums: Float64, block: Float32, patches: Int64) -> None:
     """Add the weighted residuals and Jacobians of the distances of a block to their patches."""
     for k in range(len(patches)):
-        if block[FITS * LANES + k] > 0:
-            root = np.float64(block[ROOT * LANES + k])
+        if block[IS_INLIER * LANES + k] > 0:
+            sqrt_weight = np.float64(block[SQRT_WEIGHT * LANES + k])
             patch = sums[patches[k]]
-            patch[PATCH_WEIGHT] += root * root
-            patch[PATCH_RESIDUAL] += root * block[MISFIT * LANES + k]
+            patch[PATCH_WEIGHT] += sqrt_weight * sqrt_weight
+            patch[PATCH_RESIDUAL] += sqrt_weight * block[WEIGHTED_RESIDUAL * LANES + k]
             for p in range(6):
-                patch[PATCH_RESPONSE + p] += root * block[(JACOBIAN + p) * LANES + k]
+                patch[PATCH_RESPONSE + p] += sqrt_weight * block[(JACOBIAN + p) * LANES + k]
 
 
 @kernel
-def _add_cubes(total: Float64, block: Float32, which: int) -> None:
-    """Add w^(3/2) of the robust weights w, which is 1 minus the robust cost."""
-    place = STAT + which - INLIERS
-    row = block[place * LANES : (place + 1) * LANES]
+def _add_support(total: Float64, block: Float32, statistic: int) -> None:
+    """Add w^(3/2), which is 1 minus the robust cost, of the robust weights w in a statistic."""
+    index = STAT + statistic - INLIERS
+    row = block[index * LANES : (index + 1) * LANES]
     for k in range(LANES):
         total[k] += row[k] * np.sqrt(row[k])
 
 
 @kernel
-def _add(A: Float64, g: Float64, J: Float64, r: float, weight: float, unknowns: int) -> None:
+def _add_residual(
+    A: Float64, g: Float64, J: Float64, r: float, weight: float, unknowns: int
+) -> None:
     """Add w J J^T to the upper triangle of A, and w r J to g."""
     for p in range(unknowns):
         weighted = weight * J[p]
@@ -548,16 +550,16 @@ def overlaps(
     min_overlap: float,
     out: Float64,
 ) -> None:
-    """Write to `out` (S,) the fraction of each source view's points that the target also sees.
+    """Write to `out` (S,) the fraction of each source view's points that the target sees as well.
 
     Parameters
     ----------
     points, starts
-        (M, POINT_SIZE) points of all views, those of view k from starts[k] to starts[k + 1].
+        (M, POINT_SIZE) points of all views; those of view k are from starts[k] to starts[k + 1].
     sources
         (S,) indices of the source views.
     target
-        What they are compared with.
+        The view that they are compared with.
     T_target_world, T_world_source
         (4, 4) of the target, and (N, 4, 4) of all views.
     tolerance, min_cosine
@@ -577,11 +579,11 @@ def overlaps(
                 for c in range(3):
                     T[a, b] += T_target_world[a, c] * pose[c, b]
         start, stop = starts[sources[s]], starts[sources[s] + 1]
-        # With more unseen points than this, the overlap can only be too small.
-        spare = (stop - start) - min_overlap * (stop - start) + 1e-9
-        seen = 0
+        # With more unseen points than this, the overlap is certainly too small.
+        max_unseen = (stop - start) - min_overlap * (stop - start) + 1e-9
+        shared = 0
         for k in range(start, stop):
-            if k - start - seen > spare:
+            if k - start - shared > max_unseen:
                 break
             px, py, pz = points[k, POINT], points[k, POINT + 1], points[k, POINT + 2]
             z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
@@ -605,6 +607,6 @@ def overlaps(
                 + n2 * (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz)
             )
             if cosine >= min_cosine:
-                seen += 1
-        fraction = seen / max(stop - start, 1)
+                shared += 1
+        fraction = shared / max(stop - start, 1)
         out[s] = fraction if fraction >= min_overlap else 0.0

@@ -1,4 +1,4 @@
-"""Extension of fitted planes to neighbouring pixels without a fit of their own."""
+"""Extension of fitted planes to neighbouring pixels without a fit."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def extend_planes(
     wanted: Bool,
     planes: Float32,
     variance: Float32,
-    steps: Int32,
-    growth: Float32,
+    offsets: Int32,
+    variance_growth: Float32,
     sigmas: float,
     jump: float,
-    found: Float32,
-    varied: Float32,
+    planes_out: Float32,
+    variance_out: Float32,
 ) -> None:
-    """Assign to each `wanted` pixel the plane of the nearest pixel that its depth agrees with.
+    """Assign to each `wanted` pixel the nearest plane that its depth agrees with.
 
     Parameters
     ----------
@@ -32,16 +32,16 @@ def extend_planes(
     rays
         (H, W, 2) x/z and y/z.
     planes, variance
-        (H, W, 4) of `fit_planes`, 0 where there is none, and (H, W) the variance of 1/z on them.
-    steps, growth
-        (K, 2) offsets in rows and columns of the candidates, in order of preference, and (K,) the
-        factor by which the variance of their planes grows up to the pixel.
+        (H, W, 4) of `fit_planes`, 0 where there is none, and (H, W) the variance of their 1/z.
+    offsets, variance_growth
+        (K, 2) rows and columns of the candidates relative to the pixel, in order of preference, and
+        (K,) the factor by which the variance of their planes grows up to the pixel.
     sigmas, jump
         The pixel agrees with a plane if 1/z differs by at most `sigmas` standard deviations, 1/z of
         the plane changes by at most the fraction `jump` between the two pixels, and the pixel's
-        sigma is at most twice that of the other one, as a change in noise marks another surface.
-    found, varied
-        (H, W, 4) and (H, W), written: planes and their variances.
+        sigma is at most twice the other one's, as a change of noise indicates another surface.
+    planes_out, variance_out
+        (H, W, 4) and (H, W), written: planes, and the variances of their 1/z.
     """
     rows, columns = w.shape
     limit = np.float32(sigmas * sigmas)
@@ -52,23 +52,23 @@ def extend_planes(
                 continue
             x = rays[i, j, 0]
             y = rays[i, j, 1]
-            here = w[i, j]
-            own = sigma[i, j] * sigma[i, j]
-            for k in range(len(steps)):
-                p = i + steps[k, 0]
-                q = j + steps[k, 1]
+            measured = w[i, j]
+            noise = sigma[i, j] * sigma[i, j]
+            for k in range(len(offsets)):
+                p = i + offsets[k, 0]
+                q = j + offsets[k, 1]
                 if p < 0 or q < 0 or p >= rows or q >= columns or not planes[p, q, 3] > 0:
                     continue
-                value = planes[p, q, 0] * x + planes[p, q, 1] * y + planes[p, q, 2]
-                if not abs(value - planes[p, q, 3]) <= tolerance * value:
+                predicted = planes[p, q, 0] * x + planes[p, q, 1] * y + planes[p, q, 2]
+                if not abs(predicted - planes[p, q, 3]) <= tolerance * predicted:
                     continue
-                off = here - value
-                grown = growth[k] * variance[p, q]
-                quiet = np.float32(4) * sigma[p, q] * sigma[p, q]
-                if own > quiet or off * off > limit * (own + grown):
+                difference = measured - predicted
+                plane_variance = variance_growth[k] * variance[p, q]
+                max_noise = np.float32(4) * sigma[p, q] * sigma[p, q]
+                if noise > max_noise or difference * difference > limit * (noise + plane_variance):
                     continue
-                varied[i, j] = grown
+                variance_out[i, j] = plane_variance
                 for c in range(3):
-                    found[i, j, c] = planes[p, q, c]
-                found[i, j, 3] = value
+                    planes_out[i, j, c] = planes[p, q, c]
+                planes_out[i, j, 3] = predicted
                 break

@@ -1,10 +1,11 @@
 """Plane bundle adjustment: normal equations of all poses, with the shared planes eliminated.
 
-All points lie in cells, and each cell has one plane. With x a world point, c the mean of its cell,
+Points are divided into cells, each with one plane. With x a world point, c the mean of its cell,
 and n, u, v the principal axes of the cell's points (n the normal), the residual of a point is
-``r = n . (x - c)``. Its derivative by the pose of its view is J, and by the plane's offset and two
-slopes ``b = (1, u . (x - c), v . (x - c))``. The planes are eliminated from the normal equations
-(Schur complement), so that a plane seen by one view only does not constrain its pose.
+``r = n . (x - c)``. Its derivative with respect to the pose of its view is J, and with respect to
+the plane's offset and two slopes ``b = (1, u . (x - c), v . (x - c))``. The planes are eliminated
+from the normal equations (Schur complement), so that a plane seen by a single view does not
+constrain its pose.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from tofuse.kernels.cloud_shape import symmetric_eigen
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import jacobian_row
 
-_FLAT = 1e-9
+_MIN_PIVOT = 1e-9
 
 
 @kernel
@@ -26,8 +27,8 @@ def fit_cells(
     start: Int64,
     mean: Float64,
     axes: Float64,
-    spread: Float64,
-    views: Int64,
+    variances: Float64,
+    view_counts: Int64,
 ) -> None:
     """Compute mean, principal axes and variances of the points of each cell, and count its views.
 
@@ -37,9 +38,9 @@ def fit_cells(
         (M, 3) world points and (M,) their views, sorted by cell and then by view.
     start
         (S + 1,) first point of each cell.
-    mean, axes, spread, views
-        (S, 3), (S, 3, 3), (S, 3) and (S,), written. Axes are in rows, with ascending variances
-        `spread`; 0 for cells of fewer than four points.
+    mean, axes, variances, view_counts
+        (S, 3), (S, 3, 3), (S, 3) and (S,), written. Axes are in rows, by ascending variance; axes
+        and variances are 0 for cells of fewer than four points.
     """
     C = np.empty((3, 3))
     vectors = np.empty((3, 3))
@@ -47,13 +48,13 @@ def fit_cells(
         a, b = start[s], start[s + 1]
         mean[s] = 0.0
         axes[s] = 0.0
-        spread[s] = 0.0
-        views[s] = 0
+        variances[s] = 0.0
+        view_counts[s] = 0
         for k in range(a, b):
             for c in range(3):
                 mean[s, c] += x[k, c]
             if k == a or view[k] != view[k - 1]:
-                views[s] += 1
+                view_counts[s] += 1
         if b - a < 4:
             continue
         for c in range(3):
@@ -66,7 +67,7 @@ def fit_cells(
         for c in range(3):
             for d in range(3):
                 C[c, d] /= b - a - 3
-        symmetric_eigen(C, spread[s], vectors)
+        symmetric_eigen(C, variances[s], vectors)
         for c in range(3):
             for d in range(3):
                 axes[s, c, d] = vectors[d, c]
@@ -82,11 +83,11 @@ def plane_equations(
     axes: Float64,
     variance: Float64,
     rotations: Float64,
-    number: Int64,
+    pair_row: Int64,
     robust: float,
-    own: Float64,
+    diagonal: Float64,
     gradient: Float64,
-    mixed: Float64,
+    cross: Float64,
 ) -> None:
     """Add the normal equations of the cells, with the planes eliminated, to those of the poses.
 
@@ -97,41 +98,41 @@ def plane_equations(
     mean, axes
         As from `fit_cells`.
     variance
-        (S,) of the residuals of each cell; 0 leaves the cell out.
+        (S,) of the residuals of each cell; cells with 0 are left out.
     rotations
         (N, 3, 3) of the poses T_world_camera.
-    number
-        (N, N) row in `mixed` of each pair of views i < j.
+    pair_row
+        (N, N) row in `cross` of each pair of views i < j.
     robust
         Cut-off of Tukey's biweight, in standard deviations.
-    own, gradient, mixed
+    diagonal, gradient, cross
         (N, 6, 6), (N, 6) and (pairs, 6, 6), added to: diagonal blocks, gradient and off-diagonal
         blocks with respect to right perturbations of the poses.
     """
     J = np.empty(6)
     b = np.empty(3)
-    most = 1
+    max_views = 1
     for s in range(len(start) - 1):
-        most = max(most, start[s + 1] - start[s])
-    most = min(most, len(rotations))
-    F = np.empty((most, 6, 3))
-    E = np.empty((most, 6, 3))
-    of = np.empty(most, np.int64)
+        max_views = max(max_views, start[s + 1] - start[s])
+    max_views = min(max_views, len(rotations))
+    F = np.empty((max_views, 6, 3))
+    E = np.empty((max_views, 6, 3))
+    view_of = np.empty(max_views, np.int64)
     B = np.empty((3, 3))
     h = np.empty(3)
     for s in range(len(start) - 1):
         if variance[s] <= 0:
             continue
-        seen = 0
+        view_count = 0
         B[:, :] = 0.0
         h[:] = 0.0
         n0, n1, n2 = axes[s, 0, 0], axes[s, 0, 1], axes[s, 0, 2]
         for k in range(start[s], start[s + 1]):
             i = view[k]
-            if seen == 0 or of[seen - 1] != i:
-                of[seen] = i
-                F[seen] = 0.0
-                seen += 1
+            if view_count == 0 or view_of[view_count - 1] != i:
+                view_of[view_count] = i
+                F[view_count] = 0.0
+                view_count += 1
             d0, d1, d2 = x[k, 0] - mean[s, 0], x[k, 1] - mean[s, 1], x[k, 2] - mean[s, 2]
             r = n0 * d0 + n1 * d1 + n2 * d2
             e2 = r * r / (variance[s] * robust * robust)
@@ -159,17 +160,17 @@ def plane_equations(
                 wJ = w * J[c]
                 gradient[i, c] += wJ * r
                 for d in range(6):
-                    own[i, c, d] += wJ * J[d]
+                    diagonal[i, c, d] += wJ * J[d]
                 for d in range(3):
-                    F[seen - 1, c, d] += wJ * b[d]
-        # Cholesky: B = L L^T, in place. A slope that nothing holds is left out.
-        first0, first1, first2 = B[0, 0], B[1, 1], B[2, 2]
+                    F[view_count - 1, c, d] += wJ * b[d]
+        # Cholesky: B = L L^T, in place. An unconstrained slope is left out.
+        pivot0, pivot1, pivot2 = B[0, 0], B[1, 1], B[2, 2]
         for c in range(3):
-            first = first0 if c == 0 else (first1 if c == 1 else first2)
-            rest = B[c, c]
+            pivot = pivot0 if c == 0 else (pivot1 if c == 1 else pivot2)
+            remainder = B[c, c]
             for e in range(c):
-                rest -= B[c, e] * B[c, e]
-            B[c, c] = np.sqrt(rest) if rest > _FLAT * first else 0.0
+                remainder -= B[c, e] * B[c, e]
+            B[c, c] = np.sqrt(remainder) if remainder > _MIN_PIVOT * pivot else 0.0
             for d in range(c + 1, 3):
                 value = B[d, c]
                 for e in range(c):
@@ -180,17 +181,17 @@ def plane_equations(
                 h[c] -= B[c, e] * h[e]
             h[c] = h[c] / B[c, c] if B[c, c] > 0 else 0.0
         # E = F L^-T, so that F B^-1 F^T = E E^T.
-        for j in range(seen):
+        for j in range(view_count):
             for a in range(6):
                 for c in range(3):
                     value = F[j, a, c]
                     for e in range(c):
                         value -= B[c, e] * E[j, a, e]
                     E[j, a, c] = value / B[c, c] if B[c, c] > 0 else 0.0
-                    gradient[of[j], a] -= E[j, a, c] * h[c]
-        for j in range(seen):
+                    gradient[view_of[j], a] -= E[j, a, c] * h[c]
+        for j in range(view_count):
             for i in range(j + 1):
-                out = own[of[j]] if i == j else mixed[number[of[i], of[j]]]
+                out = diagonal[view_of[j]] if i == j else cross[pair_row[view_of[i], view_of[j]]]
                 for a in range(6):
                     for c in range(6):
                         value = 0.0
@@ -206,23 +207,23 @@ def plane_support(
     start: Int64,
     mean: Float64,
     axes: Float64,
-    views: Int64,
+    view_counts: Int64,
     limit: float,
     support: Float64,
 ) -> None:
-    """Add what supports each view: its points on planes that other views see as well.
+    """Add the support of each view: its points on planes that other views see as well.
 
     Parameters
     ----------
-    x, view, start, mean, axes, views
+    x, view, start, mean, axes, view_counts
         As in `fit_cells`.
     limit
-        Distance from the plane, m, at which a point supports nothing (Tukey's biweight).
+        Distance from the plane, m, beyond which a point is no support (Tukey's biweight).
     support
-        (N,) to add to: 1 for a point on a plane.
+        (N,), added to: 1 for a point on a plane.
     """
     for s in range(len(start) - 1):
-        if views[s] < 2:
+        if view_counts[s] < 2:
             continue
         for k in range(start[s], start[s + 1]):
             r = 0.0

@@ -48,7 +48,7 @@ def project_ray(
 def project_rays(
     x: Float32, y: Float32, lookup: Float32, lookup_frame: Float64, u: Float64, v: Float64
 ) -> None:
-    """Project N rays as `project_ray` does, in loops without branches, which can use SIMD.
+    """Project N rays like `project_ray`, in branch-free loops, so that they are vectorised.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def project_rays(
     lookup, lookup_frame
         As for `project_ray`.
     u, v
-        (N,) are overwritten by the pixels, NaN for rays outside the grid.
+        (N,), are overwritten by the pixels, NaN for rays outside the grid.
     """
     table = lookup.reshape(-1)
     cell = np.empty(len(x), np.int32)
@@ -90,7 +90,7 @@ def project_rays(
 def jacobian_row(
     J: Float64, m0: float, m1: float, m2: float, px: float, py: float, pz: float
 ) -> None:
-    """Write (m, p x m), the derivative of m . p by a right perturbation, to J[:6]."""
+    """Write (m, p x m), the derivative of m . p under a right perturbation, to J[:6]."""
     J[0] = m0
     J[1] = m1
     J[2] = m2

@@ -1,8 +1,7 @@
 """Point-to-plane residuals between views of two cameras of a rig, each with its own range offset.
 
 As in `pair_equations`, source points are compared with the plane of the target pixel that they
-project to.
-Every point gives a row of its own, as the cameras' unknowns are shared by many pairs of views.
+project to. Each point has its own row, as the cameras' unknowns are shared by many pairs of views.
 """
 
 from __future__ import annotations
@@ -14,16 +13,16 @@ from tofuse.kernels.alignment import DISTANCE, NORMAL, PLANE, POINT, SIGMA, VARI
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import project_ray
 
-# Columns of a row: signed distance to the target's plane in m and its variance (0: no
-# correspondence), the target's normal in the source's frame, the source's own normal, the displaced
+# Columns of a row: signed distance from the target's plane in m and its variance (0: no
+# correspondence), the target's normal in the source's frame, the source's own normal, the corrected
 # source point, and the derivatives of the residual by the range offsets of source and target.
 RESIDUAL = 0
-OWN = 1
+RESIDUAL_VARIANCE = 1
 TARGET_NORMAL = 2
 SOURCE_NORMAL = 5
-MOVED = 8
-BY_SOURCE = 11
-BY_TARGET = 12
+SOURCE_POINT = 8
+BY_SOURCE_OFFSET = 11
+BY_TARGET_OFFSET = 12
 ROW = 13
 
 
@@ -37,7 +36,7 @@ def residuals(
     min_cosine: float,
     out: Float64,
 ) -> None:
-    """Compare points with a target, into `out` (N, ROW), which is overwritten.
+    """Compare points with a target; overwrites `out` (N, ROW).
 
     Parameters
     ----------
@@ -54,11 +53,11 @@ def residuals(
         y = np.float64(points[k, POINT + 1])
         z = np.float64(points[k, POINT + 2])
         length = np.sqrt(x * x + y * y + z * z)
-        longer = source_offset / length
+        relative_offset = source_offset / length
         b0, b1, b2 = x / length, y / length, z / length
-        x += longer * x
-        y += longer * y
-        z += longer * z
+        x += relative_offset * x
+        y += relative_offset * y
+        z += relative_offset * z
         q0 = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
         q1 = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
         q2 = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
@@ -83,19 +82,19 @@ def residuals(
         if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
             continue
         # The target's offset moves its plane along the ray of the pixel.
-        by_target = (n0 * q0 + n1 * q1 + n2 * q2) / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2)
-        along = (m0 * x + m1 * y + m2 * z) * np.float64(points[k, SIGMA])
+        target_derivative = (n0 * q0 + n1 * q1 + n2 * q2) / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2)
+        source_sigma = (m0 * x + m1 * y + m2 * z) * np.float64(points[k, SIGMA])
         row = out[k]
-        row[RESIDUAL] = n0 * q0 + n1 * q1 + n2 * q2 - distance - target_offset * by_target
-        row[OWN] = along * along + np.float64(pixel[VARIANCE])
+        row[RESIDUAL] = n0 * q0 + n1 * q1 + n2 * q2 - distance - target_offset * target_derivative
+        row[RESIDUAL_VARIANCE] = source_sigma * source_sigma + np.float64(pixel[VARIANCE])
         row[TARGET_NORMAL] = m0
         row[TARGET_NORMAL + 1] = m1
         row[TARGET_NORMAL + 2] = m2
         row[SOURCE_NORMAL] = s0
         row[SOURCE_NORMAL + 1] = s1
         row[SOURCE_NORMAL + 2] = s2
-        row[MOVED] = x
-        row[MOVED + 1] = y
-        row[MOVED + 2] = z
-        row[BY_SOURCE] = m0 * b0 + m1 * b1 + m2 * b2
-        row[BY_TARGET] = -by_target
+        row[SOURCE_POINT] = x
+        row[SOURCE_POINT + 1] = y
+        row[SOURCE_POINT + 2] = z
+        row[BY_SOURCE_OFFSET] = m0 * b0 + m1 * b1 + m2 * b2
+        row[BY_TARGET_OFFSET] = -target_derivative

@@ -33,33 +33,33 @@ def retract(T: Float64, xi: Float64) -> Float64:
             square = 0.0
             for k in range(3):
                 square += W[i, k] * W[k, j]
-            one = 1.0 if i == j else 0.0
-            R[i, j] = one + s1 * W[i, j] + s2 * square
-            V[i, j] = one + s2 * W[i, j] + s3 * square
+            identity = 1.0 if i == j else 0.0
+            R[i, j] = identity + s1 * W[i, j] + s2 * square
+            V[i, j] = identity + s2 * W[i, j] + s3 * square
     out = np.zeros((4, 4))
     for i in range(3):
         out[i, 3] = T[i, 3]
         for j in range(3):
-            step = 0.0
+            translation = 0.0
             for k in range(3):
                 out[i, j] += T[i, k] * R[k, j]
-                step += V[j, k] * xi[k]
-            out[i, 3] += T[i, j] * step
+                translation += V[j, k] * xi[k]
+            out[i, 3] += T[i, j] * translation
     # One Newton step towards orthogonality: R (3 - R^T R) / 2.
     G = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
             for k in range(3):
                 G[i, j] += out[k, i] * out[k, j]
-    fixed = np.zeros((3, 3))
+    orthogonal = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
             for k in range(3):
                 h = (3.0 if k == j else 0.0) - G[k, j]
-                fixed[i, j] += 0.5 * out[i, k] * h
+                orthogonal[i, j] += 0.5 * out[i, k] * h
     for i in range(3):
         for j in range(3):
-            out[i, j] = fixed[i, j]
+            out[i, j] = orthogonal[i, j]
     out[3, 3] = 1
     return out
 

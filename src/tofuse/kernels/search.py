@@ -2,8 +2,8 @@
 
 Images are resampled to pinhole grids (H, W, 5): the unit normal (away from the camera) and the
 distance n . p of the plane on the node's ray; 0, 0, 0 and the negative depth where only a depth is
-known; all 0 where nothing is known; and the log albedo, NaN where unknown. The frame
-(x0, y0, 1/dx, 1/dy) gives the ray coordinates of the nodes.
+known; 0 where nothing is known; and the log albedo, NaN where unknown. The frame
+(x0, y0, 1/dx, 1/dy) defines the ray coordinates of the nodes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tofuse.kernels.rigid_motions import retract
 _MIN_DEPTH = 0.05
 # Largest penalty of albedo differences, relative to the weight of the supporting points.
 _MAX_ALBEDO_PENALTY = 2.0
-# A pose has converged when its step is smaller than this fraction of the reach.
+# A pose has converged when its step is smaller than this fraction of the cut-off.
 _CONVERGED = 0.001
 # Layout of the counts that `measure_agreement` returns.
 PROJECTED = 0
@@ -34,7 +34,7 @@ AGREEMENT_SIZE = 5
 
 # Poses are scored in structure-of-arrays blocks, one pose per column, so that loops over poses are
 # vectorised. Rows of a block: the pose (rotation, then translation), the transformed point, the
-# target node it projects to, and the sums: support minus violations, the weights of the points
+# target node that it projects to, and the sums: support minus violations, the weights of the points
 # whose albedo is compared, and the weighted sums of their log albedo differences and squares.
 _LANES = 128
 _ROTATION, _TRANSLATION, _POSITION, _PIXEL, _TOTAL, _ALBEDO = 0, 9, 12, 15, 20, 21
@@ -108,9 +108,9 @@ class Tolerance(NamedTuple):
     Attributes
     ----------
     sigmas, floor_m, floor_fraction
-        A point supports the pose if its distance is below `sigmas` standard deviations plus
-        `floor_m` plus `floor_fraction` times its depth; it violates free space if it is nearer than
-        the surface by twice that.
+        A point supports the pose if its distance from the plane is below `sigmas` standard
+        deviations plus `floor_m` plus `floor_fraction` times its depth; it violates free space if
+        it is in front of the surface by more than twice that.
     min_cosine
         Smallest cosine between the normals of a supporting point and the plane.
     """
@@ -153,13 +153,13 @@ def _score_points(
     planes = grid.reshape(grid.size)
     su, sv = np.float32(frame[2]), np.float32(frame[3])
     u0, v0 = np.float32(0.5 - frame[0] * frame[2]), np.float32(0.5 - frame[1] * frame[3])
-    nearest, none, one, two = np.float32(_MIN_DEPTH), np.float32(0), np.float32(1), np.float32(2)
+    min_depth, zero, one, two = np.float32(_MIN_DEPTH), np.float32(0), np.float32(1), np.float32(2)
     # Upper limits, so that coordinates fit into an integer.
     far_u, far_v = np.float32(columns), np.float32(rows)
-    reach32, per2 = np.float32(reach), np.float32(1.0 / (reach * reach))
+    reach32, inv_reach2 = np.float32(reach), np.float32(1.0 / (reach * reach))
     for k in range(len(points)):
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]
-        landed = 0
+        projected = 0
         for b in range(_LANES):
             x = block[b] * px + block[_LANES + b] * py + block[2 * _LANES + b] * pz
             y = block[3 * _LANES + b] * px + block[4 * _LANES + b] * py + block[5 * _LANES + b] * pz
@@ -167,29 +167,29 @@ def _score_points(
             x += block[_TRANSLATION * _LANES + b]
             y += block[(_TRANSLATION + 1) * _LANES + b]
             z += block[(_TRANSLATION + 2) * _LANES + b]
-            before = z > nearest
-            inverse = one / z if before else none
-            u = x * inverse * su + u0
-            v = y * inverse * sv + v0
-            inside = before & (u > none) & (v > none) & (u < far_u) & (v < far_v)
-            j = np.int32(u if inside else none)
-            i = np.int32(v if inside else none)
+            in_front = z > min_depth
+            inv_z = one / z if in_front else zero
+            u = x * inv_z * su + u0
+            v = y * inv_z * sv + v0
+            inside = in_front & (u > zero) & (v > zero) & (u < far_u) & (v < far_v)
+            j = np.int32(u if inside else zero)
+            i = np.int32(v if inside else zero)
             node[b] = i * columns + j if inside else np.int32(-1)
-            landed += inside
+            projected += inside
             block[_POSITION * _LANES + b] = x
             block[(_POSITION + 1) * _LANES + b] = y
             block[(_POSITION + 2) * _LANES + b] = z
-        if landed == 0:
+        if projected == 0:
             continue
         for b in range(_LANES):
-            at = 5 * max(node[b], np.int32(0))
-            block[_PIXEL * _LANES + b] = planes[at]
-            block[(_PIXEL + 1) * _LANES + b] = planes[at + 1]
-            block[(_PIXEL + 2) * _LANES + b] = planes[at + 2]
-            block[(_PIXEL + 3) * _LANES + b] = planes[at + 3] if node[b] >= 0 else none
-            block[(_PIXEL + 4) * _LANES + b] = planes[at + 4]
+            index = 5 * max(node[b], np.int32(0))
+            block[_PIXEL * _LANES + b] = planes[index]
+            block[(_PIXEL + 1) * _LANES + b] = planes[index + 1]
+            block[(_PIXEL + 2) * _LANES + b] = planes[index + 2]
+            block[(_PIXEL + 3) * _LANES + b] = planes[index + 3] if node[b] >= 0 else zero
+            block[(_PIXEL + 4) * _LANES + b] = planes[index + 4]
         nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
-        level = log_albedo[k]
+        source_albedo = log_albedo[k]
         for b in range(_LANES):
             m0, m1 = block[_PIXEL * _LANES + b], block[(_PIXEL + 1) * _LANES + b]
             m2, d = block[(_PIXEL + 2) * _LANES + b], block[(_PIXEL + 3) * _LANES + b]
@@ -215,22 +215,22 @@ def _score_points(
                     + block[8 * _LANES + b] * nz
                 )
             )
-            through = ((d > none) & (r < -reach32)) | ((d < none) & (z < -d - reach32))
-            fits = (d > none) & (r >= -reach32) & (r < reach32) & (c > none)
-            w = c * (one - r * r * per2) if fits else none
-            block[_TOTAL * _LANES + b] += w - (two if through else none)
-            albedo_ratio = block[(_PIXEL + 4) * _LANES + b] - level
-            known = albedo_ratio == albedo_ratio
-            w = w if known else none
-            albedo_ratio = albedo_ratio if known else none
+            violation = ((d > zero) & (r < -reach32)) | ((d < zero) & (z < -d - reach32))
+            inlier = (d > zero) & (r >= -reach32) & (r < reach32) & (c > zero)
+            w = c * (one - r * r * inv_reach2) if inlier else zero
+            block[_TOTAL * _LANES + b] += w - (two if violation else zero)
+            albedo_difference = block[(_PIXEL + 4) * _LANES + b] - source_albedo
+            known = albedo_difference == albedo_difference
+            w = w if known else zero
+            albedo_difference = albedo_difference if known else zero
             block[_ALBEDO * _LANES + b] += w
-            block[(_ALBEDO + 1) * _LANES + b] += w * albedo_ratio
-            block[(_ALBEDO + 2) * _LANES + b] += w * albedo_ratio * albedo_ratio
+            block[(_ALBEDO + 1) * _LANES + b] += w * albedo_difference
+            block[(_ALBEDO + 2) * _LANES + b] += w * albedo_difference * albedo_difference
 
 
 @kernel
 def select_distinct(
-    rotations: Float64, translations: Float64, depth: float, apart: float, count: int
+    rotations: Float64, translations: Float64, depth: float, min_distance: float, count: int
 ) -> Int64:
     """Return the indices of the first `count` poses that differ from all those selected before.
 
@@ -238,32 +238,32 @@ def select_distinct(
     ----------
     rotations, translations
         (N, 3, 3) and (N, 3), best first.
-    depth, apart
-        Poses differ if they move a point at `depth` m by more than `apart` m.
+    depth, min_distance
+        Poses differ if they displace a point at `depth` m by more than `min_distance` m.
     count
         Maximum number of poses.
     """
-    chosen = np.empty(min(count, len(rotations)), np.int64)
+    selected = np.empty(min(count, len(rotations)), np.int64)
     size = 0
     for k in range(len(rotations)):
-        free = True
-        for other in chosen[:size]:
+        distinct = True
+        for other in selected[:size]:
             trace = 0.0
-            squared = 0.0
+            distance2 = 0.0
             for i in range(3):
                 for j in range(3):
                     trace += rotations[k, i, j] * rotations[other, i, j]
-                squared += (translations[k, i] - translations[other, i]) ** 2
-            turned = np.sqrt(max(3.0 - trace, 0.0))  # about the angle
-            if turned * depth + np.sqrt(squared) <= apart:
-                free = False
+                distance2 += (translations[k, i] - translations[other, i]) ** 2
+            angle = np.sqrt(max(3.0 - trace, 0.0))  # about the angle
+            if angle * depth + np.sqrt(distance2) <= min_distance:
+                distinct = False
                 break
-        if free:
-            chosen[size] = k
+        if distinct:
+            selected[size] = k
             size += 1
             if size == count:
                 break
-    return chosen[:size]
+    return selected[:size]
 
 
 @kernel
@@ -273,7 +273,7 @@ def score_grid(
     rotations: Float64,
     translations: Float64,
     reach: float,
-    albedo: float,
+    albedo_sigma: float,
     scores: Float32,
     start: int,
     stop: int,
@@ -287,9 +287,9 @@ def score_grid(
     rotations, translations
         (A, 3, 3) and (A, B, 3), or (1, B, 3) for all rotations, of T_target_source.
     reach
-        Distance from a plane within which a point supports the pose, m; a point nearer than the
+        Distance from a plane within which a point supports the pose, m; a point in front of the
         surface by more than that violates free space.
-    albedo
+    albedo_sigma
         Standard deviation of log albedo differences (without exposure) at which the penalty cancels
         the support.
     scores
@@ -298,49 +298,53 @@ def score_grid(
     """
     source_points, source_normals, source_log_albedo, source_grid, source_frame = source
     target_points, target_normals, target_log_albedo, target_grid, target_frame = target
-    per_point = 1.0 / max(len(source_points) + len(target_points), 1)
-    per2 = 1.0 / (albedo * albedo)
-    many = translations.shape[1]
-    there, back = np.zeros(_ROWS * _LANES, np.float32), np.zeros(_ROWS * _LANES, np.float32)
+    inv_count = 1.0 / max(len(source_points) + len(target_points), 1)
+    inv_sigma2 = 1.0 / (albedo_sigma * albedo_sigma)
+    poses_per_rotation = translations.shape[1]
+    forward, backward = np.zeros(_ROWS * _LANES, np.float32), np.zeros(_ROWS * _LANES, np.float32)
     node = np.empty(_LANES, np.int32)
-    for first in range(start * many, stop * many, _LANES):
-        count = min(_LANES, stop * many - first)
+    for first in range(start * poses_per_rotation, stop * poses_per_rotation, _LANES):
+        count = min(_LANES, stop * poses_per_rotation - first)
         for b in range(_LANES):
-            a, c = divmod(first + min(b, count - 1), many)
+            a, c = divmod(first + min(b, count - 1), poses_per_rotation)
             R, t = rotations[a], translations[min(a, translations.shape[0] - 1), c]
             for i in range(3):
-                moved_back = 0.0
+                inverse_translation = 0.0
                 for j in range(3):
-                    there[(_ROTATION + 3 * i + j) * _LANES + b] = R[i, j]
-                    back[(_ROTATION + 3 * i + j) * _LANES + b] = R[j, i]
-                    moved_back -= R[j, i] * t[j]
-                there[(_TRANSLATION + i) * _LANES + b] = t[i]
-                back[(_TRANSLATION + i) * _LANES + b] = moved_back
-        there[_TOTAL * _LANES :] = np.float32(0)
-        back[_TOTAL * _LANES :] = np.float32(0)
+                    forward[(_ROTATION + 3 * i + j) * _LANES + b] = R[i, j]
+                    backward[(_ROTATION + 3 * i + j) * _LANES + b] = R[j, i]
+                    inverse_translation -= R[j, i] * t[j]
+                forward[(_TRANSLATION + i) * _LANES + b] = t[i]
+                backward[(_TRANSLATION + i) * _LANES + b] = inverse_translation
+        forward[_TOTAL * _LANES :] = np.float32(0)
+        backward[_TOTAL * _LANES :] = np.float32(0)
         _score_points(
             source_points, source_normals, source_log_albedo, target_grid, target_frame, reach,
-            there, node,
+            forward, node,
         )  # fmt: skip
         _score_points(
             target_points, target_normals, target_log_albedo, source_grid, source_frame, reach,
-            back, node,
+            backward, node,
         )  # fmt: skip
         for b in range(count):
-            total = np.float64(there[_TOTAL * _LANES + b]) + back[_TOTAL * _LANES + b]
-            weight = np.float64(there[_ALBEDO * _LANES + b]) + back[_ALBEDO * _LANES + b]
+            total = np.float64(forward[_TOTAL * _LANES + b]) + backward[_TOTAL * _LANES + b]
+            weight = np.float64(forward[_ALBEDO * _LANES + b]) + backward[_ALBEDO * _LANES + b]
             if weight > 0:
                 # The mean difference is the exposure, which has opposite signs in the two
                 # directions.
                 mean = (
-                    np.float64(there[(_ALBEDO + 1) * _LANES + b]) - back[(_ALBEDO + 1) * _LANES + b]
+                    np.float64(forward[(_ALBEDO + 1) * _LANES + b])
+                    - backward[(_ALBEDO + 1) * _LANES + b]
                 )
                 square = (
-                    np.float64(there[(_ALBEDO + 2) * _LANES + b]) + back[(_ALBEDO + 2) * _LANES + b]
+                    np.float64(forward[(_ALBEDO + 2) * _LANES + b])
+                    + backward[(_ALBEDO + 2) * _LANES + b]
                 )
-                total -= min((square - mean * mean / weight) * per2, _MAX_ALBEDO_PENALTY * weight)
-            a, c = divmod(first + b, many)
-            scores[a, c] = total * per_point
+                total -= min(
+                    (square - mean * mean / weight) * inv_sigma2, _MAX_ALBEDO_PENALTY * weight
+                )
+            a, c = divmod(first + b, poses_per_rotation)
+            scores[a, c] = total * inv_count
 
 
 @kernel
@@ -375,7 +379,7 @@ def _add_equations(
             t[i] = T[i, 3]
         else:
             t[i] = -(T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
-    per2 = 1.0 / (reach * reach)
+    inv_reach2 = 1.0 / (reach * reach)
     for k in range(points.shape[0]):
         px = np.float64(points[k, 0])
         py = np.float64(points[k, 1])
@@ -398,7 +402,7 @@ def _add_equations(
         n1 = np.float64(grid[i, j, 1])
         n2 = np.float64(grid[i, j, 2])
         r = n0 * x + n1 * y + n2 * z - d
-        e2 = r * r * per2
+        e2 = r * r * inv_reach2
         if e2 >= 1:
             continue
         # The plane's normal in the frame of the points.
@@ -411,7 +415,7 @@ def _add_equations(
         if forward:
             jacobian_row(J, m0, m1, m2, px, py, pz)
         else:
-            # T exp(xi) moves a target point by exp(-xi) in the source frame.
+            # T exp(xi) transforms a target point by exp(-xi) in the source frame.
             jacobian_row(J, -n0, -n1, -n2, x, y, z)
         for p in range(6):
             g[p] += w * J[p] * r
@@ -512,11 +516,11 @@ def refine_poses(
                 H[p + 3, p + 3] += damping * unit_m * unit_m
             step = _solve(H, g)
             T = retract(T, step)
-            along = step[0] ** 2 + step[1] ** 2 + step[2] ** 2
-            turned = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
+            translation2 = step[0] ** 2 + step[1] ** 2 + step[2] ** 2
+            rotation2 = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
             # Converged at the final reach.
             if (
-                along + unit_m * unit_m * turned < (_CONVERGED * reach) ** 2
+                translation2 + unit_m * unit_m * rotation2 < (_CONVERGED * reach) ** 2
                 and reach == reaches[-1]
             ):
                 break
@@ -525,36 +529,36 @@ def refine_poses(
 
 @kernel
 def measure_agreement(
-    of: ViewPoints,
+    view_points: ViewPoints,
     image: Image,
     T: Float64,
     tolerance: Tolerance,
     differences: Float32,
-    slants: Float32,
+    log_cosine_ratios: Float32,
     start: int,
     stop: int,
 ) -> Float64:
-    """Count how the points start..stop of one view agree with another image under a pose.
+    """Count the points start..stop of a view that agree with another image under a pose.
 
     Parameters
     ----------
-    of, image
+    view_points, image
         The points and the image.
     T
-        (4, 4) from the points' frame to the image's.
+        (4, 4) T_image_points.
     tolerance
         Of points that support the pose.
     differences
-        (N,) written: log albedo of the image minus the point's for supporting points, else NaN.
-    slants
+        (N,) written: log albedo of the image minus that of the point; NaN without support.
+    log_cosine_ratios
         (N,) written for supporting points: log of the ratio of the cosines to the optical axes, in
-        the points' own view relative to the image.
+        the points' own view over the image.
 
     Returns
     -------
     (AGREEMENT_SIZE,) counts, and the supporting points' sum of squared distances.
     """
-    points, normals, sigma, log_albedo = of
+    points, normals, sigma, log_albedo = view_points
     planes, plane_variance, albedo, nearest, lookup, lookup_frame = image
     sigmas, floor_m, floor_fraction, min_cosine = tolerance
     out = np.zeros(AGREEMENT_SIZE)
@@ -591,9 +595,9 @@ def measure_agreement(
         m0 = (T[0, 0] * a + T[1, 0] * b + T[2, 0] * c) / length
         m1 = (T[0, 1] * a + T[1, 1] * b + T[2, 1] * c) / length
         m2 = (T[0, 2] * a + T[1, 2] * b + T[2, 2] * c) / length
-        along = (m0 * px + m1 * py + m2 * pz) / pz
-        own = along * np.float64(sigma[k])
-        variance = own * own + np.float64(plane_variance[i, j]) / (length * length)
+        dr_dz = (m0 * px + m1 * py + m2 * pz) / pz
+        sigma_r = dr_dz * np.float64(sigma[k])
+        variance = sigma_r * sigma_r + np.float64(plane_variance[i, j]) / (length * length)
         limit = sigmas * np.sqrt(variance) + floor_m + floor_fraction * z
         if r < -2 * limit:
             out[VIOLATION] += 1
@@ -603,8 +607,8 @@ def measure_agreement(
             out[SUPPORT] += 1
             out[SQUARES_M] += r * r
             differences[k] = albedo[i, j, 0] - log_albedo[k]
-            here, there = (px * px + py * py) / (pz * pz), (x * x + y * y) / (z * z)
-            slants[k] = 0.5 * np.log((1 + there) / (1 + here))
+            source_slope2, image_slope2 = (px * px + py * py) / (pz * pz), (x * x + y * y) / (z * z)
+            log_cosine_ratios[k] = 0.5 * np.log((1 + image_slope2) / (1 + source_slope2))
     return out
 
 
@@ -612,46 +616,46 @@ def measure_agreement(
 def lowest_plane(
     points: Float64,
     normals: Float64,
-    band: Float64,
+    tolerance: Float64,
     candidates: Int64,
-    cosine: float,
+    min_cosine: float,
     max_below: float,
-    far: float,
+    below_factor: float,
 ) -> int:
-    """Return the candidate whose plane contains most points, among planes with few points below.
+    """Return the candidate whose plane has the most points on it, and few points below it.
 
     Parameters
     ----------
     points, normals
         (n, 3) m, unit.
-    band
+    tolerance
         (n,) tolerance of a point's distance to a plane, m.
     candidates
         Indices of the points whose tangent planes are tried.
-    cosine
+    min_cosine
         Smallest cosine between the normals of a plane and of a point on it.
     max_below
         Planes with more points below are rejected; if all are, the first candidate is returned.
-    far
-        A point is below a plane by more than `far` times its band.
+    below_factor
+        A point counts as below a plane at more than `below_factor` times its tolerance.
     """
     best = candidates[0]
-    most = 0
+    max_on_plane = 0
     for k in candidates:
         nx, ny, nz = normals[k]
         height = points[k, 0] * nx + points[k, 1] * ny + points[k, 2] * nz
-        on = 0
+        on_plane = 0
         below = 0
         for i in range(len(points)):
             r = points[i, 0] * nx + points[i, 1] * ny + points[i, 2] * nz - height
-            if r > far * band[i]:
+            if r > below_factor * tolerance[i]:
                 below += 1
                 if below > max_below:
                     break
-            elif abs(r) < band[i]:
-                turned = normals[i, 0] * nx + normals[i, 1] * ny + normals[i, 2] * nz
-                on += turned > cosine
-        if below <= max_below and on > most:
-            most = on
+            elif abs(r) < tolerance[i]:
+                cosine = normals[i, 0] * nx + normals[i, 1] * ny + normals[i, 2] * nz
+                on_plane += cosine > min_cosine
+        if below <= max_below and on_plane > max_on_plane:
+            max_on_plane = on_plane
             best = k
     return best

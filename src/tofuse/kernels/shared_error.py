@@ -16,10 +16,10 @@ from tofuse.kernels.pair_equations import PATCH_RESIDUAL, PATCH_WEIGHT, UNKNOWNS
 
 
 @kernel
-def discount_shared_errors(
-    sums: Float64, correlation: Float64, variance: Float64, which: Int64, rows: Float64
+def marginalise_shared_errors(
+    sums: Float64, correlation: Float64, variance: Float64, pairs: Int64, rows: Float64
 ) -> None:
-    """Marginalise the patches' shared errors in the normal equations of pairs, in place.
+    """Marginalise the patches' shared errors out of the normal equations of pairs, in place.
 
     Parameters
     ----------
@@ -29,31 +29,31 @@ def discount_shared_errors(
         (patches, patches) correlation of the errors of patches.
     variance
         (K,) variances of these errors, m^2.
-    which
-        (K,) pairs.
+    pairs
+        (K,) indices of the pairs.
     rows
         (N, SIZE) equations of the pairs, see `pair_equations`; updated.
     """
-    for k in range(len(which)):
-        _discount(sums[which[k]], correlation, variance[k], rows[which[k]])
+    for k in range(len(pairs)):
+        _marginalise(sums[pairs[k]], correlation, variance[k], rows[pairs[k]])
 
 
 @kernel
-def _discount(sums: Float64, correlation: Float64, variance: float, row: Float64) -> None:
-    """Do so for one pair."""
+def _marginalise(sums: Float64, correlation: Float64, variance: float, row: Float64) -> None:
+    """Do the same for one pair."""
     count = len(sums)
     R = np.zeros((count, 7))
-    root = np.sqrt(sums[:, PATCH_WEIGHT])
+    sqrt_weight = np.sqrt(sums[:, PATCH_WEIGHT])
     for k in range(count):
-        if root[k] > 0:
+        if sqrt_weight[k] > 0:
             for p in range(7):
-                R[k, p] = sums[k, PATCH_RESIDUAL + p] / root[k]
+                R[k, p] = sums[k, PATCH_RESIDUAL + p] / sqrt_weight[k]
     # Cholesky factor L of 1 + D^1/2 K D^1/2, row by row, and Z with L Z = R.
     L = np.zeros((count, count))
     Z = np.zeros((count, 7))
     for i in range(count):
         for j in range(i + 1):
-            total = variance * root[i] * root[j] * correlation[i, j]
+            total = variance * sqrt_weight[i] * sqrt_weight[j] * correlation[i, j]
             for k in range(j):
                 total -= L[i, k] * L[j, k]
             if i == j:
@@ -68,7 +68,7 @@ def _discount(sums: Float64, correlation: Float64, variance: float, row: Float64
     for p in range(6):
         for k in range(count):
             row[G + p] -= R[k, 0] * R[k, 1 + p] - Z[k, 0] * Z[k, 1 + p]
-        place = H + p * UNKNOWNS - p * (p - 1) // 2
+        index = H + p * UNKNOWNS - p * (p - 1) // 2
         for o in range(p, 6):
             for k in range(count):
-                row[place + o - p] -= R[k, 1 + p] * R[k, 1 + o] - Z[k, 1 + p] * Z[k, 1 + o]
+                row[index + o - p] -= R[k, 1 + p] * R[k, 1 + o] - Z[k, 1 + p] * Z[k, 1 + o]

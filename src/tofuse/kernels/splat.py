@@ -7,7 +7,7 @@ import numpy as np
 from tofuse.arrays import Float64, Int32
 from tofuse.kernels.jit import kernel
 
-# Fraction of the eye's distance; nearer points are not drawn.
+# Fraction of the viewpoint's distance; nearer points are not drawn.
 _MIN_DEPTH = 0.02
 
 
@@ -16,47 +16,46 @@ def nearest_points(
     points: Float64,
     T_view_world: Float64,
     scale: float,
-    distance: float,
-    radius: int,
+    eye_distance: float,
+    side: int,
     depth: Float64,
-    found: Int32,
+    index: Int32,
 ) -> None:
-    """Find the nearest point of each pixel, with points drawn as squares; ties go to the last.
+    """Find the nearest point of each pixel; points are drawn as squares, ties go to the last.
 
     Parameters
     ----------
     points
         (N, 3) m.
     T_view_world
-        (4, 4) into a view whose axes are x right, y down, z into the picture.
+        (4, 4) into a view whose axes are x right, y down, z into the image.
     scale
-        Pixels per metre (at the view's origin, where there is a perspective).
-    distance
-        Of the eye from the view's origin in m; 0 for a parallel projection.
-    radius
-        Pixels along the side of a square, whose upper left one the point is in. Points outside of
-        the picture are not drawn.
-    depth, found
-        (H, W) depths and rows of the nearest points, written where one is nearer: infinite and -1
-        at first.
+        Pixels per metre (in perspective projections at the view's origin).
+    eye_distance
+        Distance of the viewpoint from the view's origin in m; 0 for a parallel projection.
+    side
+        Pixels along the side of a square, whose upper left pixel contains the point. Points outside
+        the image are not drawn.
+    depth, index
+        (H, W) depth and row of the nearest point, updated; initially infinite and -1.
     """
-    height, width = found.shape
+    height, width = index.shape
     T = T_view_world
     for k in range(len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        far = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        view_z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
         zoom = scale
-        if distance > 0:
-            far += distance
-            if not far > _MIN_DEPTH * distance:
+        if eye_distance > 0:
+            view_z += eye_distance
+            if not view_z > _MIN_DEPTH * eye_distance:
                 continue
-            zoom = scale * distance / far
+            zoom = scale * eye_distance / view_z
         u = np.rint(0.5 * width + zoom * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]))
         v = np.rint(0.5 * height + zoom * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]))
         if not (u >= 0 and v >= 0 and u < width and v < height):
             continue
-        for r in range(int(v), min(int(v) + radius, height)):
-            for c in range(int(u), min(int(u) + radius, width)):
-                if far <= depth[r, c]:
-                    depth[r, c] = far
-                    found[r, c] = k
+        for r in range(int(v), min(int(v) + side, height)):
+            for c in range(int(u), min(int(u) + side, width)):
+                if view_z <= depth[r, c]:
+                    depth[r, c] = view_z
+                    index[r, c] = k

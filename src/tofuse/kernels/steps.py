@@ -14,9 +14,9 @@ from tofuse.kernels.rigid_motions import compose, retract, twist_between
 from tofuse.kernels.spurious_information import spurious_information
 
 # Number of points from which the spurious information is estimated.
-SOME_POINTS = 500
-# Nuisance parameters that are estimated along the way: log albedo of the targets minus the
-# source's, scale of the sigmas of distances, sigma of the log albedo (0 leaves it out).
+SAMPLE_SIZE = 500
+# Nuisance parameters that are also estimated: log albedo of the targets minus that of the source,
+# scale of the sigmas of distances, and sigma of the log albedo (0 leaves it out).
 EXPOSURE, SCALE_G, SCALE_P = 0, 1, 2
 
 
@@ -28,7 +28,7 @@ class LevelSettings(NamedTuple):
     iterations
         Maximum number of iterations.
     tolerance
-        Iteration stops when the step is smaller than this, in `units`.
+        Iterations stop when the step is smaller than this, in `units`.
     max_scale
         Upper limit of the scale of the sigmas.
     inflation, albedo_inflation
@@ -76,7 +76,7 @@ def iterate_level(
     Parameters
     ----------
     points, targets
-        Source as in `accumulate`, and n targets.
+        Source points as in `accumulate`, and n targets.
     T_targets
         (n, 4, 4) T_target_world of each target.
     T, estimates
@@ -89,16 +89,16 @@ def iterate_level(
     Returns
     -------
     The last sums (SIZE,), the spurious information (6, 6), the degenerate directions (k, 6), the
-    size of the last step in `units`, and the number of iterations. If the sums are not finite, the
-    returned sums are 0, all directions are degenerate, and T is unchanged.
+    size of the last step in `units`, and the number of iterations. If sums or step are not finite,
+    the returned sums are 0, all directions are degenerate, and T keeps its last value.
     """
     inflation, prior, units = settings.inflation, settings.prior, settings.units
     total = np.zeros(sums.SIZE)
-    weak = np.zeros((0, 6))
+    degenerate = np.zeros((0, 6))
     spurious = np.zeros((6, 6))
-    size = np.inf
-    done = 0
-    while done < settings.iterations and size >= settings.tolerance:
+    step_size = np.inf
+    iterations = 0
+    while iterations < settings.iterations and step_size >= settings.tolerance:
         total[:] = 0.0
         residuals = Residuals(
             estimates[EXPOSURE],
@@ -110,10 +110,10 @@ def iterate_level(
         )
         for k in range(len(targets)):
             total += accumulate(points, targets[k], compose(T_targets[k], T), residuals)
-        if settings.remap and done == 0:
+        if settings.remap and iterations == 0:
             spurious = total[sums.INLIERS] * spurious_information(
                 points,
-                max(1, len(points) // SOME_POINTS),
+                max(1, len(points) // SAMPLE_SIZE),
                 estimates[SCALE_G],
                 inflation,
                 estimates[SCALE_P] ** 2,
@@ -124,28 +124,28 @@ def iterate_level(
         if finite:
             if settings.remap:
                 cross = cross_information(total) - spurious
-                weak = degenerate_directions(cross, units, settings.max_sigma)
-            onward, step = solve_step(total, T, T_predicted, weak, prior, units)
+                degenerate = degenerate_directions(cross, units, settings.max_sigma)
+            T_updated, step = solve_step(total, T, T_predicted, degenerate, prior, units)
             finite = np.isfinite(step.sum())
-        if not finite:  # fits to noise alone can make planes without bounds
-            return np.zeros(sums.SIZE), np.zeros((6, 6)), np.eye(6), np.inf, done
-        T[:] = onward
-        done += 1
-        size = 0.0
+        if not finite:  # planes fitted to mere noise can have unbounded coefficients
+            return np.zeros(sums.SIZE), np.zeros((6, 6)), np.eye(6), np.inf, iterations
+        T[:] = T_updated
+        iterations += 1
+        step_size = 0.0
         for p in range(6):
-            size = max(size, abs(step[p] / units[p]))
+            step_size = max(step_size, abs(step[p] / units[p]))
         if estimates[SCALE_P] > 0:
             estimates[EXPOSURE] += step[6]
         _rescale(total, estimates, settings.max_scale, settings.albedo_inflation)
-    return total, spurious, weak, size, done
+    return total, spurious, degenerate, step_size, iterations
 
 
 @kernel
 def _rescale(total: Float64, estimates: Float64, max_scale: float, albedo_inflation: float) -> None:
-    """Estimate the sigmas from the residuals, which contain both views' noise and bias."""
-    seen = scale_of_distances(total[sums.HISTOGRAM :])
-    if not np.isnan(seen):
-        estimates[SCALE_G] = min(max(seen, 0.7), max_scale)
+    """Estimate the sigmas from the residuals, which include both views' noise and bias."""
+    scale = scale_of_distances(total[sums.HISTOGRAM :])
+    if not np.isnan(scale):
+        estimates[SCALE_G] = min(max(scale, 0.7), max_scale)
     if estimates[SCALE_P] > 0 and total[sums.WEIGHT_P] > 0:
         variance = total[sums.SQUARES_P] / total[sums.WEIGHT_P] / 0.72
         estimates[SCALE_P] = min(max(np.sqrt(variance + albedo_inflation**2), 0.005), 0.5)
@@ -157,8 +157,8 @@ def _without_exposure(A: Float64) -> Float64:
     out = np.empty((6, 6))
     for p in range(6):
         for o in range(6):
-            taken = A[p, 6] * A[6, o] / A[6, 6] if A[6, 6] > 0 else 0.0
-            out[p, o] = A[p, o] - taken
+            marginalised = A[p, 6] * A[6, o] / A[6, 6] if A[6, 6] > 0 else 0.0
+            out[p, o] = A[p, o] - marginalised
     return out
 
 
@@ -197,7 +197,7 @@ def solve_step(
     total: Float64,
     T: Float64,
     T_predicted: Float64,
-    weak: Float64,
+    degenerate: Float64,
     prior: Float64,
     units: Float64,
 ) -> tuple[Float64, Float64]:
@@ -209,8 +209,8 @@ def solve_step(
         (SIZE,) sums of `accumulate`.
     T, T_predicted
         (4, 4) current and predicted pose of the source.
-    weak
-        (k, 6) unit directions, in `units`, that are fixed to the prediction.
+    degenerate
+        (k, 6) unit directions, in `units`, in which the pose stays at the prediction.
     prior
         (6,) sigma of the prediction, m and rad.
     units
@@ -221,9 +221,9 @@ def solve_step(
     The updated pose (4, 4) and the step (7,), whose last element is the exposure's.
     """
     A, g, _ = normal_equations(total)
-    away = twist_between(T_predicted, T)
+    deviation = twist_between(T_predicted, T)
     for p in range(6):
-        away[p] /= units[p]
+        deviation[p] /= units[p]
         g[p] *= units[p]
         for o in range(7):
             A[p, o] *= units[p]
@@ -231,21 +231,21 @@ def solve_step(
     for p in range(6):
         weight = (units[p] / prior[p]) ** 2
         A[p, p] += weight
-        g[p] += weight * away[p]
-    if weak.shape[0]:
-        # Degenerate directions get a stiff prior, far above the information of noise.
+        g[p] += weight * deviation[p]
+    if degenerate.shape[0]:
+        # Degenerate directions get a stiff prior, much stronger than the information of noise.
         trace = 0.0
         for p in range(6):
             trace += A[p, p]
         stiffness = 1e3 * max(trace, 1.0)
-        for k in range(weak.shape[0]):
+        for k in range(degenerate.shape[0]):
             along = 0.0
             for p in range(6):
-                along += weak[k, p] * away[p]
+                along += degenerate[k, p] * deviation[p]
             for p in range(6):
-                g[p] += stiffness * along * weak[k, p]
+                g[p] += stiffness * along * degenerate[k, p]
                 for o in range(6):
-                    A[p, o] += stiffness * weak[k, p] * weak[k, o]
+                    A[p, o] += stiffness * degenerate[k, p] * degenerate[k, o]
     _solve(A, g)
     for p in range(7):
         g[p] *= -units[p] if p < 6 else -1.0
@@ -275,17 +275,17 @@ def _solve(A: Float64, b: Float64) -> None:
 def scale_of_distances(histogram: Float64) -> float:
     """Return the ratio of observed to stated sigma of all compared distances; NaN without any.
 
-    1.48 times the median of the absolute distances. Outliers are included, as a scale estimated
-    from inliers only would confirm itself.
+    It is 1.48 times the median absolute distance. Outliers are included, as a scale estimated from
+    inliers only would confirm itself.
     """
     count = 0.0
     for k in range(sums.BINS):
         count += histogram[k]
-    below = 0.0
+    cumulative = 0.0
     for k in range(sums.BINS):
-        here = histogram[k]
-        if here > 0 and 2 * (below + here) >= count:
+        in_bin = histogram[k]
+        if in_bin > 0 and 2 * (cumulative + in_bin) >= count:
             low, high = bin_edge(k), bin_edge(k + 1)
-            return 1.48 * np.sqrt(low + (high - low) * (0.5 * count - below) / here)
-        below += here
+            return 1.48 * np.sqrt(low + (high - low) * (0.5 * count - cumulative) / in_bin)
+        cumulative += in_bin
     return np.nan

@@ -1,4 +1,4 @@
-"""One thread pool, used so that the result does not depend on how many threads there are.
+"""One thread pool, used so that results do not depend on the number of threads.
 
 Work is divided into a number of chunks that depends on the work alone. Each chunk is computed by
 one call of a GIL-free kernel, and results are combined in chunk order.
@@ -17,35 +17,35 @@ from tofuse.kernels.cores import usable_cores
 
 R = TypeVar("R")
 
-_count = usable_cores()
-# A pool for each number of threads. None is ever shut down, as another thread may be using it.
+_thread_count = usable_cores()
+# A pool for each number of threads. Pools are never shut down, as other threads may be using them.
 _pools: dict[int, ThreadPoolExecutor] = {}
 _lock = threading.Lock()
-_here = threading.local()
+_thread_state = threading.local()
 
 
 def thread_count() -> int:
-    """Return how many threads `run_chunks` uses."""
-    return _count
+    """Return the number of threads that `run_chunks` uses."""
+    return _thread_count
 
 
 def set_thread_count(count: int) -> None:
     """Use `count` (1 or more) threads from now on."""
-    global _count
+    global _thread_count
     if count < 1:
         raise ValueError("the number of threads must be at least 1")
-    _count = count
+    _thread_count = count
 
 
 @contextmanager
 def threads(count: int | None) -> Iterator[None]:
     """Use `count` threads inside the block (None: no change)."""
-    before = _count
-    set_thread_count(before if count is None else count)
+    previous = _thread_count
+    set_thread_count(previous if count is None else count)
     try:
         yield
     finally:
-        set_thread_count(before)
+        set_thread_count(previous)
 
 
 def chunk_bounds(size: int, chunks: int = 16) -> list[tuple[int, int]]:
@@ -62,9 +62,9 @@ def run_chunks(function: Callable[[int, int], R], size: int, chunks: int = 16) -
     calling thread, as waiting for the pool could deadlock.
     """
     bounds = chunk_bounds(size, chunks)
-    if _count == 1 or len(bounds) <= 1 or getattr(_here, "inside", False):
+    if _thread_count == 1 or len(bounds) <= 1 or getattr(_thread_state, "inside", False):
         return [function(a, b) for a, b in bounds]
-    return list(_pool(_count).map(lambda ab: function(*ab), bounds))
+    return list(_pool(_thread_count).map(lambda ab: function(*ab), bounds))
 
 
 def _pool(count: int) -> ThreadPoolExecutor:
@@ -77,7 +77,7 @@ def _pool(count: int) -> ThreadPoolExecutor:
 
 
 def _mark_inside() -> None:
-    _here.inside = True
+    _thread_state.inside = True
 
 
 def job_pool(count: int, name: str) -> ThreadPoolExecutor:
@@ -89,14 +89,14 @@ def job_pool(count: int, name: str) -> ThreadPoolExecutor:
 
 
 @contextmanager
-def serial_chunks(wanted: bool = True) -> Iterator[None]:
-    """Compute chunks serially inside the block, while other threads have work of their own."""
-    before = getattr(_here, "inside", False)
-    _here.inside = before or wanted
+def serial_chunks(serial: bool = True) -> Iterator[None]:
+    """Compute chunks serially inside the block, while other threads are busy with other work."""
+    previous = getattr(_thread_state, "inside", False)
+    _thread_state.inside = previous or serial
     try:
         yield
     finally:
-        _here.inside = before
+        _thread_state.inside = previous
 
 
 def run_all(tasks: Sequence[Callable[[], R]]) -> list[R]:

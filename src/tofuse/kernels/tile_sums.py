@@ -1,8 +1,8 @@
-"""Normal equations of an alignment by image tile, for its sandwich covariance.
+"""Normal equations of an alignment per image tile, for its sandwich covariance.
 
 Systematic errors of a range camera (multipath, lens scattering, motion) are correlated over patches
-much larger than a pixel. The scatter of the tiles' gradients therefore says more about the error of
-the pose than the pixels' noise.
+much larger than a pixel. The scatter of the tiles' gradients therefore measures the error of the
+pose better than the pixels' noise.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import numpy as np
 from tofuse.arrays import Float32, Float64, Int64
 from tofuse.kernels.alignment import (
     DIFFERENCE,
-    FITS,
     INLIERS,
+    IS_INLIER,
     JACOBIAN,
     LANES,
-    MISFIT,
     POINT_SIZE,
-    ROOT,
     ROWS,
+    SQRT_WEIGHT,
     STAT,
     WEIGHT_G,
     WEIGHT_P,
+    WEIGHTED_RESIDUAL,
     Residuals,
     TargetImage,
     ViewImages,
@@ -30,13 +30,13 @@ from tofuse.kernels.alignment import (
     compare_planes,
     load_block,
     project_block,
-    put_point,
     transform_block,
+    write_point,
 )
 from tofuse.kernels.jit import kernel
 
 # Layout of a tile's sums, over the distances of its pixels.
-A = 0  # 7: sum of w J, the response of the gradient to an error shared by the tile
+RESPONSE = 0  # 7: sum of w J, the response of the gradient to an error shared by the tile
 WEIGHT = 7  # sum of w
 RESIDUAL = 8  # sum of w r
 COUNT = 9
@@ -45,7 +45,7 @@ SIZE = 10
 # exposure. w J J^T of the distances and of the albedo; and for both terms together, the symmetrised
 # product of the target's and source's Jacobians, weighted by w and by the derivative of the
 # influence function.
-GEOMETRY, PHOTO, WEIGHED, CROSS = 0, 1, 2, 3
+GEOMETRIC, PHOTOMETRIC, WEIGHTED, CROSS = 0, 1, 2, 3
 KINDS = 4
 UPPER = 28
 
@@ -74,21 +74,21 @@ def tile_sums(
     rows, columns = planes.shape[0], planes.shape[1]
     tiles = np.zeros((tiles_y * tiles_x, SIZE))
     points = np.zeros((LANES, POINT_SIZE), np.float32)
-    of = np.zeros(LANES, np.int64)
+    tile_index = np.zeros(LANES, np.int64)
     block = np.zeros(ROWS * LANES, np.float32)
     sums = np.zeros((KINDS * UPPER, LANES))
     count = 0
     for row in range(stride // 2, rows, stride):
         for column in range(stride // 2, columns, stride):
             if planes[row, column, 3] > 0:
-                put_point(
+                write_point(
                     points[count],
                     rays[row, column],
                     planes[row, column],
                     plane_variance[row, column],
                     albedo[row, column],
                 )
-                of[count] = row * tiles_y // rows * tiles_x + column * tiles_x // columns
+                tile_index[count] = row * tiles_y // rows * tiles_x + column * tiles_x // columns
                 count += 1
             if count < LANES and (row + stride < rows or column + stride < columns):
                 continue
@@ -96,11 +96,11 @@ def tile_sums(
             transform_block(block, T)
             project_block(block, count, image, lookup, lookup_frame)
             compare_planes(block, T, scale_g, inflation, robust, min_cosine)
-            _add_to_tiles(tiles, of, block, count)
-            _add_products(sums, block, GEOMETRY, WEIGHT_G)
+            _add_to_tiles(tiles, tile_index, block, count)
+            _add_products(sums, block, GEOMETRIC, WEIGHT_G)
             if scale_p > 0:
                 compare_albedos(block, T, exposure, scale_p, robust)
-                _add_products(sums, block, PHOTO, WEIGHT_P)
+                _add_products(sums, block, PHOTOMETRIC, WEIGHT_P)
             count = 0
     upper = np.zeros((KINDS, UPPER))
     for c in range(KINDS):
@@ -111,28 +111,28 @@ def tile_sums(
 
 
 @kernel
-def _add_to_tiles(tiles: Float64, of: Int64, block: Float32, count: int) -> None:
+def _add_to_tiles(tiles: Float64, tile_index: Int64, block: Float32, count: int) -> None:
     for k in range(count):
-        if block[FITS * LANES + k] > 0:
-            tile, root = tiles[of[k]], np.float64(block[ROOT * LANES + k])
+        if block[IS_INLIER * LANES + k] > 0:
+            tile, sqrt_weight = tiles[tile_index[k]], np.float64(block[SQRT_WEIGHT * LANES + k])
             for p in range(7):
-                tile[A + p] += root * block[(JACOBIAN + p) * LANES + k]
-            tile[WEIGHT] += root * root
-            tile[RESIDUAL] += root * block[MISFIT * LANES + k]
+                tile[RESPONSE + p] += sqrt_weight * block[(JACOBIAN + p) * LANES + k]
+            tile[WEIGHT] += sqrt_weight * sqrt_weight
+            tile[RESIDUAL] += sqrt_weight * block[WEIGHTED_RESIDUAL * LANES + k]
             tile[COUNT] += 1
 
 
 @kernel
-def _add_products(sums: Float64, block: Float32, of: int, weight: int) -> None:
-    """Add the products of the rows of J to those of the kind `of`, and to the cross sums.
+def _add_products(sums: Float64, block: Float32, kind: int, statistic: int) -> None:
+    """Add the products of the rows of J to those of a `kind`, and to the weighted and cross sums.
 
-    Tukey's influence function is r f^2 with f = 1 - (r / limit)^2; its derivative is f^2 (5 - 4 /
-    f).
+    Tukey's influence function is r f^2 with f = 1 - (r / limit)^2, and its derivative is
+    f^2 (5 - 4 / f).
     """
-    per_weight = np.empty(LANES, np.float32)
-    weights = block[(STAT + weight - INLIERS) * LANES : (STAT + weight - INLIERS + 1) * LANES]
+    influence_ratio = np.empty(LANES, np.float32)
+    weights = block[(STAT + statistic - INLIERS) * LANES : (STAT + statistic - INLIERS + 1) * LANES]
     for k in range(LANES):
-        per_weight[k] = (
+        influence_ratio[k] = (
             np.float32(5) - np.float32(4) / np.sqrt(weights[k])
             if weights[k] > np.float32(0)
             else np.float32(0)
@@ -144,17 +144,17 @@ def _add_products(sums: Float64, block: Float32, of: int, weight: int) -> None:
         for o in range(p, 7):
             b = block[(JACOBIAN + o) * LANES : (JACOBIAN + o + 1) * LANES]
             d = block[(DIFFERENCE + o) * LANES : (DIFFERENCE + o + 1) * LANES]
-            own = sums[of * UPPER + q]
-            weighed, cross = sums[WEIGHED * UPPER + q], sums[CROSS * UPPER + q]
+            products = sums[kind * UPPER + q]
+            weighted, cross = sums[WEIGHTED * UPPER + q], sums[CROSS * UPPER + q]
             for k in range(LANES):
-                own[k] += a[k] * b[k]
+                products[k] += a[k] * b[k]
             if o < 6:
                 for k in range(LANES):
-                    both = a[k] * b[k] - c[k] * d[k]
-                    weighed[k] += both
-                    cross[k] += per_weight[k] * both
+                    symmetrised = a[k] * b[k] - c[k] * d[k]
+                    weighted[k] += symmetrised
+                    cross[k] += influence_ratio[k] * symmetrised
             else:  # the exposure has the same derivative in both Jacobians
                 for k in range(LANES):
-                    weighed[k] += a[k] * b[k]
-                    cross[k] += per_weight[k] * a[k] * b[k]
+                    weighted[k] += a[k] * b[k]
+                    cross[k] += influence_ratio[k] * a[k] * b[k]
             q += 1

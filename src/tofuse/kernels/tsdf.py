@@ -15,20 +15,20 @@ from tofuse.kernels.blocks import EDGE, EMPTY, HALF, VOXELS, Blocks, block_key, 
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import project_ray
 
-MAX_SEEN = 65535  # saturation of a voxel's counter of views
-# Largest number of lookup cells that are inspected to classify a block as a whole.
+MAX_VIEWS = 65535  # at which a voxel's counter of views saturates
+# Maximum number of lookup cells that are inspected to classify a block as a whole.
 _MAX_CELLS = 600
-_PER_UNIT = np.float32(1 / 127)  # of normals in bytes
+_NORMAL_UNIT = np.float32(1 / 127)  # of normals stored in bytes
 _MIN_WEIGHT = np.float32(1e-30)  # avoids a division by 0
 
 
 class StoredView(NamedTuple):
-    """The stored form of a view.
+    """A view as it is stored.
 
     Attributes
     ----------
     z, unit
-        (H, W) z in counts of `unit` m, 0 where there is none.
+        (H, W) z in multiples of `unit` m, 0 where there is none.
     normals, strength
         (H, W, 3) 127 times the unit normals away from the camera, and (H, W) codes of the weights;
         0 for pixels that are not fused.
@@ -48,14 +48,14 @@ class Decoding(NamedTuple):
 
     Attributes
     ----------
-    weights, backs
-        (256,) in 1/m^2, and truncation distances behind a surface in m, by the code of the weight.
+    weights, rear_limits
+        (256,) in 1/m^2, and truncation distances behind a surface in m, by weight code.
     reach
         Truncation distance in front of a surface, m.
     """
 
     weights: Float32
-    backs: Float32
+    rear_limits: Float32
     reach: float
 
 
@@ -67,14 +67,14 @@ class Batch(NamedTuple):
     numbers, T_camera_world
         (V,) global numbers of the views, and (V, 4, 4).
     heights, codes
-        (V, H W + 1) h of the pixel's plane n . p = h, and n and the code of the weight in four
-        bytes. The last element stands for all points outside the image.
+        (V, H W + 1) h of the pixel's plane n . p = h, and n and the weight code packed into four
+        bytes. The last element is for all points outside the image.
     intensity
         (V, H W, C) colour or amplitude; C may be 0.
     cells, coarse
-        (V, A, B, 3) for the cells of the lookup: the z in front of which all is free, the z behind
-        which all is occluded, and the smallest weight, 0 where a pixel has no surface or the cell
-        has no pixel. `coarse` is the same for each 4 x 4 cells.
+        (V, A, B, 3) for the cells of the lookup: the z in front of which all space is free, the z
+        behind which all is occluded, and the smallest weight, 0 where a pixel has no surface or the
+        cell has no pixel. `coarse` is the same for each 4 x 4 cells.
     """
 
     numbers: Int64
@@ -188,13 +188,13 @@ def shrink_to_planes(
     detail
         Standard deviation of the surface relief, as a fraction of the depth.
     sigmas
-        A pixel measures its plane if it is within this number of standard deviations.
+        A pixel measures its plane if it is within this number of standard deviations of it.
     smooth, variance, measured
         (H, W) written: depth in m, its variance in m^2, and whether the pixel measures its plane.
     """
     rows, columns = z.shape
     one = np.float32(1)
-    relative, most = np.float32(detail), np.float32(sigmas)
+    relative, max_sigmas = np.float32(detail), np.float32(sigmas)
     for r in range(rows):
         for c in range(columns):
             depth = z[r, c]
@@ -208,13 +208,13 @@ def shrink_to_planes(
             plane = one / on_plane
             relief = (relative * depth) * (relative * depth)
             gain = relief / max(relief + noise, np.float32(1e-12))
-            rest = (one - gain) * (one - gain)
-            # d z = z^2 d(1/z); the removed part of the relief adds to the uncertainty.
-            of_plane = plane_variance[r, c] * (plane * plane) * (plane * plane)
+            complement2 = (one - gain) * (one - gain)
+            # dz = z^2 d(1/z); the removed part of the relief adds to the uncertainty.
+            fit_variance = plane_variance[r, c] * (plane * plane) * (plane * plane)
             smooth[r, c] = plane + gain * (depth - plane)
-            variance[r, c] = gain * gain * noise + rest * (of_plane + min(relief, noise))
-            off = abs(depth * on_plane - one) * depth
-            measured[r, c] = depth > 0 and off <= most * sigma[r, c]
+            variance[r, c] = gain * gain * noise + complement2 * (fit_variance + min(relief, noise))
+            deviation = abs(depth * on_plane - one) * depth
+            measured[r, c] = depth > 0 and deviation <= max_sigmas * sigma[r, c]
 
 
 @kernel
@@ -232,7 +232,7 @@ def mark_jumps(z: Float32, sigma: Float32, fraction: float, sigmas: float, jump:
         (H, W) of zeros; set to 1 at edges.
     """
     rows, columns = z.shape
-    part, limit = np.float32(fraction), np.float32(sigmas * sigmas)
+    min_fraction, limit = np.float32(fraction), np.float32(sigmas * sigmas)
     for r in range(rows):
         for c in range(columns):
             a = z[r, c]
@@ -245,7 +245,7 @@ def mark_jumps(z: Float32, sigma: Float32, fraction: float, sigmas: float, jump:
                     continue
                 b = z[i, j]
                 step = abs(a - b)
-                if not (b > 0 and step > part * min(a, b)):
+                if not (b > 0 and step > min_fraction * min(a, b)):
                     continue
                 if step * step > limit * (noise + sigma[i, j] * sigma[i, j]):
                     jump[r, c] = 1
@@ -258,7 +258,7 @@ def pack_view(
     rays: Float32,
     lengths2: Float32,
     variance: Float32,
-    good: Bool,
+    valid: Bool,
     min_cosine: float,
     normals: Int8,
     weights: Float32,
@@ -272,14 +272,14 @@ def pack_view(
         surface is assumed to face the camera.
     rays, lengths2
         (H, W, 2) x/z and y/z, and (H, W) the squared ratio of the range to z; NaN where unknown.
-    variance, good
+    variance, valid
         (H, W) of the depth in m^2, and whether the pixel is to be fused.
     min_cosine
         Smallest cosine of incidence of pixels that are fused.
     normals, weights
         (H, W, 3) in units of 1/127, and (H, W) in 1/m^2, written.
     """
-    rows, columns = good.shape
+    rows, columns = valid.shape
     for r in range(rows):
         for c in range(columns):
             length = np.sqrt(lengths2[r, c])
@@ -298,18 +298,18 @@ def pack_view(
             normals[r, c, 1] = np.int8(np.rint(np.float32(127) * y))
             normals[r, c, 2] = np.int8(np.rint(np.float32(127) * z))
             cosine = (x * rays[r, c, 0] + y * rays[r, c, 1] + z) / length
-            if good[r, c] and cosine > min_cosine:
-                of_distance = cosine * cosine * variance[r, c]
-                weights[r, c] = 1 / of_distance
+            if valid[r, c] and cosine > min_cosine:
+                distance_variance = cosine * cosine * variance[r, c]
+                weights[r, c] = 1 / distance_variance
 
 
 @kernel
 def unpack_view(
     view: StoredView, lookup_frame: Float64, decoding: Decoding, batch: Batch, s: int
 ) -> None:
-    """Unpack a view into row `s` of a batch, but for its intensity."""
+    """Unpack a view, except its intensity, into row `s` of a batch."""
     z, unit, normals, strength, rays = view
-    weights, backs, reach = decoding
+    weights, rear_limits, reach = decoding
     heights, codes = batch.heights[s], batch.codes[s]
     cells, coarse = batch.cells[s], batch.coarse[s]
     rows, columns = z.shape
@@ -340,7 +340,7 @@ def unpack_view(
             cells[j, i, 2] = min(cells[j, i, 2], w)
             if w > 0:
                 cells[j, i, 0] = min(cells[j, i, 0], depth - reach / along)
-                cells[j, i, 1] = max(cells[j, i, 1], depth + backs[code] / along)
+                cells[j, i, 1] = max(cells[j, i, 1], depth + rear_limits[code] / along)
     coarse[..., 0] = np.inf
     coarse[..., 1] = -np.inf
     coarse[..., 2] = np.inf
@@ -356,11 +356,11 @@ def unpack_view(
 
 
 @kernel
-def max_informative_depth(view: StoredView, backs: Float32) -> float:
+def max_informative_depth(view: StoredView, rear_limits: Float32) -> float:
     """Return an upper bound of the z (m) at which a view still observes anything; 0 if nothing.
 
-    `backs` are those of `Decoding`. Voxels that project to a pixel are up to half its width from
-    its ray, and see its plane at another depth; a whole width is allowed for.
+    `rear_limits` are those of `Decoding`. Voxels that project to a pixel are up to half its width
+    from its ray, where its plane has another depth; a whole width is allowed for.
     """
     z, unit, normals, strength, rays = view
     rows, columns = z.shape
@@ -378,23 +378,23 @@ def max_informative_depth(view: StoredView, backs: Float32) -> float:
             along = n0 * x + n1 * y + n2
             if not along > 0:
                 continue
-            turned = 0.0
+            change = 0.0
             for axis in range(2):
-                wide = -1.0
+                max_change = -1.0
                 for step in range(-1, 2, 2):
                     i = r + step * axis
                     j = c + step * (1 - axis)
                     if i < 0 or j < 0 or i >= rows or j >= columns:
                         continue
-                    across = abs(n0 * (rays[i, j, 0] - x)) + abs(n1 * (rays[i, j, 1] - y))
-                    if across > wide:
-                        wide = across
-                if wide < 0:
+                    step_change = abs(n0 * (rays[i, j, 0] - x)) + abs(n1 * (rays[i, j, 1] - y))
+                    if step_change > max_change:
+                        max_change = step_change
+                if max_change < 0:
                     return np.inf
-                turned += wide
-            if along <= turned:
+                change += max_change
+            if along <= change:
                 return np.inf
-            far = max(far, (z[r, c] * unit * along + backs[code]) / (along - turned))
+            far = max(far, (z[r, c] * unit * along + rear_limits[code]) / (along - change))
     return far
 
 
@@ -410,14 +410,14 @@ def _classify_ball(
 ) -> float:
     """Classify a ball around (x, y, z) in the camera's frame.
 
-    Returns -1 if it is occluded or outside the image, a positive weight if it is all free space,
-    and 0 if it is neither. `margin` is half the width of a pixel, in cells.
+    Returns -1 if it is occluded or outside the image, a positive weight if it is entirely in free
+    space, and 0 if it is neither. `margin` is half the width of a pixel, in cells.
     """
     if z + radius <= 1e-3:
         return -1.0
     if z - radius < 0.2 * z:
         return 0.0
-    # Ray coordinates of the ball's box, at its near and far end.
+    # Ray coordinates of the ball's bounding box, at its near and far ends.
     near = 1 / (z - radius)
     far = 1 / (z + radius)
     a = min((x - radius) * near, (x - radius) * far)
@@ -431,23 +431,23 @@ def _classify_ball(
     if gu < 0 or gv < 0 or fu >= cells.shape[1] or fv >= cells.shape[0]:
         return -1.0
     inside = fu >= 0 and fv >= 0 and gu < cells.shape[1] and gv < cells.shape[0]
-    least = np.inf if inside else 0.0
+    min_weight = np.inf if inside else 0.0
     i0 = int(max(fu, 0))
     i1 = int(min(gu, cells.shape[1] - 1))
     j0 = int(max(fv, 0))
     j1 = int(min(gv, cells.shape[0] - 1))
     if (i1 - i0 + 1) * (j1 - j0 + 1) > _MAX_CELLS:
         return 0.0
-    hidden = True
+    occluded = True
     for j in range(j0, j1 + 1):
         for i in range(i0, i1 + 1):
-            hidden = hidden and z - radius > cells[j, i, 1]
-            least = min(least, cells[j, i, 2])
+            occluded = occluded and z - radius > cells[j, i, 1]
+            min_weight = min(min_weight, cells[j, i, 2])
             if z + radius >= cells[j, i, 0]:
-                least = 0.0
-        if not hidden and least == 0:
+                min_weight = 0.0
+        if not occluded and min_weight == 0:
             return 0.0
-    return -1.0 if hidden else least
+    return -1.0 if occluded else min_weight
 
 
 @kernel
@@ -480,8 +480,8 @@ def _local_projection(
 ) -> tuple[float, float, float, float, float, float, bool]:
     """Linearise the projection of a small ball around (x, y, z) in x/z and y/z.
 
-    u = u0 + ux x/z + uy y/z, v likewise. Returns (u0, v0, ux, uy, vx, vy) and whether that is
-    accurate enough: not at the border, nor for a ball over which distortion varies.
+    u = u0 + ux x/z + uy y/z, v likewise. Returns (u0, v0, ux, uy, vx, vy) and whether they are
+    accurate enough: not at the border, nor for a ball across which distortion varies.
     """
     if z - radius < 0.5 * z or radius / z * max(lookup_frame[2], lookup_frame[3]) > nodes:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False
@@ -504,8 +504,8 @@ def integrate(
     batch: Batch,
     camera: Camera,
     decoding: Decoding,
-    near: UInt8,
-    turns: int,
+    near_surface: UInt8,
+    period: int,
     start: int,
     stop: int,
 ) -> None:
@@ -516,30 +516,30 @@ def integrate(
     are occluded: behind its surface by `reach`, or by more where the pixel is noisy. The loop over
     blocks is the outer one, so that a block is fetched once for all views.
 
-    Far from its surface a view only observes free space. There, views are integrated round-robin:
-    every `turns`-th one, with `turns` times its weight.
+    Far from its surface a view observes only free space. There, views are integrated round-robin:
+    every `period`-th one, with `period` times its weight.
 
     Parameters
     ----------
     blocks
-        Updated. Their numbers and those of the views determine whose turn it is.
+        Updated. Their numbers and those of the views determine the round-robin order.
     voxel_m
         Edge of a voxel, m.
     batch, camera, decoding
         The views.
-    near
-        (V, B) bit mask of the eighths of a block that are near a view's surface.
-    turns
+    near_surface
+        (V, B) bit mask of the octants of a block that are near a view's surface.
+    period
         Period of the round-robin integration of free space.
     """
-    keys, numbers, distance, weight, seen, color, free = blocks
+    keys, numbers, distance, weight, view_count, color, free_weight = blocks
     views, T_camera_world, heights, codes, intensity, cells, coarse = batch
     (rows, columns), lookup, lookup_frame, nodes = camera
-    weights, backs, reach = decoding
-    middle = 0.5 * (EDGE - 1) * voxel_m
-    radius = np.sqrt(3.0) * middle
-    # A block that can't be classified as a whole is divided into eighths.
-    small = np.sqrt(3.0) * 1.5 * voxel_m
+    weights, rear_limits, reach = decoding
+    half_extent = 0.5 * (EDGE - 1) * voxel_m
+    radius = np.sqrt(3.0) * half_extent
+    # A block that can't be classified as a whole is divided into octants.
+    octant_radius = np.sqrt(3.0) * 1.5 * voxel_m
     # Half a pixel, doubled as pixels of a lens with distortion differ in size.
     margin = max(cells.shape[2] / columns, cells.shape[1] / rows)
     coarse_frame = lookup_frame.copy()
@@ -553,14 +553,14 @@ def integrate(
     right = radius * np.sqrt(1 + x1 * x1)
     above = radius * np.sqrt(1 + y0 * y0)
     below = radius * np.sqrt(1 + y1 * y1)
-    straight = nodes == np.inf
+    undistorted = nodes == np.inf
     linear = _global_projection(lookup, lookup_frame)
     code = np.empty(64, np.int32)
     d = np.empty(64, np.float32)
     w = np.empty(64, np.float32)
-    back = np.empty(64, np.float32)
+    rear = np.empty(64, np.float32)
     centre = np.empty(3, np.float32)
-    # Offsets of an eighth's voxels from its centre, in the frame of each camera.
+    # Offsets of an octant's voxels from its centre, in the frame of each camera.
     offsets = np.empty((len(T_camera_world), 3, 64), np.float32)
     for s in range(len(T_camera_world)):
         for q in range(64):
@@ -570,20 +570,20 @@ def integrate(
                     + (((q >> 2) & 3) - 1.5) * T_camera_world[s, a, 1]
                     + ((q & 3) - 1.5) * T_camera_world[s, a, 2]
                 )
-    place = np.empty(64, np.int32)
+    pixels = np.empty(64, np.int32)
     points = np.empty((3, 64), np.float32)
     for b in range(start, stop):
         bi, bj, bk = block_of(keys[b])
         ox = bi * EDGE * voxel_m
         oy = bj * EDGE * voxel_m
         oz = bk * EDGE * voxel_m
-        mx = ox + middle
-        my = oy + middle
-        mz = oz + middle
+        mx = ox + half_extent
+        my = oy + half_extent
+        mz = oz + half_extent
         for s in range(len(T_camera_world)):
-            # Neighbouring blocks take turns in different views.
-            turn = (views[s] + numbers[b]) % turns == 0
-            if near[s, b] == 0 and not turn:
+            # Adjacent blocks are updated by different views.
+            is_turn = (views[s] + numbers[b]) % period == 0
+            if near_surface[s, b] == 0 and not is_turn:
                 continue
             T = T_camera_world[s]
             z = T[2, 0] * mx + T[2, 1] * my + T[2, 2] * mz + T[2, 3]
@@ -595,106 +595,119 @@ def integrate(
             y = T[1, 0] * mx + T[1, 1] * my + T[1, 2] * mz + T[1, 3]
             if y - y0 * z < -above or y - y1 * z > below:
                 continue
-            if near[s, b] == 0:
+            if near_surface[s, b] == 0:
                 state = _classify_ball(x, y, z, radius, coarse[s], coarse_frame, 0.25 * margin)
                 if state != 0:
-                    for part in range(8):
-                        free[b, part] += turns * max(0.0, state)
+                    for octant in range(8):
+                        free_weight[b, octant] += period * max(0.0, state)
                     continue
-            for part in range(8):
-                close = (near[s, b] >> part) & 1 == 1
-                if not (close or turn):
+            for octant in range(8):
+                is_near = (near_surface[s, b] >> octant) & 1 == 1
+                if not (is_near or is_turn):
                     continue
-                px = ox + (4 * (part >> 2) + 1.5) * voxel_m
-                py = oy + (4 * ((part >> 1) & 1) + 1.5) * voxel_m
-                pz = oz + (4 * (part & 1) + 1.5) * voxel_m
+                px = ox + (4 * (octant >> 2) + 1.5) * voxel_m
+                py = oy + (4 * ((octant >> 1) & 1) + 1.5) * voxel_m
+                pz = oz + (4 * (octant & 1) + 1.5) * voxel_m
                 x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
                 y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
                 z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-                if not close:
-                    state = _classify_ball(x, y, z, small, cells[s], lookup_frame, margin)
+                if not is_near:
+                    state = _classify_ball(x, y, z, octant_radius, cells[s], lookup_frame, margin)
                     if state != 0:
-                        free[b, part] += turns * max(0.0, state)
+                        free_weight[b, octant] += period * max(0.0, state)
                         continue
-                times = 1.0 if close else float(turns)
+                factor = 1.0 if is_near else float(period)
                 centre[0] = x
                 centre[1] = y
                 centre[2] = z
-                lines = straight
-                if not straight:
-                    linear = _local_projection(x, y, z, small, lookup, lookup_frame, nodes)
-                    lines = linear[6]
-                if lines:
-                    _project_linear(centre, offsets[s], linear, rows, columns, place, points)
+                is_linear = undistorted
+                if not undistorted:
+                    linear = _local_projection(x, y, z, octant_radius, lookup, lookup_frame, nodes)
+                    is_linear = linear[6]
+                if is_linear:
+                    _project_linear(centre, offsets[s], linear, rows, columns, pixels, points)
                 else:
                     _project_by_lookup(
-                        centre, offsets[s], lookup, lookup_frame, rows, columns, place, points
+                        centre, offsets[s], lookup, lookup_frame, rows, columns, pixels, points
                     )
-                voxels = slice(64 * part, 64 * part + 64)
-                _fetch(place, heights[s], codes[s], weights, backs, times, code, d, w, back)
-                _measure(code, points, d)
-                _average(d, w, back, reach, distance[b, voxels], weight[b, voxels])
-                _count(d, reach, seen[b, voxels])
+                voxels = slice(64 * octant, 64 * octant + 64)
+                _fetch(
+                    pixels,
+                    heights[s],
+                    codes[s],
+                    weights,
+                    rear_limits,
+                    factor,
+                    code,
+                    d,
+                    w,
+                    rear,
+                )
+                _point_to_plane(code, points, d)
+                _update_distances(d, w, rear, reach, distance[b, voxels], weight[b, voxels])
+                _count_views(d, reach, view_count[b, voxels])
                 if intensity.shape[2]:
-                    _average_color(place, d, reach, intensity[s], seen[b, voxels], color[b, voxels])
+                    _update_colors(
+                        pixels, d, reach, intensity[s], view_count[b, voxels], color[b, voxels]
+                    )
 
 
 @kernel
 def _fetch(
-    place: Int32,
+    pixels: Int32,
     heights: Float32,
     codes: Int32,
     weights: Float32,
-    backs: Float32,
-    times: float,
+    rear_limits: Float32,
+    factor: float,
     code: Int32,
     distance: Float32,
     weight: Float32,
-    back: Float32,
+    rear: Float32,
 ) -> None:
-    """Gather the pixels `place` (64,): plane codes, heights, weights and rear truncation distances.
+    """Fetch plane codes, heights, weights and rear truncation distances of `pixels` (64,).
 
-    Heights are written to `distance`; weights are multiplied by `times`.
+    Heights are written to `distance`; weights are multiplied by `factor`.
     """
-    many = np.float32(times)
+    factor32 = np.float32(factor)
     for q in range(64):
-        at = np.uintp(place[q])
-        code[q] = codes[at]
-        distance[q] = heights[at]
-        known = np.uintp((codes[at] >> 24) & 0xFF)
-        weight[q] = many * weights[known]
-        back[q] = backs[known]
+        pixel = np.uintp(pixels[q])
+        code[q] = codes[pixel]
+        distance[q] = heights[pixel]
+        weight_code = np.uintp((codes[pixel] >> 24) & 0xFF)
+        weight[q] = factor32 * weights[weight_code]
+        rear[q] = rear_limits[weight_code]
 
 
 @kernel
-def _measure(code: Int32, points: Float32, distance: Float32) -> None:
+def _point_to_plane(code: Int32, points: Float32, distance: Float32) -> None:
     """Convert the planes' heights in `distance` (64,) to distances of `points` (3, 64) to them."""
     for q in range(64):
         n0 = np.float32(np.int8(code[q]))
         n1 = np.float32(np.int8(code[q] >> 8))
         n2 = np.float32(np.int8(code[q] >> 16))
-        distance[q] -= _PER_UNIT * (n0 * points[0, q] + n1 * points[1, q] + n2 * points[2, q])
+        distance[q] -= _NORMAL_UNIT * (n0 * points[0, q] + n1 * points[1, q] + n2 * points[2, q])
 
 
 @kernel
-def _average(
+def _update_distances(
     new_distance: Float32,
     new_weight: Float32,
-    back: Float32,
+    rear: Float32,
     limit: float,
     distance: Float32,
     weight: Float32,
 ) -> None:
     """Update the weighted mean distances, branch-free so that the loop is vectorised.
 
-    New distances are truncated to +-`limit`, and are set to `limit` where nothing was observed.
+    New distances are truncated to +-`limit`, and set to `limit` where nothing was observed.
     """
-    cut = np.float32(limit)
+    truncation = np.float32(limit)
     for q in range(64):
         d = new_distance[q]
-        new = new_weight[q] if d >= -back[q] else np.float32(0)
-        d = d if d < cut and new > 0 else cut
-        d = d if d > -cut else -cut
+        new = new_weight[q] if d >= -rear[q] else np.float32(0)
+        d = d if d < truncation and new > 0 else truncation
+        d = d if d > -truncation else -truncation
         total = weight[q] + new
         distance[q] += (d - distance[q]) * (new / max(total, _MIN_WEIGHT))
         weight[q] = total
@@ -702,40 +715,40 @@ def _average(
 
 
 @kernel
-def _count(distance: Float32, limit: float, seen: UInt16) -> None:
-    """Increment the saturating counter of voxels whose surface is within `limit`."""
-    cut = np.float32(limit)
-    most = np.uint16(MAX_SEEN)
+def _count_views(distance: Float32, limit: float, view_count: UInt16) -> None:
+    """Increment the saturating view counters of voxels whose surface is within `limit`."""
+    truncation = np.float32(limit)
+    max_views = np.uint16(MAX_VIEWS)
     for q in range(64):
-        seen[q] += np.uint16((distance[q] < cut) & (seen[q] < most))
+        view_count[q] += np.uint16((distance[q] < truncation) & (view_count[q] < max_views))
 
 
 @kernel
-def _average_color(
-    place: Int32,
+def _update_colors(
+    pixels: Int32,
     distance: Float32,
     limit: float,
     intensity: Float32,
-    seen: UInt16,
+    view_count: UInt16,
     color: Float32,
 ) -> None:
     """Update the mean colour of the voxels whose surface is within `limit`.
 
     Black means that there is no colour, and is not averaged.
     """
-    cut = np.float32(limit)
+    truncation = np.float32(limit)
     for q in range(64):
-        if not distance[q] < cut:
+        if not distance[q] < truncation:
             continue
-        lit = False
-        tinted = False
+        has_color = False
+        had_color = False
         for n in range(intensity.shape[1]):
-            lit = lit or intensity[place[q], n] > 0
-            tinted = tinted or color[q, n] > 0
-        if lit:
-            per_image = np.float32(1) / np.float32(seen[q]) if tinted else np.float32(1)
+            has_color = has_color or intensity[pixels[q], n] > 0
+            had_color = had_color or color[q, n] > 0
+        if has_color:
+            inv_count = np.float32(1) / np.float32(view_count[q]) if had_color else np.float32(1)
             for n in range(intensity.shape[1]):
-                color[q, n] += (intensity[place[q], n] - color[q, n]) * per_image
+                color[q, n] += (intensity[pixels[q], n] - color[q, n]) * inv_count
 
 
 @kernel
@@ -745,20 +758,20 @@ def _project_linear(
     linear: tuple[float, float, float, float, float, float, bool],
     rows: int,
     columns: int,
-    place: Int32,
+    pixels: Int32,
     points: Float32,
 ) -> None:
-    """Project the voxels of an eighth of a block, branch-free so that the loop is vectorised.
+    """Project the voxels of an octant of a block, branch-free so that the loop is vectorised.
 
     Parameters
     ----------
     centre, offsets
-        (3,) of the eighth in the camera's frame, and (3, 64) voxels relative to it.
+        (3,) of the octant in the camera's frame, and (3, 64) voxels relative to it.
     linear
         From `_local_projection`.
     rows, columns
         Size of the image.
-    place
+    pixels
         (64,) written: row * columns + column, or rows * columns outside the image.
     points
         (3, 64) written: the voxels in the camera's frame.
@@ -766,18 +779,18 @@ def _project_linear(
     u0, v0 = np.float32(linear[0] + 1.5), np.float32(linear[1] + 1.5)
     ux, uy = np.float32(linear[2]), np.float32(linear[3])
     vx, vy = np.float32(linear[4]), np.float32(linear[5])
-    nearest, one = np.float32(1e-3), np.float32(1)
+    min_depth, one = np.float32(1e-3), np.float32(1)
     for a in range(3):
         for q in range(64):
             points[a, q] = centre[a] + offsets[a, q]
     for q in range(64):
         x, y, z = points[0, q], points[1, q], points[2, q]
-        per_z = one / z
+        inv_z = one / z
         # The conversion truncates towards zero; adding 1 first makes it round down.
-        c = np.int32(u0 + (ux * x + uy * y) * per_z) - np.int32(1)
-        r = np.int32(v0 + (vx * x + vy * y) * per_z) - np.int32(1)
-        inside = (z >= nearest) & (c >= 0) & (r >= 0) & (c < columns) & (r < rows)
-        place[q] = r * columns + c if inside else rows * columns
+        c = np.int32(u0 + (ux * x + uy * y) * inv_z) - np.int32(1)
+        r = np.int32(v0 + (vx * x + vy * y) * inv_z) - np.int32(1)
+        inside = (z >= min_depth) & (c >= 0) & (r >= 0) & (c < columns) & (r < rows)
+        pixels[q] = r * columns + c if inside else rows * columns
 
 
 @kernel
@@ -788,32 +801,32 @@ def _project_by_lookup(
     lookup_frame: Float64,
     rows: int,
     columns: int,
-    place: Int32,
+    pixels: Int32,
     points: Float32,
 ) -> None:
-    """Do the same as `_project_linear` by interpolating in the lookup for each voxel."""
+    """Do the same as `_project_linear`, by interpolation in the lookup for each voxel."""
     for q in range(64):
         for a in range(3):
             points[a, q] = centre[a] + offsets[a, q]
-        place[q] = rows * columns
+        pixels[q] = rows * columns
         z = points[2, q]
         if z < 1e-3:
             continue
         u, v, node, _ = project_ray(points[0, q] / z, points[1, q] / z, lookup, lookup_frame)
         if node < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
-        place[q] = int(v + 0.5) * columns + int(u + 0.5)
+        pixels[q] = int(v + 0.5) * columns + int(u + 0.5)
 
 
 @kernel
 def apply_free_space(blocks: Blocks, reach: float, start: int, stop: int) -> None:
-    """Integrate the free-space weights of whole eighths into the voxels of blocks start..stop."""
-    distance, weight, free = blocks.distance, blocks.weight, blocks.free
+    """Integrate the free-space weights of whole octants into the voxels of blocks start..stop."""
+    distance, weight, free_weight = blocks.distance, blocks.weight, blocks.free_weight
     for b in range(start, stop):
         for v in range(VOXELS):
-            new = free[b, v >> 6]
+            new = free_weight[b, v >> 6]
             if new > 0:
                 total = weight[b, v] + new
                 distance[b, v] += (reach - distance[b, v]) * new / total
                 weight[b, v] = total
-        free[b] = 0
+        free_weight[b] = 0

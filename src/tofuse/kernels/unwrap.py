@@ -1,4 +1,4 @@
-"""Loopy belief propagation over whole periods of neighbouring pixels."""
+"""Loopy belief propagation of the number of periods between neighbouring pixels."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import numpy as np
 from tofuse.arrays import Bool, Float32
 from tofuse.kernels.jit import kernel
 
-# Where a pixel's neighbours lie, (row, column): opposite directions two apart.
-STEPS = ((0, 1), (1, 0), (0, -1), (-1, 0))
+# Offsets of a pixel's neighbours, (row, column); opposite directions are two places apart.
+NEIGHBOURS = ((0, 1), (1, 0), (0, -1), (-1, 0))
 
 
 @kernel
@@ -18,7 +18,7 @@ def pass_messages(
     unary: Float32,
     period: float,
     scale: float,
-    most: float,
+    truncation: float,
     weight: float,
     start: int,
     stop: int,
@@ -27,7 +27,8 @@ def pass_messages(
 ) -> None:
     """Update the messages that pixels of one colour of a checkerboard send to their neighbours.
 
-    Min-sum (Felzenszwalb and Huttenlocher 2006; half of the pixels at a time, section 3.2).
+    Min-sum algorithm (Felzenszwalb and Huttenlocher 2006; half of the pixels at a time, section
+    3.2).
 
     Parameters
     ----------
@@ -35,12 +36,12 @@ def pass_messages(
         Wrapped range in [0, period).
     unary (H, W, K)
         Cost of each number of periods.
-    period, scale, most, weight
-        Neighbours a and b, unwrapped, cost weight * min(|a - b| / scale, most).
+    period, scale, truncation, weight
+        Neighbours with unwrapped ranges a and b cost weight * min(|a - b| / scale, truncation).
     start, stop, parity
         Rows whose pixels (i + j) % 2 == parity send.
     messages (4, H, W, K)
-        Messages received by each pixel from each side, in the order of `STEPS`; updated.
+        Messages received by each pixel from each side, in the order of `NEIGHBOURS`; updated.
     """
     height, width, labels = unary.shape
     belief = np.empty(labels)
@@ -50,25 +51,25 @@ def pass_messages(
             if not valid[i, j] or (i + j) % 2 != parity:
                 continue
             for s in range(4):
-                v, u = i + STEPS[s][0], j + STEPS[s][1]
+                v, u = i + NEIGHBOURS[s][0], j + NEIGHBOURS[s][1]
                 if v < 0 or u < 0 or v >= height or u >= width or not valid[v, u]:
                     continue
                 for k in range(labels):
                     total = unary[i, j, k]
                     for t in range(4):
-                        # The message received from there is not sent back.
+                        # The message received from that neighbour is not sent back.
                         if t != s:
                             total += messages[t, i, j, k]
                     belief[k] = total
                 difference = range_m[v, u] - range_m[i, j]
-                least = np.inf
+                lowest = np.inf
                 for m in range(labels):
                     best = np.inf
                     for k in range(labels):
-                        gap = abs(difference + (m - k) * period) / scale
-                        best = min(best, belief[k] + weight * min(gap, most))
+                        jump = abs(difference + (m - k) * period) / scale
+                        best = min(best, belief[k] + weight * min(jump, truncation))
                     sent[m] = best
-                    least = min(least, best)
-                back = (s + 2) % 4
+                    lowest = min(lowest, best)
+                opposite = (s + 2) % 4
                 for m in range(labels):
-                    messages[back, v, u, m] = sent[m] - least
+                    messages[opposite, v, u, m] = sent[m] - lowest

@@ -1,4 +1,4 @@
-"""How well one range image agrees with another under a relative pose."""
+"""Agreement of one range image with another under a relative pose."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from tofuse.kernels.jit import kernel
 
 
 @kernel
-def move_points(points: Float64, T: Float64, out: Float64) -> None:
-    """Write the points (N, 3) mapped by T (4, 4); the origin for those at z = 0, the invalid."""
+def transform_points(points: Float64, T: Float64, out: Float64) -> None:
+    """Write the points (N, 3) transformed by T (4, 4); invalid ones (z = 0) become the origin."""
     for k in range(len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         if z == 0:
@@ -49,17 +49,17 @@ def project_by_lens(points: Float64, lens: Float64, out: Float64) -> None:
         if r2 > lens[13]:
             continue
         if lens[12] == 1:
-            above = 1 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
-            below = 1 + r2 * (lens[9] + r2 * (lens[10] + r2 * lens[11]))
-            scale = above / below
+            numerator = 1 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
+            denominator = 1 + r2 * (lens[9] + r2 * (lens[10] + r2 * lens[11]))
+            scale = numerator / denominator
             u = x * scale + 2 * lens[6] * x * y + lens[7] * (r2 + 2 * x * x)
             v = y * scale + lens[6] * (r2 + 2 * y * y) + 2 * lens[7] * x * y
         else:
             r = math.sqrt(r2)
             theta = math.atan(r)
             t2 = theta * theta
-            bent = theta * (1 + t2 * (lens[4] + t2 * (lens[5] + t2 * (lens[8] + t2 * lens[9]))))
-            scale = bent / r if r > 1e-9 else 1.0
+            theta_d = theta * (1 + t2 * (lens[4] + t2 * (lens[5] + t2 * (lens[8] + t2 * lens[9]))))
+            scale = theta_d / r if r > 1e-9 else 1.0
             u, v = x * scale, y * scale
         out[k, 0] = lens[0] * u + lens[2]
         out[k, 1] = lens[1] * v + lens[3]
@@ -74,7 +74,7 @@ def agreement_sums(
     same_surface: float,
     inlier: float,
 ) -> tuple[int, int, int, float]:
-    """Compare points with the image they project to.
+    """Compare points with the image that they project to.
 
     Parameters
     ----------
@@ -93,9 +93,9 @@ def agreement_sums(
     among these; and the sum of the inliers' squared distances from the plane, m^2.
     """
     height, width = target.shape[:2]
-    overlapping, planes, inliers, squares = 0, 0, 0, 0.0
+    overlapping, plane_points, inliers, squares = 0, 0, 0, 0.0
     for k in range(len(points)):
-        # Half to even, as NumPy's rint.
+        # Ties go to even numbers, as in NumPy.
         u, v = np.rint(pixels[k, 0]), np.rint(pixels[k, 1])
         if not (points[k, 2] > 0.05 and u >= 0 and v >= 0 and u < width and v < height):
             continue
@@ -108,10 +108,10 @@ def agreement_sums(
         nx, ny, nz = normals[i, j, 0], normals[i, j, 1], normals[i, j, 2]
         if nx == 0 and ny == 0 and nz == 0:
             continue
-        planes += 1
+        plane_points += 1
         dx, dy = points[k, 0] - target[i, j, 0], points[k, 1] - target[i, j, 1]
         if math.sqrt(dx * dx + dy * dy + dz * dz) <= inlier:
             inliers += 1
             r = nx * dx + ny * dy + nz * dz
             squares += r * r
-    return overlapping, planes, inliers, squares
+    return overlapping, plane_points, inliers, squares

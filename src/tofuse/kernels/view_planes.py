@@ -30,8 +30,8 @@ def halve(
     """Downsample an image by 2 without mixing surfaces, to rows start..stop of the output.
 
     Of each 2 x 2 pixels, those whose depth is within `jump` (relative) of the second nearest are
-    averaged: inverse depths, and `value`. Pixels with depth 0 are invalid. `variance`, that of z,
-    becomes the variance of the mean of independent values.
+    averaged: their inverse depths and their `value`. Pixels with depth 0 are invalid. `variance`,
+    that of z, becomes the variance of the mean of independent values.
 
     Parameters
     ----------
@@ -80,20 +80,20 @@ def halve(
                 value_out[i, j] = 0
                 variance_out[i, j] = 0
                 continue
-            middle = d[1] if n > 1 else d[0]
-            total = 0.0
-            amount = 0.0
-            spread = 0.0
+            reference = d[1] if n > 1 else d[0]
+            w_sum = 0.0
+            value_sum = 0.0
+            variance_sum = 0.0
             count = 0
             for k in range(n):
-                if abs(d[k] - middle) <= jump * middle:
-                    total += 1.0 / d[k]
-                    amount += a[k]
-                    spread += s[k]
+                if abs(d[k] - reference) <= jump * reference:
+                    w_sum += 1.0 / d[k]
+                    value_sum += a[k]
+                    variance_sum += s[k]
                     count += 1
-            z_out[i, j] = count / total
-            value_out[i, j] = amount / count
-            variance_out[i, j] = spread / (count * count)
+            z_out[i, j] = count / w_sum
+            value_out[i, j] = value_sum / count
+            variance_out[i, j] = variance_sum / (count * count)
 
 
 @kernel
@@ -104,8 +104,8 @@ def fit_planes(
     wanted: Bool,
     radii: Int64,
     limit: float,
-    fill: float,
-    offset: float,
+    min_fill: float,
+    max_offset2: float,
     planes: Float32,
     quality: Float32,
     start: int,
@@ -119,7 +119,7 @@ def fit_planes(
 
     A window contains one surface if its mean weighted squared residual is within three standard
     deviations of that of noise with variance `limit`, the pixel itself is within 5 sigmas, enough
-    of the window is valid, and the valid pixels surround the pixel, unlike at an occlusion edge.
+    of the window is valid, and the valid pixels surround the pixel, unlike at an occluding edge.
 
     Parameters
     ----------
@@ -131,9 +131,9 @@ def fit_planes(
         Half widths of the windows in pixels, ascending.
     limit
         Expected mean weighted squared residual.
-    fill
+    min_fill
         Smallest valid fraction of a window.
-    offset
+    max_offset2
         Largest squared offset of the valid pixels' centroid, relative to their variance.
     planes
         (H, W, 4) written: coefficients a, b, c of 1/z = a x + b y + c, and 1/z at the pixel; 0
@@ -146,28 +146,28 @@ def fit_planes(
         Rows to fit.
     """
     rows, columns = w.shape
-    # Ring buffer of as many rows of the integral image as a window needs.
-    most = radii[-1]
-    kept = 2 * most + 2
-    sums = np.empty((kept, columns + 1, _SUMS))
-    summed = max(start - most, 0)
-    sums[summed % kept] = 0.0
+    # Ring buffer of those rows of the integral image that a window needs.
+    max_radius = radii[-1]
+    buffer_rows = 2 * max_radius + 2
+    sums = np.empty((buffer_rows, columns + 1, _SUMS))
+    summed = max(start - max_radius, 0)
+    sums[summed % buffer_rows] = 0.0
     s = np.empty(_SUMS)
-    per_free, allowed = _by_count(radii, limit)
+    inv_dof, max_residual = _tabulate_by_count(radii, limit)
     above, below = np.empty_like(radii), np.empty_like(radii)
     for i in range(start, stop):
-        while summed < min(i + most + 1, rows):
+        while summed < min(i + max_radius + 1, rows):
             _add_row(
                 w[summed],
                 rays[summed],
                 weight[summed],
-                sums[summed % kept],
-                sums[(summed + 1) % kept],
+                sums[summed % buffer_rows],
+                sums[(summed + 1) % buffer_rows],
             )
             summed += 1
         for q in range(len(radii)):
-            above[q] = max(i - radii[q], 0) % kept
-            below[q] = min(i + radii[q] + 1, rows) % kept
+            above[q] = max(i - radii[q], 0) % buffer_rows
+            below[q] = min(i + radii[q] + 1, rows) % buffer_rows
         for j in range(columns):
             planes[i, j, 0] = 0
             planes[i, j, 1] = 0
@@ -183,47 +183,47 @@ def fit_planes(
             # bridges a gap that a smaller one has detected.
             for q in range(len(radii)):
                 r = radii[q]
-                high, low = sums[above[q]], sums[below[q]]
+                upper, lower = sums[above[q]], sums[below[q]]
                 left = max(j - r, 0)
                 right = min(j + r + 1, columns)
                 for k in range(_SUMS):
-                    s[k] = low[right, k] - high[right, k] - low[left, k] + high[left, k]
+                    s[k] = lower[right, k] - upper[right, k] - lower[left, k] + upper[left, k]
                 n = s[10]
                 side = 2 * r + 1
-                if n < fill * side * side or n < 6:
+                if n < min_fill * side * side or n < 6:
                     break
-                inverse = 1.0 / s[0]
-                mx = s[1] * inverse
-                my = s[2] * inverse
-                mw = s[3] * inverse
-                cxx = s[4] * inverse - mx * mx
-                cxy = s[5] * inverse - mx * my
-                cyy = s[6] * inverse - my * my
-                cxw = s[7] * inverse - mx * mw
-                cyw = s[8] * inverse - my * mw
-                cww = s[9] * inverse - mw * mw
+                inv_weight = 1.0 / s[0]
+                mx = s[1] * inv_weight
+                my = s[2] * inv_weight
+                mw = s[3] * inv_weight
+                cxx = s[4] * inv_weight - mx * mx
+                cxy = s[5] * inv_weight - mx * my
+                cyy = s[6] * inv_weight - my * my
+                cxw = s[7] * inv_weight - mx * mw
+                cyw = s[8] * inv_weight - my * mw
+                cww = s[9] * inv_weight - mw * mw
                 det = cxx * cyy - cxy * cxy
                 if not det > 1e-6 * cxx * cyy:
                     break
                 dx = x0 - mx
                 dy = y0 - my
-                if dx * dx > offset * cxx or dy * dy > offset * cyy:
+                if dx * dx > max_offset2 * cxx or dy * dy > max_offset2 * cyy:
                     break
-                per_det = 1.0 / det
-                a = (cyy * cxw - cxy * cyw) * per_det
-                b = (cxx * cyw - cxy * cxw) * per_det
-                left_over = max(cww - a * cxw - b * cyw, 0.0) * s[0] * per_free[q, int(n)]
+                inv_det = 1.0 / det
+                a = (cyy * cxw - cxy * cyw) * inv_det
+                b = (cxx * cyw - cxy * cxw) * inv_det
+                residual = max(cww - a * cxw - b * cyw, 0.0) * s[0] * inv_dof[q, int(n)]
                 if q == 0:
-                    quality[i, j, 0] = left_over
+                    quality[i, j, 0] = residual
                 value = mw + a * dx + b * dy
-                off = np.float64(w[i, j]) - value
-                if left_over > allowed[q, int(n)]:
+                deviation = np.float64(w[i, j]) - value
+                if residual > max_residual[q, int(n)]:
                     break
-                if off * off * weight[i, j] > 25 * limit or value <= 0:
+                if deviation * deviation * weight[i, j] > 25 * limit or value <= 0:
                     break
                 if q == 0:
-                    leverage = (cyy * dx * dx - 2 * cxy * dx * dy + cxx * dy * dy) * per_det
-                    quality[i, j, 1] = inverse * (1.0 + leverage)
+                    leverage = (cyy * dx * dx - 2 * cxy * dx * dy + cxx * dy * dy) * inv_det
+                    quality[i, j, 1] = inv_weight * (1.0 + leverage)
                     planes[i, j, 3] = value
                 planes[i, j, 0] = a
                 planes[i, j, 1] = b
@@ -231,21 +231,21 @@ def fit_planes(
 
 
 @kernel
-def _by_count(radii: Int64, limit: float) -> tuple[Float64, Float64]:
+def _tabulate_by_count(radii: Int64, limit: float) -> tuple[Float64, Float64]:
     """Tabulate 1 / (n - 3) and the largest mean squared residual by the number n of valid pixels.
 
     Each is (len(radii), largest n + 1).
     """
-    most = (2 * radii[-1] + 1) ** 2
-    per_free = np.zeros((len(radii), most + 1))
-    allowed = np.zeros((len(radii), most + 1))
+    max_count = (2 * radii[-1] + 1) ** 2
+    inv_dof = np.zeros((len(radii), max_count + 1))
+    max_residual = np.zeros((len(radii), max_count + 1))
     for q in range(len(radii)):
         for n in range(4, (2 * radii[q] + 1) ** 2 + 1):
-            per_free[q, n] = 1.0 / (n - 3)
+            inv_dof[q, n] = 1.0 / (n - 3)
             # The mean of n - 3 squared normal deviates has a standard deviation of
             # sqrt(2 / (n - 3)).
-            allowed[q, n] = limit * (1.0 + 3.0 * np.sqrt(2.0 / (n - 3)))
-    return per_free, allowed
+            max_residual[q, n] = limit * (1.0 + 3.0 * np.sqrt(2.0 / (n - 3)))
+    return inv_dof, max_residual
 
 
 @kernel
@@ -285,8 +285,8 @@ def albedo_image(
     planes: Float32,
     rays: Float32,
     amplitude: Float32,
-    falls: bool,
-    own_lamp: bool,
+    inverse_square: bool,
+    active_illumination: bool,
     falloff: float,
     out: Float32,
 ) -> None:
@@ -296,10 +296,10 @@ def albedo_image(
     ----------
     planes, rays, amplitude
         (H, W, 4) of `fit_planes`, (H, W, 2), and (H, W) amplitude.
-    falls
-        Whether the amplitude falls with the squared range; it does not if it is range-compensated.
-    own_lamp
-        Whether the scene is lit by the camera. Otherwise the cosine of incidence is left out, as
+    inverse_square
+        Whether the amplitude falls with the squared range; not if it is range-compensated.
+    active_illumination
+        Whether the camera illuminates the scene. Otherwise the cosine of incidence is left out, as
         for a Lambertian surface in ambient light.
     falloff
         Exponent of the cosine to the optical axis by which amplitude falls off.
@@ -324,9 +324,9 @@ def albedo_image(
             cosine = v / np.sqrt((a * a + b * b + c * c) * length2)
             if cosine < np.float32(0.15):
                 continue
-            shade = cosine if own_lamp else one
-            apart = length2 / (v * v)  # the squared range
-            out[i, j] = np.log(amplitude[i, j] / shade * (apart if falls else one))
+            shading = cosine if active_illumination else one
+            range2 = length2 / (v * v)  # the squared range
+            out[i, j] = np.log(amplitude[i, j] / shading * (range2 if inverse_square else one))
             if falloff != 0:
                 out[i, j] += np.float32(0.5 * falloff) * np.log(length2)
 
@@ -342,7 +342,7 @@ def smooth_and_slope(
     start: int,
     stop: int,
 ) -> None:
-    """Box-filter an image with NaN holes and compute its gradient, not across depth edges.
+    """Box-filter an image with NaN holes and compute its gradient, except across depth edges.
 
     Parameters
     ----------
@@ -351,40 +351,40 @@ def smooth_and_slope(
     radius
         Boxes have (2 radius + 1)^2 pixels. A partial box is assigned to the centroid of its pixels.
     jump
-        The gradient needs four neighbours whose planes continue the centre's to within this
-        fraction of the inverse depth.
+        The gradient requires four neighbours whose inverse depths agree with the centre's plane to
+        within this fraction.
     out
         (H, W, 3) written in rows start..stop: mean, and its derivatives by the ray coordinates x
         and y; NaN where they are not defined.
     """
     rows, columns = image.shape
     h = radius + 1
-    above = max(start - h, 0)
-    mean = np.empty((min(stop + h, rows) - above, columns, 3), np.float32)
-    _box_means(image, rays, radius, above, mean)
+    first_row = max(start - h, 0)
+    mean = np.empty((min(stop + h, rows) - first_row, columns, 3), np.float32)
+    _box_means(image, rays, radius, first_row, mean)
     inner = columns - 2 * h
     for i in range(start, stop):
         out[i] = np.nan
         if i < h or i >= rows - h or inner <= 0:
             continue
         # Pixels with four neighbours at distance h, and these neighbours.
-        here, k = slice(h, h + inner), i - above
-        m, p, r = mean[k, here], planes[i, here], rays[i, here]
+        interior, k = slice(h, h + inner), i - first_row
+        m, p, r = mean[k, interior], planes[i, interior], rays[i, interior]
         m0, p0, r0 = mean[k, :inner], planes[i, :inner], rays[i, :inner]
         m1, p1, r1 = mean[k, 2 * h :], planes[i, 2 * h :], rays[i, 2 * h :]
-        m2, p2, r2 = mean[k - h, here], planes[i - h, here], rays[i - h, here]
-        m3, p3, r3 = mean[k + h, here], planes[i + h, here], rays[i + h, here]
-        own, to = image[i, here], out[i, here]
+        m2, p2, r2 = mean[k - h, interior], planes[i - h, interior], rays[i - h, interior]
+        m3, p3, r3 = mean[k + h, interior], planes[i + h, interior], rays[i + h, interior]
+        image_row, out_row = image[i, interior], out[i, interior]
         for j in range(inner):
             v = p[j, 3]
-            if v <= 0 or np.isnan(own[j]):
+            if v <= 0 or np.isnan(image_row[j]):
                 continue
-            most = np.float32(jump) * v
+            tolerance = np.float32(jump) * v
             if not (
-                _continues(p[j], p0[j], r0[j], most)
-                and _continues(p[j], p1[j], r1[j], most)
-                and _continues(p[j], p2[j], r2[j], most)
-                and _continues(p[j], p3[j], r3[j], most)
+                _continues(p[j], p0[j], r0[j], tolerance)
+                and _continues(p[j], p1[j], r1[j], tolerance)
+                and _continues(p[j], p2[j], r2[j], tolerance)
+                and _continues(p[j], p3[j], r3[j], tolerance)
             ):
                 continue
             # Chain rule from pixel to ray coordinates, for any lens. Missing means are NaN and
@@ -392,63 +392,63 @@ def smooth_and_slope(
             du, dv = m1[j, 0] - m0[j, 0], m3[j, 0] - m2[j, 0]
             xu, xv = m1[j, 1] - m0[j, 1], m3[j, 1] - m2[j, 1]
             yu, yv = m1[j, 2] - m0[j, 2], m3[j, 2] - m2[j, 2]
-            per_det = np.float32(1) / (xu * yv - yu * xv)
-            sx = (yv * du - yu * dv) * per_det
-            sy = (xu * dv - xv * du) * per_det
-            to[j, 0] = m[j, 0] + sx * (r[j, 0] - m[j, 1]) + sy * (r[j, 1] - m[j, 2])
-            to[j, 1] = sx
-            to[j, 2] = sy
+            inv_det = np.float32(1) / (xu * yv - yu * xv)
+            sx = (yv * du - yu * dv) * inv_det
+            sy = (xu * dv - xv * du) * inv_det
+            out_row[j, 0] = m[j, 0] + sx * (r[j, 0] - m[j, 1]) + sy * (r[j, 1] - m[j, 2])
+            out_row[j, 1] = sx
+            out_row[j, 2] = sy
 
 
 @kernel
-def _continues(plane: Float32, other: Float32, ray: Float32, most: np.float32) -> bool:
-    """Whether a plane extends to another pixel, to within `most` in inverse depth."""
+def _continues(plane: Float32, other: Float32, ray: Float32, tolerance: np.float32) -> bool:
+    """Whether a plane continues at another pixel, to within `tolerance` in inverse depth."""
     expected = plane[0] * ray[0] + plane[1] * ray[1] + plane[2]
-    return other[3] > 0 and abs(other[3] - expected) <= most
+    return other[3] > 0 and abs(other[3] - expected) <= tolerance
 
 
 @kernel
-def _box_means(image: Float32, rays: Float32, radius: int, above: int, out: Float32) -> None:
-    """Write mean and centroid (x, y) of each pixel's box, from row `above` on, to `out`.
+def _box_means(image: Float32, rays: Float32, radius: int, first_row: int, out: Float32) -> None:
+    """Write mean and centroid (x, y) of each pixel's box, from row `first_row` on, to `out`.
 
     `out` is (rows, W, 3); NaN where the box is empty.
     """
     rows, columns = image.shape
     full = np.float32((2 * radius + 1) * (2 * radius + 1))
-    per_full = np.float32(1) / full
+    inv_full = np.float32(1) / full
     known = np.empty(columns, np.float32)
-    one, none = np.float32(1), np.float32(0)
+    one, zero = np.float32(1), np.float32(0)
     # Sums over the rows of a box, padded by zeros, and sums over the whole box.
-    down = np.zeros((4, columns + 2 * radius), np.float32)
-    box = np.empty((4, columns), np.float32)
+    column_sums = np.zeros((4, columns + 2 * radius), np.float32)
+    box_sums = np.empty((4, columns), np.float32)
     for k in range(out.shape[0]):
-        i = above + k
-        down[:, radius : radius + columns] = 0.0
+        i = first_row + k
+        column_sums[:, radius : radius + columns] = 0.0
         for a in range(max(i - radius, 0), min(i + radius + 1, rows)):
-            line = image[a]
+            row = image[a]
             for j in range(columns):
-                known[j] = none if np.isnan(line[j]) else one
-            _add_known(down[0, radius:], line, known)
-            _add_known(down[1, radius:], known, known)
-            _add_known(down[2, radius:], rays[a, :, 0], known)
-            _add_known(down[3, radius:], rays[a, :, 1], known)
-        box[:] = 0.0
+                known[j] = zero if np.isnan(row[j]) else one
+            _add_known(column_sums[0, radius:], row, known)
+            _add_known(column_sums[1, radius:], known, known)
+            _add_known(column_sums[2, radius:], rays[a, :, 0], known)
+            _add_known(column_sums[3, radius:], rays[a, :, 1], known)
+        box_sums[:] = 0.0
         for c in range(4):
             for b in range(2 * radius + 1):
-                total, part = box[c], down[c, b : b + columns]
+                total, column_part = box_sums[c], column_sums[c, b : b + columns]
                 for j in range(columns):
-                    total[j] += part[j]
+                    total[j] += column_part[j]
         for j in range(columns):
-            if box[1, j] == full:
-                out[k, j, 0] = box[0, j] * per_full
+            if box_sums[1, j] == full:
+                out[k, j, 0] = box_sums[0, j] * inv_full
                 out[k, j, 1], out[k, j, 2] = rays[i, j, 0], rays[i, j, 1]
             else:
                 for c in range(3):
-                    out[k, j, c] = box[c if c == 0 else c + 1, j] / box[1, j]
+                    out[k, j, c] = box_sums[c if c == 0 else c + 1, j] / box_sums[1, j]
 
 
 @kernel
 def _add_known(total: Float32, values: Float32, known: Float32) -> None:
-    none = np.float32(0)
+    zero = np.float32(0)
     for j in range(len(known)):
-        total[j] += values[j] if known[j] > none else none
+        total[j] += values[j] if known[j] > zero else zero

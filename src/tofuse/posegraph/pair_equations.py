@@ -17,7 +17,7 @@ from tofuse.geometry import se3
 from tofuse.kernels import pair_equations as kernels
 from tofuse.kernels import steps
 from tofuse.kernels.alignment import POINT_SIZE
-from tofuse.kernels.shared_error import discount_shared_errors
+from tofuse.kernels.shared_error import marginalise_shared_errors
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.view_store import SampledView
@@ -272,7 +272,9 @@ def discount_shared(
         return
 
     def work(a: int, b: int) -> None:
-        discount_shared_errors(state.sums, correlation, variance[a:b], photometric[a:b], state.rows)
+        marginalise_shared_errors(
+            state.sums, correlation, variance[a:b], photometric[a:b], state.rows
+        )
 
     run_chunks(work, len(photometric), -(-len(photometric) // _PAIRS_A_CHUNK))
 

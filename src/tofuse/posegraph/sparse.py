@@ -100,7 +100,7 @@ class PairSystem:
         rows = np.concatenate([np.arange(n), self.rows])
         columns = np.concatenate([np.arange(n), self.columns])
         panels = _panels(n, rows, columns, self.size)
-        return panels, kernels.places(panels, rows, columns)
+        return panels, kernels.entry_indices(panels, rows, columns)
 
     def assemble(
         self,

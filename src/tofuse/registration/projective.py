@@ -99,7 +99,7 @@ def points_of(view: PreparedView, stride: int) -> Float32:
     The points lie on the fitted surface, as the target's do, so that the smoothing of curved
     surfaces is the same for both.
     """
-    return kernels.gather(view.images, stride)
+    return kernels.sample_points(view.images, stride)
 
 
 def _points_of_level(view: PreparedView, level: Level) -> Float32:
@@ -327,7 +327,7 @@ def align(
 
 def _initial_exposure(points: Float32, targets: Sequence[Target], T: Float64) -> float:
     """Return the median difference in log albedo over a subset of the points at T (4, 4)."""
-    stride = max(1, len(points) // steps.SOME_POINTS)
+    stride = max(1, len(points) // steps.SAMPLE_SIZE)
     per_target = []
     for target in targets:
         T_target_source = np.ascontiguousarray(target.T_target_world @ T)

@@ -174,14 +174,14 @@ def patches(
     tile_sums = tile_sums[valid]
     weights = tile_sums[:, kernels.WEIGHT]
     return Patches(
-        _matrix(upper[kernels.GEOMETRY]),
-        _matrix(upper[kernels.PHOTO]),
-        _matrix(upper[kernels.WEIGHED]),
+        _matrix(upper[kernels.GEOMETRIC]),
+        _matrix(upper[kernels.PHOTOMETRIC]),
+        _matrix(upper[kernels.WEIGHTED]),
         _matrix(upper[kernels.CROSS]),
         positions,
         weights,
         tile_sums[:, kernels.RESIDUAL] / weights,
-        tile_sums[:, kernels.A : kernels.A + 7] * _SCALE,
+        tile_sums[:, kernels.RESPONSE : kernels.RESPONSE + 7] * _SCALE,
         sum(changes) / len(changes),
         depth,
         stride,

@@ -183,7 +183,7 @@ def distances_between(
         rows,
     )
     distance = np.abs(rows[:, kernels.RESIDUAL])
-    valid = (rows[:, kernels.OWN] > 0) & (distance < _MAX_DISTANCE * target.depth)
+    valid = (rows[:, kernels.RESIDUAL_VARIANCE] > 0) & (distance < _MAX_DISTANCE * target.depth)
     return np.asarray(distance[valid], np.float64)
 
 
@@ -234,7 +234,7 @@ class _System:
                     out,
                 )
                 # Larger distances are between different surfaces.
-                valid = (out[:, kernels.OWN] > 0) & (
+                valid = (out[:, kernels.RESIDUAL_VARIANCE] > 0) & (
                     np.abs(out[:, kernels.RESIDUAL]) < _MAX_DISTANCE * self.depth
                 )
                 if valid.sum() >= self.options.overlap * len(points):
@@ -249,7 +249,9 @@ class _System:
         ratios: dict[tuple[int, int], list[Float64]] = {}
         for (i, j), row in zip(self.pairs, rows, strict=True):
             ends = self.views[i].camera, self.views[j].camera
-            ratios.setdefault(ends, []).append(row[:, kernels.RESIDUAL] ** 2 / row[:, kernels.OWN])
+            ratios.setdefault(ends, []).append(
+                row[:, kernels.RESIDUAL] ** 2 / row[:, kernels.RESIDUAL_VARIANCE]
+            )
         for a in range(count):
             for b in range(count):
                 normalised = np.concatenate(ratios.get((a, b), [np.zeros(0)]))
@@ -263,7 +265,7 @@ class _System:
         The first uses the mean of both normals, the second half of their difference.
         """
         target, source = (self.views[i].camera for i in self.pairs[k])
-        p = row[:, kernels.MOVED : kernels.MOVED + 3]
+        p = row[:, kernels.SOURCE_POINT : kernels.SOURCE_POINT + 3]
         m = row[:, kernels.TARGET_NORMAL : kernels.TARGET_NORMAL + 3]
         s = row[:, kernels.SOURCE_NORMAL : kernels.SOURCE_NORMAL + 3]
         T_source_target = se3.inverse(self.poses[source]) @ self.poses[target]
@@ -275,8 +277,8 @@ class _System:
                 np.concatenate([J, np.zeros((len(J), 1)), J @ by_target, np.zeros((len(J), 1))], 1)
             )
         by_mean, by_difference = out
-        by_mean[:, 6] = row[:, kernels.BY_SOURCE]
-        by_mean[:, 13] = row[:, kernels.BY_TARGET]
+        by_mean[:, 6] = row[:, kernels.BY_SOURCE_OFFSET]
+        by_mean[:, 13] = row[:, kernels.BY_TARGET_OFFSET]
         return by_mean * np.tile(_UNITS, 2), by_difference * np.tile(_UNITS, 2)
 
     def unknowns(self, k: int) -> Intp:
@@ -320,7 +322,9 @@ class _System:
     def weights(self, k: int, row: Float64, inflation_m: float) -> tuple[Float64, Float64]:
         """Return Tukey's weights over the variance, and the derivative of the influence."""
         target, source = (self.views[i].camera for i in self.pairs[k])
-        variance = row[:, kernels.OWN] * self.scale[target, source] ** 2 + inflation_m**2
+        variance = (
+            row[:, kernels.RESIDUAL_VARIANCE] * self.scale[target, source] ** 2 + inflation_m**2
+        )
         e2 = row[:, kernels.RESIDUAL] ** 2 / (variance * self.options.robust**2)
         f = np.maximum(1 - e2, 0)
         return f * f / variance, f * (1 - 5 * e2) / variance
@@ -352,7 +356,9 @@ class _System:
             gradient = np.zeros((len(row), size))
             gradient[:, at] = J * (w * r)[:, None]
             source = self.views[self.pairs[k][1]].camera
-            positions = se3.transform(self.poses[source], row[:, kernels.MOVED : kernels.MOVED + 3])
+            positions = se3.transform(
+                self.poses[source], row[:, kernels.SOURCE_POINT : kernels.SOURCE_POINT + 3]
+            )
             positions /= self.depth
             region, summed = by_region(positions, gradient)
             regions.append(region)
@@ -422,11 +428,11 @@ class _System:
             (N, 14) its weighted derivatives, see `jacobian`.
         """
         target, source = (self.views[i] for i in self.pairs[k])
-        p = row[:, kernels.MOVED : kernels.MOVED + 3]
+        p = row[:, kernels.SOURCE_POINT : kernels.SOURCE_POINT + 3]
         T_target_source = se3.inverse(self.poses[target.camera]) @ self.poses[source.camera]
         q = se3.transform(T_target_source, p)
         at = self.unknowns(k)
-        ends = (source, p, kernels.BY_SOURCE), (target, q, kernels.BY_TARGET)
+        ends = (source, p, kernels.BY_SOURCE_OFFSET), (target, q, kernels.BY_TARGET_OFFSET)
         for view, points, column in ends:
             by_error = row[:, column] * np.linalg.norm(points, axis=1)
             patch = shared_error.patches_of(points, view.sampled.projection)

@@ -233,7 +233,7 @@ def _indirect_ratio(surfaces: Surfaces, sources: Float32, wave_number: float) ->
 
     def chunk(a: int, b: int) -> Float32:
         out = np.zeros((2, receivers.shape[1]), np.float32)
-        kernels.exchange(sources, a, b, receivers, 2 * np.pi / wave_number, out)
+        kernels.add_irradiance(sources, a, b, receivers, 2 * np.pi / wave_number, out)
         return out
 
     total = np.sum(run_chunks(chunk, len(sources), chunks=4), axis=0, dtype=float)

@@ -134,7 +134,7 @@ class OffscreenCells:
             )
 
     def sources(self, surfaces: Surfaces, gain: float, wave_number: float) -> Float32:
-        """Return the light sources (S, 9) outside the image, see `kernels.multipath.exchange`.
+        """Return the light sources (S, 9) outside the image, as in `kernels.add_irradiance`.
 
         Cells without a mapped surface extrapolate the plane and albedo of the nearest node at the
         image's border.

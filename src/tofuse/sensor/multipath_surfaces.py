@@ -136,7 +136,7 @@ def visible_sources(surfaces: Surfaces, radiosity: Complex128) -> Float32:
 
     Returns
     -------
-    Sources as in `kernels.multipath.exchange`.
+    Sources as in `kernels.multipath.add_irradiance`.
     """
     out = np.empty((surfaces.has_plane.size, 9), np.float32)
     count = kernels.visible_sources(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.arrays import Float64, Int64
-from tofuse.kernels.kdtree import KdTree, checked_points, spread_queries
+from tofuse.kernels.kdtree import KdTree, checked_points, run_queries
 from tofuse.lab.kernels.cloud_search import ball_moments, kdtree_nearest_featured
 
 
@@ -50,7 +50,7 @@ class FeaturedKdTree(KdTree):
                 distance2[a:b],
             )
 
-        spread_queries(work, len(array))
+        run_queries(work, len(array))
         return index, distance2
 
     def moments(self, centres: ArrayLike, radius: float) -> Float64:
@@ -66,5 +66,5 @@ class FeaturedKdTree(KdTree):
         def work(a: int, b: int) -> None:
             out[a:b] = ball_moments(arranged, axes, cuts, self._depth, array[a:b], radius)
 
-        spread_queries(work, len(array))
+        run_queries(work, len(array))
         return out
