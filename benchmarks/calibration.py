@@ -24,7 +24,7 @@ from tofuse.geometry.cameras import Camera
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
-from tofuse.lab.simulation.sensor import calibrated
+from tofuse.lab.simulation.sensor import factory_correction
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.models import CameraModel, camera_model
 
@@ -72,7 +72,7 @@ def depth_row(recording: Recording, model: CameraModel) -> str:
         lambda: board_planes(recording, BOARD, "amplitude", wall=False),
         lambda: scene_planes(recording, 1, 0),
     ]
-    true = calibrated(model, EFFECTS)
+    true = factory_correction(model, EFFECTS)
     assert true.pixel_bias_m is not None
     cells, before = [], ""
     for way in ways:
