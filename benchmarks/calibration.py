@@ -25,7 +25,7 @@ from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
-from tofuse.lab.simulation.sensor import calibrated
+from tofuse.lab.simulation.sensor import factory_correction
 from tofuse.recordings.recording import Recording
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
@@ -72,7 +72,7 @@ def depth_row(recording: Recording, model: CameraModel) -> str:
         lambda: board_planes(recording, BOARD, "amplitude", wall=False),
         lambda: scene_planes(recording, 1, 0),
     ]
-    true = calibrated(model, EFFECTS)
+    true = factory_correction(model, EFFECTS)
     assert true.pixel_bias_m is not None
     cells, before = [], ""
     for way in ways:

@@ -65,7 +65,7 @@ def chain(kind: str, seed: int, effects: Effects, camera: str) -> Chain:
         twist = np.concatenate([rng.normal(0, 0.15, 3), rng.normal(0, np.radians(8), 3)])
     path, start = sequence.camera_path, first / sequence.frame_rate_hz
     sequence = replace(sequence, camera_path=lambda t: path(t) @ se3.exp(twist * (t - start)))
-    factory = sensor.calibrated(model, effects)
+    factory = sensor.factory_correction(model, effects)
     frames, poses = [], []
     for index in (first, first + step, first + 2 * step):
         raw = render(scene, sequence, model, index, effects=effects, seed=seed).frame

@@ -166,7 +166,7 @@ def main() -> None:
     arguments = parser.parse_args()
     model = camera_model(arguments.camera)
     effects = Effects(noise=arguments.noise)
-    factory = sensor.calibrated(model, effects)
+    factory = sensor.factory_correction(model, effects)
     rows: dict[str, list[tuple[str, float, dict[str, float], float, bool]]] = defaultdict(list)
     for seed in range(arguments.first, arguments.first + arguments.seeds):
         for kind in KINDS:

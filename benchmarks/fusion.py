@@ -51,7 +51,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.experiments.surface_error import Surface, compare_surfaces, distances
 from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.record import Plan, plan
+from tofuse.lab.simulation.record import RecordingPlan, plan
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.correction_file import corrected_depth
@@ -65,7 +65,7 @@ _ELSEWHERE = np.repeat([0.05, 0.03], 3)  # deviation from the path, m and rad
 _CELL_M = 0.01  # one observed point is kept in each cell
 
 
-def simulated(every: int, everything: bool) -> tuple[Plan, list[RangeFrame]]:
+def simulated(every: int, everything: bool) -> tuple[RecordingPlan, list[RangeFrame]]:
     """The plan and its frames, after factory correction."""
     made = plan("room", effects=Effects() if everything else _NOISE)
     made = replace(made, raw=made.raw[::every])
@@ -77,7 +77,7 @@ def simulated(every: int, everything: bool) -> tuple[Plan, list[RangeFrame]]:
     return made, frames
 
 
-def seen_by(made: Plan, masks: list[Bool], frames: list[RangeFrame]) -> Float64:
+def seen_by(made: RecordingPlan, masks: list[Bool], frames: list[RangeFrame]) -> Float64:
     """True surface points (N, 3) of the pixels in the masks, one per cell."""
     seen = []
     rate = made.sequence.frame_rate_hz

@@ -35,7 +35,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.experiments.surface_error import Surface, distances
 from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.record import Plan, plan, write
+from tofuse.lab.simulation.record import RecordingPlan, plan, write
 from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.preparation import Preparation
@@ -95,7 +95,7 @@ class Walk:
         return f"{name}/direct" if self.direct else name
 
     @cached_property
-    def plan(self) -> Plan:
+    def plan(self) -> RecordingPlan:
         """The plan of the simulation."""
         return plan(
             self.scene,

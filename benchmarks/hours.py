@@ -125,11 +125,11 @@ def _room(assembly: Assembly, room: int, rng: np.random.Generator) -> None:
     lining = [quad((s * DOOR, -a - WALL, 0), (0, WALL, 0), (0, 0, DOOR_TOP)) for s in (-1, 1)]
     lining.append(quad((-DOOR, -a - WALL, DOOR_TOP), (2 * DOOR, 0, 0), (0, WALL, 0)))
     for wall, parts in zip(walls, sides, strict=True):
-        assembly.add(wall, *(part.moved(T) for part in parts))
-    assembly.add(walls[3], *(part.moved(T) for part in lining))
+        assembly.add(wall, *(part.transformed(T) for part in parts))
+    assembly.add(walls[3], *(part.transformed(T) for part in lining))
     floor = quad((-a, -a - WALL, 0), (2 * a, 0, 0), (0, 2 * a + WALL, 0))
-    assembly.add(material(rng, f"floor {room}"), floor.moved(T))
-    assembly.add(material(rng, f"ceiling {room}"), floor.shifted(0, 0, h).moved(T))
+    assembly.add(material(rng, f"floor {room}"), floor.transformed(T))
+    assembly.add(material(rng, f"ceiling {room}"), floor.translated(0, 0, h).transformed(T))
     fabric = material(rng, f"fabric {room}")
     corners = [(-1.65, -1.6), (1.65, -1.6), (1.65, 1.6), (-1.65, 1.6)]
     order = rng.permutation(4)
@@ -159,7 +159,7 @@ def _corridor(assembly: Assembly, rooms: int, rng: np.random.Generator) -> None:
     span = (length, 0, 0)
     floor = quad((low, -CORRIDOR, 0), span, (0, 2 * CORRIDOR, 0))
     assembly.add(material(rng, "corridor floor"), floor)
-    assembly.add(material(rng, "corridor ceiling"), floor.shifted(0, 0, HEIGHT))
+    assembly.add(material(rng, "corridor ceiling"), floor.translated(0, 0, HEIGHT))
     for x in (low, high):
         end = quad((x, -CORRIDOR, 0), (0, 2 * CORRIDOR, 0), (0, 0, HEIGHT))
         assembly.add(material(rng, f"end {x:.0f}"), end)

@@ -30,7 +30,7 @@ from tofuse.inspection.inspect import inspect_recording
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
-from tofuse.lab.simulation.record import Plan
+from tofuse.lab.simulation.record import RecordingPlan
 from tofuse.lab.simulation.scene import SCENES, build
 from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
@@ -67,7 +67,7 @@ def film(scene: str, camera: str, seed: int, raw, *, still=False, well=None, wal
         sequence = walk(sequence)
     if scene == "corridor" or walk is not None:
         effects = effects.without("wrap")  # longer than the ambiguity range of some cameras
-    plan = Plan(built, sequence, model, effects, seed, np.asarray(raw))
+    plan = RecordingPlan(built, sequence, model, effects, seed, np.asarray(raw))
     factory = plan.correction
     return [
         replace(f, index=k, depth=corrected_depth(factory, f.camera, f.depth, f.depth_kind))

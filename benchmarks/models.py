@@ -20,7 +20,7 @@ from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.geometry import se3
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.cases import CHEST
-from tofuse.lab.experiments.recorded import Recorded
+from tofuse.lab.experiments.recorded import RecordedScene
 from tofuse.lab.simulation.record import plan, simulate_recording
 from tofuse.lab.simulation.scenes import box
 from tofuse.pipeline.config import Config
@@ -118,7 +118,7 @@ def _model(scene: str, recording: Recording, result: Reconstruction) -> str:
     if scene not in OBJECTS:
         return ""
     made = plan(scene, every=1)
-    recorded = Recorded(made, (), made.poses)
+    recorded = RecordedScene(made, (), made.poses)
     points = se3.transform(recorded.T_truth_world, result.cloud.points)
     if scene == "box":
         fit = measures.fit_box(points, box.BOTTOM, box.HEIGHT, box.WIDTH)

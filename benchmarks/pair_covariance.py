@@ -180,7 +180,7 @@ def _views(
     built, sequence = scenes.build(kind, seed=seed, texture=bool(rng.random() > 0.2))
     step = int(rng.integers(gap[0], gap[1] + 1))
     first = int(rng.integers(0, sequence.frames - step))
-    factory = sensor.calibrated(model, effects)
+    factory = sensor.factory_correction(model, effects)
     frames = []
     for index in (first, first + step):
         raw = render(built, sequence, model, index, effects=effects, seed=seed).frame

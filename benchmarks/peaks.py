@@ -23,7 +23,7 @@ import numpy as np
 
 from tofuse.lab.experiments.peaks import (
     peaks_bound,
-    peaks_bound_of_one,
+    peaks_bound_quantiles,
     reconstruct_peaks,
     refine_peaks,
     sweep_peaks,
@@ -43,7 +43,7 @@ REFERENCE = {
 
 def whole_runs(seeds: range) -> None:
     """Print the errors of whole runs, and the bound for single recordings."""
-    low, median, high = peaks_bound_of_one(0.10, (0.05, 0.5, 0.95))
+    low, median, high = peaks_bound_quantiles(0.10, (0.05, 0.5, 0.95))
     print(f"bound of one recording: median {median:.3f} m, 5 to 95 %: {low:.3f} to {high:.3f} m")
     for seed in seeds:
         errors, posed = reconstruct_peaks(0.10, seed)

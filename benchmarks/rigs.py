@@ -35,7 +35,7 @@ from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.paths import look_at, rotation
-from tofuse.lab.simulation.rig import Mount, around, relative, simulate_rig, wander
+from tofuse.lab.simulation.rig import Mount, camera_ring, relative, simulate_rig, wander
 from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig, RigCamera
@@ -92,7 +92,7 @@ def print_errors(label: str, rig: Rig, truth: list[Float64], clocks: tuple[float
 
 def still(instants: list[int], seeds: int, *, all_effects: bool) -> None:
     scene, sequence = scenes.build("torso")
-    stands = around((0, 0, 0.8), 1.6, 0.5, 4)
+    stands = camera_ring((0, 0, 0.8), 1.6, 0.5, 4)
     truth = relative(stands)
     sequence = replace(sequence, camera_path=lambda t: stands[0])
     model = smaller(camera_model("kinect2"), 256)
@@ -117,7 +117,7 @@ def stands_of(scene: str, rng: np.random.Generator) -> list[Float64]:
     if scene == "torso":
         centre, radius = (0, 0, 0.8 + rng.uniform(-0.1, 0.1)), rng.uniform(1.3, 2.0)
         count, first = int(rng.integers(3, 6)), rng.uniform(0, 2 * np.pi)
-        stands = around(centre, radius, rng.uniform(0.2, 0.7), count, first)
+        stands = camera_ring(centre, radius, rng.uniform(0.2, 0.7), count, first)
     else:
         middle, step = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(30, 70))
         target = [-0.6 * np.cos(middle), -0.6 * np.sin(middle), 0.7]
@@ -244,7 +244,7 @@ def coverage(seeds: int) -> None:
 def check(seeds: int) -> None:
     """Check rigs of four, calibrated to 0.6 mm and 0.03 degrees, for displaced cameras."""
     sigma = np.array([0.0006] * 3 + [np.radians(0.03)] * 3)
-    truth = relative(around((0, 0, 0.8), 1.6, 0.5, 4))
+    truth = relative(camera_ring((0, 0, 0.8), 1.6, 0.5, 4))
 
     def measured(poses: list[Float64], rng: np.random.Generator) -> Rig:
         rows = [RigCamera("0", "", np.eye(4), np.zeros((6, 6)))]

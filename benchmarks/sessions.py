@@ -29,7 +29,7 @@ from tofuse.evaluation.trajectory import align, displacement
 from tofuse.geometry import se3
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.record import Plan, plan, write
+from tofuse.lab.simulation.record import RecordingPlan, plan, write
 from tofuse.lab.simulation.scenes import flat, furniture
 from tofuse.lab.simulation.scenes.composition import Assembly, placed
 from tofuse.pipeline.merging import MergeOptions, merge_files
@@ -71,7 +71,7 @@ class Tour:
     chair: float | None = 0.0
     refurnished: bool = False
 
-    def plan(self) -> Plan:
+    def plan(self) -> RecordingPlan:
         """The plan of the simulation."""
         with ExitStack() as stack:
             if self.scene == "flat":

@@ -41,7 +41,7 @@ def still(
     effects = effects or Effects()
     built, moving = scenes.build(scene)
     model = camera_model(camera)
-    correction = sensor.calibrated(model, effects)
+    correction = sensor.factory_correction(model, effects)
     out = []
     for k in raw:
         t = k / moving.frame_rate_hz
@@ -238,7 +238,7 @@ def print_correction() -> None:
     built, sequence = scenes.build("wall")
     for name in CAMERAS:
         model = camera_model(name)
-        correction = sensor.calibrated(model, effects)
+        correction = sensor.factory_correction(model, effects)
         rendered = render(built, sequence, model, 20, effects=effects)
         frame = rendered.frame
         depth = corrected_depth(correction, frame.camera, frame.depth, frame.depth_kind)

@@ -21,7 +21,7 @@ from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.paths import Path
-from tofuse.lab.simulation.record import Plan
+from tofuse.lab.simulation.record import RecordingPlan
 from tofuse.lab.simulation.scenes.composition import Assembly, placed, shell
 from tofuse.lab.simulation.scenes.furniture import chair, plant
 from tofuse.lab.simulation.texture import Material
@@ -171,7 +171,7 @@ def _table(assembly: Assembly, rng: np.random.Generator) -> None:
         x, y, yaw = *rng.uniform(-0.3, 0.3, 2), rng.uniform(0, 3)
         size = rng.uniform(0.05, 0.14, 3)
         T = placed((x, y), yaw)
-        assembly.add(material, meshes.box(size, (0, 0, size[2] / 2)).moved(T))
+        assembly.add(material, meshes.box(size, (0, 0, size[2] / 2)).transformed(T))
 
 
 def _yard(assembly: Assembly, rng: np.random.Generator) -> None:
@@ -184,7 +184,9 @@ def _yard(assembly: Assembly, rng: np.random.Generator) -> None:
             assembly.add(WOOD, meshes.rod((x, y, 0), (x, y, 3.0), 0.06))
         else:
             size = rng.uniform(0.3, 0.7, 3)
-            crate = meshes.box(size, (0, 0, size[2] / 2)).moved(placed((x, y), rng.uniform(0, 3)))
+            crate = meshes.box(size, (0, 0, size[2] / 2)).transformed(
+                placed((x, y), rng.uniform(0, 3))
+            )
             assembly.add(THINGS[k % 5], crate)
 
 
@@ -207,11 +209,11 @@ def _stairwell(assembly: Assembly, _rng: np.random.Generator) -> None:
     assembly.add(WALL, meshes.box_between((-0.25, -0.25, 0), (0.25, 0.25, height)))
     for T in (placed((0, 0), k * np.pi / 2) for k in range(4)):
         wall = meshes.quad((-1.3, 1.3, 0), (2.6, 0, 0), (0, 0, height))
-        assembly.add(WALL, wall.moved(T))
+        assembly.add(WALL, wall.transformed(T))
     for k in range(64):
         T = placed((0, 0), 2 * np.pi * k / 16)
         step = meshes.box((1.3, 0.45, 0.18), (0.85, 0, 0.18 * k - 0.09))
-        assembly.add(WOOD, step.moved(T))
+        assembly.add(WOOD, step.transformed(T))
     for k in range(4):
         low = 2.88 * k
         assembly.add(THINGS[1], meshes.box_between((1.2, -0.5, low), (1.3, 0.5, low + 2.0)))
@@ -264,7 +266,7 @@ def _tunnel(assembly: Assembly, _rng: np.random.Generator) -> None:
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
     T[0, 3] = -4
-    assembly.add(WALL, meshes.inside_out(meshes.lathe(profile, 48)).moved(T))
+    assembly.add(WALL, meshes.inside_out(meshes.lathe(profile, 48)).transformed(T))
 
 
 def _pausing(seed: int) -> Path:
@@ -380,8 +382,8 @@ def record(one: Unusual, seed: int, *without: str) -> Recording:
     sequence = scenes.Sequence(one.frames, 1, one.rate_hz, one.path(seed))
     model = replace(one.camera, frame_rate_hz=one.rate_hz)
     effects = Effects().without(*(without or ("multipath", "smear")))
-    made = Plan(one.scene(seed), sequence, model, effects, seed, np.arange(one.frames))
-    factory = sensor.calibrated(model, effects)
+    made = RecordingPlan(one.scene(seed), sequence, model, effects, seed, np.arange(one.frames))
+    factory = sensor.factory_correction(model, effects)
     frames = [
         replace(
             r.frame,

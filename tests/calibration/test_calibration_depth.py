@@ -20,7 +20,7 @@ from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
-from tofuse.lab.simulation.sensor import calibrated
+from tofuse.lab.simulation.sensor import factory_correction
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
@@ -158,7 +158,7 @@ def views() -> Recording:
 
 def simulated_error(fit: DepthFit) -> tuple[float, float]:
     """Residual and original error of the curve, rms in m."""
-    true = calibrated(camera_model("sr4000"), EFFECTS)
+    true = factory_correction(camera_model("sr4000"), EFFECTS)
     assert true.pixel_bias_m is not None
     r = np.linspace(*fit.range_m, 300)
     bias = np.interp(r, true.range_m, true.bias_m) + true.pixel_bias_m.mean()

@@ -80,7 +80,7 @@ def test_corners_follow_pixel_centre_convention() -> None:
     assert found is not None
     T, rms = found
     assert rms < 0.1
-    place = checkerboard.places(0)[0]
+    place = checkerboard.camera_poses(0)[0]
     # Where the wall and the board's middle are, to the millimetre.
     middle = se3.transform(se3.inverse(place), [[0, -0.0005, 1.5]])[0]
     mean = se3.transform(T, BOARD.points).mean(0)

@@ -91,10 +91,12 @@ def test_path_score_localizes_errors():
 def test_rotation_accumulates_beyond_full_turn():
     poses = turning(20.0, 28)  # 540 degrees
     up = np.array([0.0, 1.0, 0.0])
-    assert measures.turned_deg(poses, up)[-1] == pytest.approx(540)
-    assert measures.turned_deg(poses, -up)[-1] == pytest.approx(-540)
+    assert measures.unwrapped_angle_deg(poses, up)[-1] == pytest.approx(540)
+    assert measures.unwrapped_angle_deg(poses, -up)[-1] == pytest.approx(-540)
     poses[5] = np.nan
-    np.testing.assert_allclose(measures.turned_deg(poses, up)[[4, 5, 6, -1]], [80, 80, 120, 540])
+    np.testing.assert_allclose(
+        measures.unwrapped_angle_deg(poses, up)[[4, 5, 6, -1]], [80, 80, 120, 540]
+    )
 
 
 def test_straightness_and_circle_radius():
@@ -128,7 +130,7 @@ def test_surface_error_is_distance_to_model():
 @pytest.mark.slow
 def test_strided_frames_match_recording_with_that_stride():
     recorded = record_scene("rail", (2, 3), 1, limit=4)
-    assert recorded.made.raw.tolist() == [0, 2, 3]
+    assert recorded.plan.raw.tolist() == [0, 2, 3]
     ours, reference = recorded.every(3), simulate_recording("rail", every=3, frames=2, seed=1)
     assert len(ours) == len(reference) == 2
     np.testing.assert_array_equal(ours.reference, reference.reference)

@@ -93,7 +93,7 @@ def test_each_triangle_is_in_one_leaf_inside_its_ancestors():
         assert (inside >= box[node, :3] - 1e-5).all()
         assert (inside <= box[node, 3:] + 1e-5).all()
     assert (covered == 1).all()
-    assert count.max() <= bvh.LEAF
+    assert count.max() <= bvh.MAX_LEAF_SIZE
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 400])

@@ -57,15 +57,15 @@ def test_path_is_tracked_with_default_parameters():
 
 def test_threshold_follows_prediction_errors():
     """Eqs 3 to 5: rms of the sufficiently large deviations; the initial value before any."""
-    threshold = AdaptiveThreshold(range_m=5.0, smallest=0.01, initial=0.2)
+    threshold = AdaptiveThreshold(range_m=5.0, min_delta=0.01, initial_sigma=0.2)
     assert threshold.sigma == 0.2
-    threshold.learn(np.eye(4))
+    threshold.update(np.eye(4))
     assert threshold.sigma == 0.2  # too small to count
     theta, shift = 0.1, 0.05
-    threshold.learn(se3.exp([0, 0, 0, 0, theta, 0]) + np.pad([[shift]], ((0, 3), (3, 0))))
+    threshold.update(se3.exp([0, 0, 0, 0, theta, 0]) + np.pad([[shift]], ((0, 3), (3, 0))))
     delta = 2 * 5 * np.sin(theta / 2) + shift
     assert threshold.sigma == pytest.approx(delta)
-    threshold.learn(se3.exp([0.3, 0, 0, 0, 0, 0]))
+    threshold.update(se3.exp([0.3, 0, 0, 0, 0, 0]))
     assert threshold.sigma == pytest.approx(np.sqrt((delta**2 + 0.3**2) / 2))
 
 

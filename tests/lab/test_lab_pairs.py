@@ -18,7 +18,7 @@ from tofuse.lab.methods.implicit import Implicit
 from tofuse.lab.methods.least_squares_matching import LeastSquaresMatching
 from tofuse.lab.methods.ndt import Ndt
 from tofuse.lab.methods.neighbourhoods import neighbourhood
-from tofuse.lab.methods.robust_metrics import Adaptive, Graduated, shape_of
+from tofuse.lab.methods.robust_metrics import Adaptive, Graduated, estimate_shape
 from tofuse.lab.methods.squared_distance import SquaredDistance, approximant
 from tofuse.recordings.frames import CloudFrame
 from tofuse.registration.icp import Icp
@@ -241,7 +241,7 @@ def test_principal_curvatures_of_cylinder():
     tube = np.column_stack([0.3 * np.sin(angle), z, 1.0 - 0.3 * np.cos(angle)])
     frame = CloudFrame(0, 0.0, tube.astype(np.float32))
     inner = np.flatnonzero((np.abs(angle) < 0.6) & (np.abs(z) < 0.3))
-    bending = neighbourhood(Points.of(frame, np.arange(4000))).bending
+    bending = neighbourhood(Points.of(frame, np.arange(4000))).principal_curvatures
     k = bending.curvature[inner]
     assert np.median(k[:, 0]) == pytest.approx(-1 / 0.3, rel=0.05)
     assert abs(np.median(k[:, 1])) < 0.15
@@ -302,9 +302,9 @@ def test_adaptive_loss_shape_follows_residuals():
     normal = rng(0).normal(size=20000)
     cauchy = rng(1).standard_cauchy(20000)
     contaminated = np.where(rng(2).uniform(size=20000) < 0.3, rng(3).uniform(-9, 9, 20000), normal)
-    assert shape_of(normal) == 2
-    assert -0.75 <= shape_of(cauchy * np.sqrt(2)) <= 0.75
-    assert shape_of(contaminated) < shape_of(normal)
+    assert estimate_shape(normal) == 2
+    assert -0.75 <= estimate_shape(cauchy * np.sqrt(2)) <= 0.75
+    assert estimate_shape(contaminated) < estimate_shape(normal)
 
 
 def test_adaptive_loss_matches_least_squares_and_is_robust():

@@ -12,9 +12,9 @@ from tofuse import parts
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
 from tofuse.lab.methods.bergevin import Bergevin
-from tofuse.lab.methods.multiview import Cloud, Pairs, relaxed
-from tofuse.lab.methods.pulli import Pulli, spread
-from tofuse.lab.methods.simultaneous import SmallAngles, WilliamsBennamoun, corresponding
+from tofuse.lab.methods.multiview import Cloud, Pairs, relax_poses
+from tofuse.lab.methods.pulli import Pulli, distribute_errors
+from tofuse.lab.methods.simultaneous import SmallAngles, WilliamsBennamoun, solve_correspondences
 from tofuse.posegraph.refinement import RefinementMethod
 from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.registration.prepared_view import PreparedView
@@ -85,7 +85,7 @@ def motions(n, seed):
 def test_closed_chain_error_is_reduced(method):
     T, clouds = ring()
     start = drifted(T)
-    after = relaxed(replace(method, points=2000), [Cloud.of(c) for c in clouds], start)
+    after = relax_poses(replace(method, points=2000), [Cloud.of(c) for c in clouds], start)
     np.testing.assert_allclose(after[0], T[0], atol=1e-9)
     before, left = errors_of(start, T), errors_of(after, T)
     assert left.max() < 0.25 * before.max()
@@ -133,8 +133,8 @@ def test_bergevin_is_independent_of_view_order():
     ready = [Cloud.of(c) for c in clouds]
     method = Bergevin(points=2000, rounds=5)
     order = np.array([0, 5, 2, 7, 4, 1, 6, 3])
-    plain = relaxed(method, ready, start)
-    shuffled = relaxed(method, [ready[k] for k in order], start[order])
+    plain = relax_poses(method, ready, start)
+    shuffled = relax_poses(method, [ready[k] for k in order], start[order])
     np.testing.assert_allclose(shuffled, plain[order], atol=1e-6)
 
 
@@ -155,7 +155,7 @@ def test_pulli_distributes_misfit_evenly_over_ring():
     for p in pairs[:-1]:
         A = np.linalg.lstsq(np.c_[p.p_j, np.ones(100)], np.c_[p.p_i, np.ones(100)], rcond=None)[0].T
         chain.append(chain[-1] @ se3.orthonormalise(A))
-    poses = spread(np.array(chain), pairs, 1e-7)
+    poses = distribute_errors(np.array(chain), pairs, 1e-7)
     gaps = [
         np.rad2deg(
             np.median(
@@ -173,7 +173,7 @@ def test_pulli_distributes_misfit_evenly_over_ring():
 def test_williams_bennamoun_decreases_monotonically_to_truth():
     poses, pairs = motions(6, 0)
     start = poses @ np.array([np.eye(4)] + [se3.exp(rng(9, k).normal(0, 0.3, 6)) for k in range(5)])
-    found, history = corresponding(start, pairs, 200)
+    found, history = solve_correspondences(start, pairs, 200)
     assert (np.diff(history) <= 1e-9 * abs(history[-1])).all()
     np.testing.assert_allclose(found, poses, atol=1e-5)
     for p in pairs:
@@ -188,7 +188,7 @@ def test_williams_bennamoun_solves_unconnected_components_separately():
     both[3:] = turn([0, 0, 1], 90) @ both[3:]
     start = both.copy()
     start[[1, 2, 4, 5]] = start[[1, 2, 4, 5]] @ se3.exp([0.1, 0.2, 0, 0.1, 0, 0.2])
-    np.testing.assert_allclose(corresponding(start, apart, 200)[0], both, atol=1e-5)
+    np.testing.assert_allclose(solve_correspondences(start, apart, 200)[0], both, atol=1e-5)
 
 
 def test_small_angles_is_second_order_accurate():

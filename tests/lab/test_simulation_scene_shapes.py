@@ -59,7 +59,7 @@ def test_normals_are_smooth_on_curved_surfaces_and_sharp_at_edges():
 
 def test_joined_meshes_keep_surfaces_and_positions():
     a = meshes.box((1, 1, 1)).of_surface(3)
-    b = meshes.box((1, 1, 1)).moved(se3.exp([5, 0, 0, 0, 0, 1])).of_surface(4)
+    b = meshes.box((1, 1, 1)).transformed(se3.exp([5, 0, 0, 0, 0, 1])).of_surface(4)
     both = meshes.joined([a, b])
     assert list(np.unique(both.surface)) == [3, 4]
     np.testing.assert_allclose(both.corners()[12:], b.corners())

@@ -14,7 +14,7 @@ from tofuse.kernels.threads import threads
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.models import CAMERAS, camera_model
-from tofuse.lab.simulation.render import Rendered, render
+from tofuse.lab.simulation.render import RenderedFrame, render
 from tofuse.lab.simulation.scene import Hits, Sequence, build
 from tofuse.recordings.correction_file import corrected_depth
 
@@ -78,7 +78,9 @@ def wall(z: float, albedo: float = 0.5, gloss: float = 0.0, ambient: float = 0.0
     return Boards([Board((0, 0, z), albedo=albedo, gloss=gloss)], ambient)
 
 
-def shoot(scene, effects: Effects, index: int = 0, model=MODEL, sequence=STILL, seed=0) -> Rendered:
+def shoot(
+    scene, effects: Effects, index: int = 0, model=MODEL, sequence=STILL, seed=0
+) -> RenderedFrame:
     return render(scene, sequence, model, index, effects=effects, seed=seed)
 
 
@@ -248,7 +250,7 @@ def test_second_frequency_resolves_ambiguity() -> None:
     model = camera_model("kinect2")
     true = np.linspace(0.01, model.ambiguity_m - 0.01, 3001)
     phasors = np.stack([np.exp(2j * np.pi * true * 2 * f / 299792458.0) for f in model.frequencies])
-    np.testing.assert_allclose(sensor.unwrapped(model, phasors), true, atol=1e-9)
+    np.testing.assert_allclose(sensor.unwrapped_range(model, phasors), true, atol=1e-9)
 
 
 def test_wiggling_has_four_periods_per_phase_period() -> None:
@@ -346,9 +348,9 @@ def test_single_wall_has_no_multipath() -> None:
     np.testing.assert_array_equal(one, other)
 
 
-def test_bounced_light_matches_form_factor_integral() -> None:
+def test_single_bounce_light_matches_form_factor_integral() -> None:
     """The light that a small patch receives from a lit one, compared with the integral."""
-    from tofuse.lab.simulation.optics import bounced_light
+    from tofuse.lab.simulation.optics import single_bounce_light
 
     # A floor 1 m below the lens, a lit wall 3 m ahead; no shadows between.
     scene = Boards(
@@ -364,7 +366,7 @@ def test_bounced_light_matches_form_factor_integral() -> None:
     for k, depth in enumerate(z):
         points[2 + 4 * k, :] = (0, 1, depth)
         normals[2 + 4 * k, :] = (0, -1, 0)
-    light = bounced_light(scene, model, points, normals, np.eye(4), None)[0]
+    light = single_bounce_light(scene, model, points, normals, np.eye(4), None)[0]
     x, y = np.meshgrid(np.linspace(-1, 1, 400), np.linspace(-1, 1, 400))
     area = (2 / 400) ** 2
     for k, depth in enumerate(z):
@@ -535,7 +537,7 @@ def test_factory_correction_leaves_less_than_1_mm(name: str) -> None:
     effects = Effects().without(
         "shot_noise", "scatter", "multipath", "thermal_drift", "under_exposure", "saturation"
     )
-    correction = sensor.calibrated(model, effects)
+    correction = sensor.factory_correction(model, effects)
     for z in (1.1, 2.9):
         rendered = shoot(wall(z), effects, model=model)
         frame = rendered.frame

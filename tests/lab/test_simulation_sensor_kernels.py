@@ -39,14 +39,14 @@ def test_pooling_is_weighted_sum_over_windows(stride: int, weights: list[float])
             np.testing.assert_allclose(out[v, u], twin, atol=1e-12)
 
 
-def test_off_plane_distance_matches_twin() -> None:
+def test_plane_deviation_matches_twin() -> None:
     points = RNG.normal(size=(7, 9, 3))
     points[0:3, 0:3][RNG.random((3, 3)) < 0.3] = np.inf
     points[1, 3] = np.inf
     normals = RNG.normal(size=(7, 9, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     out = np.zeros((3, 4))
-    phasor.off_plane(points, normals, 3, 2, 0, 3, out)
+    phasor.plane_deviation(points, normals, 3, 2, 0, 3, out)
     for v in range(3):
         for u in range(4):
             window = points[2 * v : 2 * v + 3, 2 * u : 2 * u + 3].reshape(-1, 3)

@@ -9,7 +9,7 @@ from tofuse.geometry import se3
 from tofuse.kernels import planes as kernels
 from tofuse.kernels.threads import threads
 from tofuse.lab.experiments.bound import mean_distance, mean_distances, pose_covariances
-from tofuse.lab.experiments.peaks import PoseErrors, peaks_bound, peaks_bound_of_one, run_peaks
+from tofuse.lab.experiments.peaks import PoseErrors, peaks_bound, peaks_bound_quantiles, run_peaks
 from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.posegraph.common_planes import PlaneOptions, refine_clouds
 from tofuse.posegraph.plane_refinement import Planes
@@ -247,7 +247,7 @@ def test_bound_of_peaks_grows_with_noise():
 
 
 def test_bound_of_single_recordings_varies_with_first_view():
-    low, high = peaks_bound_of_one(0.1, (0.05, 0.95))
+    low, high = peaks_bound_quantiles(0.1, (0.05, 0.95))
     assert low < peaks_bound(0.1) < high
     assert high > 2 * low
     # Two views: half the distance of the second one.

@@ -15,7 +15,7 @@ from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
-from tofuse.lab.simulation.rig import around, relative
+from tofuse.lab.simulation.rig import camera_ring, relative
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
@@ -28,7 +28,9 @@ from tofuse.rigs.inputs import Camera, unique_names
 from tofuse.viewer.content import read_content
 
 # Three cameras, neighbours 25 degrees apart.
-STANDS = [around((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + (k - 1) * np.radians(25))[0] for k in range(3)]
+STANDS = [
+    camera_ring((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + (k - 1) * np.radians(25))[0] for k in range(3)
+]
 
 
 def images(k: int, count: int = 1, offset: float = 0.0) -> list[RangeFrame]:
@@ -83,7 +85,7 @@ def test_images_of_static_scene_are_averaged() -> None:
 
 def test_static_camera_beside_moving_camera_is_refused() -> None:
     rng = np.random.default_rng(0)
-    turned = [around((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + 0.12 * i)[0] for i in range(8)]
+    turned = [camera_ring((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + 0.12 * i)[0] for i in range(8)]
     frames = [
         RangeFrame(i, i / 30, CAMERA, looked_at(T, rng, 0.0, ROOM).depth, "z", None)
         for i, T in enumerate(turned)
@@ -194,7 +196,7 @@ def test_rig_folder_with_missing_camera_is_refused(
 
 
 def test_ring_is_drawn_upright() -> None:
-    poses = upright(np.stack(relative(around((0.4, 0, 0.5), 1.6, 0.5, 6))))
+    poses = upright(np.stack(relative(camera_ring((0.4, 0, 0.5), 1.6, 0.5, 6))))
     heights = poses[:, 1, 3]
     assert np.ptp(heights) < 1e-9  # though the first camera looks down on the others
     # The first still looks forward, not sideways.

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from rig_scene import looked_at
 from tofuse.geometry import se3
-from tofuse.lab.simulation.rig import around, relative
+from tofuse.lab.simulation.rig import camera_ring, relative
 from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import prepare_view
@@ -32,7 +32,7 @@ def rig(
     seed: int, offset: float = 0.0, distortion: np.ndarray | None = None
 ) -> tuple[list[View], np.ndarray]:
     rng = np.random.default_rng([seed, 3])
-    T = around((0, 0, 0.2), 1.3, 1.3, 4)
+    T = camera_ring((0, 0, 0.2), 1.3, 1.3, 4)
     views = []
     for k in range(4):
         frame = looked_at(T[k], rng, offset if k == 2 else 0.0)

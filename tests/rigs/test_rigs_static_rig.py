@@ -11,14 +11,16 @@ from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
 from tofuse.errors import InputError
 from tofuse.geometry import se3
-from tofuse.lab.simulation.rig import around, relative
+from tofuse.lab.simulation.rig import camera_ring, relative
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.rigs.calibrate import Calibration, calibrate_cameras
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.static_rig import minimum_cost_lag
 
-STANDS = [around((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + (k - 0.5) * np.radians(25))[0] for k in (0, 1)]
+STANDS = [
+    camera_ring((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + (k - 0.5) * np.radians(25))[0] for k in (0, 1)
+]
 INTERVAL_S = 0.1
 Board = tuple[tuple[float, ...], float, float]
 

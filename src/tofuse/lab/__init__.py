@@ -1,4 +1,4 @@
-"""What experiments with the program need, and its use does not: nothing outside imports it.
+"""Laboratory: simulator, demo, experiments of the thesis, and methods of the literature.
 
-The simulator, the thesis's experiments, the demo, and methods of the literature for comparison.
+The pipeline needs none of it; only the command line and the registry of parts refer to it.
 """

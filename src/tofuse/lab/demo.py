@@ -66,13 +66,13 @@ def demo(
         _replacing_recording(out / RECORDING) as fresh,
     ):
         remove_states(out / CHECKPOINT)  # of the replaced recording
-        fails = scene == FAILURE
+        expect_failure = scene == FAILURE
         simulate_to(
             scene,
             fresh,
             seed=seed,
-            texture=not fails,
-            without=("wrap",) if fails else (),
+            texture=not expect_failure,
+            without=("wrap",) if expect_failure else (),
             progress=progress,
         )
         if scene == "peaks":
@@ -107,8 +107,8 @@ def _replacing_recording(path: Path) -> Iterator[Path]:
     try:
         yield fresh
     except BaseException:
-        for made in (fresh, path):
-            shutil.rmtree(made, ignore_errors=True)
+        for leftover in (fresh, path):
+            shutil.rmtree(leftover, ignore_errors=True)
         if old.exists():
             os.replace(old, path)
         raise
@@ -126,11 +126,11 @@ def _is_simulated(folder: Path) -> bool:
     """Whether a folder contains a simulated recording, or a part of it, and nothing else."""
     if folder.is_symlink() or not folder.is_dir():
         return False
-    for here, folders, names in os.walk(folder):
-        if any((Path(here) / name).is_symlink() for name in (*folders, *names)):
+    for parent, folders, names in os.walk(folder):
+        if any((Path(parent) / name).is_symlink() for name in (*folders, *names)):
             return False
-        inside = Path(here).relative_to(folder)
-        if not all(_SIMULATED.fullmatch((inside / name).as_posix()) for name in names):
+        relative = Path(parent).relative_to(folder)
+        if not all(_SIMULATED.fullmatch((relative / name).as_posix()) for name in names):
             return False
     return folder.name.startswith(UNFINISHED) or (folder / "truth").is_dir()
 
@@ -180,16 +180,16 @@ def simulate_to(
     """
     progress = progress or Silent()
     effects = Effects().without(*without)
-    seen = 0
+    completed = 0
 
-    def tell(done: int, total: int) -> None:
-        nonlocal seen
+    def report(done: int, total: int) -> None:
+        nonlocal completed
         if done == 1:
             progress.stage("simulating", total)
-        seen = done
+        completed = done
         progress.advance()
 
-    ours = not out.exists() or (out.is_dir() and not any(out.iterdir()))
+    created = not out.exists() or (out.is_dir() and not any(out.iterdir()))
     options: dict[str, Any] = {} if sigma is None else {"sigma_m": sigma}
     try:
         simulate(
@@ -205,11 +205,11 @@ def simulate_to(
             correction=correction,
             texture=texture,
             imu=imu,
-            progress=tell,
+            progress=report,
             **options,
         )
     except BaseException:
-        if ours:
+        if created:
             shutil.rmtree(out, ignore_errors=True)
         raise
-    return seen or len(list(out.glob("cloud/*.ply")))
+    return completed or len(list(out.glob("cloud/*.ply")))

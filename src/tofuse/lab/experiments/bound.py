@@ -11,7 +11,7 @@ _DRAWS = 20_000
 
 
 def joint_covariance(
-    points: Float64, normals: Float64, seen: Bool, poses: Float64, sigma: float
+    points: Float64, normals: Float64, visible: Bool, poses: Float64, sigma: float
 ) -> Float64:
     """Cramer-Rao bound of poses from the distances of their points from a surface.
 
@@ -23,7 +23,7 @@ def joint_covariance(
     ----------
     points, normals
         (S, 3) samples of the surface in the frame of the poses, and its unit normals.
-    seen
+    visible
         (S, N) visibility of each sample in each view.
     poses
         (N, 4, 4) true poses, which map a view into the frame of the points.
@@ -34,27 +34,27 @@ def joint_covariance(
     -------
     (6 N - 6, 6 N - 6) covariance of the right perturbations of all poses but the first (m, rad).
     """
-    samples, views = seen.shape
+    samples, views = visible.shape
     J = np.zeros((samples, views, 6))
     H = np.zeros((views, 6, views, 6))
     for k, T in enumerate(poses):
         p = se3.transform(se3.inverse(T), points)
         m = normals @ T[:3, :3]
-        J[:, k] = np.hstack([m, np.cross(p, m)]) * seen[:, [k]]
+        J[:, k] = np.hstack([m, np.cross(p, m)]) * visible[:, [k]]
         H[k, :, k] = J[:, k].T @ J[:, k]
     # The height of a sample is estimated from all views that see it.
-    J /= np.sqrt(np.maximum(seen.sum(1), 1))[:, None, None]
+    J /= np.sqrt(np.maximum(visible.sum(1), 1))[:, None, None]
     rows = J.reshape(samples, -1)
     information = H.reshape(6 * views, 6 * views) - rows.T @ rows
     return np.asarray(sigma**2 * np.linalg.inv(information[6:, 6:]), np.float64)
 
 
 def pose_covariances(
-    points: Float64, normals: Float64, seen: Bool, poses: Float64, sigma: float
+    points: Float64, normals: Float64, visible: Bool, poses: Float64, sigma: float
 ) -> Float64:
     """(N, 6, 6) covariances of single poses in `joint_covariance`; 0 for the first."""
     views = len(poses)
-    joint = joint_covariance(points, normals, seen, poses, sigma)
+    joint = joint_covariance(points, normals, visible, poses, sigma)
     C = np.zeros((views, 6, views, 6))
     C[1:, :, 1:] = joint.reshape(views - 1, 6, views - 1, 6)
     return C[np.arange(views), :, np.arange(views)]

@@ -14,7 +14,7 @@ from tofuse.arrays import Bool, Float32, Float64
 from tofuse.geometry import se3
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.measures import BoxFit, PathScore
-from tofuse.lab.experiments.recorded import Recorded, record_scene
+from tofuse.lab.experiments.recorded import RecordedScene, record_scene
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.scene import SCENES
 from tofuse.lab.simulation.scenes import box
@@ -216,7 +216,7 @@ def run_case(
     seed
         Of the simulation, and of the first draw.
     limit
-        Stop after so many raw frames.
+        Maximum number of raw frames.
     draws
         Number of repetitions with other random points of each run with the previous guess, and of
         each at the thesis's stride.
@@ -229,15 +229,15 @@ def run_case(
     """
     start = perf_counter()
 
-    def tell(done: int, total: int) -> None:
+    def report(done: int, total: int) -> None:
         if done == 1:
             progress.stage(f"{case.scene}: simulating", total)
         progress.advance()
 
     recorded = record_scene(
-        case.scene, case.strides, seed, limit=limit, effects=effects, progress=tell
+        case.scene, case.strides, seed, limit=limit, effects=effects, progress=report
     )
-    simulated = perf_counter()
+    simulation_end = perf_counter()
     plans = [
         (method, stride, guess, draw)
         for method in methods
@@ -260,25 +260,25 @@ def run_case(
     thesis, _ = filtered["thesis"]
     recording = thesis.every(case.stride)
     facts = _facts(case, thesis, recording, {m: c.to_dict() for m, c in configs.items()})
-    middle = [round(k * (len(recording) - 1)) for k in (0.0, 1 / 3, 2 / 3)]
-    samples = [recorded.every(case.stride)[k] for k in middle]
+    sample_indices = [round(k * (len(recording) - 1)) for k in (0.0, 1 / 3, 2 / 3)]
+    samples = [recorded.every(case.stride)[k] for k in sample_indices]
     return CaseResult(
         case,
         tuple(runs),
-        build_model(case, thesis, list(recording), recording.reference, keep=True),
+        build_model(case, thesis, list(recording), recording.reference, keep_points=True),
         tuple(f for f in samples if isinstance(f, RangeFrame)),
         thesis.T_truth_world,
         thesis.surface,
         facts,
-        {"simulation": simulated - start, "registration": perf_counter() - simulated},
+        {"simulation": simulation_end - start, "registration": perf_counter() - simulation_end},
     )
 
 
-def configuration(method: str, recorded: Recorded) -> Config:
+def configuration(method: str, recorded: RecordedScene) -> Config:
     """Return a method with the settings of chapter 4: loops by hand, background cut off."""
     config = from_method(method)
     filters = config.to_dict()["filters"]
-    depth = recorded.made.scene.max_depth_m
+    depth = recorded.plan.scene.max_depth_m
     if depth is not None:
         filters = [{"part": "distance", "maximum": depth}, *filters]
     changes = {
@@ -290,7 +290,9 @@ def configuration(method: str, recorded: Recorded) -> Config:
     return changed(config, changes, where="experiments")
 
 
-def _run(case: Case, recorded: Recorded, config: Config, stride: int, seed: int, draw: int) -> Run:
+def _run(
+    case: Case, recorded: RecordedScene, config: Config, stride: int, seed: int, draw: int
+) -> Run:
     recording = recorded.every(stride)
     first, last = int(recording.indices[0]), int(recording.indices[-1])
     loops = [PriorLoop(first, last)] if last > first else []
@@ -301,7 +303,7 @@ def _run(case: Case, recorded: Recorded, config: Config, stride: int, seed: int,
     truth = recording.reference
     before, after = result.diagnostics.sequential, result.trajectory
     frames = list(recording)
-    keep = draw == 0 and stride == case.stride
+    keep_points = draw == 0 and stride == case.stride
     record = next(iter(result.diagnostics.loops), None)
     return Run(
         case.scene,
@@ -317,14 +319,19 @@ def _run(case: Case, recorded: Recorded, config: Config, stride: int, seed: int,
         result.diagnostics.verdict,
         measures.score_path(before, truth),
         measures.score_path(after, truth),
-        build_model(case, recorded, frames, before, keep=keep),
-        build_model(case, recorded, frames, after, keep=keep),
+        build_model(case, recorded, frames, before, keep_points=keep_points),
+        build_model(case, recorded, frames, after, keep_points=keep_points),
         seconds,
     )
 
 
 def build_model(
-    case: Case, recorded: Recorded, frames: list[Frame], poses: Float64 | None, *, keep: bool
+    case: Case,
+    recorded: RecordedScene,
+    frames: list[Frame],
+    poses: Float64 | None,
+    *,
+    keep_points: bool,
 ) -> Model:
     """Merge frames by poses (N, 4, 4), NaN where lost, and measure the model."""
     assert poses is not None
@@ -351,28 +358,30 @@ def build_model(
             "height_m": fit.height_m,
             "worst_angle_deg": float(np.abs(fit.angles_deg - 90).max()),
         }
-    return Model(points.astype(np.float32) if keep else np.zeros((0, 3), np.float32), sizes, fit)
+    return Model(
+        points.astype(np.float32) if keep_points else np.zeros((0, 3), np.float32), sizes, fit
+    )
 
 
-_Facts = Callable[[Recorded, Recording], dict[str, Any]]
+_Facts = Callable[[RecordedScene, Recording], dict[str, Any]]
 
 
 def _facts(
-    case: Case, recorded: Recorded, recording: Recording, configs: dict[str, Any]
+    case: Case, recorded: RecordedScene, recording: Recording, configs: dict[str, Any]
 ) -> dict[str, Any]:
-    found: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "frames": {stride: len(recorded.every(stride)) for stride in case.strides},
         "configurations": configs,
     }
-    more: dict[str, _Facts] = {
+    extra: dict[str, _Facts] = {
         "room": lambda a, b: {"door": _door(a, b)},
         "empty-room": lambda a, b: {"corners": {s: corner_in_view(a, s) for s in case.strides}},
         "torso": lambda a, b: {"girth_m": measures.girth_m(a.surface, *CHEST)},
     }
-    return found | (more[case.scene](recorded, recording) if case.scene in more else {})
+    return facts | (extra[case.scene](recorded, recording) if case.scene in extra else {})
 
 
-def corner_in_view(recorded: Recorded, stride: int) -> Bool:
+def corner_in_view(recorded: RecordedScene, stride: int) -> Bool:
     """(N,) mask of the frames of a stride with a visible corner of the room, by the true poses."""
     from tofuse.lab.simulation.scenes import room
 
@@ -381,21 +390,21 @@ def corner_in_view(recorded: Recorded, stride: int) -> Bool:
     assert isinstance(frame, RangeFrame)
     assert recording.reference is not None
     T = recorded.T_truth_world @ recording.reference
-    half = np.arctan(np.nanmax(np.abs(frame.camera.rays()[..., 0])))
+    half_fov = np.arctan(np.nanmax(np.abs(frame.camera.rays()[..., 0])))
     x, y = room.LENGTH / 2, room.WIDTH / 2
-    seen = np.zeros(len(T), bool)
+    visible = np.zeros(len(T), bool)
     for corner in ((x, y), (-x, y), (-x, -y), (x, -y)):
         towards = np.array(corner) - T[:, :2, 3]
-        ahead = T[:, :2, 2]
-        cosine = (towards * ahead).sum(1) / (
-            np.linalg.norm(towards, axis=1) * np.linalg.norm(ahead, axis=1)
+        forward = T[:, :2, 2]
+        cosine = (towards * forward).sum(1) / (
+            np.linalg.norm(towards, axis=1) * np.linalg.norm(forward, axis=1)
         )
         # A few degrees inside the image, so that both walls are visible.
-        seen |= np.arccos(np.clip(cosine, -1, 1)) < half - np.radians(4)
-    return seen
+        visible |= np.arccos(np.clip(cosine, -1, 1)) < half_fov - np.radians(4)
+    return visible
 
 
-def _door(recorded: Recorded, recording: Recording) -> dict[str, float]:
+def _door(recorded: RecordedScene, recording: Recording) -> dict[str, float]:
     """Points per frame on the glossy door, and on the section of that wall at -x."""
     from tofuse.lab.simulation.scenes import room
 
@@ -406,6 +415,6 @@ def _door(recorded: Recorded, recording: Recording) -> dict[str, float]:
         p = se3.transform(T, frame.points)
         on_wall = (np.abs(p[:, 1] + room.WIDTH / 2) < 0.15) & (p[:, 2] < 2.0)
         for name, side in (("door", 1), ("wall", -1)):
-            at = side * p[:, 0]
-            counts[name] += int((on_wall & (at > 1.4) & (at < 2.2)).sum())
+            x = side * p[:, 0]
+            counts[name] += int((on_wall & (x > 1.4) & (x < 2.2)).sum())
     return {name: count / len(frames) for name, count in counts.items()}

@@ -49,22 +49,22 @@ def plan(
         True and measured closed outlines (K, 2).
     """
     extent = box[1] - box[0]
-    inner = width - 62.0
-    height = float(np.clip(inner * extent[1] / extent[0], 120, 1.15 * inner))
+    inner_width = width - 62.0
+    height = float(np.clip(inner_width * extent[1] / extent[0], 120, 1.15 * inner_width))
     figure, axes = make_figure(width, height + 62, _MARGINS)
-    scale = max(extent[0] / inner, extent[1] / height)
-    middle = box.mean(0)
-    x0, x1 = middle[0] - scale * inner / 2, middle[0] + scale * inner / 2
-    y0, y1 = middle[1] - scale * height / 2, middle[1] + scale * height / 2
-    columns = int(0.75 * inner)
-    rows = max(2, int(columns * height / inner))
+    scale = max(extent[0] / inner_width, extent[1] / height)
+    centre = box.mean(0)
+    x0, x1 = centre[0] - scale * inner_width / 2, centre[0] + scale * inner_width / 2
+    y0, y1 = centre[1] - scale * height / 2, centre[1] + scale * height / 2
+    columns = int(0.75 * inner_width)
+    rows = max(2, int(columns * height / inner_width))
     density, _, _ = np.histogram2d(
         points[:, 1], points[:, 0], bins=(rows, columns), range=((y0, y1), (x0, x1))
     )
-    top = np.percentile(density[density > 0], 99) if (density > 0).any() else 1.0
+    dense = np.percentile(density[density > 0], 99) if (density > 0).any() else 1.0
     image = np.zeros((rows, columns, 4), np.uint8)
     image[..., :3] = _POINTS_RGB
-    shade = (np.log1p(density) / np.log1p(top)).clip(0, 1)
+    shade = (np.log1p(density) / np.log1p(dense)).clip(0, 1)
     # Few levels keep the file small.
     image[..., 3] = np.where(density > 0, 60 + 13 * np.round(15 * shade), 0).astype(np.uint8)
     axes.imshow(image, extent=(x0, x1, y0, y1), origin="lower", interpolation="none", aspect="auto")
@@ -78,7 +78,7 @@ def plan(
     axes.plot(cameras[:1, 0], cameras[:1, 1], "o", color=INK, markersize=4)
     axes.set_xlim(x0, x1)
     axes.set_ylim(y0, y1)
-    for axis, size in ((axes.xaxis, inner), (axes.yaxis, height)):
+    for axis, size in ((axes.xaxis, inner_width), (axes.yaxis, height)):
         axis.set_major_locator(plots.locator(size / 45))
     _label(axes, names[0], f"{title} — {names[1]}")
     return svg(figure, label)
@@ -90,17 +90,17 @@ def _label(axes: Axes, x: str, title: str) -> None:
 
 
 def drift(
-    before: Float64, after: Float64, axis: str, *, beside: tuple[Float64, Float64], label: str
+    before: Float64, after: Float64, axis: str, *, other_method: tuple[Float64, Float64], label: str
 ) -> str:
     """Plot the error of the position along one axis (figures 5.2, 5.6).
 
-    `beside` is that of the other method, dotted.
+    `other_method` is that of the other method before and after, dotted.
     """
     return plots.lines(
         np.arange(len(before), dtype=float),
         [
-            (100 * beside[0], BEFORE, ":"),
-            (100 * beside[1], AFTER, ":"),
+            (100 * other_method[0], BEFORE, ":"),
+            (100 * other_method[1], AFTER, ":"),
             (100 * before, BEFORE, "-"),
             (100 * after, AFTER, "-"),
         ],
@@ -126,11 +126,11 @@ def objective(values: Sequence[float], *, label: str) -> str:
 
 def cameras(before: Float64, after: Float64, truth: Float64) -> tuple[str, str]:
     """Draw the cameras before and after at the same scale (figure 5.5); poses (N, 4, 4)."""
-    known = np.isfinite(before[:, 0, 0])
-    before, after = before[known], after[known]
-    flat = [plots.project(p[:, :3, 3], "above") for p in (before, after, truth)]
-    box = plots.limits(*flat)
-    drawn = [
+    has_pose = np.isfinite(before[:, 0, 0])
+    before, after = before[has_pose], after[has_pose]
+    projected = [plots.project(p[:, :3, 3], "above") for p in (before, after, truth)]
+    box = plots.limits(*projected)
+    pictures = [
         plots.cameras(
             poses,
             box,
@@ -142,33 +142,33 @@ def cameras(before: Float64, after: Float64, truth: Float64) -> tuple[str, str]:
         )
         for poses, color, name in ((before, BEFORE, "before"), (after, AFTER, "after"))
     ]
-    return drawn[0], drawn[1]
+    return pictures[0], pictures[1]
 
 
-def sweep(found: PeaksSweep) -> list[str]:
-    """Draw figure 5.12: error of each parameter over the noise, with the spread of the seeds."""
-    drawn = []
+def sweep(result: PeaksSweep) -> list[str]:
+    """Draw figure 5.12: mean error and standard deviation of each parameter over the noise."""
+    pictures = []
     for k, name in enumerate(AXES):
         figure, axes = make_figure(330, 220, _MARGINS)
         unit, factor = ("m", 1.0) if k < 3 else ("°", 180 / np.pi)
         for which, color in ((0, BEFORE), (1, AFTER)):
-            mean = factor * found.axes[:, which, k]
-            spread = factor * found.axes_spread[:, which, k]
+            mean = factor * result.axes[:, which, k]
+            deviation = factor * result.axes_std[:, which, k]
             axes.fill_between(
-                found.sigmas,
-                np.maximum(mean - spread, 0),
-                mean + spread,
+                result.sigmas,
+                np.maximum(mean - deviation, 0),
+                mean + deviation,
                 color=color,
                 alpha=0.18,
                 linewidth=0,
             )
-            axes.plot(found.sigmas, mean, color=color, linewidth=1.6, marker="o", markersize=3)
+            axes.plot(result.sigmas, mean, color=color, linewidth=1.6, marker="o", markersize=3)
         axes.set_ylim(bottom=0)
         axes.locator_params(axis="y", nbins=5)
         axes.locator_params(axis="x", nbins=6)
         _label(axes, "sigma, m", f"mean error in {name}, {unit}")
-        drawn.append(svg(figure, f"Mean error in {name} over the noise"))
-    return drawn
+        pictures.append(svg(figure, f"Mean error in {name} over the noise"))
+    return pictures
 
 
 def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
@@ -176,29 +176,33 @@ def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
 
     `clouds` are the (N, 3) points of the views in their cameras' frames, m.
     """
-    drawn = []
-    shown = (run.poses_sequential, run.poses_optimised)
-    flat = [plots.project(p[:, :3, 3], "above") for p in (*shown, run.truth)]
-    box = plots.limits(*flat)
-    for k, (poses, name) in enumerate(zip(shown, ("before", "after"), strict=True)):
+    pictures = []
+    estimates = (run.poses_sequential, run.poses_optimised)
+    projected = [plots.project(p[:, :3, 3], "above") for p in (*estimates, run.truth)]
+    box = plots.limits(*projected)
+    for k, (poses, name) in enumerate(zip(estimates, ("before", "after"), strict=True)):
         points = np.concatenate(
             [c @ T[:3, :3].T + T[:3, 3] for c, T in zip(clouds, poses, strict=True)]
         )
         figure, axes = make_figure(400, 400 * 0.95, _MARGINS)
-        some = points[:: max(1, len(points) // 3000)]
+        sample = points[:: max(1, len(points) // 3000)]
         axes.plot(
-            some[:, 0], some[:, 2], ".", color=MUTED, markersize=1.2, alpha=0.5, rasterized=True
+            sample[:, 0], sample[:, 2], ".", color=MUTED, markersize=1.2, alpha=0.5, rasterized=True
         )
         if k == 1:
-            for true, estimate in zip(flat[2], flat[1], strict=True):
+            for true, estimate in zip(projected[2], projected[1], strict=True):
                 ends = np.stack([true, estimate])
                 axes.plot(ends[:, 0], ends[:, 1], color=GRID, linewidth=1)
-            axes.plot(flat[2][:, 0], flat[2][:, 1], "s", color=REFERENCE, markersize=4)
-            axes.plot(flat[1][:, 0], flat[1][:, 1], "o-", color=AFTER, markersize=4, linewidth=1)
-        axes.plot(flat[0][:, 0], flat[0][:, 1], "o-", color=BEFORE, markersize=4, linewidth=1)
+            axes.plot(projected[2][:, 0], projected[2][:, 1], "s", color=REFERENCE, markersize=4)
+            axes.plot(
+                projected[1][:, 0], projected[1][:, 1], "o-", color=AFTER, markersize=4, linewidth=1
+            )
+        axes.plot(
+            projected[0][:, 0], projected[0][:, 1], "o-", color=BEFORE, markersize=4, linewidth=1
+        )
         axes.set_xlim(box[0, 0], box[1, 0])
         axes.set_ylim(box[0, 1], box[1, 1])
         axes.set_aspect("equal", "box")
         _label(axes, "x, m", f"{name} optimisation — z, m")
-        drawn.append(svg(figure, f"The synthetic case {name} optimisation, from above"))
-    return drawn[0], drawn[1]
+        pictures.append(svg(figure, f"The synthetic case {name} optimisation, from above"))
+    return pictures[0], pictures[1]

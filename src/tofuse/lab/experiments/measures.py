@@ -1,6 +1,7 @@
 """Measurements on trajectories and models: sizes, angles, girth, distances from the truth.
 
-Models are points in the frame of the true surface, which has z up; see `Recorded.T_truth_world`.
+Models are points in the frame of the true surface, which has z up; see
+`RecordedScene.T_truth_world`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.geometry import se3
 
-_FITTED = 20_000  # max points of a wall fit
+_MAX_FIT_POINTS = 20_000  # max points of a wall fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +57,10 @@ def score_path(poses: Float64, truth: Float64) -> PathScore:
     end = se3.inverse(truth[last]) @ poses[last]
     step_m, step_deg = np.full((2, len(poses)), np.nan)
     if len(poses) > 1:
-        wrong = se3.inverse(motions(truth)) @ motions(poses)
-        step_m[1:] = np.linalg.norm(wrong[:, :3, 3], axis=1)
-        known = np.flatnonzero(np.isfinite(wrong[:, 0, 0]))
-        step_deg[1 + known] = np.degrees(se3.angle(wrong[known]))
+        motion_errors = se3.inverse(motions(truth)) @ motions(poses)
+        step_m[1:] = np.linalg.norm(motion_errors[:, :3, 3], axis=1)
+        valid = np.flatnonzero(np.isfinite(motion_errors[:, 0, 0]))
+        step_deg[1 + valid] = np.degrees(se3.angle(motion_errors[valid]))
     return PathScore(
         error.ate_rms_m,
         float(np.degrees(error.rotation_rms_rad)),
@@ -76,32 +77,32 @@ def motions(poses: Float64) -> Float64:
     return se3.inverse(poses[:-1]) @ poses[1:]
 
 
-def turned_deg(poses: Float64, axis: Float64) -> Float64:
-    """(N,) angle in degrees turned since the first pose about an axis (3,) of the camera.
+def unwrapped_angle_deg(poses: Float64, axis: Float64) -> Float64:
+    """(N,) rotation in degrees since the first pose about an axis (3,) of the camera.
 
-    Angles are unwrapped. A lost frame takes the angle of the previous one.
+    Angles continue beyond 360 degrees. A lost frame takes the angle of the previous one.
     """
-    known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
+    has_pose = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     angle = np.zeros(len(poses))
-    angle[known[1:]] = se3.so3_log(motions(poses[known])[:, :3, :3]) @ axis
+    angle[has_pose[1:]] = se3.so3_log(motions(poses[has_pose])[:, :3, :3]) @ axis
     return np.degrees(np.cumsum(angle))
 
 
 def straightness_m(positions: Float64) -> float:
     """RMS distance of positions (N, 3) from their best-fit line."""
-    known = positions[np.isfinite(positions[:, 0])]
-    centred = known - known.mean(0)
-    across = np.linalg.svd(centred, compute_uv=False)[1:]
-    return float(np.sqrt((across**2).sum() / len(known)))
+    valid = positions[np.isfinite(positions[:, 0])]
+    centred = valid - valid.mean(0)
+    residual = np.linalg.svd(centred, compute_uv=False)[1:]
+    return float(np.sqrt((residual**2).sum() / len(valid)))
 
 
 def circle_radius_m(positions: Float64) -> float:
     """Radius of the best-fit circle of positions (N, 3), in their best-fit plane (Kasa 1976)."""
-    known = positions[np.isfinite(positions[:, 0])]
-    centred = known - known.mean(0)
-    flat = centred @ np.linalg.svd(centred, full_matrices=False)[2][:2].T
-    A = np.column_stack([2 * flat, np.ones(len(flat))])
-    (a, b, c), *_ = np.linalg.lstsq(A, (flat**2).sum(1), rcond=None)
+    valid = positions[np.isfinite(positions[:, 0])]
+    centred = valid - valid.mean(0)
+    planar = centred @ np.linalg.svd(centred, full_matrices=False)[2][:2].T
+    A = np.column_stack([2 * planar, np.ones(len(planar))])
+    (a, b, c), *_ = np.linalg.lstsq(A, (planar**2).sum(1), rcond=None)
     return float(np.sqrt(c + a * a + b * b))
 
 
@@ -111,10 +112,10 @@ def extent_m(points: Float64, outer: float = 1.0) -> Float64:
     return high - low
 
 
-def surface_error_m(points: Float64, surface: Any, most: int = 10_000) -> float:
+def surface_error_m(points: Float64, surface: Any, max_points: int = 10_000) -> float:
     """Median distance of a model's points from those of a tree of the true surface, m."""
-    some = points[:: -(-len(points) // most)]
-    return float(np.median(surface.query(some)[0]))
+    sample = points[:: -(-len(points) // max_points)]
+    return float(np.median(surface.query(sample)[0]))
 
 
 def girth_m(points: Float64, low: float, high: float, sectors: int = 36) -> float:
@@ -123,14 +124,14 @@ def girth_m(points: Float64, low: float, high: float, sectors: int = 36) -> floa
     Each sector contributes its median distance from the centre, so that double walls of a poor
     model are averaged.
     """
-    flat = points[(points[:, 2] >= low) & (points[:, 2] <= high), :2]
-    if len(flat) == 0:
+    xy = points[(points[:, 2] >= low) & (points[:, 2] <= high), :2]
+    if len(xy) == 0:
         return float("nan")
     # The centre of the outline; the points may be denser on one side.
-    low_xy, high_xy = np.percentile(flat, [2, 98], axis=0)
-    arm = flat - (low_xy + high_xy) / 2
-    sector = ((np.arctan2(arm[:, 1], arm[:, 0]) / (2 * np.pi) % 1) * sectors).astype(int) % sectors
-    radius = np.linalg.norm(arm, axis=1)
+    low_xy, high_xy = np.percentile(xy, [2, 98], axis=0)
+    r = xy - (low_xy + high_xy) / 2
+    sector = ((np.arctan2(r[:, 1], r[:, 0]) / (2 * np.pi) % 1) * sectors).astype(int) % sectors
+    radius = np.linalg.norm(r, axis=1)
     median = np.array(
         [np.median(radius[sector == k]) if (sector == k).any() else np.nan for k in range(sectors)]
     )
@@ -175,65 +176,64 @@ def fit_box(points: Float64, bottom: float, height: float, width: float) -> BoxF
     """
     z = points[:, 2]
     sides = points[(z > bottom + 0.15 * height) & (z < bottom + 0.85 * height), :2]
-    sides = sides[:: -(-len(sides) // _FITTED)]
+    sides = sides[:: -(-len(sides) // _MAX_FIT_POINTS)]
     # The centre of the outline, not biased towards the side with most points.
-    middle = (np.percentile(sides, 3, axis=0) + np.percentile(sides, 97, axis=0)) / 2
-    fits = [_walls(sides, middle, turn, width) for turn in np.radians([-30, -15, 0, 15, 30])]
+    initial_centre = (np.percentile(sides, 3, axis=0) + np.percentile(sides, 97, axis=0)) / 2
+    fits = [_walls(sides, initial_centre, a, width) for a in np.radians([-30, -15, 0, 15, 30])]
     normals, offsets, _ = min(fits, key=lambda fit: fit[2])
     if np.isnan(offsets).any():
-        nothing = np.full((4, 2), np.nan)
-        return BoxFit(nothing, nothing[0], nothing[:, 0], float("nan"))
-    following = np.roll(np.arange(4), -1)
-    pairs = np.stack([np.arange(4), following], 1)
+        missing = np.full((4, 2), np.nan)
+        return BoxFit(missing, missing[0], missing[:, 0], float("nan"))
+    next_wall = np.roll(np.arange(4), -1)
+    pairs = np.stack([np.arange(4), next_wall], 1)
     corners = np.linalg.solve(normals[pairs], offsets[pairs][..., None])[..., 0].astype(np.float64)
     centre = corners.mean(0)
-    reach = offsets - normals @ centre
-    cosines = (normals * normals[following]).sum(1)
-    inside = 180 - np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-    near = np.abs(points[:, :2] - centre).max(1)
-    top = z[(near < 0.35 * width) & (z > bottom + 0.8 * height)]
-    walls = z[(near > 0.4 * width) & (near < 0.75 * width) & (z > bottom - 0.1)]
+    distances = offsets - normals @ centre
+    cosines = (normals * normals[next_wall]).sum(1)
+    interior_angles = 180 - np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    distance = np.abs(points[:, :2] - centre).max(1)
+    top = z[(distance < 0.35 * width) & (z > bottom + 0.8 * height)]
+    walls = z[(distance > 0.4 * width) & (distance < 0.75 * width) & (z > bottom - 0.1)]
     rise = float(np.median(top) - np.percentile(walls, 0.5)) if len(top) and len(walls) else np.nan
-    return BoxFit(corners, reach[:2] + reach[2:], inside, rise)
+    return BoxFit(corners, distances[:2] + distances[2:], interior_angles, rise)
 
 
 def _walls(
-    flat: Float64, middle: Float64, turn: float, width: float
+    xy: Float64, centre: Float64, start_angle: float, width: float
 ) -> tuple[Float64, Float64, float]:
-    """Fit four lines, n . p = d, starting at a square at angle `turn` (rad); returns n, d, misfit.
+    """Fit four lines, n . p = d, to points (N, 2); returns n, d (NaN without points) and misfit.
 
-    d is NaN for a line without points.
-
-    Points are assigned to the nearest line, with distances truncated at a fifth of the width, so
-    that a model with double walls keeps four lines.
+    The initial lines are a square of `width` m at `start_angle` rad about `centre`. Points are
+    assigned to the nearest line, with distances truncated at a fifth of the width, so that a model
+    with double walls keeps four lines.
     """
-    angle = turn + np.pi / 2 * np.arange(4)
+    angle = start_angle + np.pi / 2 * np.arange(4)
     normals = np.stack([np.cos(angle), np.sin(angle)], 1)
-    offsets = normals @ middle + width / 2
-    reach = width / 5
+    offsets = normals @ centre + width / 2
+    truncation = width / 5
     fitted = np.zeros(4, bool)
     for _ in range(15):
-        distance = np.abs(flat @ normals.T - offsets)
+        distance = np.abs(xy @ normals.T - offsets)
         nearest = distance.argmin(1)
-        good = distance.min(1) < reach
+        inlier = distance.min(1) < truncation
         for k in range(4):
-            own = flat[good & (nearest == k)]
-            if len(own) < 10:
+            assigned = xy[inlier & (nearest == k)]
+            if len(assigned) < 10:
                 continue
-            mean = own.mean(0)
-            n = np.linalg.svd(own - mean, full_matrices=False)[2][1]
-            n *= np.sign(n @ (mean - middle)) or 1.0
+            mean = assigned.mean(0)
+            n = np.linalg.svd(assigned - mean, full_matrices=False)[2][1]
+            n *= np.sign(n @ (mean - centre)) or 1.0
             # Reject lines that cross the box.
             if n @ normals[k] > 0.8:
                 normals[k], offsets[k], fitted[k] = n, n @ mean, True
-    misfit = np.minimum(np.abs(flat @ normals.T - offsets).min(1), reach)
+    misfit = np.minimum(np.abs(xy @ normals.T - offsets).min(1), truncation)
     return normals, np.where(fitted, offsets, np.nan), float(np.mean(misfit**2))
 
 
-def displacement_m(a: Float64, b: Float64, ahead: float = 2.0) -> Float64:
-    """(N,) distance of a point `ahead` m in front of a camera between poses a and b (N, 4, 4).
+def displacement_m(a: Float64, b: Float64, depth: float = 2.0) -> Float64:
+    """(N,) displacement of a point `depth` m in front of a camera between poses a and b (N, 4, 4).
 
     It combines position and orientation errors in one length. NaN where a pose is NaN.
     """
-    point = np.array([0.0, 0.0, ahead, 1.0])
+    point = np.array([0.0, 0.0, depth, 1.0])
     return np.linalg.norm(((a - b) @ point)[:, :3], axis=1)

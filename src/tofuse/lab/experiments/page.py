@@ -20,7 +20,7 @@ from tofuse.files.staging import Names
 from tofuse.lab.experiments import sections
 from tofuse.lab.experiments.cases import CASES, DRAWS, METHODS, CaseResult, Run, run_case
 from tofuse.lab.experiments.peaks import AXES, SIGMAS_M, PeaksSweep, sweep_peaks
-from tofuse.lab.experiments.statements import Judged, Results, judge_all
+from tofuse.lab.experiments.statements import JudgedStatement, Results, judge_all
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.results.folder import Contract, OutputFolder, read_json_object
 from tofuse.results.run_json import plain
@@ -78,14 +78,14 @@ def run_experiments(
             raise InputError(
                 f"there is no case {name!r}", where="--cases", remedy=f"use some of {list(NAMES)}"
             )
-    chosen = cases or NAMES
+    selected = cases or NAMES
     start = perf_counter()
     with OutputFolder(out, overwrite=overwrite, contract=_CONTRACT) as folder:
         # BLAS sums depend on its number of threads; ours don't.
         with threadpool_limits(1):
-            results = _run_all(chosen, seeds, seed, progress, limit, draws)
+            results = _run_all(selected, seeds, seed, progress, limit, draws)
             judged = judge_all(results, METHODS)
-        parameters = {"cases": list(chosen), "seeds": seeds, "seed": seed, "draws": draws}
+        parameters = {"cases": list(selected), "seeds": seeds, "seed": seed, "draws": draws}
         parameters |= {} if limit is None else {"limit": limit}
         progress.stage("drawing")
         seconds = perf_counter() - start
@@ -108,28 +108,28 @@ _CONTRACT = Contract(Names(frozenset({"index.html", _MARKER})), _MARKER, is_expe
 
 
 def _run_all(
-    chosen: tuple[str, ...],
+    selected: tuple[str, ...],
     seeds: int,
     seed: int,
     progress: Progress,
     limit: int | None,
     draws: int,
 ) -> Results:
-    found = {
+    case_results = {
         case.scene: run_case(case, seed, progress, limit=limit, draws=draws)
         for case in CASES
-        if case.scene in chosen
+        if case.scene in selected
     }
     peaks = None
-    if "peaks" in chosen:
+    if "peaks" in selected:
         progress.stage("peaks: registering", seeds * len(SIGMAS_M))
-        peaks = sweep_peaks(range(seed, seed + seeds), finished=progress.advance)
-    return Results(found, peaks)
+        peaks = sweep_peaks(range(seed, seed + seeds), on_finished=progress.advance)
+    return Results(case_results, peaks)
 
 
 def results_json(
     results: Results,
-    judged: tuple[Judged, ...],
+    judged: tuple[JudgedStatement, ...],
     parameters: Mapping[str, Any],
     seconds: float,
 ) -> dict[str, Any]:
@@ -167,14 +167,18 @@ def _case_json(result: CaseResult) -> dict[str, Any]:
     return {
         "section": result.case.section,
         "thesis_stride": result.case.stride,
-        "facts": {str(k): _keyed(v) for k, v in result.facts.items()},
+        "facts": {str(k): _with_string_keys(v) for k, v in result.facts.items()},
         "true_poses": result.perfect.sizes,
         "runs": [_run_json(run) for run in result.runs],
     }
 
 
-def _keyed(value: Any) -> Any:
-    return {str(k): _keyed(v) for k, v in value.items()} if isinstance(value, dict) else value
+def _with_string_keys(value: Any) -> Any:
+    return (
+        {str(k): _with_string_keys(v) for k, v in value.items()}
+        if isinstance(value, dict)
+        else value
+    )
 
 
 def _run_json(run: Run) -> dict[str, Any]:
@@ -218,13 +222,13 @@ def _peaks_json(sweep: PeaksSweep) -> dict[str, Any]:
         "rotation_rad": both(sweep.rotation),
         "axes": list(AXES),
         "axes_mean": both(sweep.axes),
-        "axes_spread": both(sweep.axes_spread),
+        "axes_spread": both(sweep.axes_std),
     }
 
 
 def render(
     results: Results,
-    judged: tuple[Judged, ...],
+    judged: tuple[JudgedStatement, ...],
     parameters: Mapping[str, Any],
     seconds: float,
 ) -> str:
@@ -232,7 +236,8 @@ def render(
     counts = Counter(j.findings[METHODS[0]].outcome for j in judged)
     return _template().render(
         version=__version__,
-        style=_text("tofuse.report", "style.css") + _text("tofuse.lab.experiments", "style.css"),
+        style=_read_template("tofuse.report", "style.css")
+        + _read_template("tofuse.lab.experiments", "style.css"),
         judged=judged,
         methods=METHODS,
         counts=counts,
@@ -244,7 +249,7 @@ def render(
     )
 
 
-def _text(package: str, name: str) -> str:
+def _read_template(package: str, name: str) -> str:
     return (resources.files(package) / "templates" / name).read_text(encoding="utf-8")
 
 
@@ -255,4 +260,4 @@ def _template() -> Template:
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    return environment.from_string(_text("tofuse.lab.experiments", "experiments.html.j2"))
+    return environment.from_string(_read_template("tofuse.lab.experiments", "experiments.html.j2"))

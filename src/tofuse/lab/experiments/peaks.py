@@ -19,8 +19,8 @@ from tofuse.lab.simulation.peaks import (
     peaks_cameras,
     peaks_normals,
     peaks_points,
-    peaks_seen,
     peaks_views,
+    peaks_visible,
 )
 from tofuse.odometry.sequential import Sequential
 from tofuse.pipeline.methods import default
@@ -60,7 +60,7 @@ class PoseErrors:
     @classmethod
     def of(cls, estimate: Float64, truth: Float64) -> PoseErrors:
         """Compare poses (N, 4, 4) in the same world frame, without alignment."""
-        shift = estimate[:, :3, 3] - truth[:, :3, 3]
+        translation = estimate[:, :3, 3] - truth[:, :3, 3]
         R = np.swapaxes(truth[:, :3, :3], 1, 2) @ estimate[:, :3, :3]
         angles = np.stack(
             [
@@ -70,7 +70,9 @@ class PoseErrors:
             ],
             axis=1,
         )
-        return cls(np.linalg.norm(shift, axis=1), se3.angle(R), np.hstack([shift, angles]))
+        return cls(
+            np.linalg.norm(translation, axis=1), se3.angle(R), np.hstack([translation, angles])
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,30 +166,32 @@ def reconstruct_peaks(sigma: float, seed: int) -> tuple[PoseErrors, int]:
     """
     views, truth = peaks_views(sigma, seed)
     recording = Recording.of(ArraySource(views, truth), "peaks", "simulated")
-    found = reconstruct(recording, default("cloud"), seed=seed)
-    has = found.has_pose
-    first = truth[has][0] @ se3.inverse(found.trajectory[has][0])
-    return PoseErrors.of(first @ found.trajectory[has], truth[has]), int(has.sum())
+    result = reconstruct(recording, default("cloud"), seed=seed)
+    has_pose = result.has_pose
+    T_world_result = truth[has_pose][0] @ se3.inverse(result.trajectory[has_pose][0])
+    return PoseErrors.of(T_world_result @ result.trajectory[has_pose], truth[has_pose]), int(
+        has_pose.sum()
+    )
 
 
 def peaks_bound(sigma: float) -> float:
     """Lower bound of the mean error (m) of the 20 positions from the surface only; see `bound`."""
-    C = pose_covariances(peaks_points(), peaks_normals(), _seen(), peaks_cameras(), sigma)
+    C = pose_covariances(peaks_points(), peaks_normals(), _visibility(), peaks_cameras(), sigma)
     return mean_distance(C[:, :3, :3])
 
 
-def peaks_bound_of_one(sigma: float, quantiles: Sequence[float]) -> Float64:
-    """Quantiles (m) of the mean error of single recordings for a method at the bound."""
-    C = joint_covariance(peaks_points(), peaks_normals(), _seen(), peaks_cameras(), sigma)
+def peaks_bound_quantiles(sigma: float, quantiles: Sequence[float]) -> Float64:
+    """Quantiles (m) of the mean error of a single recording, for a method at the bound."""
+    C = joint_covariance(peaks_points(), peaks_normals(), _visibility(), peaks_cameras(), sigma)
     return np.asarray(np.quantile(mean_distances(C), quantiles), np.float64)
 
 
-def _seen() -> Bool:
+def _visibility() -> Bool:
     """(points, cameras) visibility mask."""
-    seen = np.zeros((len(peaks_points()), len(peaks_cameras())), bool)
-    for k, rows in enumerate(peaks_seen()):
-        seen[rows, k] = True
-    return seen
+    visible = np.zeros((len(peaks_points()), len(peaks_cameras())), bool)
+    for k, rows in enumerate(peaks_visible()):
+        visible[rows, k] = True
+    return visible
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +208,7 @@ class PeaksSweep:
         (S, 2) mean angle, rad.
     axes
         (S, 2, 6) mean absolute error for each of `AXES`, m and rad: the panels of figure 5.12.
-    axes_spread
+    axes_std
         (S, 2, 6) standard deviation over the seeds of the values averaged in `axes`.
     runs
         Every run.
@@ -214,21 +218,21 @@ class PeaksSweep:
     position: Float64
     rotation: Float64
     axes: Float64
-    axes_spread: Float64
+    axes_std: Float64
     runs: tuple[PeaksRun, ...]
 
 
 def sweep_peaks(
     seeds: Sequence[int],
     sigmas: Sequence[float] = SIGMAS_M,
-    finished: Callable[[], None] = lambda: None,
+    on_finished: Callable[[], None] = lambda: None,
 ) -> PeaksSweep:
-    """Run every sigma with every seed, and average; calls `finished` after every run."""
+    """Run every sigma with every seed, and average; calls `on_finished` after each run."""
     runs = []
     for sigma in sigmas:
         for seed in seeds:
             runs.append(run_peaks(sigma, seed))
-            finished()
+            on_finished()
     position, rotation, axes = (
         _by_seed(runs, len(sigmas), name) for name in ("position", "rotation", "axes")
     )

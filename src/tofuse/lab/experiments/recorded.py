@@ -13,7 +13,7 @@ from tofuse.arrays import Float64
 from tofuse.filters.base import apply_filters
 from tofuse.geometry import se3
 from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.record import Plan, plan
+from tofuse.lab.simulation.record import RecordingPlan, plan
 from tofuse.pipeline.config import Config
 from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -24,30 +24,30 @@ _SURFACE_POINTS = 500_000
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
+class RecordedScene:
     """Some raw frames of a simulated scene, numbered from 0 in the order of the raw sequence.
 
     Attributes
     ----------
-    made
-        The recording's plan; `made.raw` are the numbers of the raw frames.
+    plan
+        The recording's plan; `plan.raw` are the indices of the raw frames.
     frames
         The camera's frames, after its factory correction.
     poses
         (N, 4, 4) true T_world_camera; the first is the identity.
     """
 
-    made: Plan
+    plan: RecordingPlan
     frames: tuple[Frame, ...]
     poses: Float64
 
     def every(self, stride: int) -> Recording:
         """Return every `stride`-th raw frame as a recording."""
-        chosen = np.flatnonzero(self.made.raw % stride == 0)
+        indices = np.flatnonzero(self.plan.raw % stride == 0)
         source = ArraySource(self.frames, self.poses)
-        return Recording(source, f"simulated {self.made.scene.name}", "simulated", chosen)
+        return Recording(source, f"simulated {self.plan.scene.name}", "simulated", indices)
 
-    def filtered(self, config: Config) -> tuple[Recorded, Config]:
+    def filtered(self, config: Config) -> tuple[RecordedScene, Config]:
         """Filter all frames once, for runs with common filters; return the remaining configuration.
 
         Filters that depend on previous frames remain in the configuration.
@@ -60,12 +60,12 @@ class Recorded:
     @cached_property
     def T_truth_world(self) -> Float64:
         """(4, 4) from the recording's world to the frame of the true surface, which has z up."""
-        return se3.inverse(self.made.sequence.T_world_truth(0.0))
+        return se3.inverse(self.plan.sequence.T_world_truth(0.0))
 
     @cached_property
     def surface(self) -> Float64:
         """(K, 3) random points on the true surface, in its own frame (z up), m."""
-        vertices, faces = self.made.scene.truth_mesh()
+        vertices, faces = self.plan.scene.truth_mesh()
         return sample_surface(vertices[faces], _SURFACE_POINTS)
 
     @cached_property
@@ -84,7 +84,7 @@ def record_scene(
     limit: int | None = None,
     effects: Effects | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Recorded:
+) -> RecordedScene:
     """Simulate the raw frames of a scene for a set of strides, each frame once.
 
     Parameters
@@ -98,17 +98,17 @@ def record_scene(
     progress
         Called with the number of frames done and the total.
     """
-    made = plan(scene, seed=seed, every=1, frames=limit, effects=effects or Effects())
-    needed = np.any([made.raw % stride == 0 for stride in strides], axis=0)
-    made = replace(made, raw=made.raw[needed])
-    factory = made.correction
+    planned = plan(scene, seed=seed, every=1, frames=limit, effects=effects or Effects())
+    needed = np.any([planned.raw % stride == 0 for stride in strides], axis=0)
+    planned = replace(planned, raw=planned.raw[needed])
+    correction = planned.correction
 
     def corrected(frame: RangeFrame) -> Frame:
-        depth = corrected_depth(factory, frame.camera, frame.depth, frame.depth_kind)
+        depth = corrected_depth(correction, frame.camera, frame.depth, frame.depth_kind)
         return replace(frame, depth=depth)
 
-    frames = tuple(corrected(rendered.frame) for rendered in made.frames(progress))
-    return Recorded(made, frames, made.poses)
+    frames = tuple(corrected(rendered.frame) for rendered in planned.frames(progress))
+    return RecordedScene(planned, frames, planned.poses)
 
 
 def sample_surface(triangles: Float64, count: int) -> Float64:

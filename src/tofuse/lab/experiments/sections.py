@@ -31,16 +31,16 @@ class Figure:
 def case_section(result: CaseResult) -> dict[str, Any]:
     """Return the template's values for one case of the simulator."""
     case = result.case
-    shown = {m: result.select(m)[0] for m in METHODS}
-    crude = {m: result.select(m, "identity")[0] for m in METHODS}
-    first, beside = (shown[m] for m in METHODS)
+    previous_runs = {m: result.select(m)[0] for m in METHODS}
+    identity_runs = {m: result.select(m, "identity")[0] for m in METHODS}
+    first, other = (previous_runs[m] for m in METHODS)
     drifts = [
         Figure(
             figures.drift(
                 first.score_before.drift[:, k],
                 first.score_after.drift[:, k],
                 axis,
-                beside=(beside.score_before.drift[:, k], beside.score_after.drift[:, k]),
+                other_method=(other.score_before.drift[:, k], other.score_after.drift[:, k]),
                 label=f"Error of the position in {axis}, {case.title}",
             )
         )
@@ -57,7 +57,7 @@ def case_section(result: CaseResult) -> dict[str, Any]:
         "pictures": [_picture(frame) for frame in result.samples],
         "rows": _rows(result),
         "sizes": _sizes(result),
-        "plans": _plans(result, crude, shown),
+        "plans": _plans(result, identity_runs, previous_runs),
         "drifts": drifts,
         "cameras": [
             Figure(before, "thesis, before optimisation"),
@@ -94,7 +94,7 @@ def _rows(result: CaseResult) -> list[dict[str, Any]]:
                         "thesis": stride == result.case.stride,
                         "guess": guess,
                         "draws": len(runs),
-                        "posed": f"{_mid(r.posed for r in runs):.0f} of {len(runs[0].truth)}",
+                        "posed": f"{_median(r.posed for r in runs):.0f} of {len(runs[0].truth)}",
                         "ate": _pair(
                             [100 * r.score_before.ate_m for r in runs],
                             [100 * r.score_after.ate_m for r in runs],
@@ -111,28 +111,28 @@ def _rows(result: CaseResult) -> list[dict[str, Any]]:
                             [100 * r.model_before.sizes["surface_error_m"] for r in runs],
                             [100 * r.model_after.sizes["surface_error_m"] for r in runs],
                         ),
-                        "loop": _agreed([r.loop[0] for r in runs]),
-                        "verdict": _most([r.verdict for r in runs]),
+                        "loop": _count_true([r.loop[0] for r in runs]),
+                        "verdict": _by_frequency([r.verdict for r in runs]),
                     }
                 )
     return rows
 
 
-def _mid(values: Any) -> float:
+def _median(values: Any) -> float:
     return float(np.median(list(values)))
 
 
 def _pair(before: Sequence[float], after: Sequence[float]) -> str:
-    return f"{_mid(before):.1f} → {_mid(after):.1f}"
+    return f"{_median(before):.1f} → {_median(after):.1f}"
 
 
-def _agreed(flags: Sequence[bool]) -> str:
+def _count_true(flags: Sequence[bool]) -> str:
     if len(set(flags)) == 1:
         return "yes" if flags[0] else "no"
     return f"{sum(flags)} of {len(flags)}"
 
 
-def _most(values: Sequence[str]) -> str:
+def _by_frequency(values: Sequence[str]) -> str:
     return ", ".join(sorted(set(values), key=lambda v: (-values.count(v), v)))
 
 
@@ -167,51 +167,51 @@ def _sizes(result: CaseResult) -> list[list[str]]:
         cells = [true[name], result.perfect.sizes[name]]
         for method in METHODS:
             runs = result.select(method)
-            cells.append(_mid(r.model_before.sizes[name] for r in runs))
-            cells.append(_mid(r.model_after.sizes[name] for r in runs))
+            cells.append(_median(r.model_before.sizes[name] for r in runs))
+            cells.append(_median(r.model_after.sizes[name] for r in runs))
         rows.append([text, *(form.format(factor * float(c or 0)) for c in cells)])
     return rows
 
 
 def _plans(
-    result: CaseResult, crude: dict[str, Run], shown: dict[str, Run]
+    result: CaseResult, identity_runs: dict[str, Run], previous_runs: dict[str, Run]
 ) -> list[dict[str, Any]]:
     """Top views: a row of three for each method, and one by the true poses."""
     T = result.T_truth_world
 
-    def flat(poses: Float64) -> Float64:
+    def positions(poses: Float64) -> Float64:
         return (T @ poses)[:, :2, 3]
 
-    def about(model: Model) -> Float64:
+    def top_view(model: Model) -> Float64:
         return model.points[:, :2].astype(float)
 
-    truth = flat(shown[METHODS[0]].truth)
+    truth = positions(previous_runs[METHODS[0]].truth)
     outlines = _outlines(result)
-    groups = [about(r.model_after) for r in shown.values()]
-    groups += [about(r.model_before) for r in shown.values()]
-    # Cameras around an object are left out of the picture, to show the object larger.
-    seen = [] if shown[METHODS[0]].case in ("torso", "box") else [truth]
-    frame = figures.plan_limits(*groups, about(result.perfect), *outlines, *seen)
+    groups = [top_view(r.model_after) for r in previous_runs.values()]
+    groups += [top_view(r.model_before) for r in previous_runs.values()]
+    # Cameras around an object are excluded from the limits, to show the object larger.
+    visible = [] if previous_runs[METHODS[0]].case in ("torso", "box") else [truth]
+    limits = figures.plan_limits(*groups, top_view(result.perfect), *outlines, *visible)
 
     def draw(model: Model, cameras: Float64, title: str, method: str) -> Figure:
         label = f"{result.case.title} from above, {method}, {title}"
         measured = [model.box.corners] if model.box and np.isfinite(model.box.corners).all() else []
-        drawn = figures.plan(
-            about(model), cameras, frame, title=title, label=label, true=outlines,
+        picture = figures.plan(
+            top_view(model), cameras, limits, title=title, label=label, true=outlines,
             measured=measured,
         )  # fmt: skip
-        return Figure(drawn)
+        return Figure(picture)
 
     rows = []
     for method in METHODS:
-        a, b = crude[method], shown[method]
+        a, b = identity_runs[method], previous_runs[method]
         rows.append(
             {
                 "title": f"Method {method}",
                 "figures": [
-                    draw(a.model_before, flat(a.before), "identity guess", method),
-                    draw(b.model_before, flat(b.before), "previous guess", method),
-                    draw(b.model_after, flat(b.after), "optimised", method),
+                    draw(a.model_before, positions(a.before), "identity guess", method),
+                    draw(b.model_before, positions(b.before), "previous guess", method),
+                    draw(b.model_after, positions(b.after), "optimised", method),
                 ],
             }
         )

@@ -37,7 +37,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Results:
-    """Results to test statements with; statements about cases that were not run are skipped."""
+    """Results by which statements are tested; those about cases that were not run are skipped."""
 
     cases: Mapping[str, CaseResult]
     peaks: PeaksSweep | None
@@ -75,35 +75,35 @@ class Statement:
         )
 
 
-def graded(grades: Iterable[float], numbers: str, what: str = "draw") -> Finding:
+def graded(grades: Iterable[float], numbers: str, unit: str = "draw") -> Finding:
     """Decide by the mean of grades between 0 (false) and 1 (true)."""
-    given = [float(g) for g in grades]
-    mean = float(np.mean(given))
+    values = [float(g) for g in grades]
+    mean = float(np.mean(values))
     outcome: Outcome = "partly"
     if mean >= _AGREES:
         outcome = "agrees"
     elif mean <= _DISAGREES:
         outcome = "disagrees"
-    if len(given) > 1:
-        full = sum(g == 1 for g in given)
-        numbers += f" Holds in {full} of {len(given)} {what}s."
+    if len(values) > 1:
+        true_count = sum(g == 1 for g in values)
+        numbers += f" Holds in {true_count} of {len(values)} {unit}s."
     return Finding(outcome, numbers)
 
 
-def _parts(*parts: bool) -> float:
+def _fraction_true(*parts: bool) -> float:
     return float(np.mean(parts))
 
 
-def _mid(values: Iterable[float]) -> float:
+def _median(values: Iterable[float]) -> float:
     return float(np.median(list(values)))
 
 
 def _cm(values: Iterable[float]) -> str:
-    return f"{100 * _mid(values):.1f} cm"
+    return f"{100 * _median(values):.1f} cm"
 
 
 def _deg(values: Iterable[float]) -> str:
-    return f"{_mid(values):.1f}°"
+    return f"{_median(values):.1f}°"
 
 
 # 5.1, the rail
@@ -111,9 +111,9 @@ def _deg(values: Iterable[float]) -> str:
 
 def _legs(run: Run) -> tuple[Float64, Float64]:
     """End-to-end lengths in m of the outward and the return path: estimated, and true."""
-    known = np.flatnonzero(np.isfinite(run.before[:, 0, 0]))
-    turn = known[np.linalg.norm(run.truth[known, :3, 3], axis=1).argmax()]
-    ends = [0, turn, known[-1]]
+    has_pose = np.flatnonzero(np.isfinite(run.before[:, 0, 0]))
+    turning_point = has_pose[np.linalg.norm(run.truth[has_pose, :3, 3], axis=1).argmax()]
+    ends = [0, turning_point, has_pose[-1]]
     return (
         np.linalg.norm(np.diff(run.before[ends, :3, 3], axis=0), axis=1),
         np.linalg.norm(np.diff(run.truth[ends, :3, 3], axis=0), axis=1),
@@ -131,8 +131,8 @@ def _pushed_together(results: Results, method: str) -> Finding:
     }
     return graded(
         [s < 0.9 for s in fractions["identity"]],
-        f"The way out comes out {_mid(fractions['identity']):.0%} as long as it is "
-        f"({_mid(fractions['previous']):.0%} with the previous motion as guess).",
+        f"The way out comes out {_median(fractions['identity']):.0%} as long as it is "
+        f"({_median(fractions['previous']):.0%} with the previous motion as guess).",
     )
 
 
@@ -146,11 +146,11 @@ def _slower_is_better(results: Results, method: str) -> Finding:
             errors.append([float(leg.mean()) for leg in legs])
     if not errors:
         return Finding("disagrees", "The sequence ends before the way back.")
-    out, back = zip(*errors, strict=True)
+    outward, returning = zip(*errors, strict=True)
     return graded(
         [b < o for o, b in errors],
-        f"Mean error of one motion: {1000 * _mid(out):.1f} mm on the way out, "
-        f"{1000 * _mid(back):.1f} mm on the way back.",
+        f"Mean error of one motion: {1000 * _median(outward):.1f} mm on the way out, "
+        f"{1000 * _median(returning):.1f} mm on the way back.",
     )
 
 
@@ -160,14 +160,14 @@ def _almost_returns(results: Results, method: str) -> Finding:
     path = 2 * rail.RAIL_LENGTH
     return graded(
         [1.0 if e < 0.1 * path else 0.5 if e < 0.2 * path else 0.0 for e in ends],
-        f"It ends {_cm(ends)} from where it should, {_mid(ends) / path:.0%} of the path.",
+        f"It ends {_cm(ends)} from where it should, {_median(ends) / path:.0%} of the path.",
     )
 
 
 def _mostly_in_y(results: Results, method: str) -> Finding:
     rms = np.array([r.score_before.axes_rms_m for r in results.cases["rail"].select(method)])
     return graded(
-        [_parts(x < y, z < y) for x, y, z in rms],
+        [_fraction_true(x < y, z < y) for x, y, z in rms],
         f"Error rms: x {_cm(rms[:, 0])}, y {_cm(rms[:, 1])}, z {_cm(rms[:, 2])}.",
     )
 
@@ -178,7 +178,10 @@ def _lowered(case: str, axes: str) -> Callable[[Results, str], Finding]:
         before, after = _axes_rms(runs)
         columns = ["xyz".index(a) for a in axes]
         return graded(
-            [_parts(*(a[k] < b[k] for k in columns)) for b, a in zip(before, after, strict=True)],
+            [
+                _fraction_true(*(a[k] < b[k] for k in columns))
+                for b, a in zip(before, after, strict=True)
+            ],
             _before_after(before, after, columns),
         )
 
@@ -214,15 +217,15 @@ def _fluctuates(results: Results, method: str) -> Finding:
     if not runs:
         return Finding("disagrees", "No loop was closed, so nothing was optimised.")
     rises = [int((np.diff(r.objective) > 0).sum()) for r in runs]
-    first, last = (_mid(r.objective[k] for r in runs) for k in (0, -1))
-    steps = _mid(len(r.objective) - 1 for r in runs)
+    first, last = (_median(r.objective[k] for r in runs) for k in (0, -1))
+    steps = _median(len(r.objective) - 1 for r in runs)
     return graded(
         [
-            _parts(up > 0, r.objective[-1] < r.objective[0])
+            _fraction_true(up > 0, r.objective[-1] < r.objective[0])
             for r, up in zip(runs, rises, strict=True)
         ],
         f"Falls from {first:.3g} to {last:.3g} in {steps:.0f} steps and rises in "
-        f"{_mid(rises):.0f} of them: this optimiser keeps the constraint at every step.",
+        f"{_median(rises):.0f} of them: this optimiser keeps the constraint at every step.",
     )
 
 
@@ -233,7 +236,7 @@ def _keeps_shape(results: Results, method: str) -> Finding:
     case = results.cases["room"]
     sizes = [r.model_before.sizes for r in case.select(method)]
     return graded(
-        [_parts(*_near_size(s)) for s in sizes],
+        [_fraction_true(*_near_size(s)) for s in sizes],
         f"{_room_size(sizes)} before optimisation ({_room_size([case.perfect.sizes])} when the "
         "same frames are put together by the true poses).",
     )
@@ -247,15 +250,20 @@ def _near_size(sizes: Mapping[str, float]) -> tuple[bool, bool]:
 
 
 def _room_size(sizes: Sequence[Mapping[str, float]]) -> str:
-    return f"{_mid(s['length_m'] for s in sizes):.2f} x {_mid(s['width_m'] for s in sizes):.2f} m"
+    return (
+        f"{_median(s['length_m'] for s in sizes):.2f} x "
+        f"{_median(s['width_m'] for s in sizes):.2f} m"
+    )
 
 
 def _error_at_end(results: Results, method: str) -> Finding:
     pairs = []
     for run in results.cases["room"].select(method):
-        off = measures.displacement_m(run.before, run.truth)
-        third = len(off) // 3
-        pairs.append((np.nanmean(off[third : 2 * third]), np.nanmean(off[-max(1, third // 3) :])))
+        errors = measures.displacement_m(run.before, run.truth)
+        third = len(errors) // 3
+        pairs.append(
+            (np.nanmean(errors[third : 2 * third]), np.nanmean(errors[-max(1, third // 3) :]))
+        )
     middle, end = zip(*pairs, strict=True)
     return graded(
         [e > m for m, e in pairs],
@@ -266,18 +274,18 @@ def _error_at_end(results: Results, method: str) -> Finding:
 
 def _every_third(results: Results, method: str) -> Finding:
     case = results.cases["room"]
-    found = {
+    errors = {
         s: [r.model_before.sizes["surface_error_m"] for r in case.select(method, stride=s)]
         for s in (2, 3, 4)
     }
-    middle = {s: _mid(v) for s, v in found.items()}
+    medians = {s: _median(v) for s, v in errors.items()}
     numbers = "; ".join(
-        f"every {name}: {100 * middle[s]:.0f} ({100 * min(found[s]):.0f} to "
-        f"{100 * max(found[s]):.0f})"
+        f"every {name}: {100 * medians[s]:.0f} ({100 * min(errors[s]):.0f} to "
+        f"{100 * max(errors[s]):.0f})"
         for s, name in ((2, "second"), (3, "third"), (4, "fourth"))
     )
     return graded(
-        [_parts(middle[3] < middle[2], middle[3] < middle[4])],
+        [_fraction_true(medians[3] < medians[2], medians[3] < medians[4])],
         f"Median distance of the model from the true surface, cm, with the range over the draws: "
         f"{numbers}.",
     )
@@ -294,19 +302,19 @@ def _door_gap(results: Results, method: str) -> Finding:
 
 
 def _little_change(results: Results, method: str) -> Finding:
-    moved = [
+    shifts = [
         float(np.nanmedian(measures.displacement_m(r.before, r.after)))
         for r in results.cases["room"].select(method)
     ]
     return graded(
-        [m < 0.05 * room.LENGTH for m in moved],
-        f"A point 2 m ahead moves by {_cm(moved)} (median), {_mid(moved) / room.LENGTH:.0%} of "
-        "the room's length.",
+        [m < 0.05 * room.LENGTH for m in shifts],
+        f"A point 2 m ahead moves by {_cm(shifts)} (median), "
+        f"{_median(shifts) / room.LENGTH:.0%} of the room's length.",
     )
 
 
 def _closer_together(results: Results, method: str) -> Finding:
-    pairs = [(_heap(r.before), _heap(r.after)) for r in results.cases["room"].select(method)]
+    pairs = [(_scatter(r.before), _scatter(r.after)) for r in results.cases["room"].select(method)]
     before, after = zip(*pairs, strict=True)
     return graded(
         [a[0] < b[0] for b, a in pairs],
@@ -316,7 +324,7 @@ def _closer_together(results: Results, method: str) -> Finding:
 
 
 def _first_in_middle(results: Results, method: str) -> Finding:
-    pairs = [(_heap(r.before), _heap(r.after)) for r in results.cases["room"].select(method)]
+    pairs = [(_scatter(r.before), _scatter(r.after)) for r in results.cases["room"].select(method)]
     before, after = zip(*pairs, strict=True)
     return graded(
         [a[1] < b[1] for b, a in pairs],
@@ -325,18 +333,18 @@ def _first_in_middle(results: Results, method: str) -> Finding:
     )
 
 
-def _heap(poses: Float64) -> tuple[float, float]:
+def _scatter(poses: Float64) -> tuple[float, float]:
     """RMS distance of the cameras from their centroid, and distance of the first one."""
-    known = poses[np.isfinite(poses[:, 0, 0]), :3, 3]
-    away = np.linalg.norm(known - known.mean(0), axis=1)
-    return float(np.sqrt(np.mean(away**2))), float(away[0])
+    positions = poses[np.isfinite(poses[:, 0, 0]), :3, 3]
+    distances = np.linalg.norm(positions - positions.mean(0), axis=1)
+    return float(np.sqrt(np.mean(distances**2))), float(distances[0])
 
 
-def _z_kept(results: Results, method: str) -> Finding:
+def _z_unchanged(results: Results, method: str) -> Finding:
     before, after = _axes_rms(results.cases["room"].select(method))
     return graded(
         [
-            _parts(a[0] < b[0], a[1] < b[1], abs(a[2] / b[2] - 1) < 0.2)
+            _fraction_true(a[0] < b[0], a[1] < b[1], abs(a[2] / b[2] - 1) < 0.2)
             for b, a in zip(before, after, strict=True)
         ],
         _before_after(before, after, (0, 1, 2)),
@@ -350,9 +358,9 @@ def _flat_walls(results: Results, method: str) -> Finding:
     case = results.cases["empty-room"]
     pairs = []
     for run in case.select(method):
-        off = measures.displacement_m(measures.motions(run.before), measures.motions(run.truth))
+        errors = measures.displacement_m(measures.motions(run.before), measures.motions(run.truth))
         corner = _corner_steps(case, run)
-        pairs.append((_rms(off[~corner]), _rms(off[corner])))
+        pairs.append((_rms(errors[~corner]), _rms(errors[corner])))
     wall, corner_error = zip(*pairs, strict=True)
     return graded(
         [1.0 if w > 1.5 * c else 0.5 if w > c else 0.0 for w, c in pairs],
@@ -366,22 +374,24 @@ def _picks_up(results: Results, method: str) -> Finding:
     pairs = []
     for run in case.select(method):
         corner = _corner_steps(case, run)
-        turn, true = (np.diff(measures.turned_deg(p, Y_DOWN)) for p in (run.before, run.truth))
+        turn, true = (
+            np.diff(measures.unwrapped_angle_deg(p, Y_DOWN)) for p in (run.before, run.truth)
+        )
         pairs.append(
             (turn[~corner].sum() / true[~corner].sum(), turn[corner].sum() / true[corner].sum())
         )
-    wall, seen = zip(*pairs, strict=True)
+    wall, corner_part = zip(*pairs, strict=True)
     return graded(
-        [_parts(abs(c - 1) < abs(w - 1), abs(c - 1) < 0.2) for w, c in pairs],
-        f"Share of the turn that is found: {_mid(wall):.0%} facing a wall, {_mid(seen):.0%} with "
-        "a corner in view.",
+        [_fraction_true(abs(c - 1) < abs(w - 1), abs(c - 1) < 0.2) for w, c in pairs],
+        f"Share of the turn that is found: {_median(wall):.0%} facing a wall, "
+        f"{_median(corner_part):.0%} with a corner in view.",
     )
 
 
 def _corner_steps(case: CaseResult, run: Run) -> Bool:
     """(N - 1,) mask of the motions between two frames with a visible corner."""
-    seen: Bool = case.facts["corners"][run.stride]
-    return seen[1:] & seen[:-1]
+    visible: Bool = case.facts["corners"][run.stride]
+    return visible[1:] & visible[:-1]
 
 
 def _rms(values: Float64) -> float:
@@ -392,7 +402,7 @@ def _closes_loop(results: Results, method: str) -> Finding:
     runs = results.cases["empty-room"].select(method)
     return graded(
         [
-            _parts(
+            _fraction_true(
                 r.score_after.end_m < 0.25 * r.score_before.end_m,
                 r.score_after.end_deg < 0.25 * r.score_before.end_deg,
             )
@@ -432,18 +442,21 @@ def _objects_matter(results: Results, method: str) -> Finding:
 def _overlap_deg(case: CaseResult, run: Run) -> tuple[float, float]:
     """Excess of the cameras' total rotation over the truth, before and after, degrees."""
     axis = case.T_truth_world[:3, :3].T @ np.array([0.0, 0.0, 1.0])
-    end = [float(measures.turned_deg(p, axis)[-1]) for p in (run.before, run.after, run.truth)]
+    end = [
+        float(measures.unwrapped_angle_deg(p, axis)[-1]) for p in (run.before, run.after, run.truth)
+    ]
     sign = np.sign(end[2]) or 1.0
     return float(sign * (end[0] - end[2])), float(sign * (end[1] - end[2]))
 
 
 def _slight_overlap(results: Results, method: str) -> Finding:
     case = results.cases["torso"]
-    over = [_overlap_deg(case, r)[0] for r in case.select(method)]
+    excess = [_overlap_deg(case, r)[0] for r in case.select(method)]
     return graded(
-        [_parts(o > 0, abs(o) < 45) for o in over],
-        f"The cameras go {abs(_mid(over)):.1f}° {'further' if _mid(over) > 0 else 'less far'} "
-        f"round than they should ({min(over):+.0f}° to {max(over):+.0f}°).",
+        [_fraction_true(o > 0, abs(o) < 45) for o in excess],
+        f"The cameras go {abs(_median(excess)):.1f}° "
+        f"{'further' if _median(excess) > 0 else 'less far'} round than they should "
+        f"({min(excess):+.0f}° to {max(excess):+.0f}°).",
     )
 
 
@@ -466,11 +479,11 @@ def _pushed_out(results: Results, method: str) -> Finding:
         for r in runs
     ]
     before, after = zip(*pairs, strict=True)
-    short = _mid(_overlap_deg(case, r)[0] for r in runs) < 0
+    short = _median(_overlap_deg(case, r)[0] for r in runs) < 0
     return graded(
         [a > b for b, a in pairs],
-        f"Radius of the circle through the cameras: {_mid(before):.2f} m before, "
-        f"{_mid(after):.2f} m after (true: {torso.DISTANCE:.2f} m)."
+        f"Radius of the circle through the cameras: {_median(before):.2f} m before, "
+        f"{_median(after):.2f} m after (true: {torso.DISTANCE:.2f} m)."
         + (" The chain falls short of a turn, and closing a gap pulls in." if short else ""),
     )
 
@@ -482,7 +495,7 @@ def _gained_weight(results: Results, method: str) -> Finding:
     after = [r.model_after.sizes["girth_m"] for r in runs]
     perfect = case.perfect.sizes["girth_m"]
     return graded(
-        [_parts(a > b, a > 1.02 * perfect) for b, a in zip(before, after, strict=True)],
+        [_fraction_true(a > b, a > 1.02 * perfect) for b, a in zip(before, after, strict=True)],
         f"Girth of the chest with the upper arms: {_cm(before)} before, {_cm(after)} after; by "
         f"the true poses {100 * perfect:.1f} cm (true: {100 * case.facts['girth_m']:.1f} cm).",
     )
@@ -516,14 +529,14 @@ def _expanded(results: Results, method: str) -> Finding:
     sizes = [r.model_after.sizes for r in case.select(method)]
     true = {"width_a_m": box.WIDTH, "width_b_m": box.DEPTH, "height_m": box.HEIGHT}
     return graded(
-        [_parts(*(s[name] > length for name, length in true.items())) for s in sizes],
+        [_fraction_true(*(s[name] > length for name, length in true.items())) for s in sizes],
         f"{_box_size(sizes)} ({_box_size([case.perfect.sizes])} by the true poses).",
     )
 
 
 def _box_size(sizes: Sequence[Mapping[str, float]]) -> str:
     names = ("width_a_m", "width_b_m", "height_m")
-    return " x ".join(f"{1000 * _mid(s[n] for s in sizes):.0f}" for n in names) + " mm"
+    return " x ".join(f"{1000 * _median(s[n] for s in sizes):.0f}" for n in names) + " mm"
 
 
 def _white_middle(results: Results, method: str) -> Finding:
@@ -531,11 +544,13 @@ def _white_middle(results: Results, method: str) -> Finding:
     fit = run.model_after.box
     if fit is None:
         return Finding("disagrees", "There is no model.")
-    away = np.abs(run.model_after.points[:, :2] - fit.corners.mean(0)).max(1)
+    distances = np.abs(run.model_after.points[:, :2] - fit.corners.mean(0)).max(1)
     half = fit.widths_m.mean() / 2
-    middle = (away < 0.5 * half).sum() / (0.5 * half) ** 2
-    rim = ((away > 0.8 * half) & (away < 1.2 * half)).sum() / half**2 / (1.2**2 - 0.8**2)
-    ratio = middle / max(rim, 1e-9)
+    centre_density = (distances < 0.5 * half).sum() / (0.5 * half) ** 2
+    wall_density = (
+        ((distances > 0.8 * half) & (distances < 1.2 * half)).sum() / half**2 / (1.2**2 - 0.8**2)
+    )
+    ratio = centre_density / max(wall_density, 1e-9)
     return graded(
         [1.0 if ratio < 0.1 else 0.5 if ratio < 0.3 else 0.0],
         f"From above the middle is {ratio:.0%} as dense as the walls, though the camera "
@@ -556,13 +571,13 @@ def _example(results: Results) -> list[PeaksRun]:
 def _first_is_worst(results: Results, method: str) -> Finding:
     pairs = []
     for run in _example(results):
-        wrong = se3.inverse(measures.motions(run.truth)) @ measures.motions(run.poses_sequential)
-        off = np.linalg.norm(wrong[:, :3, 3], axis=1)
-        pairs.append((off[0], float(np.median(off[1:]))))
+        error = se3.inverse(measures.motions(run.truth)) @ measures.motions(run.poses_sequential)
+        errors = np.linalg.norm(error[:, :3, 3], axis=1)
+        pairs.append((errors[0], float(np.median(errors[1:]))))
     first, others = zip(*pairs, strict=True)
     return graded(
         [f > 2 * o for f, o in pairs],
-        f"Error of the first motion {_mid(first):.2f} m, of the others {_mid(others):.2f} m "
+        f"Error of the first motion {_median(first):.2f} m, of the others {_median(others):.2f} m "
         "(medians, sigma 0.09).",
         "seed",
     )
@@ -574,7 +589,7 @@ def _overall_reduced(results: Results, method: str) -> Finding:
     after = [float(r.optimised.position.mean()) for r in runs]
     return graded(
         [a < b for b, a in zip(before, after, strict=True)],
-        f"Mean error of the positions {_mid(before):.2f} m before, {_mid(after):.2f} m after "
+        f"Mean error of the positions {_median(before):.2f} m before, {_median(after):.2f} m after "
         "(sigma 0.09).",
         "seed",
     )
@@ -585,13 +600,13 @@ def _pushed_inwards(results: Results, method: str) -> Finding:
     for run in _example(results):
         centre = np.array([0.0, 0.0, RADIUS_M])
         inwards = RADIUS_M - np.linalg.norm(run.poses_optimised[:, :3, 3] - centre, axis=1)
-        far = np.linalg.norm(run.truth[:, :3, 3], axis=1) > RADIUS_M
-        near_far.append((float(inwards[~far].mean()), float(inwards[far].mean())))
-    near, far_side = zip(*near_far, strict=True)
+        far_side = np.linalg.norm(run.truth[:, :3, 3], axis=1) > RADIUS_M
+        near_far.append((float(inwards[~far_side].mean()), float(inwards[far_side].mean())))
+    near_means, far_means = zip(*near_far, strict=True)
     return graded(
-        [_parts(f > 0, f > n) for n, f in near_far],
-        f"On the far side they are {_mid(far_side):+.2f} m nearer to the middle than they should "
-        f"be, on the near side {_mid(near):+.2f} m (sigma 0.09).",
+        [_fraction_true(f > 0, f > n) for n, f in near_far],
+        f"On the far side they are {_median(far_means):+.2f} m nearer to the middle than they "
+        f"should be, on the near side {_median(near_means):+.2f} m (sigma 0.09).",
         "seed",
     )
 
@@ -601,7 +616,7 @@ def _threshold(results: Results, method: str) -> Finding:
     low = sweep.position[sweep.sigmas < 0.05 - 1e-9, 0]
     high = sweep.position[sweep.sigmas > 0.05 + 1e-9, 0]
     return graded(
-        [_parts(low.max() < 0.05 * RADIUS_M, high.min() > 0.05 * RADIUS_M)],
+        [_fraction_true(low.max() < 0.05 * RADIUS_M, high.min() > 0.05 * RADIUS_M)],
         f"Mean error of the chain: at most {low.max():.2f} m below sigma 0.05, at least "
         f"{high.min():.2f} m above.",
     )
@@ -613,7 +628,7 @@ def _improves_above(results: Results, method: str) -> Finding:
     position, rotation = sweep.position[above], sweep.rotation[above]
     ratios = [p[:, 1] / p[:, 0] for p in (position, rotation)]
     return graded(
-        [_parts(*(p[:, 1] < p[:, 0])) for p in (position, rotation)],
+        [_fraction_true(*(p[:, 1] < p[:, 0])) for p in (position, rotation)],
         f"Above 0.05 it leaves {ratios[0].min():.0%} to {ratios[0].max():.0%} of the error of "
         f"positions and {ratios[1].min():.0%} to {ratios[1].max():.0%} of that of rotations.",
         "measure",
@@ -628,7 +643,7 @@ def _y_unaltered(results: Results, method: str) -> Finding:
     )
 
 
-def _x_z_alike(results: Results, method: str) -> Finding:
+def _x_z_similar(results: Results, method: str) -> Finding:
     gain = _gain(results)
     above = gain[_sweep(results).sigmas > 0.05 + 1e-9].mean(0)
     ratio = above[0] / above[2] if above[2] > 0 else np.inf
@@ -638,12 +653,12 @@ def _x_z_alike(results: Results, method: str) -> Finding:
     )
 
 
-def _more_noise_more_good(results: Results, method: str) -> Finding:
+def _gain_grows_with_noise(results: Results, method: str) -> Finding:
     sweep, gain = _sweep(results), _gain(results)
     slopes = [float(np.polyfit(sweep.sigmas, g, 1)[0]) for g in gain.T]
     rising = sum(s > 0 for s in slopes)
     return graded(
-        [_parts(*(s > 0 for s in slopes))],
+        [_fraction_true(*(s > 0 for s in slopes))],
         f"The gain grows with sigma for {rising} of the 6 parameters.",
     )
 
@@ -662,7 +677,7 @@ def _pitch_roll_late(results: Results, method: str) -> Finding:
     low = gain[sweep.sigmas < 0.05 - 1e-9, 4:].max()
     high = gain[-1, 4:]
     return graded(
-        [_parts(low < 0.2, high.min() > 0.2)],
+        [_fraction_true(low < 0.2, high.min() > 0.2)],
         f"Pitch and roll gain at most {low:.2f}° below sigma 0.05, {high[0]:.2f}° and "
         f"{high[1]:.2f}° at the highest noise.",
     )
@@ -687,10 +702,10 @@ def _previous_is_better(results: Results, method: str) -> Finding:
     for name, case in results.cases.items():
         runs = {g: case.select(method, g) for g in ("identity", "previous")}
         error = {
-            g: _mid(r.model_before.sizes["surface_error_m"] for r in found)
-            for g, found in runs.items()
+            g: _median(r.model_before.sizes["surface_error_m"] for r in case_runs)
+            for g, case_runs in runs.items()
         }
-        posed = {g: _mid(r.posed for r in found) for g, found in runs.items()}
+        posed = {g: _median(r.posed for r in case_runs) for g, case_runs in runs.items()}
         # Models omit lost frames, which favours the guess that lost many.
         better.append(
             posed["previous"] > 1.1 * posed["identity"]
@@ -719,11 +734,11 @@ def _worsened(results: Results, method: str) -> Finding:
             before, after = (
                 measures.displacement_m(measures.motions(p), truth) for p in (run.before, run.after)
             )
-            good = before <= np.nanmedian(before)
-            fractions.append(float(np.mean(after[good] > before[good])))
+            better_half = before <= np.nanmedian(before)
+            fractions.append(float(np.mean(after[better_half] > before[better_half])))
     return graded(
         [1.0 if s > 0.4 else 0.5 if s > 0.2 else 0.0 for s in fractions],
-        f"Of the better half of the motions {_mid(fractions):.0%} are worse after optimisation.",
+        f"Of the better half of the motions {_median(fractions):.0%} are worse after optimisation.",
         "run",
     )
 
@@ -809,7 +824,7 @@ STATEMENTS = (
         "room-axes", "5.2", ("room",),
         "“The translational error is kept about the same in the z-direction, but is lowered in "
         "the x and y-directions.”",
-        _z_kept,
+        _z_unchanged,
     ),
     Statement(
         "empty-flat-walls", "5.3", ("empty-room",),
@@ -916,13 +931,13 @@ STATEMENTS = (
     Statement(
         "peaks-x-z", "5.6", ("peaks",),
         "“The x and z-positions are improved about the same.”",
-        _x_z_alike,
+        _x_z_similar,
     ),
     Statement(
         "peaks-more-noise", "5.6", ("peaks",),
         "“For every parameter the optimization seem to do more good in case of more applied "
         "noise.”",
-        _more_noise_more_good,
+        _gain_grows_with_noise,
     ),
     Statement(
         "peaks-yaw", "5.6", ("peaks",),
@@ -950,17 +965,17 @@ STATEMENTS = (
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedStatement:
     """A statement with its outcome for each method; peaks has only one method."""
 
     statement: Statement
     findings: Mapping[str, Finding]
 
 
-def judge_all(results: Results, methods: Sequence[str]) -> tuple[Judged, ...]:
+def judge_all(results: Results, methods: Sequence[str]) -> tuple[JudgedStatement, ...]:
     """Judge every statement about the cases that were run."""
     return tuple(
-        Judged(
+        JudgedStatement(
             s,
             {m: s.judge(results, m) for m in (methods[:1] if s.needs == ("peaks",) else methods)},
         )

@@ -1,1 +1,1 @@
-"""What Numba compiles for the simulator and for methods of the laboratory."""
+"""Numba kernels of the simulator and of the laboratory's methods."""

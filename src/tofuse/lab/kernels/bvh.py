@@ -1,8 +1,8 @@
-"""Rays against triangles through a tree of boxes (a bounding volume hierarchy).
+"""Ray casting against triangles in a bounding volume hierarchy.
 
 The tree is built with the surface area heuristic over bins (Wald, "On fast construction of
-SAH-based bounding volume hierarchies", 2007). Triangles are hit by the watertight test of Woop,
-Benthin and Wald (JCGT 2013): a ray never slips between two triangles that share an edge.
+SAH-based bounding volume hierarchies", 2007). Rays are intersected with triangles by the watertight
+test of Woop, Benthin and Wald (JCGT 2013): no ray passes between two triangles that share an edge.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import numpy as np
 from tofuse.arrays import Float64, Int32
 from tofuse.kernels.jit import kernel
 
-LEAF = 4
+MAX_LEAF_SIZE = 4
 BINS = 16
-# A tree that gets deeper is split at the median from there on, so this bounds the stack.
-DEEP = 40
-STACK = 64
+# Nodes at this depth and below are split at the median, which bounds the size of the stack.
+MAX_SAH_DEPTH = 40
+STACK_SIZE = 64
 
 
 @kernel
@@ -26,7 +26,7 @@ def build_tree(triangles: Float64) -> tuple[Float64, Int32, Int32, Int32]:
     Returns
     -------
     box (M, 6)
-        Lowest and highest corner of each node, a little enlarged against rounding.
+        Lowest and highest corner of each node, slightly enlarged against rounding errors.
     first (M,), count (M,)
         A leaf holds the triangles ``order[first : first + count]``; an inner node has count 0 and
         the children ``first`` and ``first + 1``.
@@ -36,21 +36,21 @@ def build_tree(triangles: Float64) -> tuple[Float64, Int32, Int32, Int32]:
     size = triangles.shape[0]
     low = np.empty((size, 3))
     high = np.empty((size, 3))
-    middle = np.empty((size, 3))
+    centre = np.empty((size, 3))
     for f in range(size):
         for k in range(3):
             a, b, c = triangles[f, k], triangles[f, 3 + k], triangles[f, 6 + k]
             low[f, k] = min(a, min(b, c))
             high[f, k] = max(a, max(b, c))
-            middle[f, k] = 0.5 * (low[f, k] + high[f, k])
+            centre[f, k] = 0.5 * (low[f, k] + high[f, k])
     order = np.arange(size).astype(np.int32)
-    spare = np.empty(size, np.int32)
+    scratch = np.empty(size, np.int32)
     box = np.empty((2 * size, 6))
     first = np.zeros(2 * size, np.int32)
     count = np.zeros(2 * size, np.int32)
-    todo = np.empty((2 * size, 4), np.int64)
-    todo[0, 0], todo[0, 1], todo[0, 2], todo[0, 3] = 0, 0, size, 0
-    waiting = 1
+    stack = np.empty((2 * size, 4), np.int64)
+    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, 0, size, 0
+    stacked = 1
     nodes = 1
     bin_low = np.empty((BINS, 3))
     bin_high = np.empty((BINS, 3))
@@ -58,13 +58,13 @@ def build_tree(triangles: Float64) -> tuple[Float64, Int32, Int32, Int32]:
     right_cost = np.empty(BINS)
     lo = np.empty(3)
     hi = np.empty(3)
-    while waiting > 0:
-        waiting -= 1
+    while stacked > 0:
+        stacked -= 1
         node, start, stop, depth = (
-            todo[waiting, 0],
-            todo[waiting, 1],
-            todo[waiting, 2],
-            todo[waiting, 3],
+            stack[stacked, 0],
+            stack[stacked, 1],
+            stack[stacked, 2],
+            stack[stacked, 3],
         )
         for k in range(3):
             box[node, k] = np.inf
@@ -76,17 +76,17 @@ def build_tree(triangles: Float64) -> tuple[Float64, Int32, Int32, Int32]:
             for k in range(3):
                 box[node, k] = min(box[node, k], low[f, k])
                 box[node, 3 + k] = max(box[node, 3 + k], high[f, k])
-                lo[k] = min(lo[k], middle[f, k])
-                hi[k] = max(hi[k], middle[f, k])
-        number = stop - start
-        if number <= LEAF:
+                lo[k] = min(lo[k], centre[f, k])
+                hi[k] = max(hi[k], centre[f, k])
+        length = stop - start
+        if length <= MAX_LEAF_SIZE:
             first[node] = start
-            count[node] = number
+            count[node] = length
             continue
         best_cost = np.inf
         best_axis = -1
         best_bin = 0
-        if depth < DEEP:
+        if depth < MAX_SAH_DEPTH:
             for axis in range(3):
                 extent = hi[axis] - lo[axis]
                 if extent <= 1e-12:
@@ -97,7 +97,7 @@ def build_tree(triangles: Float64) -> tuple[Float64, Int32, Int32, Int32]:
                 bin_count[:] = 0
                 for i in range(start, stop):
                     f = order[i]
-                    b = int((middle[f, axis] - lo[axis]) * scale)
+                    b = int((centre[f, axis] - lo[axis]) * scale)
                     bin_count[b] += 1
                     for k in range(3):
                         bin_low[b, k] = min(bin_low[b, k], low[f, k])
@@ -123,7 +123,7 @@ def build_tree(triangles: Float64) -> tuple[Float64, Int32, Int32, Int32]:
                     y0, y1 = min(y0, bin_low[b, 1]), max(y1, bin_high[b, 1])
                     z0, z1 = min(z0, bin_low[b, 2]), max(z1, bin_high[b, 2])
                     members += bin_count[b]
-                    if members == 0 or members == number:
+                    if members == 0 or members == length:
                         continue
                     dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
                     cost = members * (dx * dy + dy * dz + dz * dx) + right_cost[b + 1]
@@ -135,24 +135,24 @@ def build_tree(triangles: Float64) -> tuple[Float64, Int32, Int32, Int32]:
         if best_axis >= 0:
             scale = BINS * (1 - 1e-9) / (hi[best_axis] - lo[best_axis])
             split = start
-            others = 0
+            right = 0
             for i in range(start, stop):
                 f = order[i]
-                if int((middle[f, best_axis] - lo[best_axis]) * scale) <= best_bin:
+                if int((centre[f, best_axis] - lo[best_axis]) * scale) <= best_bin:
                     order[split] = f
                     split += 1
                 else:
-                    spare[others] = f
-                    others += 1
-            for i in range(others):
-                order[split + i] = spare[i]
+                    scratch[right] = f
+                    right += 1
+            for i in range(right):
+                order[split + i] = scratch[i]
         first[node] = nodes
-        todo[waiting, 0], todo[waiting, 1] = nodes, start
-        todo[waiting, 2], todo[waiting, 3] = split, depth + 1
-        waiting += 1
-        todo[waiting, 0], todo[waiting, 1] = nodes + 1, split
-        todo[waiting, 2], todo[waiting, 3] = stop, depth + 1
-        waiting += 1
+        stack[stacked, 0], stack[stacked, 1] = nodes, start
+        stack[stacked, 2], stack[stacked, 3] = split, depth + 1
+        stacked += 1
+        stack[stacked, 0], stack[stacked, 1] = nodes + 1, split
+        stack[stacked, 2], stack[stacked, 3] = stop, depth + 1
+        stacked += 1
         nodes += 2
     box = box[:nodes].copy()
     for node in range(nodes):
@@ -175,7 +175,7 @@ def cast_rays(
     face: Int32,
     weights: Float64,
 ) -> None:
-    """Find the nearest triangle along each ray, nearer than `distance` already says.
+    """Find the nearest triangle along each ray that is nearer than the given `distance`.
 
     Parameters
     ----------
@@ -184,18 +184,18 @@ def cast_rays(
     triangles (F, 9)
         Corners, in the order of the leaves.
     origins (1 or N, 3), directions (N, 3)
-        Rays; distances are in lengths of the direction.
+        Rays; distances are in multiples of the direction's length.
     distance (N,), face (N,), weights (N, 2)
-        Changed where a nearer triangle is hit: distance, index of the triangle (in the order of
+        Updated where a nearer triangle is hit: distance, index of the triangle (in the order of
         the leaves), and barycentric weights of its second and third corner.
     """
-    stack = np.empty(STACK, np.int32)
+    stack = np.empty(STACK_SIZE, np.int32)
     shared = origins.shape[0] == 1
     for i in range(directions.shape[0]):
         j = 0 if shared else i
         ox, oy, oz = origins[j, 0], origins[j, 1], origins[j, 2]
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-        # Finite inverses: infinity times a zero offset would be NaN.
+        # Finite inverses, as infinity times a zero offset would be NaN.
         ix = 1.0 / dx if abs(dx) > 1e-200 else 1e200
         iy = 1.0 / dy if abs(dy) > 1e-200 else 1e200
         iz = 1.0 / dz if abs(dz) > 1e-200 else 1e200
@@ -206,10 +206,10 @@ def cast_rays(
             kz = 2
         kx = (kz + 1) % 3
         ky = (kz + 2) % 3
-        d_main = directions[i, kz]
-        if d_main == 0.0 or not np.isfinite(dx + dy + dz):
+        d_major = directions[i, kz]
+        if d_major == 0.0 or not np.isfinite(dx + dy + dz):
             continue
-        sz = 1.0 / d_main
+        sz = 1.0 / d_major
         sx = directions[i, kx] * sz
         sy = directions[i, ky] * sz
         px, py, pz = origins[j, kx], origins[j, ky], origins[j, kz]
@@ -220,10 +220,10 @@ def cast_rays(
         depth = 0
         node = 0
         while True:
-            number = count[node]
-            if number > 0:
+            length = count[node]
+            if length > 0:
                 begin = first[node]
-                for f in range(begin, begin + number):
+                for f in range(begin, begin + length):
                     az = triangles[f, kz] - pz
                     bz = triangles[f, 3 + kz] - pz
                     cz = triangles[f, 6 + kz] - pz

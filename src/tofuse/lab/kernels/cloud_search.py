@@ -1,4 +1,4 @@
-"""Searches among the points of a cloud by more than their distance, and moments of balls of points.
+"""Closest points of a cloud by distance and features, or from a pixel; moments of points in balls.
 
 All but `grid_search` take the arrays of a `KdTree`.
 """
@@ -26,35 +26,35 @@ def kdtree_nearest_featured(
     weight: float,
     limit: float,
     index: Int64,
-    cost: Float64,
+    distance2: Float64,
 ) -> None:
     """Find the point with the least ``|x - q|^2 + weight |f - g|^2`` for each query q (m, 3).
 
-    The first five are the arrays of a `KdTree`; `features` f (n, k), in the order of the points as
-    they were given, and `query_features` g (m, k) come ready weighted, in m. Only points closer in
-    space than the squared distance `limit`, and with no feature off by more than `tolerance`, are
-    looked at. Writes `index` (m,), -1 where there is none, and the squared distance in space
-    `cost` (m,), infinity there. NaN features match nothing. Of equal points the one with the
-    lowest index is found.
+    The first five arguments are the arrays of a `KdTree`. `features` f (n, k), in the original
+    order of the points, and `query_features` g (m, k) are already scaled to m. Only points within
+    the squared distance `limit` in space, all of whose features differ by at most `tolerance`, are
+    considered. Writes `index` (m,), -1 where there is none, and the squared distance in space
+    `distance2` (m,), infinity there. NaN features match nothing. Of equally close points the one
+    with the lowest index is returned.
     """
     n = len(arranged)
     inner = len(cuts)
-    waiting = np.empty(depth + 1, np.int64)
+    stack = np.empty(depth + 1, np.int64)
     bounds = np.empty((depth + 1, 3))
     for q in range(len(queries)):
-        best = np.inf
-        found = -1
-        apart = np.inf
-        waiting[0] = 0
+        lowest = np.inf
+        nearest = -1
+        best_distance2 = np.inf
+        stack[0] = 0
         bounds[0, :] = 0.0
         count = 1
         while count > 0:
             count -= 1
-            node = waiting[count]
+            node = stack[count]
             bx = bounds[count, 0]
             by = bounds[count, 1]
             bz = bounds[count, 2]
-            if bx * bx + by * by + bz * bz > min(best, limit):
+            if bx * bx + by * by + bz * bz > min(lowest, limit):
                 continue
             while node < inner:
                 axis = axes[node]
@@ -66,8 +66,8 @@ def kdtree_nearest_featured(
                 far = near + 1
                 if gap >= 0:
                     near, far = far, near
-                if fx * fx + fy * fy + fz * fz <= min(best, limit):
-                    waiting[count] = far
+                if fx * fx + fy * fy + fz * fz <= min(lowest, limit):
+                    stack[count] = far
                     bounds[count, 0] = fx
                     bounds[count, 1] = fy
                     bounds[count, 2] = fz
@@ -81,39 +81,40 @@ def kdtree_nearest_featured(
                 if not d <= limit:
                     continue
                 total = d
-                alike = True
+                compatible = True
                 for a in range(features.shape[1]):
                     gap = query_features[q, a] - features[order[i], a]
                     if not abs(gap) <= tolerance:
-                        alike = False
+                        compatible = False
                         break
                     total += weight * gap * gap
-                if alike and (total < best or (total == best and order[i] < found)):
-                    best = total
-                    found = order[i]
-                    apart = d
-        index[q] = found
-        cost[q] = apart
+                if compatible and (total < lowest or (total == lowest and order[i] < nearest)):
+                    lowest = total
+                    nearest = order[i]
+                    best_distance2 = d
+        index[q] = nearest
+        distance2[q] = best_distance2
 
 
 @kernel
 def grid_search(
     grid: Int64,
     points: Float64,
-    moved: Float64,
+    transformed: Float64,
     pixels: Float64,
     radius: int,
     index: Int64,
     distance2: Float64,
 ) -> None:
-    """Find the closest point near the pixel on which each of the `moved` points (m, 3) falls.
+    """Find the closest point near the pixel to which each `transformed` point (m, 3) projects.
 
-    `grid` (H, W) holds positions in `points` (n, 3), -1 for none; `pixels` (m, 2) are (u, v), NaN
-    behind the camera. The search takes the closest of the pixels within `radius` and goes on from
-    there until none is closer. Writes `index` (m,), -1 where there is none, and `distance2` (m,).
+    `grid` (H, W) contains indices into `points` (n, 3), -1 for none; `pixels` (m, 2) are (u, v),
+    NaN behind the camera. The search moves to the closest point within `radius` pixels, and
+    continues from there until none is closer. Writes `index` (m,), -1 where there is none, and
+    `distance2` (m,).
     """
     rows, columns = grid.shape
-    for k in range(len(moved)):
+    for k in range(len(transformed)):
         index[k] = -1
         distance2[k] = np.inf
         if not np.isfinite(pixels[k, 0] + pixels[k, 1]):
@@ -127,15 +128,15 @@ def grid_search(
             best_v = v
             for i in range(max(0, v - radius), min(rows, v + radius + 1)):
                 for j in range(max(0, u - radius), min(columns, u + radius + 1)):
-                    other = grid[i, j]
-                    if other < 0:
+                    candidate = grid[i, j]
+                    if candidate < 0:
                         continue
                     d = 0.0
                     for a in range(3):
-                        d += (moved[k, a] - points[other, a]) ** 2
+                        d += (transformed[k, a] - points[candidate, a]) ** 2
                     if d < distance2[k]:
                         distance2[k] = d
-                        index[k] = other
+                        index[k] = candidate
                         best_u = j
                         best_v = i
             if best_u == u and best_v == v:
@@ -150,23 +151,23 @@ def ball_moments(
 ) -> Float64:
     """Second-order moments of the points within `radius` of each of the `centres` (m, 3).
 
-    Takes the arrays of a `KdTree`. Returns (m, 3): the eigenvalues, rising, of the moment matrix
+    Takes the arrays of a `KdTree`. Returns (m, 3): the eigenvalues, ascending, of the moment matrix
     ``sum (x - c)(x - c)^T / count`` about the ball's centre c, in m^2; zero where it is empty.
     """
     n = len(arranged)
     inner = len(cuts)
     out = np.zeros((len(centres), 3))
-    waiting = np.empty(depth + 1, np.int64)
+    stack = np.empty(depth + 1, np.int64)
     M = np.empty((3, 3))
     vectors = np.empty((3, 3))
     for q in range(len(centres)):
         M[:, :] = 0.0
-        found = 0
-        waiting[0] = 0
+        members = 0
+        stack[0] = 0
         count = 1
         while count > 0:
             count -= 1
-            node = waiting[count]
+            node = stack[count]
             while node < inner:
                 gap = centres[q, axes[node]] - cuts[node]
                 near = 2 * node + 1
@@ -174,7 +175,7 @@ def ball_moments(
                 if gap >= 0:
                     near, far = far, near
                 if abs(gap) <= radius:
-                    waiting[count] = far
+                    stack[count] = far
                     count += 1
                 node = near
             leaf = node - inner
@@ -183,15 +184,15 @@ def ball_moments(
                 for a in range(3):
                     d += (arranged[i, a] - centres[q, a]) ** 2
                 if d <= radius * radius:
-                    found += 1
+                    members += 1
                     for a in range(3):
                         for b in range(3):
                             M[a, b] += (arranged[i, a] - centres[q, a]) * (
                                 arranged[i, b] - centres[q, b]
                             )
-        if found > 0:
+        if members > 0:
             for a in range(3):
                 for b in range(3):
-                    M[a, b] /= found
+                    M[a, b] /= members
             symmetric_eigen(M, out[q], vectors)
     return out

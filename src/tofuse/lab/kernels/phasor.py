@@ -1,8 +1,8 @@
-"""Sums of light in a pixel of a modulated camera.
+"""Phasors of the light in a pixel of an amplitude-modulated camera.
 
-Light that has gone a path of L m at a wave number k (2 pi f / c, per m) and has the strength s
-contributes ``s exp(i n k L)`` to harmonic n. Channels are, in this order: the sum of strengths,
-then real and imaginary part of the harmonics 1, 3 and 5.
+Light of strength s on a path of L m, at the wave number k (2 pi f / c, per m), contributes
+``s exp(i n k L)`` to harmonic n. Channels, in this order: the sum of the strengths, then the real
+and imaginary parts of harmonics 1, 3 and 5.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ CHANNELS = 7
 def ray_phasors(
     strength: Float64, path: Float64, wave_number: float, start: int, stop: int, out: Float64
 ) -> None:
-    """Phasors out (N, 7) of rays start to stop, from R returns each: strength, path (N, R)."""
+    """Phasors `out` (N, 7) of rays start to stop, from R returns each: strength, path (N, R)."""
     for i in range(start, stop):
         for c in range(7):
             out[i, c] = 0.0
@@ -45,7 +45,7 @@ def ray_phasors(
 
 @kernel
 def pool(fine: Float64, weights: Float64, stride: int, start: int, stop: int, out: Float64) -> None:
-    """Weighted sums out (H, W, C) over windows of fine (Hf, Wf, C), for rows start to stop."""
+    """Weighted sums `out` (H, W, C) over windows of `fine` (Hf, Wf, C), for rows start to stop."""
     for v in range(start, stop):
         for u in range(out.shape[1]):
             for c in range(out.shape[2]):
@@ -57,7 +57,7 @@ def pool(fine: Float64, weights: Float64, stride: int, start: int, stop: int, ou
 
 
 @kernel
-def off_plane(
+def plane_deviation(
     points: Float64,
     normals: Float64,
     window: int,
@@ -66,19 +66,19 @@ def off_plane(
     stop: int,
     out: Float64,
 ) -> None:
-    """Largest distance out (H, W) of a window's points from the plane at its centre.
+    """Largest distance `out` (H, W) of a window's points from the tangent plane at its centre.
 
-    Points (Hf, Wf, 3) that are not finite don't count; where the centre isn't, the nearest
-    and the farthest finite point are compared.
+    Non-finite points (Hf, Wf, 3) are ignored. Where the centre is not finite, the difference of the
+    largest and the smallest range is used.
     """
-    middle = window // 2
+    half = window // 2
     for v in range(start, stop):
         for u in range(out.shape[1]):
-            cv, cu = v * stride + middle, u * stride + middle
+            cv, cu = v * stride + half, u * stride + half
             px, py, pz = points[cv, cu, 0], points[cv, cu, 1], points[cv, cu, 2]
             nx, ny, nz = normals[cv, cu, 0], normals[cv, cu, 1], normals[cv, cu, 2]
             centre = np.isfinite(px)
-            worst = 0.0
+            largest = 0.0
             near = np.inf
             far = 0.0
             for i in range(window):
@@ -90,12 +90,12 @@ def off_plane(
                         continue
                     if centre:
                         d = abs(nx * (x - px) + ny * (y - py) + nz * (z - pz))
-                        worst = max(worst, d)
+                        largest = max(largest, d)
                     else:
                         r = np.sqrt(x * x + y * y + z * z)
                         near = min(near, r)
                         far = max(far, r)
-            out[v, u] = worst if centre else max(0.0, far - near)
+            out[v, u] = largest if centre else max(0.0, far - near)
 
 
 @kernel
@@ -110,11 +110,12 @@ def upsample(
     stop: int,
     out: Float64,
 ) -> None:
-    """Joint bilateral interpolation of a coarse grid, for rows start to stop of out (H, W, C).
+    """Joint bilateral interpolation of a coarse grid, for rows start to stop of `out` (H, W, C).
 
-    Node (i, j) of coarse (Hc, Wc, C) lies at pixel (step // 2 + i step, step // 2 + j step). A
-    node counts by its distance in the image, by how far it lies off the pixel's plane, and by
-    how alike the normals are, so nothing leaks over edges. Points (H, W, 3) not finite: out 0.
+    Node (i, j) of `coarse` (Hc, Wc, C) lies at pixel (step // 2 + i step, step // 2 + j step).
+    Nodes are weighted by their distance in the image, by their distance from the pixel's tangent
+    plane, and by the angle between the normals, so that nothing leaks across edges. `out` is 0 at
+    non-finite points (H, W, 3).
     """
     first = step // 2
     for v in range(start, stop):
@@ -135,19 +136,21 @@ def upsample(
                 for j in range(max(0, cj - 1), min(coarse.shape[1], cj + 2)):
                     if not np.isfinite(coarse_points[i, j, 0]):
                         continue
-                    off = (
+                    deviation = (
                         nx * (coarse_points[i, j, 0] - px)
                         + ny * (coarse_points[i, j, 1] - py)
                         + nz * (coarse_points[i, j, 2] - pz)
                     ) / scale
-                    alike = (
+                    cosine = (
                         nx * coarse_normals[i, j, 0]
                         + ny * coarse_normals[i, j, 1]
                         + nz * coarse_normals[i, j, 2]
                     )
-                    alike = max(0.0, alike)
-                    away = (i - fi) ** 2 + (j - fj) ** 2
-                    w = np.exp(-1.5 * away) * (np.exp(-off * off) * alike**4 + 1e-6)
+                    cosine = max(0.0, cosine)
+                    distance2 = (i - fi) ** 2 + (j - fj) ** 2
+                    w = np.exp(-1.5 * distance2) * (
+                        np.exp(-deviation * deviation) * cosine**4 + 1e-6
+                    )
                     total += w
                     for c in range(out.shape[2]):
                         out[v, u, c] += w * coarse[i, j, c]

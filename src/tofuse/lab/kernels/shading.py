@@ -1,6 +1,6 @@
-"""Procedural albedo, evaluated at points on surfaces: continuous, and the same for one seed.
+"""Procedural albedo, evaluated at points on surfaces: continuous, and determined by the seed.
 
-Noise is value noise on a lattice (Perlin 1985, with values instead of gradients): band-limited
+The noise is value noise on a lattice (Perlin 1985, with values instead of gradients), band-limited
 by its finest octave, so that a camera's pixels can resolve it.
 """
 
@@ -16,7 +16,7 @@ from tofuse.kernels.jit import kernel
 PLAIN, NOISE, WOOD, TILES, PRINT, SPECKLE = 0, 1, 2, 3, 4, 5
 
 # Columns of a row of texture parameters.
-ALBEDO, CONTRAST, SCALE, KIND, GLOSS, SHIFT, COLUMNS = 0, 1, 2, 5, 6, 7, 10
+ALBEDO, CONTRAST, SCALE, KIND, GLOSS, OFFSET, COLUMNS = 0, 1, 2, 5, 6, 7, 10
 LATTICE = 256
 
 
@@ -37,7 +37,7 @@ class Triangles(NamedTuple):
 
 
 class Textures(NamedTuple):
-    """Texture parameters (S, COLUMNS) of every surface; the others as in `value_noise`."""
+    """Texture parameters (S, COLUMNS) of all surfaces; `order` and `values` as in `value_noise`."""
 
     rows: Float64
     order: Int32
@@ -45,7 +45,7 @@ class Textures(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """Rays in a body's frame, and what they hit.
+    """Rays in a body's frame, and their hits.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Rays(NamedTuple):
 
 
 class Shading(NamedTuple):
-    """What N rays hit.
+    """Surface properties where N rays hit.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Shading(NamedTuple):
 
 @kernel
 def value_noise(order: Int32, values: Float64, x: float, y: float, z: float) -> float:
-    """Smooth noise of unit variance at the lattice points, cell size 1, period 256 cells.
+    """Smooth noise with unit variance at the lattice points, cells of size 1, period 256 cells.
 
     `order` (256,) is a permutation of 0 to 255, `values` (256,) the noise on the lattice.
     """
@@ -103,9 +103,9 @@ def value_noise(order: Int32, values: Float64, x: float, y: float, z: float) -> 
 
 @kernel
 def fractal_noise(order: Int32, values: Float64, x: float, y: float, z: float) -> float:
-    """Three octaves of `value_noise`, near unit variance on the average over a surface.
+    """Three octaves of `value_noise`, with nearly unit variance averaged over a surface.
 
-    Each octave is turned its own way: surfaces along the axes would show the lattice.
+    Each octave is rotated differently: surfaces along the axes would show the lattice.
     """
     a = (2.0 * x + 2.0 * y - z) / 3.0
     b = (2.0 * z - x + 2.0 * y) / 3.0
@@ -120,24 +120,24 @@ def fractal_noise(order: Int32, values: Float64, x: float, y: float, z: float) -
 
 @kernel
 def pattern_at(order: Int32, values: Float64, row: Float64, x: float, y: float, z: float) -> float:
-    """Pattern of one surface at a point of its body: mean near 0, standard deviation near 1."""
+    """Pattern of a surface at a point of its body: mean near 0, standard deviation near 1."""
     kind = int(row[KIND])
     if kind == PLAIN:
         return 0.0
-    u = (x + row[SHIFT]) / row[SCALE]
-    v = (y + row[SHIFT + 1]) / row[SCALE + 1]
-    w = (z + row[SHIFT + 2]) / row[SCALE + 2]
+    u = (x + row[OFFSET]) / row[SCALE]
+    v = (y + row[OFFSET + 1]) / row[SCALE + 1]
+    w = (z + row[OFFSET + 2]) / row[SCALE + 2]
     if kind == WOOD:
         warp = value_noise(order, values, 0.4 * u, 0.4 * v, 0.4 * w)
         rings = np.sin(6.2831853 * 0.35 * (u + v + w) + 4.0 * warp)
         return 0.9 * rings + 0.7 * value_noise(order, values, u, v, w)
     if kind == TILES:
-        # Joints between square tiles, with soft edges, and a tone for each tile.
+        # Joints between square tiles, with soft edges; each tile has its own tone.
         joint = 0.0
         for k in range(3):
             q = u if k == 0 else (v if k == 1 else w)
-            away = abs(q - np.floor(q) - 0.5)
-            s = min(max((away - 0.44) / 0.04, 0.0), 1.0)
+            offset = abs(q - np.floor(q) - 0.5)
+            s = min(max((offset - 0.44) / 0.04, 0.0), 1.0)
             joint = max(joint, s * s * (3.0 - 2.0 * s))
         tone = values[(int(np.floor(u)) * 7 + int(np.floor(v)) * 57 + int(np.floor(w))) & 255]
         return (0.6 * tone + 0.3) * (1.0 - joint) - 2.0 * joint
@@ -153,9 +153,9 @@ def pattern_at(order: Int32, values: Float64, row: Float64, x: float, y: float, 
 def shade_hits(
     triangles: Triangles, textures: Textures, rays: Rays, rotation: Float64, out: Shading
 ) -> None:
-    """Fill in what each ray hit, where its face is not negative.
+    """Fill in the surface properties of each hit: where the ray's face is not negative.
 
-    `rotation` (3, 3) turns directions of the body's frame into the room's.
+    `rotation` (3, 3) is R_room_body.
     """
     corner_normals, face_normals, face_surface = triangles
     rows, order, values = textures
@@ -170,8 +170,8 @@ def shade_hits(
         j = 0 if shared else i
         v, w = weights[i, 0], weights[i, 1]
         u = 1.0 - v - w
-        flat = 0.0
-        smooth = 0.0
+        face_cosine = 0.0
+        smooth_cosine = 0.0
         norm = 0.0
         for k in range(3):
             n[k] = (
@@ -180,12 +180,12 @@ def shade_hits(
                 + w * corner_normals[f, 6 + k]
             )
             norm += n[k] * n[k]
-            flat += face_normals[f, k] * directions[i, k]
-            smooth += n[k] * directions[i, k]
+            face_cosine += face_normals[f, k] * directions[i, k]
+            smooth_cosine += n[k] * directions[i, k]
         norm = np.sqrt(norm)
-        sign = -1.0 if flat > 0.0 else 1.0
-        # A normal blended between corners may turn away from the ray at a silhouette.
-        if norm < 1e-6 or sign * smooth >= 0.0:
+        sign = -1.0 if face_cosine > 0.0 else 1.0
+        # At a silhouette, a normal interpolated between corners may face away from the ray.
+        if norm < 1e-6 or sign * smooth_cosine >= 0.0:
             norm = 1.0
             for k in range(3):
                 n[k] = face_normals[f, k]

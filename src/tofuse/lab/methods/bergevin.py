@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
-from tofuse.lab.methods.multiview import Cloud, Pairs, Relaxing
+from tofuse.lab.methods.multiview import Cloud, Pairs, RelaxationMethod
 from tofuse.parts import part
 
 # Relative size below which eigenvalues are rounding errors.
@@ -19,7 +19,7 @@ _RANK = 1e-10
 
 @part("refinement", "bergevin", label="validated")
 @dataclass(frozen=True)
-class Bergevin(Relaxing):
+class Bergevin(RelaxationMethod):
     """Each round aligns each view with the tangent planes of all others at their previous poses.
 
     The views form a star about the first, which is fixed. The increments of all views are computed
@@ -29,23 +29,23 @@ class Bergevin(Relaxing):
     """
 
     def relax(self, poses: Float64, pairs: Sequence[Pairs], clouds: Sequence[Cloud]) -> Float64:
-        """See `Relaxing.relax`."""
+        """See `RelaxationMethod.relax`."""
         n = len(poses)
         H, g = np.zeros((n, 6, 6)), np.zeros((n, 6))
-        middle = np.array(
+        centroids = np.array(
             [transform_points(T, c.points).mean(0) for T, c in zip(poses, clouds, strict=True)]
         )
         for p in pairs:
             x = transform_points(poses[p.i], p.p_i)
             normal = p.n_j @ poses[p.j][:3, :3].T
-            known = np.isfinite(normal).all(1)
-            r = ((x - transform_points(poses[p.j], p.p_j)) * normal).sum(1)[known]
-            J = np.column_stack([normal, np.cross(x - middle[p.i], normal)])[known]
+            valid = np.isfinite(normal).all(1)
+            r = ((x - transform_points(poses[p.j], p.p_j)) * normal).sum(1)[valid]
+            J = np.column_stack([normal, np.cross(x - centroids[p.i], normal)])[valid]
             H[p.i] += J.T @ J
             g[p.i] += J.T @ r
         out = poses.copy()
         for k in range(1, n):
             if H[k].any():
                 step = -np.linalg.lstsq(H[k], g[k], rcond=_RANK)[0]
-                out[k] = se3.about(middle[k], se3.exp(step)) @ poses[k]
+                out[k] = se3.about(centroids[k], se3.exp(step)) @ poses[k]
         return out

@@ -31,9 +31,9 @@ class NormalCompatibility(Bounded, Rejector):
 
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
         """See `Rejector.reject`."""
-        turn = np.eye(4)
-        turn[:3, :3] = alignment.T_target_source[:3, :3]
-        a = transform_points(turn, alignment.source.normals[matches.source])
+        rotation = np.eye(4)
+        rotation[:3, :3] = alignment.T_target_source[:3, :3]
+        a = transform_points(rotation, alignment.source.normals[matches.source])
         b = alignment.target.normals[matches.target]
         return matches.keep((a * b).sum(1) >= math.cos(self.max_angle_rad))
 
@@ -93,8 +93,8 @@ class ColorCompatibility(Bounded, Rejector):
 
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
         """See `Rejector.reject`."""
-        gap = alignment.source.color[matches.source] - alignment.target.color[matches.target]
-        return matches.keep((gap * gap).sum(1) <= self.tolerance**2)
+        difference = alignment.source.color[matches.source] - alignment.target.color[matches.target]
+        return matches.keep((difference * difference).sum(1) <= self.tolerance**2)
 
 
 @part("rejector", "boundary", label="validated")

@@ -17,8 +17,8 @@ from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.selectors import All, Random
 from tofuse.registration.stopping import SmallStep
 
-# Initial number of neighbours per query, doubled when all are taken.
-_FIRST = 8
+# Initial number of neighbours per query, doubled when all are matched.
+_INITIAL_NEIGHBOURS = 8
 
 
 @part("matcher", "comprehensive", label="validated")
@@ -44,27 +44,29 @@ class _LookupSearch:
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
         points, size = alignment.transformed, len(self.tree)
-        near, squared = self.tree.neighbours(points, min(_FIRST, size))
-        lists = dict(enumerate(zip(near, squared, strict=True)))
-        offers = [(float(squared[k, 0]), k, 0) for k in range(len(points))]
-        heapq.heapify(offers)
-        taken = np.zeros(size, bool)
+        indices, distances2 = self.tree.neighbours(points, min(_INITIAL_NEIGHBOURS, size))
+        candidates = dict(enumerate(zip(indices, distances2, strict=True)))
+        proposals = [(float(distances2[k, 0]), k, 0) for k in range(len(points))]
+        heapq.heapify(proposals)
+        matched = np.zeros(size, bool)
         pairs = []
-        while offers:
-            distance2, source, rank = heapq.heappop(offers)
+        while proposals:
+            distance2, source, rank = heapq.heappop(proposals)
             if distance2 > reach * reach:
                 break
-            target = int(lists[source][0][rank])
-            if not taken[target]:
-                taken[target] = True
+            target = int(candidates[source][0][rank])
+            if not matched[target]:
+                matched[target] = True
                 pairs.append((source, target, distance2))
                 continue
             rank += 1
-            if rank == len(lists[source][0]) < size:
-                index, far = self.tree.neighbours(points[source : source + 1], min(2 * rank, size))
-                lists[source] = index[0], far[0]
-            if rank < len(lists[source][0]):
-                heapq.heappush(offers, (float(lists[source][1][rank]), source, rank))
+            if rank == len(candidates[source][0]) < size:
+                index, more_distances2 = self.tree.neighbours(
+                    points[source : source + 1], min(2 * rank, size)
+                )
+                candidates[source] = index[0], more_distances2[0]
+            if rank < len(candidates[source][0]):
+                heapq.heappush(proposals, (float(candidates[source][1][rank]), source, rank))
         pairs.sort()
         i, j, d2 = np.array(pairs).reshape(-1, 3).T
         return Matches(i.astype(np.int64), j.astype(np.int64), np.sqrt(d2))

@@ -20,8 +20,8 @@ from tofuse.registration.interfaces import Alignment, Matcher, Matches, Points, 
 
 Invariant = Literal["curvature", "moments"]
 
-# Min cosine between line and normal; lines closer to the tangent plane are rejected.
-_GRAZING = 0.1
+# Min cosine of the angle between the line and the normal; more grazing lines are rejected.
+_MIN_COSINE = 0.1
 
 
 @part("matcher", "normal-shooting", label="validated")
@@ -54,24 +54,24 @@ class _NormalSearch:
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
         start, target = alignment.transformed, alignment.target
-        turn = np.eye(4)
-        turn[:3, :3] = alignment.T_target_source[:3, :3]
-        line = transform_points(turn, alignment.source.normals)
-        at = start
-        index, _ = self.tree.nearest(at, reach)
+        rotation = np.eye(4)
+        rotation[:3, :3] = alignment.T_target_source[:3, :3]
+        directions = transform_points(rotation, alignment.source.normals)
+        intersection = start
+        index, _ = self.tree.nearest(intersection, reach)
         for _ in range(self.steps):
-            safe = np.maximum(index, 0)
-            n = target.normals[safe]
-            slope = (line * n).sum(1)
-            good = (index >= 0) & (np.abs(slope) > _GRAZING)
-            slope = np.where(good, slope, 1.0)
-            along = ((target.points[safe] - start) * n).sum(1) / slope
-            at = np.where(good[:, None], start + along[:, None] * line, np.nan)
-            index, _ = self.tree.nearest(at, reach)
+            clamped = np.maximum(index, 0)
+            n = target.normals[clamped]
+            cosine = (directions * n).sum(1)
+            intersects = (index >= 0) & (np.abs(cosine) > _MIN_COSINE)
+            cosine = np.where(intersects, cosine, 1.0)
+            t = ((target.points[clamped] - start) * n).sum(1) / cosine
+            intersection = np.where(intersects[:, None], start + t[:, None] * directions, np.nan)
+            index, _ = self.tree.nearest(intersection, reach)
         source = np.flatnonzero(index >= 0)
         index = index[source]
-        gap = start[source] - target.points[index]
-        distance = np.sqrt((gap * gap).sum(1))
+        difference = start[source] - target.points[index]
+        distance = np.sqrt((difference * difference).sum(1))
         return Matches(source, index, distance).keep(distance <= reach)
 
 
@@ -133,13 +133,15 @@ class _GridSearch:
     radius: int
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
-        moved = alignment.transformed
-        pixels = np.ascontiguousarray(self.view.camera.project(moved))
-        index = np.empty(len(moved), np.int64)
-        squared = np.empty(len(moved))
-        grid_search(self.grid, alignment.target.points, moved, pixels, self.radius, index, squared)
-        source = np.flatnonzero(squared <= reach * reach)
-        return Matches(source, index[source], np.sqrt(squared[source]))
+        transformed = alignment.transformed
+        pixels = np.ascontiguousarray(self.view.camera.project(transformed))
+        index = np.empty(len(transformed), np.int64)
+        distance2 = np.empty(len(transformed))
+        grid_search(
+            self.grid, alignment.target.points, transformed, pixels, self.radius, index, distance2
+        )
+        source = np.flatnonzero(distance2 <= reach * reach)
+        return Matches(source, index[source], np.sqrt(distance2[source]))
 
 
 @part("matcher", "closest-compatible", label="validated")
@@ -174,12 +176,12 @@ class _CompatibleSearch:
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
         # Amplitudes select candidates; among these only the distance in space counts.
-        asked = _log_amplitude(alignment.source)
-        index, squared = self.tree.nearest_featured(
-            alignment.transformed, self.features, asked, self.tolerance, reach, 0.0
+        source_features = _log_amplitude(alignment.source)
+        index, distance2 = self.tree.nearest_featured(
+            alignment.transformed, self.features, source_features, self.tolerance, reach, 0.0
         )
         source = np.flatnonzero(index >= 0)
-        return Matches(source, index[source], np.sqrt(squared[source]))
+        return Matches(source, index[source], np.sqrt(distance2[source]))
 
 
 def _log_amplitude(points: Points) -> Float64:
@@ -223,22 +225,26 @@ class _InvariantSearch:
     options: ClosestInvariant
     tree: FeaturedKdTree
     # Features of both views, cached at the first matching; the source's by its identity.
-    known: dict[str, tuple[Points, Float64]]
+    cache: dict[str, tuple[Points, Float64]]
 
     def match(self, alignment: Alignment, reach: float) -> Matches:
-        of_target = self._features("target", alignment.target, alignment.resolution)
-        of_source = self._features("source", alignment.source, alignment.resolution)
-        spread = np.array([_mean_deviation(column) for column in of_target.T])
-        by = self.options.weight * alignment.resolution / (spread * np.sqrt(of_target.shape[1]))
-        index, squared = self.tree.nearest_featured(
-            alignment.transformed, of_target * by, of_source * by, np.inf, reach
+        target_features = self._features("target", alignment.target, alignment.resolution)
+        source_features = self._features("source", alignment.source, alignment.resolution)
+        deviation = np.array([_mean_deviation(column) for column in target_features.T])
+        scale = (
+            self.options.weight
+            * alignment.resolution
+            / (deviation * np.sqrt(target_features.shape[1]))
+        )
+        index, distance2 = self.tree.nearest_featured(
+            alignment.transformed, target_features * scale, source_features * scale, np.inf, reach
         )
         source = np.flatnonzero(index >= 0)
-        return Matches(source, index[source], np.sqrt(squared[source]))
+        return Matches(source, index[source], np.sqrt(distance2[source]))
 
-    def _features(self, which: str, points: Points, resolution: float) -> Float64:
-        if which in self.known and self.known[which][0] is points:
-            return self.known[which][1]
+    def _features(self, role: str, points: Points, resolution: float) -> Float64:
+        if role in self.cache and self.cache[role][0] is points:
+            return self.cache[role][1]
         columns = []
         for feature in self.options.features:
             if feature == "curvature":
@@ -247,8 +253,8 @@ class _InvariantSearch:
                 radius = self.options.radius * resolution
                 moments = FeaturedKdTree(points.view.points).moments(points.points, radius)
                 columns.append(moments / radius**2)
-        self.known[which] = (points, np.concatenate(columns, 1))
-        return self.known[which][1]
+        self.cache[role] = (points, np.concatenate(columns, 1))
+        return self.cache[role][1]
 
 
 def _mean_deviation(column: Float64) -> float:

@@ -19,7 +19,7 @@ from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import check_graph
 from tofuse.posegraph.sparse import parts_of
 
-_LEAST = 1e-12  # min edge length relative to the largest
+_MIN_RELATIVE_LENGTH = 1e-12  # min edge length relative to the largest
 
 
 @part("optimiser", "elch", label="validated")
@@ -41,24 +41,26 @@ class Elch(Optimiser):
         check_graph(graph)
         lengths = _lengths(graph)
         poses = graph.poses.copy()
-        known = ~graph.loop
+        included = ~graph.loop
         history = [graph.chi2()]
         order = np.flatnonzero(graph.loop)
         order = order[np.argsort(graph.edges[order].max(axis=1), kind="stable")]
         for loop in map(int, order):
-            fractions = [_fractions(graph, length, known, loop) for length in lengths]
+            fractions = [_fractions(graph, length, included, loop) for length in lengths]
             if fractions[0] is not None and fractions[1] is not None:
-                poses = _spread(poses, graph, loop, fractions[0], fractions[1])
+                poses = _distribute(poses, graph, loop, fractions[0], fractions[1])
                 history.append(graph.with_poses(poses).chi2())
-            known[loop] = True
-        part = parts_of(len(poses), graph.edges)
-        for k in range(int(part.max(initial=-1)) + 1):
-            here = np.flatnonzero(part == k)
-            first = graph.poses[here[0]]
-            if np.array_equal(poses[here], graph.poses[here]):
+            included[loop] = True
+        component = parts_of(len(poses), graph.edges)
+        for k in range(int(component.max(initial=-1)) + 1):
+            members = np.flatnonzero(component == k)
+            first = graph.poses[members[0]]
+            if np.array_equal(poses[members], graph.poses[members]):
                 continue  # not even by rounding
-            poses[here] = se3.orthonormalise(first @ se3.inverse(poses[here[0]]) @ poses[here])
-            poses[here[0]] = first
+            poses[members] = se3.orthonormalise(
+                first @ se3.inverse(poses[members[0]]) @ poses[members]
+            )
+            poses[members[0]] = first
         return Optimisation(graph.with_poses(poses), tuple(history), True)
 
 
@@ -66,33 +68,35 @@ def _lengths(graph: PoseGraph) -> tuple[Float64, Float64]:
     """Traces of the covariances of translation (m^2) and of rotation (rad^2), (M,) each."""
     C = np.linalg.pinv(graph.information, hermitian=True)
     diagonal = np.diagonal(C, axis1=1, axis2=2)
-    out = []
-    for part_of in (diagonal[:, :3], diagonal[:, 3:]):
-        length = part_of.sum(axis=1)
-        out.append(np.maximum(length, _LEAST * length.max(initial=1e-300)))
-    return out[0], out[1]
+    lengths = []
+    for block in (diagonal[:, :3], diagonal[:, 3:]):
+        length = block.sum(axis=1)
+        lengths.append(np.maximum(length, _MIN_RELATIVE_LENGTH * length.max(initial=1e-300)))
+    return lengths[0], lengths[1]
 
 
-def _fractions(graph: PoseGraph, length: Float64, known: Bool, loop: int) -> Float64 | None:
+def _fractions(graph: PoseGraph, length: Float64, included: Bool, loop: int) -> Float64 | None:
     """(N,) fraction of the loop's error for each pose, 0 to 1; None if it closes no loop."""
     n = len(graph.ids)
     start, end = graph.edges[loop]
-    i, j = graph.edges[known].T
+    i, j = graph.edges[included].T
     # Keep the shortest of parallel edges, which the sparse matrix would add up.
-    order = np.lexsort((length[known], np.maximum(i, j), np.minimum(i, j)))
-    low, high, value = np.minimum(i, j)[order], np.maximum(i, j)[order], length[known][order]
+    order = np.lexsort((length[included], np.maximum(i, j), np.minimum(i, j)))
+    low, high, value = np.minimum(i, j)[order], np.maximum(i, j)[order], length[included][order]
     first = np.ones(len(order), bool)
     first[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
-    links = sparse.csr_matrix((value[first], (low[first], high[first])), shape=(n, n))
-    distance, before = dijkstra(links, directed=False, indices=start, return_predecessors=True)
+    adjacency = sparse.csr_matrix((value[first], (low[first], high[first])), shape=(n, n))
+    distance, predecessors = dijkstra(
+        adjacency, directed=False, indices=start, return_predecessors=True
+    )
     if not np.isfinite(distance[end]):
         return None
     path = [int(end)]
     while path[-1] != start:
-        path.append(int(before[path[-1]]))
+        path.append(int(predecessors[path[-1]]))
     on_path = np.array(path)
     _, _, nearest = dijkstra(
-        links, directed=False, indices=on_path, min_only=True, return_predecessors=True
+        adjacency, directed=False, indices=on_path, min_only=True, return_predecessors=True
     )
     fraction = np.zeros(n)
     reached = nearest >= 0
@@ -101,13 +105,15 @@ def _fractions(graph: PoseGraph, length: Float64, known: Bool, loop: int) -> Flo
     return fraction
 
 
-def _spread(poses: Float64, graph: PoseGraph, loop: int, slide: Float64, turn: Float64) -> Float64:
+def _distribute(
+    poses: Float64, graph: PoseGraph, loop: int, t_fraction: Float64, R_fraction: Float64
+) -> Float64:
     """Move every pose by its fractions of the loop's correction."""
     i, j = graph.edges[loop]
-    wanted = poses[i] @ graph.measurements[loop]
-    shift = wanted[:3, 3] - poses[j, :3, 3]
-    rotation = se3.so3_log(wanted[:3, :3] @ poses[j, :3, :3].T)
+    corrected = poses[i] @ graph.measurements[loop]
+    translation = corrected[:3, 3] - poses[j, :3, 3]
+    rotation = se3.so3_log(corrected[:3, :3] @ poses[j, :3, :3].T)
     out = poses.copy()
-    out[:, :3, 3] += slide[:, None] * shift
-    out[:, :3, :3] = se3.so3_exp(turn[:, None] * rotation) @ poses[:, :3, :3]
+    out[:, :3, 3] += t_fraction[:, None] * translation
+    out[:, :3, :3] = se3.so3_exp(R_fraction[:, None] * rotation) @ poses[:, :3, :3]
     return out

@@ -1,4 +1,4 @@
-"""A kd-tree that also compares features, and sums over balls."""
+"""A kd-tree that also compares features, and computes moments of points in balls."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tofuse.lab.kernels.cloud_search import ball_moments, kdtree_nearest_feature
 
 
 class FeaturedKdTree(KdTree):
-    """See `KdTree`."""
+    """A `KdTree` with searches by distance and features."""
 
     def nearest_featured(
         self,
@@ -22,27 +22,29 @@ class FeaturedKdTree(KdTree):
         max_distance: float = np.inf,
         weight: float = 1.0,
     ) -> tuple[Int64, Float64]:
-        """Find the point least far away in space and features together, for each query (M, 3).
+        """Find the point closest in space and features, for each query (M, 3).
 
-        Least is the squared distance in space plus `weight` times that of the features, `features`
-        (N, K) of the points and `query_features` (M, K), weighted so that they are in m. Points
-        further away in space than `max_distance` m, or off by more than `tolerance` in a feature,
-        don't count, nor do NaN features. Returns index (M,), -1 where there is none, and the
-        squared distance in space (M,) in m^2, infinity there.
+        Minimises the squared distance in space plus `weight` times that of the features: `features`
+        (N, K) of the points and `query_features` (M, K), already scaled to m. Points beyond
+        `max_distance` m in space, or with a feature that differs by more than `tolerance` or is
+        NaN, are ignored. Returns index (M,), -1 where there is none, and the squared distance in
+        space (M,) in m^2, infinity there.
         """
         array = checked_points(queries, "queries")
         index = np.empty(len(array), np.int64)
         distance2 = np.empty(len(array))
         limit = max_distance * max_distance if max_distance >= 0 else -1.0
-        own, asked = (np.ascontiguousarray(f, np.float64) for f in (features, query_features))
+        point_rows, query_rows = (
+            np.ascontiguousarray(f, np.float64) for f in (features, query_features)
+        )
 
-        def work(a: int, b: int) -> None:
+        def search(a: int, b: int) -> None:
             kdtree_nearest_featured(
                 *self._tree,
                 self._depth,
-                own,
+                point_rows,
                 array[a:b],
-                asked[a:b],
+                query_rows[a:b],
                 tolerance,
                 weight,
                 limit,
@@ -50,21 +52,21 @@ class FeaturedKdTree(KdTree):
                 distance2[a:b],
             )
 
-        run_queries(work, len(array))
+        run_queries(search, len(array))
         return index, distance2
 
     def moments(self, centres: ArrayLike, radius: float) -> Float64:
-        """Eigenvalues (M, 3), rising, of the second moments in a ball round each centre (M, 3).
+        """Eigenvalues (M, 3), ascending, of the second moments in a ball around each centre (M, 3).
 
-        Of ``sum (x - c)(x - c)^T / count`` over the points x not further than `radius` m from the
-        centre c, in m^2; zero where there are none.
+        Of ``sum (x - c)(x - c)^T / count`` over the points x within `radius` m of the centre c, in
+        m^2; zero where there are none.
         """
         array = checked_points(centres, "centres")
         out = np.empty((len(array), 3))
         _, arranged, axes, cuts = self._tree
 
-        def work(a: int, b: int) -> None:
+        def compute(a: int, b: int) -> None:
             out[a:b] = ball_moments(arranged, axes, cuts, self._depth, array[a:b], radius)
 
-        run_queries(work, len(array))
+        run_queries(compute, len(array))
         return out

@@ -76,27 +76,27 @@ class Features(Bounded, Registrar):
             If a view has neither amplitude nor colour, or too few matches are inliers, or the
             images contradict the motion.
         """
-        (a, s), (b, t) = self._found(source), self._found(target)
+        (a, s), (b, t) = self._detect(source), self._detect(target)
         pairs = self.pairs(a, b)
-        found = consensus(pairs, self.consensus, self.consensus.motions(rng))
-        scores = [c.score / len(pairs) for c in found]
+        hypotheses = consensus(pairs, self.consensus, self.consensus.motions(rng))
+        scores = [c.score / len(pairs) for c in hypotheses]
         if self.verify:
-            agreed = [agreement(s, t, c.T_target_source).score for c in found]
-            if max(agreed) <= 0:
+            agreements = [agreement(s, t, c.T_target_source).score for c in hypotheses]
+            if max(agreements) <= 0:
                 raise RegistrationError(
-                    f"{found[0].count} of {len(pairs)} pairs of points agree on a motion that "
+                    f"{hypotheses[0].count} of {len(pairs)} pairs of points agree on a motion that "
                     "what both images saw contradicts"
                 )
-            scores = [a + b for a, b in zip(scores, agreed, strict=True)]
-        best = max(range(len(found)), key=lambda k: scores[k])
+            scores = [a + b for a, b in zip(scores, agreements, strict=True)]
+        best = max(range(len(hypotheses)), key=lambda k: scores[k])
         rival = max((score for k, score in enumerate(scores) if k != best), default=0.0)
-        return registration_of(pairs, found[best], scores[best] - max(rival, 0.0))
+        return registration_of(pairs, hypotheses[best], scores[best] - max(rival, 0.0))
 
-    def _found(self, view: Frame) -> tuple[Keypoints, PreparedView]:
+    def _detect(self, view: Frame) -> tuple[Keypoints, PreparedView]:
         if not isinstance(view, RangeFrame):
             raise RegistrationError("is not an image", where=f"frame {view.index}")
         surface = prepare_view(view, SurfaceOptions())
-        points = keypoints(
+        detected = keypoints(
             view,
             surface,
             detector=self.detector,
@@ -104,25 +104,25 @@ class Features(Bounded, Registrar):
             count=self.count,
             blur_px=self.blur_px,
         )
-        return points, surface
+        return detected, surface
 
     def pairs(self, source: Keypoints, target: Keypoints) -> Pairs:
         """Match the points of two views."""
-        i, j = self._matched(source.descriptors, target.descriptors)
+        i, j = self._match(source.descriptors, target.descriptors)
         return Pairs(source.points[i], target.points[j], source.variance[i] + target.variance[j])
 
-    def _matched(self, a: NDArray[Any], b: NDArray[Any]) -> tuple[Int64, Int64]:
+    def _match(self, a: NDArray[Any], b: NDArray[Any]) -> tuple[Int64, Int64]:
         """Index pairs of matching descriptors, in the order of a."""
-        nothing = np.zeros(0, np.int64)
+        empty = np.zeros(0, np.int64)
         if len(a) < 2 or len(b) < 2:
-            return nothing, nothing
+            return empty, empty
         matcher = cv2.BFMatcher(cv2.NORM_HAMMING if a.dtype == np.uint8 else cv2.NORM_L2)
         best = matcher.knnMatch(a, b, k=2)
-        kept = [m for m, second in best if m.distance < self.ratio * second.distance]
+        matches = [m for m, second in best if m.distance < self.ratio * second.distance]
         if self.mutual:
-            back = [m.trainIdx for m in matcher.match(b, a)]
-            kept = [m for m in kept if back[m.trainIdx] == m.queryIdx]
+            backward = [m.trainIdx for m in matcher.match(b, a)]
+            matches = [m for m in matches if backward[m.trainIdx] == m.queryIdx]
         return (
-            np.array([m.queryIdx for m in kept], np.int64),
-            np.array([m.trainIdx for m in kept], np.int64),
+            np.array([m.queryIdx for m in matches], np.int64),
+            np.array([m.trainIdx for m in matches], np.int64),
         )

@@ -17,7 +17,7 @@ from tofuse.registration.pairs import SurfacePairs, solve, surface_pairs
 from tofuse.registration.surface_metrics import PointToPlane, SurfaceMetric
 
 # Cutoff of the weights in widths (exp(-9)).
-_FAR = 3.0
+_CUTOFF = 3.0
 
 
 @part("metric", "imls", label="validated")
@@ -41,8 +41,8 @@ class Implicit(Bounded, SurfaceMetric):
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.motion`."""
         pairs = surface_pairs(matches, alignment)
-        kept = with_normals(matches, alignment)
-        distance = self.distance(alignment.transformed[kept.source], alignment)
+        usable = with_normals(matches, alignment)
+        distance = self.distance(alignment.transformed[usable.source], alignment)
         n = pairs.target_normals
         weight = np.where(np.isfinite(distance), pairs.weight, 0.0)
         H, g, _ = plane_sums(pairs.points, n, n, np.nan_to_num(distance), weight)
@@ -52,11 +52,11 @@ class Implicit(Bounded, SurfaceMetric):
         """I(x), (m,) in m, of points (m, 3) in the target's frame; NaN without neighbours."""
         target, h = alignment.target, self.width * alignment.resolution
         tree = neighbourhood(target).tree
-        near, squared = tree.neighbours(x, min(target.neighbours, len(tree)))
-        normals = target.normals[near]
-        height = ((x[:, None] - target.points[near]) * normals).sum(2)
-        W = np.exp(-squared / h**2)
-        W[(squared > (_FAR * h) ** 2) | ~np.isfinite(height)] = 0.0
+        index, distance2 = tree.neighbours(x, min(target.neighbours, len(tree)))
+        normals = target.normals[index]
+        height = ((x[:, None] - target.points[index]) * normals).sum(2)
+        W = np.exp(-distance2 / h**2)
+        W[(distance2 > (_CUTOFF * h) ** 2) | ~np.isfinite(height)] = 0.0
         total = W.sum(1)
         sums = (W * np.nan_to_num(height)).sum(1)
         return np.divide(sums, total, out=np.full(len(x), np.nan), where=total > 0)

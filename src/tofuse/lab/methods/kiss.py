@@ -24,11 +24,11 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.search import SearchOptions
 
 # Relative to the range: voxel size of the map, initial sigma of the threshold and the smallest
-# motion that updates it (the paper: 1 m, 2 m and 0.1 m of 100 m).
-_VOXEL, _INITIAL, _MOTION = 0.01, 0.02, 0.001
-_IN_VOXEL = 20
+# deviation that updates it (the paper: 1 m, 2 m and 0.1 m of 100 m).
+_VOXEL_RATIO, _SIGMA_RATIO, _MOTION_RATIO = 0.01, 0.02, 0.001
+_MAX_POINTS_PER_VOXEL = 20
 _RANGE_QUANTILE = 95
-_AT_REST = 1e-4  # largest motion of a point, in voxels
+_CONVERGENCE = 1e-4  # largest motion of a point, in voxels
 
 
 @dataclass
@@ -43,28 +43,28 @@ class AdaptiveThreshold:
     ----------
     range_m
         r, the largest range.
-    smallest
+    min_delta
         Deltas below this (m) are ignored.
-    initial
+    initial_sigma
         Initial value of sigma, m.
     """
 
     range_m: float
-    smallest: float
-    initial: float
+    min_delta: float
+    initial_sigma: float
     _sum: float = 0.0
     _count: int = 0
 
     @property
     def sigma(self) -> float:
         """Standard deviation of the predictions, m."""
-        return math.sqrt(self._sum / self._count) if self._count else self.initial
+        return math.sqrt(self._sum / self._count) if self._count else self.initial_sigma
 
-    def learn(self, correction: Float64) -> None:
+    def update(self, correction: Float64) -> None:
         """Update sigma by the correction (4, 4) of a prediction."""
         theta = float(se3.angle(correction[:3, :3]))
         delta = 2 * self.range_m * math.sin(theta / 2) + float(np.linalg.norm(correction[:3, 3]))
-        if delta > self.smallest:
+        if delta > self.min_delta:
             self._sum += delta**2
             self._count += 1
 
@@ -107,18 +107,18 @@ class _Map:
     size: float
     points: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
 
-    def add(self, x: Float64, position: Float64, reach: float) -> None:
-        """Add points, and remove those beyond `reach` m of the camera."""
-        every = np.concatenate([self.points, x])
-        cell = np.floor(every / self.size).astype(np.int64)
+    def add(self, x: Float64, position: Float64, max_range: float) -> None:
+        """Add points, and remove those beyond `max_range` m from the camera."""
+        points = np.concatenate([self.points, x])
+        cell = np.floor(points / self.size).astype(np.int64)
         _, key = np.unique(cell, axis=0, return_inverse=True)
         key = key.ravel()
         order = np.argsort(key, kind="stable")
         first = np.searchsorted(key[order], np.arange(key.max() + 1))
         rank = np.empty(len(key), np.int64)
         rank[order] = np.arange(len(key)) - first[key[order]]
-        near = ((every - position) ** 2).sum(1) <= reach**2
-        self.points = every[(rank < _IN_VOXEL) & near]
+        in_range = ((points - position) ** 2).sum(1) <= max_range**2
+        self.points = points[(rank < _MAX_POINTS_PER_VOXEL) & in_range]
 
 
 class _KissTracker(Tracker):
@@ -126,7 +126,7 @@ class _KissTracker(Tracker):
         self._options = options
         self._map: _Map | None = None
         self._pose, self._motion = np.eye(4), np.eye(4)
-        self._last = 0
+        self._reference = 0
 
     def interrupt(self) -> None:
         """See `Tracker.interrupt`."""
@@ -137,33 +137,35 @@ class _KissTracker(Tracker):
     ) -> Step:
         """See `Tracker.push`; frames without points raise no error."""
         if len(frame) < self._options.minimum_points:
-            need = f"{len(frame)} valid points, {self._options.minimum_points} are needed"
-            return Step("lost", need, None)
+            reason = f"{len(frame)} valid points, {self._options.minimum_points} are needed"
+            return Step("lost", reason, None)
         points = frame.points.astype(np.float64)
         if self._map is None:
-            reach = float(np.percentile(np.linalg.norm(points, axis=1), _RANGE_QUANTILE))
-            self._reach = reach
-            self._map = _Map(self._options.voxel or _VOXEL * reach)
-            self._threshold = AdaptiveThreshold(reach, _MOTION * reach, _INITIAL * reach)
+            max_range = float(np.percentile(np.linalg.norm(points, axis=1), _RANGE_QUANTILE))
+            self._max_range = max_range
+            self._map = _Map(self._options.voxel or _VOXEL_RATIO * max_range)
+            self._threshold = AdaptiveThreshold(
+                max_range, _MOTION_RATIO * max_range, _SIGMA_RATIO * max_range
+            )
         size = self._map.size
-        thinned = first_of_voxels(points, size / 2)
+        downsampled = first_of_voxels(points, size / 2)
         if not len(self._map.points):
-            self._map.add(thinned, self._pose[:3, 3], self._reach)
-            self._last = frame.index
+            self._map.add(downsampled, self._pose[:3, 3], self._max_range)
+            self._reference = frame.index
             return Step("tracked", "", self._pose.copy())
         predicted = self._pose @ self._motion
         try:
-            pose, found = self._registered(first_of_voxels(thinned, 1.5 * size), predicted)
+            pose, registration = self._register(first_of_voxels(downsampled, 1.5 * size), predicted)
         except RegistrationError as error:
-            return Step("lost", f"not registered to the map: {error}", None, self._last)
-        self._threshold.learn(se3.inverse(predicted) @ pose)
+            return Step("lost", f"not registered to the map: {error}", None, self._reference)
+        self._threshold.update(se3.inverse(predicted) @ pose)
         self._motion = se3.orthonormalise(se3.inverse(self._pose) @ pose)
         self._pose = pose
-        self._map.add(transform_points(pose, thinned), pose[:3, 3], self._reach)
-        reference, self._last = self._last, frame.index
-        return Step("tracked", "", pose.copy(), reference, found)
+        self._map.add(transform_points(pose, downsampled), pose[:3, 3], self._max_range)
+        reference, self._reference = self._reference, frame.index
+        return Step("tracked", "", pose.copy(), reference, registration)
 
-    def _registered(self, p: Float64, predicted: Float64) -> tuple[Float64, Registration]:
+    def _register(self, p: Float64, predicted: Float64) -> tuple[Float64, Registration]:
         """Pose T_world_camera of points p (n, 3), and the motion since the last frame."""
         assert self._map is not None
         sigma = self._threshold.sigma
@@ -175,18 +177,18 @@ class _KissTracker(Tracker):
         while not converged and iterations < self._options.max_iterations:
             iterations += 1
             x = transform_points(T, p)
-            near, squared = tree.nearest(x, 3 * sigma)
-            point = np.flatnonzero(near >= 0)
+            index, distance2 = tree.nearest(x, 3 * sigma)
+            matched = np.flatnonzero(index >= 0)
             scale2 = (sigma / 3) ** 2
-            weight = (scale2 / (scale2 + squared[point])) ** 2
-            pairs = Matches(point, near[point], np.sqrt(squared[point]), weight)
-            here = Alignment(source, target, self._map.size, T, x)
-            motion = metric.motion(pairs, here)
+            weight = (scale2 / (scale2 + distance2[matched])) ** 2
+            pairs = Matches(matched, index[matched], np.sqrt(distance2[matched]), weight)
+            alignment = Alignment(source, target, self._map.size, T, x)
+            motion = metric.motion(pairs, alignment)
             T = se3.orthonormalise(motion @ T)
-            shift = transform_points(T, p) - x
-            converged = float(np.abs(shift).max()) < _AT_REST * self._map.size
+            displacement = transform_points(T, p) - x
+            converged = float(np.abs(displacement).max()) < _CONVERGENCE * self._map.size
         relative = se3.inverse(self._pose) @ T
-        found = Registration(
+        registration = Registration(
             T_target_source=relative,
             converged=converged,
             iterations=iterations,
@@ -194,9 +196,9 @@ class _KissTracker(Tracker):
             points=len(p),
             error=float(pairs.distance.sum()) / (len(p) * self._map.size),
             rms_m=float(np.sqrt((pairs.distance**2).mean())),
-            information=metric.information(pairs, here),
+            information=metric.information(pairs, alignment),
         )
-        return T, found
+        return T, registration
 
 
 def first_of_voxels(points: Float64, size: float) -> Float64:

@@ -18,11 +18,11 @@ from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.interfaces import Points
 from tofuse.registration.selectors import All, at_most
 
-_FEWEST = 8
+_MIN_POINTS = 8
 # Max side length of a triangle in resolutions; longer ones bridge a gap.
-_WIDEST = 5.0
-_AT_REST = 1e-4  # largest change of a parameter, in resolutions
-_SMALLEST_SIGMA = 1e-3
+_MAX_SIDE = 5.0
+_CONVERGENCE = 1e-4  # largest change of a parameter, in resolutions
+_MIN_SIGMA = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class SimilarityMatch(Registration):
 
 
 @dataclass(frozen=True, eq=False)
-class _Feet:
+class _FootPoints:
     """Foot points on the triangles of the target, for the points that have one."""
 
     point: Int64
@@ -110,40 +110,41 @@ class LeastSquaresMatching(Bounded, Registrar):
         data = Points.of(source, at_most(self.points).select(source, rng))
         model = Points.of(target, All().select(target, rng))
         intensity = (data.amplitude, model.amplitude) if self.intensity else None
-        middle = data.points.mean(0)
-        arm = data.points - middle
-        size = float(np.sqrt((arm**2).sum(1).mean()))
-        units = np.r_[1, 1, 1, size, size, size, size]
+        centroid = data.points.mean(0)
+        centred = data.points - centroid
+        radius = float(np.sqrt((centred**2).sum(1).mean()))
+        units = np.r_[1, 1, 1, radius, radius, radius, radius]
         T, scale = se3.orthonormalise(guess), 1.0
         errors: list[float] = []
         converged = False
         while not converged and len(errors) < self.max_iterations:
-            turned = scale * arm @ T[:3, :3].T
-            centre = T[:3, :3] @ middle + T[:3, 3]
-            feet = self._feet(turned + centre, model, intensity)
-            if len(feet.point) < _FEWEST:
+            rotated = scale * centred @ T[:3, :3].T
+            centre = T[:3, :3] @ centroid + T[:3, 3]
+            foot = self._foot_points(rotated + centre, model, intensity)
+            if len(foot.point) < _MIN_POINTS:
                 raise RegistrationError(
-                    f"only {len(feet.point)} points lie on the target's surface, {_FEWEST} needed"
+                    f"only {len(foot.point)} points lie on the target's surface, "
+                    f"{_MIN_POINTS} needed"
                 )
-            N, g = self._normal_equations(turned[feet.point], feet, intensity, scale)
+            N, g = self._normal_equations(rotated[foot.point], foot, intensity, scale)
             step = np.zeros(7)
-            free = 7 if self.scale_sigma else 6
-            step[:free] = np.linalg.lstsq(N[:free, :free], g[:free], rcond=1e-12)[0]
+            dof = 7 if self.scale_sigma else 6
+            step[:dof] = np.linalg.lstsq(N[:dof, :dof], g[:dof], rcond=1e-12)[0]
             T = se3.orthonormalise(se3.about(centre, se3.exp(step[:6])) @ T)
             scale *= 1 + step[6]
-            errors.append(float(np.abs(feet.distance).sum()) / (len(data) * self.resolution))
-            converged = bool(np.abs(step * units).max() < _AT_REST * self.resolution)
+            errors.append(float(np.abs(foot.distance).sum()) / (len(data) * self.resolution))
+            converged = bool(np.abs(step * units).max() < _CONVERGENCE * self.resolution)
         covariance = np.zeros((7, 7))
-        covariance[:free, :free] = np.linalg.pinv(N[:free, :free])
+        covariance[:dof, :dof] = np.linalg.pinv(N[:dof, :dof])
         return SimilarityMatch(
             T_target_source=T,
             converged=converged,
             iterations=len(errors),
-            correspondences=len(feet.point),
+            correspondences=len(foot.point),
             points=len(data),
             error=errors[-1],
-            rms_m=float(np.sqrt((feet.distance**2).mean())),
-            information=_in_source(N[:6, :6], T, middle),
+            rms_m=float(np.sqrt((foot.distance**2).mean())),
+            information=_information_in_source(N[:6, :6], T, centroid),
             errors=tuple(errors),
             scale=scale,
             precision=np.sqrt(np.diag(covariance)),
@@ -151,19 +152,19 @@ class LeastSquaresMatching(Bounded, Registrar):
 
     def _normal_equations(
         self,
-        arm: Float64,
-        feet: _Feet,
+        centred: Float64,
+        foot: _FootPoints,
         intensity: tuple[Float64, Float64] | None,
         scale: float,
     ) -> tuple[Float64, Float64]:
         """N (7, 7) and right-hand side (7,) of the inlier observations, and the scale's.
 
-        `arm` (k, 3) are the source's points relative to their centroid, in the target's frame.
+        `centred` (k, 3) are the source's points relative to their centroid, in the target's axes.
         """
-        A, height = self._equations(arm, feet, intensity)
-        keep = np.abs(height) <= self.outlier * _sigma(height)
-        A, height = A[keep], height[keep]
-        weight = 1 / max(_sigma(height), _SMALLEST_SIGMA * self.resolution) ** 2
+        A, height = self._equations(centred, foot, intensity)
+        inlier = np.abs(height) <= self.outlier * _sigma(height)
+        A, height = A[inlier], height[inlier]
+        weight = 1 / max(_sigma(height), _MIN_SIGMA * self.resolution) ** 2
         N, g = weight * A.T @ A, -weight * A.T @ height
         if self.scale_sigma:
             N[6, 6] += self.scale_sigma**-2
@@ -171,22 +172,22 @@ class LeastSquaresMatching(Bounded, Registrar):
         return N, g
 
     def _equations(
-        self, arm: Float64, feet: _Feet, intensity: tuple[Float64, Float64] | None
+        self, centred: Float64, foot: _FootPoints, intensity: tuple[Float64, Float64] | None
     ) -> tuple[Float64, Float64]:
         """Design matrix (k, 7) and distances (k,) in m, of geometry and intensity."""
-        A = _rows(arm, feet.normal)
+        A = _jacobian(centred, foot.normal)
         if intensity is None:
-            return A, feet.distance
+            return A, foot.distance
         unit = self.intensity / max(float(np.median(intensity[1])), 1e-12)
-        r = unit * (feet.intensity - intensity[0][feet.point])
-        return np.vstack([A, _rows(arm, unit * feet.gradient)]), np.r_[feet.distance, r]
+        r = unit * (foot.intensity - intensity[0][foot.point])
+        return np.vstack([A, _jacobian(centred, unit * foot.gradient)]), np.r_[foot.distance, r]
 
-    def _feet(
+    def _foot_points(
         self,
         x: Float64,
         model: Points,
         intensity: tuple[Float64, Float64] | None,
-    ) -> _Feet:
+    ) -> _FootPoints:
         """Foot points of x (n, 3) on the triangles around the nearest points of the target."""
         surface = neighbourhood(model)
         nearest, _ = surface.tree.nearest(x, self.reach * self.resolution)
@@ -197,47 +198,47 @@ class LeastSquaresMatching(Bounded, Registrar):
         b, c = model.points[fan], model.points[np.roll(fan, -1, axis=1)]
         e1, e2 = b - a, c - a
         normal = np.cross(e1, e2)
-        double = np.linalg.norm(normal, axis=2)
-        away = x[point][:, None] - a
+        double_area = np.linalg.norm(normal, axis=2)
+        offset = x[point][:, None] - a
         with np.errstate(invalid="ignore", divide="ignore"):
-            normal = normal / double[..., None]
+            normal = normal / double_area[..., None]
             # Barycentric coordinates of the foot.
-            u = (np.cross(away, e2) * normal).sum(2) / double
-            v = (np.cross(e1, away) * normal).sum(2) / double
-        sides = np.maximum(np.linalg.norm(e1, axis=2), np.linalg.norm(e2, axis=2))
-        height = (away * normal).sum(2)
-        inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (sides <= _WIDEST * self.resolution)
+            u = (np.cross(offset, e2) * normal).sum(2) / double_area
+            v = (np.cross(e1, offset) * normal).sum(2) / double_area
+        longest_side = np.maximum(np.linalg.norm(e1, axis=2), np.linalg.norm(e2, axis=2))
+        height = (offset * normal).sum(2)
+        inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (longest_side <= _MAX_SIDE * self.resolution)
         height = np.where(inside & np.isfinite(height), height, np.inf)
         best = np.argmin(np.abs(height), axis=1)
         row = np.arange(len(point))
-        good = np.isfinite(height[row, best])
-        row, best = row[good], best[good]
+        has_foot = np.isfinite(height[row, best])
+        row, best = row[has_foot], best[has_foot]
         n, d = normal[row, best], height[row, best]
         value, gradient = np.zeros(len(row)), np.zeros((len(row), 3))
         if intensity is not None:
             A = intensity[1][q[row]]
             B, C = (intensity[1][f[row, best]] for f in (fan, np.roll(fan, -1, axis=1)))
             value = A + u[row, best] * (B - A) + v[row, best] * (C - A)
-            E1, E2, twice = e1[row, best], e2[row, best], double[row, best][:, None]
+            E1, E2, foot_double_area = e1[row, best], e2[row, best], double_area[row, best][:, None]
             gradient = (
                 np.cross(E2, n) * (B - A)[:, None] + np.cross(n, E1) * (C - A)[:, None]
-            ) / twice
-        return _Feet(point[row], d, n, value, gradient)
+            ) / foot_double_area
+        return _FootPoints(point[row], d, n, value, gradient)
 
 
-def _in_source(N: Float64, T_target_source: Float64, middle: Float64) -> Float64:
-    """Convert information (6, 6) about `middle`, in the target's frame, to `Registration`'s."""
-    turn, shift = np.zeros((6, 6)), np.eye(4)
-    turn[:3, :3] = turn[3:, 3:] = T_target_source[:3, :3]
-    shift[:3, 3] = -middle
-    J = turn @ se3.adjoint(shift)
+def _information_in_source(N: Float64, T_target_source: Float64, centroid: Float64) -> Float64:
+    """Convert information (6, 6) about `centroid`, in the target's axes, to `Registration`'s."""
+    rotation, translation = np.zeros((6, 6)), np.eye(4)
+    rotation[:3, :3] = rotation[3:, 3:] = T_target_source[:3, :3]
+    translation[:3, 3] = -centroid
+    J = rotation @ se3.adjoint(translation)
     H = J.T @ N @ J
     return np.asarray((H + H.T) / 2)
 
 
-def _rows(arm: Float64, n: Float64) -> Float64:
+def _jacobian(centred: Float64, n: Float64) -> Float64:
     """Derivatives (k, 7) of n . x by translation, rotation and scale about the centroid."""
-    return np.column_stack([n, np.cross(arm, n), (arm * n).sum(1)])
+    return np.column_stack([n, np.cross(centred, n), (centred * n).sum(1)])
 
 
 def _sigma(residual: Float64) -> float:

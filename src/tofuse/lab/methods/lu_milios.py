@@ -27,7 +27,7 @@ from tofuse.posegraph.sparse import PairSystem
 
 # Heading, pitch, roll of a camera (y down): singular only where it looks straight up or down.
 _EULER = "YXZ"
-_SAME = 1e-6  # relative increase that counts as rounding error
+_RELATIVE_ROUNDING = 1e-6  # relative increase that counts as rounding error
 
 
 @part("optimiser", "lu-milios", label="validated")
@@ -56,21 +56,21 @@ class LuMilios(Optimiser):
         system = PairSystem(len(graph.ids), graph.edges)
         best, history = graph, [graph.chi2()]
         converged = bool(system.fixed.all()) or history[0] <= ROUNDING * len(graph.edges)
-        here = graph
+        current = graph
         for _ in range(0 if converged else self.max_iterations):
-            motion = solve_linear(here, system)
+            motion = solve_linear(current, system)
             if motion is None:
                 break
-            moved = _moved(here.poses, motion)
-            moved[system.fixed] = graph.poses[system.fixed]
-            here = graph.with_poses(moved)
-            before = min(history)
-            history.append(here.chi2())
-            if history[-1] < before:
-                best = here
-            if before - history[-1] <= self.tolerance * before:
+            updated = _apply_motion(current.poses, motion)
+            updated[system.fixed] = graph.poses[system.fixed]
+            current = graph.with_poses(updated)
+            previous = min(history)
+            history.append(current.chi2())
+            if history[-1] < previous:
+                best = current
+            if previous - history[-1] <= self.tolerance * previous:
                 # Converged, or diverging.
-                converged = history[-1] <= (1 + _SAME) * before
+                converged = history[-1] <= (1 + _RELATIVE_ROUNDING) * previous
                 break
         if history[-1] > min(history):
             history.append(min(history))  # return to the best
@@ -81,29 +81,29 @@ def solve_linear(graph: PoseGraph, system: PairSystem) -> Float64 | None:
     """(N, 6) motions X of the poses in the world's frame that solve G X = B; None if singular."""
     j = graph.edges[:, 1]
     e = graph.residuals()
-    into_camera = se3.adjoint(se3.inverse(graph.poses[j]))
+    adjoint_camera_world = se3.adjoint(se3.inverse(graph.poses[j]))
     D = -(se3.adjoint(graph.poses[j]) @ e[..., None])[..., 0]
-    C_inverse = np.swapaxes(into_camera, 1, 2) @ graph.information @ into_camera
-    pull = (C_inverse @ D[..., None])[..., 0]
-    matrix, gradient = system.assemble(C_inverse, -C_inverse, C_inverse, pull, -pull)
+    C_inverse = np.swapaxes(adjoint_camera_world, 1, 2) @ graph.information @ adjoint_camera_world
+    weighted_D = (C_inverse @ D[..., None])[..., 0]
+    matrix, gradient = system.assemble(C_inverse, -C_inverse, C_inverse, weighted_D, -weighted_D)
     factor = system.factor(matrix, gradient)
     return None if factor is None else factor.step()
 
 
-def _moved(poses: Float64, motion: Float64) -> Float64:
+def _apply_motion(poses: Float64, motion: Float64) -> Float64:
     """Poses (N, 4, 4) after motions X in the world's frame, via position and Euler angles."""
     angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler(_EULER)
-    turn = np.zeros((len(poses), 3, 3))  # w = turn @ change of the angles
-    first = np.eye(3)["XYZ".index(_EULER[0])]
-    outer = Rotation.from_euler(_EULER[:1], angles[:, :1])
-    both = Rotation.from_euler(_EULER[:2], angles[:, :2])
-    turn[:, :, 0] = first
-    turn[:, :, 1] = outer.apply(np.eye(3)["XYZ".index(_EULER[1])])
-    turn[:, :, 2] = both.apply(np.eye(3)["XYZ".index(_EULER[2])])
+    E = np.zeros((len(poses), 3, 3))  # w = E @ change of the angles
+    first_axis = np.eye(3)["XYZ".index(_EULER[0])]
+    R_first = Rotation.from_euler(_EULER[:1], angles[:, :1])
+    R_first_two = Rotation.from_euler(_EULER[:2], angles[:, :2])
+    E[:, :, 0] = first_axis
+    E[:, :, 1] = R_first.apply(np.eye(3)["XYZ".index(_EULER[1])])
+    E[:, :, 2] = R_first_two.apply(np.eye(3)["XYZ".index(_EULER[2])])
     v, w = motion[:, :3], motion[:, 3:]
     out = poses.copy()
     # H^-1: the position moves with the frame, the angles follow from w.
     out[:, :3, 3] += v + np.cross(w, poses[:, :3, 3])
-    change = (np.linalg.pinv(turn) @ w[..., None])[..., 0]
-    out[:, :3, :3] = Rotation.from_euler(_EULER, angles + change).as_matrix()
+    angle_change = (np.linalg.pinv(E) @ w[..., None])[..., 0]
+    out[:, :3, :3] = Rotation.from_euler(_EULER, angles + angle_change).as_matrix()
     return out

@@ -1,7 +1,7 @@
 """Joint registration of many views by corresponding points (section 2.10, eq 2.8).
 
 Correspondences and poses are updated alternately. Methods differ in how correspondences determine
-the poses: each is a `Relaxing`, in its own file.
+the poses: each is a `RelaxationMethod`, in its own file.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.shape import shape_at
 
 # Min fraction and number of points with a partner in an overlapping view.
-_OVERLAP, _FEWEST = 0.1, 30
-# Converged when no point has moved by more, in resolutions.
-_AT_REST = 1e-3
+_MIN_OVERLAP, _MIN_POINTS = 0.1, 30
+# Largest displacement of a point at convergence, in resolutions.
+_CONVERGENCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class Pairs:
 
 
 @dataclass(frozen=True)
-class Relaxing(Bounded, RefinementMethod):
+class RelaxationMethod(Bounded, RefinementMethod):
     """A joint refinement of all views by corresponding points.
 
     Attributes
@@ -118,7 +118,7 @@ class Relaxing(Bounded, RefinementMethod):
 class _Relaxation(Refiner):
     points: ClassVar[bool] = True
 
-    def __init__(self, method: Relaxing) -> None:
+    def __init__(self, method: RelaxationMethod) -> None:
         self._method = method
         self._store: ViewStore[SampledPoints] = ViewStore(
             Spacing(max_views=method.views, max_stretch=1e6)
@@ -131,41 +131,43 @@ class _Relaxation(Refiner):
     def finish(
         self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
     ) -> Refinement:
-        """See `Refiner.finish`; rejected if the views' points are less close than before."""
+        """See `Refiner.finish`; rejected if the support decreases."""
         row = {int(index): k for k, index in enumerate(ids)}
-        kept = [posed.view for posed in self._store.of(row)]
-        kept = [k for k in kept if len(k.points) >= _FEWEST]
-        if len(kept) < 2:
-            return Refinement(poses, views=len(kept))
-        at = np.array([row[k.index] for k in kept], np.intp)
-        clouds = [Cloud.of(CloudFrame.of(k.points, index=k.index)) for k in kept]
-        after = relaxed(self._method, clouds, poses[at])
+        sampled = [posed.view for posed in self._store.of(row)]
+        sampled = [k for k in sampled if len(k.points) >= _MIN_POINTS]
+        if len(sampled) < 2:
+            return Refinement(poses, views=len(sampled))
+        rows = np.array([row[k.index] for k in sampled], np.intp)
+        clouds = [Cloud.of(CloudFrame.of(k.points, index=k.index)) for k in sampled]
+        relaxed_poses = relax_poses(self._method, clouds, poses[rows])
         reach = self._method.reach * resolution_of(clouds)
-        pairs, again = (paired(clouds, some, reach) for some in (poses[at], after))
-        support = (
-            _support(poses[at], pairs, reach, clouds),
-            _support(after, again, reach, clouds),
+        pairs, pairs_after = (
+            closest_pairs(clouds, view_poses, reach) for view_poses in (poses[rows], relaxed_poses)
         )
-        unchanged = Refinement(poses, False, len(clouds), len(again), support=support)
-        better = bool(again) and support[1] >= support[0]
-        return accepted_with(unchanged, at, after) if better else unchanged
+        support = (
+            _support(poses[rows], pairs, reach, clouds),
+            _support(relaxed_poses, pairs_after, reach, clouds),
+        )
+        unchanged = Refinement(poses, False, len(clouds), len(pairs_after), support=support)
+        improved = bool(pairs_after) and support[1] >= support[0]
+        return accepted_with(unchanged, rows, relaxed_poses) if improved else unchanged
 
 
-def relaxed(method: Relaxing, clouds: Sequence[Cloud], poses: Float64) -> Float64:
+def relax_poses(method: RelaxationMethod, clouds: Sequence[Cloud], poses: Float64) -> Float64:
     """Pair and move views until convergence; poses (N, 4, 4) T_world_view, the first is fixed."""
     resolution = resolution_of(clouds)
     for _ in range(method.rounds):
-        pairs = paired(clouds, poses, method.reach * resolution)
+        pairs = closest_pairs(clouds, poses, method.reach * resolution)
         if not pairs:
             break
-        moved = method.relax(poses, pairs, clouds)
-        moved = se3.orthonormalise(poses[0] @ se3.inverse(moved[0]) @ moved)
-        shift = max(
+        updated = method.relax(poses, pairs, clouds)
+        updated = se3.orthonormalise(poses[0] @ se3.inverse(updated[0]) @ updated)
+        displacement = max(
             float(np.abs(transform_points(a, c.points) - transform_points(b, c.points)).max())
-            for a, b, c in zip(poses, moved, clouds, strict=True)
+            for a, b, c in zip(poses, updated, clouds, strict=True)
         )
-        poses = moved
-        if shift < _AT_REST * resolution:
+        poses = updated
+        if displacement < _CONVERGENCE * resolution:
             break
     return poses
 
@@ -176,23 +178,23 @@ def resolution_of(clouds: Sequence[Cloud]) -> float:
     return float(np.sqrt(np.median(nearest)))
 
 
-def paired(clouds: Sequence[Cloud], poses: Float64, reach: float) -> list[Pairs]:
+def closest_pairs(clouds: Sequence[Cloud], poses: Float64, reach: float) -> list[Pairs]:
     """Closest points of all overlapping views, in both directions; `reach` in m."""
     out = []
     for i, source in enumerate(clouds):
         for j, target in enumerate(clouds):
             if i == j:
                 continue
-            moved = transform_points(se3.inverse(poses[j]) @ poses[i], source.points)
-            near, _ = target.tree.nearest(moved, reach)
-            a = np.flatnonzero((near >= 0) & ~target.boundary[near])
-            if len(a) >= max(_FEWEST, _OVERLAP * len(moved)):
-                b = near[a]
+            transformed = transform_points(se3.inverse(poses[j]) @ poses[i], source.points)
+            nearest, _ = target.tree.nearest(transformed, reach)
+            a = np.flatnonzero((nearest >= 0) & ~target.boundary[nearest])
+            if len(a) >= max(_MIN_POINTS, _MIN_OVERLAP * len(transformed)):
+                b = nearest[a]
                 out.append(Pairs(i, j, source.points[a], target.points[b], target.normals[b]))
     return out
 
 
-def rotation_to(H: Float64) -> Float64:
+def optimal_rotation(H: Float64) -> Float64:
     """The rotation R (3, 3) that maximises the trace of R H (Arun 1987; Umeyama 1991)."""
     U, _, Vt = np.linalg.svd(H)
     sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
@@ -204,8 +206,8 @@ def _support(
 ) -> float:
     """Closeness of points to those of other views: up to 1 per view that also sees them."""
     total = sum(len(c.points) for c in clouds)
-    nearness = 0.0
+    closeness = 0.0
     for p in pairs:
-        gap = transform_points(poses[p.i], p.p_i) - transform_points(poses[p.j], p.p_j)
-        nearness += float((1 - np.linalg.norm(gap, axis=1) / reach).sum())
-    return nearness / max(total, 1)
+        difference = transform_points(poses[p.i], p.p_i) - transform_points(poses[p.j], p.p_j)
+        closeness += float((1 - np.linalg.norm(difference, axis=1) / reach).sum())
+    return closeness / max(total, 1)

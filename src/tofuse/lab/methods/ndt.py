@@ -21,10 +21,10 @@ from tofuse.registration.interfaces import Points
 from tofuse.registration.selectors import at_most
 
 # Min points of a cell, and its min variance relative to the largest.
-_FEWEST, _FLATTEST = 6, 1e-3
+_MIN_POINTS, _MIN_VARIANCE_RATIO = 6, 1e-3
 # Outlier ratio (section 6.2.1: p_o).
-_OUTLIERS = 0.55
-_HALVINGS = 12
+_OUTLIER_RATIO = 0.55
+_MAX_HALVINGS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +34,12 @@ class _Cells:
     size: float
     tree: KdTree
     mean: Float64
-    inverse: Float64
+    precision: Float64
 
     @property
     def constants(self) -> tuple[float, float]:
         """d_1 and d_2 of eq 6.8: Gaussian approximation of a mixture with uniform outliers."""
-        c1, c2 = 10 * (1 - _OUTLIERS), _OUTLIERS / self.size**3
+        c1, c2 = 10 * (1 - _OUTLIER_RATIO), _OUTLIER_RATIO / self.size**3
         d3 = -math.log(c2)
         d1 = -math.log(c1 + c2) - d3
         return d1, -2 * math.log((-math.log(c1 * math.exp(-0.5) + c2) - d3) / d1)
@@ -54,10 +54,10 @@ class Ndt(Bounded, Registrar):
 
         s(T) = -sum d_1 exp(-d_2 / 2 (T p - mu)^T Sigma^-1 (T p - mu))
 
-    of the points, each in the cell with the nearest mean, is minimised by Newton's method with the
-    analytic gradient and Hessian (shifted if not positive definite) and step halving. The cell size
-    is halved from level to level. Eigenvalues of the covariances are at least a thousandth of the
-    largest (section 6.2.3).
+    of the points, each in the cell with the nearest mean, is maximised (d_1 < 0) by Newton's method
+    with the analytic gradient and Hessian (eigenvalues made positive) and step halving. The cell
+    size is halved from level to level. Eigenvalues of the covariances are at least a thousandth of
+    the largest (section 6.2.3).
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class Ndt(Bounded, Registrar):
         Raises
         ------
         RegistrationError
-            If no point of the source lies in a cell of the target's.
+            If fewer than six points of the source lie in cells of the target.
         """
         data = Points.of(source, at_most(self.points).select(source, rng)).points
         model = target.points.astype(np.float64)
@@ -104,19 +104,19 @@ class Ndt(Bounded, Registrar):
             if size <= self.finest * self.resolution:
                 break
             size = max(size / 2, self.finest * self.resolution)
-        near, square, r, inverse = _placed(data, cells, T)
-        if len(near) < _FEWEST:
-            raise RegistrationError(f"only {len(near)} points lie in cells of the target's")
+        index, mahalanobis2, r, precision = _associate(data, cells, T)
+        if len(index) < _MIN_POINTS:
+            raise RegistrationError(f"only {len(index)} points lie in cells of the target's")
         d2 = cells.constants[1]
-        weight = np.exp(-d2 / 2 * square)
-        J = _jacobian(data[near], T)
-        information = np.einsum("n,nki,nkl,nlj->ij", weight, J, inverse, J)
+        weight = np.exp(-d2 / 2 * mahalanobis2)
+        J = _jacobian(data[index], T)
+        information = np.einsum("n,nki,nkl,nlj->ij", weight, J, precision, J)
         distance = np.linalg.norm(r, axis=1)
         return Registration(
             T_target_source=T,
             converged=converged,
             iterations=iterations,
-            correspondences=len(near),
+            correspondences=len(index),
             points=len(data),
             error=float(distance.sum()) / (len(data) * self.resolution),
             rms_m=float(np.sqrt((distance**2).mean())),
@@ -124,13 +124,13 @@ class Ndt(Bounded, Registrar):
         )
 
     def _level(self, data: Float64, cells: _Cells, T: Float64) -> tuple[Float64, int, bool]:
-        middle = data.mean(0)
-        to = np.eye(4)
-        to[:3, 3] = middle
-        arm = data - middle
-        size = max(float(np.sqrt((arm**2).sum(1).mean())), self.resolution)
-        units = np.array([1, 1, 1, 1 / size, 1 / size, 1 / size])
-        value, g, H = _score(arm, cells, T @ to)
+        centroid = data.mean(0)
+        T_source_centred = np.eye(4)
+        T_source_centred[:3, 3] = centroid
+        centred = data - centroid
+        radius = max(float(np.sqrt((centred**2).sum(1).mean())), self.resolution)
+        units = np.array([1, 1, 1, 1 / radius, 1 / radius, 1 / radius])
+        value, g, H = _score(centred, cells, T @ T_source_centred)
         for k in range(self.max_iterations):
             if value == 0.0:
                 return T, k, False
@@ -140,15 +140,15 @@ class Ndt(Bounded, Registrar):
             length = float(np.linalg.norm(step / units))
             # The quadratic model is invalid beyond a cell.
             step *= min(1.0, cells.size / max(length, 1e-300))
-            for _ in range(_HALVINGS):
-                moved = se3.orthonormalise(T @ se3.about(middle, se3.exp(step)))
-                found = _score(arm, cells, moved @ to)
-                if found[0] < value:
+            for _ in range(_MAX_HALVINGS):
+                candidate = se3.orthonormalise(T @ se3.about(centroid, se3.exp(step)))
+                trial = _score(centred, cells, candidate @ T_source_centred)
+                if trial[0] < value:
                     break
                 step = step / 2
             else:
                 return T, k + 1, True
-            T, (value, g, H) = moved, found
+            T, (value, g, H) = candidate, trial
             if np.linalg.norm(step / units) < 1e-3 * self.resolution:
                 return T, k + 1, True
         return T, self.max_iterations, False
@@ -161,44 +161,44 @@ def _cells(points: Float64, size: float) -> _Cells:
     cell = cell.ravel()
     count = np.bincount(cell)
     mean = np.stack([np.bincount(cell, points[:, a]) for a in range(3)], 1) / count[:, None]
-    away = points - mean[cell]
+    centred = points - mean[cell]
     C = np.empty((len(count), 3, 3))
     for a in range(3):
         for b in range(3):
-            C[:, a, b] = np.bincount(cell, away[:, a] * away[:, b]) / np.maximum(count - 1, 1)
-    full = count >= _FEWEST
-    if not full.any():
-        raise RegistrationError(f"no cell of {size:.3g} m has {_FEWEST} points of the target")
-    values, vectors = np.linalg.eigh(C[full])
-    values = np.maximum(values, np.maximum(_FLATTEST * values[:, 2:], 1e-18))
-    inverse = np.einsum("nij,nj,nkj->nik", vectors, 1 / values, vectors)
-    return _Cells(size, KdTree(mean[full]), mean[full], inverse)
+            C[:, a, b] = np.bincount(cell, centred[:, a] * centred[:, b]) / np.maximum(count - 1, 1)
+    populated = count >= _MIN_POINTS
+    if not populated.any():
+        raise RegistrationError(f"no cell of {size:.3g} m has {_MIN_POINTS} points of the target")
+    values, vectors = np.linalg.eigh(C[populated])
+    values = np.maximum(values, np.maximum(_MIN_VARIANCE_RATIO * values[:, 2:], 1e-18))
+    precision = np.einsum("nij,nj,nkj->nik", vectors, 1 / values, vectors)
+    return _Cells(size, KdTree(mean[populated]), mean[populated], precision)
 
 
-def _placed(p: Float64, cells: _Cells, T: Float64) -> tuple[Int64, Float64, Float64, Float64]:
-    """Cells of points (n, 3): indices, squared Mahalanobis distances, residuals, inverses."""
+def _associate(p: Float64, cells: _Cells, T: Float64) -> tuple[Int64, Float64, Float64, Float64]:
+    """Points (n, 3) with a cell: indices, squared Mahalanobis distances, residuals, precisions."""
     x = transform_points(T, p)
-    near, _ = cells.tree.nearest(x, cells.size)
-    point = np.flatnonzero(near >= 0)
-    r = x[point] - cells.mean[near[point]]
-    inverse = cells.inverse[near[point]]
-    return point, np.einsum("ni,nij,nj->n", r, inverse, r), r, inverse
+    nearest, _ = cells.tree.nearest(x, cells.size)
+    index = np.flatnonzero(nearest >= 0)
+    r = x[index] - cells.mean[nearest[index]]
+    precision = cells.precision[nearest[index]]
+    return index, np.einsum("ni,nij,nj->n", r, precision, r), r, precision
 
 
 def _score(p: Float64, cells: _Cells, T: Float64) -> tuple[float, Float64, Float64]:
     """Negative score, its gradient (6,) and Hessian (6, 6) of the right perturbation."""
-    point, square, r, inverse = _placed(p, cells, T)
+    index, mahalanobis2, r, precision = _associate(p, cells, T)
     d1, d2 = cells.constants
-    e = np.exp(-d2 / 2 * square)
-    J = _jacobian(p[point], T)
-    a = np.einsum("nki,nkl,nl->ni", J, inverse, r)  # derivative of half the square
+    e = np.exp(-d2 / 2 * mahalanobis2)
+    J = _jacobian(p[index], T)
+    a = np.einsum("nki,nkl,nl->ni", J, precision, r)  # derivative of half the square
     c = d1 * d2 * e
     value = float(d1 * e.sum())
     g = -(c[:, None] * a).sum(0)
     # Eq 6.13, with the second derivative of exp(hat w) p at zero: (w w^T - |w|^2) p, symmetric.
-    H = -np.einsum("n,nki,nkl,nlj->ij", c, J, inverse, J) + d2 * np.einsum("n,ni,nj->ij", c, a, a)
-    s = np.einsum("nij,nj->ni", inverse, r) @ T[:3, :3]
-    outer = np.einsum("n,ni,nj->ij", c, s, p[point])
+    H = -np.einsum("n,nki,nkl,nlj->ij", c, J, precision, J) + d2 * np.einsum("n,ni,nj->ij", c, a, a)
+    s = np.einsum("nij,nj->ni", precision, r) @ T[:3, :3]
+    outer = np.einsum("n,ni,nj->ij", c, s, p[index])
     H[3:, 3:] -= (outer + outer.T) / 2 - np.trace(outer) * np.eye(3)
     return value, g, H
 

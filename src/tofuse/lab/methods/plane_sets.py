@@ -23,11 +23,11 @@ from tofuse.registration.surface_options import SurfaceOptions
 
 # Min sine of the angle between two normals that determine a rotation, and min volume spanned by
 # three that determine a translation.
-_ACROSS, _SPANNED = 0.3, 0.15
+_MIN_SINE, _MIN_VOLUME = 0.3, 0.15
 # Pose candidates ranked by the agreement of the images.
-_JUDGED = 15
+_MAX_CANDIDATES = 15
 # Min mean square of the normals along a direction that counts as constrained.
-_HELD = 0.005
+_MIN_CONSTRAINT = 0.005
 
 
 @part("registration", "planes")
@@ -70,19 +70,21 @@ class PlaneSets(Bounded, Registrar):
         RegistrationError
             If a view has no plane, or the images contradict all poses.
         """
-        s, t = self._prepared(source), self._prepared(target)
+        s, t = self._prepare(source), self._prepare(target)
         a, b = self._planes(s, rng), self._planes(t, rng)
         for view, planes in ((source, a), (target, b)):
             if not planes:
                 raise RegistrationError("has no planes", where=f"frame {view.index}")
         depth = 0.5 * (s.depth + t.depth)
-        poses = _distinct(self._poses(a, b, guess, depth), depth)[:_JUDGED]
+        poses = _distinct(self._poses(a, b, guess, depth), depth)[:_MAX_CANDIDATES]
         if not poses:
             raise RegistrationError("no plane of one view matches one of the other")
-        agreed = [agreement(s, t, T).score for _, _, T in poses]
-        scores = [fraction + score for (fraction, _, _), score in zip(poses, agreed, strict=True)]
+        agreements = [agreement(s, t, T).score for _, _, T in poses]
+        scores = [
+            fraction + score for (fraction, _, _), score in zip(poses, agreements, strict=True)
+        ]
         best = max(range(len(poses)), key=lambda k: scores[k])
-        if agreed[best] <= 0:
+        if agreements[best] <= 0:
             raise RegistrationError(
                 f"{len(poses[best][1])} planes match under a pose that what both images saw "
                 "contradicts"
@@ -92,7 +94,7 @@ class PlaneSets(Bounded, Registrar):
         margin = scores[best] - max(rival, 0.0)
         return self._registration(a, b, pairs, T, len(poses), depth, margin)
 
-    def _prepared(self, view: Frame) -> PreparedView:
+    def _prepare(self, view: Frame) -> PreparedView:
         if not isinstance(view, RangeFrame):
             raise RegistrationError("is not an image", where=f"frame {view.index}")
         return prepare_view(view, SurfaceOptions())
@@ -116,18 +118,18 @@ class PlaneSets(Bounded, Registrar):
         for R in _rotations(*normals, guess[:3, :3], self.angle):
             cosine = (normals[0] @ R.T) @ normals[1].T
             aligned = list(zip(*np.nonzero(cosine > np.cos(self.angle)), strict=True))
-            for some in _independent(aligned, normals[1]):
-                T = _pose(a, b, some, R, guess)
-                pairs = self._matching(a, b, T, depth)
-                if len(pairs) < len(some):
+            for subset in _independent(aligned, normals[1]):
+                T = _pose(a, b, subset, R, guess)
+                pairs = self._match_planes(a, b, T, depth)
+                if len(pairs) < len(subset):
                     continue
                 T = _pose(a, b, pairs, R, guess)
                 fraction = sum(min(a[i].fraction, b[j].fraction) for i, j in pairs)
                 found.append((float(fraction), pairs, T))
-        found.sort(key=lambda one: -one[0])
+        found.sort(key=lambda candidate: -candidate[0])
         return found
 
-    def _matching(
+    def _match_planes(
         self, a: list[Plane], b: list[Plane], T: Float64, depth: float
     ) -> list[tuple[int, int]]:
         """Pairs of coincident planes, each plane in at most one pair."""
@@ -136,12 +138,12 @@ class PlaneSets(Bounded, Registrar):
             normal = T[:3, :3] @ plane.normal
             offset = plane.offset + float(normal @ T[:3, 3])
             best: int = -1
-            most: float = 1.0
+            lowest: float = 1.0
             for j, other in enumerate(b):
-                turned = float(np.arccos(np.clip(normal @ other.normal, -1, 1))) / self.angle
-                apart = max(turned, abs(offset - other.offset) / (self.offset * depth))
-                if apart < most and all(j != m for _, m in pairs):
-                    best, most = j, apart
+                angle_error = float(np.arccos(np.clip(normal @ other.normal, -1, 1))) / self.angle
+                error = max(angle_error, abs(offset - other.offset) / (self.offset * depth))
+                if error < lowest and all(j != m for _, m in pairs):
+                    best, lowest = j, error
             if best >= 0:
                 pairs.append((i, best))
         return pairs
@@ -152,38 +154,38 @@ class PlaneSets(Bounded, Registrar):
         b: list[Plane],
         pairs: list[tuple[int, int]],
         T: Float64,
-        tried: int,
+        candidates: int,
         depth: float,
         margin: float,
     ) -> Registration:
         normals = np.stack([a[i].normal for i, _ in pairs])
-        turned = normals @ T[:3, :3].T
-        offsets = np.array([a[i].offset for i, _ in pairs]) + turned @ T[:3, 3]
-        missed = offsets - np.array([b[j].offset for _, j in pairs])
+        rotated = normals @ T[:3, :3].T
+        offsets = np.array([a[i].offset for i, _ in pairs]) + rotated @ T[:3, 3]
+        residual = offsets - np.array([b[j].offset for _, j in pairs])
         # The matching tolerance is three standard deviations.
         sigma_m, sigma_rad = self.offset * depth / 3, self.angle / 3
         information = np.zeros((6, 6))
-        along, across = np.zeros((3, 3)), np.zeros((3, 3))
+        A_t, A_R = np.zeros((3, 3)), np.zeros((3, 3))
         for n in normals:
-            along += np.outer(n, n)
-            across += np.eye(3) - np.outer(n, n)
-        information[:3, :3], information[3:, 3:] = along / sigma_m**2, across / sigma_rad**2
-        free = np.zeros((0, 6))
-        for matrix, place in ((along, slice(0, 3)), (across, slice(3, 6))):
+            A_t += np.outer(n, n)
+            A_R += np.eye(3) - np.outer(n, n)
+        information[:3, :3], information[3:, 3:] = (A_t / sigma_m**2, A_R / sigma_rad**2)
+        unobservable = np.zeros((0, 6))
+        for matrix, block in ((A_t, slice(0, 3)), (A_R, slice(3, 6))):
             values, vectors = np.linalg.eigh(matrix / len(normals))
-            loose = np.zeros((int((values < _HELD).sum()), 6))
-            loose[:, place] = vectors[:, values < _HELD].T
-            free = np.vstack([free, loose])
+            directions = np.zeros((int((values < _MIN_CONSTRAINT).sum()), 6))
+            directions[:, block] = vectors[:, values < _MIN_CONSTRAINT].T
+            unobservable = np.vstack([unobservable, directions])
         return Registration(
             T_target_source=T,
             converged=True,
-            iterations=tried,
+            iterations=candidates,
             correspondences=len(pairs),
             points=len(a),
-            error=float(np.abs(missed).sum() / (len(a) * self.offset * depth)),
-            rms_m=float(np.sqrt((missed**2).mean())),
+            error=float(np.abs(residual).sum() / (len(a) * self.offset * depth)),
+            rms_m=float(np.sqrt((residual**2).mean())),
             information=information,
-            unobservable=free,
+            unobservable=unobservable,
             margin=margin,
         )
 
@@ -193,24 +195,24 @@ def _rotations(a: Float64, b: Float64, guess: Float64, tolerance: float) -> Iter
 
     If there are none, those nearest to the guess that align one.
     """
-    between_a, between_b = (np.arccos(np.clip(x @ x.T, -1, 1)) for x in (a, b))
+    angles_a, angles_b = (np.arccos(np.clip(x @ x.T, -1, 1)) for x in (a, b))
     for i, k in combinations(range(len(a)), 2):
-        if np.sin(between_a[i, k]) < _ACROSS:
+        if np.sin(angles_a[i, k]) < _MIN_SINE:
             continue
         for j, m in permutations(range(len(b)), 2):
-            if abs(between_a[i, k] - between_b[j, m]) < tolerance:
-                yield _aligned(np.stack([a[i], a[k]]), np.stack([b[j], b[m]]), guess)
+            if abs(angles_a[i, k] - angles_b[j, m]) < tolerance:
+                yield _align_normals(np.stack([a[i], a[k]]), np.stack([b[j], b[m]]), guess)
     for i in range(len(a)):
         for j in range(len(b)):
-            yield _aligned(a[i : i + 1], b[j : j + 1], guess)
+            yield _align_normals(a[i : i + 1], b[j : j + 1], guess)
 
 
-def _aligned(a: Float64, b: Float64, near: Float64) -> Float64:
-    """Rotation (3, 3) that best aligns normals a (n, 3) with b (n, 3); `near` if underdetermined.
+def _align_normals(a: Float64, b: Float64, prior: Float64) -> Float64:
+    """Rotation (3, 3) that best aligns normals a (n, 3) with b (n, 3), close to `prior`.
 
-    Wahba's problem by the SVD (Arun et al. 1987); a small weight of `near` regularises it.
+    Wahba's problem by the SVD (Arun et al. 1987); a small weight of `prior` regularises it.
     """
-    H = b.T @ a + 1e-4 * near
+    H = b.T @ a + 1e-4 * prior
     U, _, Vt = np.linalg.svd(H)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, np.float64)
 
@@ -221,12 +223,12 @@ def _independent(pairs: list[tuple[int, int]], normals: Float64) -> Iterator[lis
     for count in (3, 2, 1):
         if count == 1 and found:
             return
-        for some in combinations(pairs, count):
-            if len({i for i, _ in some}) < count or len({j for _, j in some}) < count:
+        for subset in combinations(pairs, count):
+            if len({i for i, _ in subset}) < count or len({j for _, j in subset}) < count:
                 continue
-            if _volume(normals[[j for _, j in some]]) > _SPANNED:
+            if _volume(normals[[j for _, j in subset]]) > _MIN_VOLUME:
                 found = True
-                yield list(some)
+                yield list(subset)
 
 
 def _volume(normals: Float64) -> float:
@@ -239,19 +241,21 @@ def _pose(
 ) -> Float64:
     """Least-squares pose (4, 4) of pairs of planes; keeps the guess where unconstrained."""
     weight = np.sqrt([min(a[i].fraction, b[j].fraction) for i, j in pairs])[:, None]
-    there, here = (
-        np.stack([planes[k].normal for k in which])
-        for planes, which in zip((a, b), zip(*pairs, strict=True), strict=True)
+    source_normals, target_normals = (
+        np.stack([planes[k].normal for k in indices])
+        for planes, indices in zip((a, b), zip(*pairs, strict=True), strict=True)
     )
     T = np.eye(4)
-    T[:3, :3] = _aligned(weight * there, weight * here, R)
-    normals = there @ T[:3, :3].T
+    T[:3, :3] = _align_normals(weight * source_normals, weight * target_normals, R)
+    rotated = source_normals @ T[:3, :3].T
     # offset in the target = offset in the source + normal . t
-    apart = np.array([b[j].offset - a[i].offset for i, j in pairs])
-    start = guess[:3, 3]
-    missing = (apart - normals @ start)[:, None]
-    move = np.linalg.lstsq(weight * normals, weight * missing, rcond=np.sqrt(_HELD))[0][:, 0]
-    T[:3, 3] = start + move
+    offsets = np.array([b[j].offset - a[i].offset for i, j in pairs])
+    t_guess = guess[:3, 3]
+    residual = (offsets - rotated @ t_guess)[:, None]
+    dt = np.linalg.lstsq(weight * rotated, weight * residual, rcond=np.sqrt(_MIN_CONSTRAINT))[0][
+        :, 0
+    ]
+    T[:3, 3] = t_guess + dt
     return T
 
 
@@ -260,10 +264,10 @@ def _distinct(
 ) -> list[tuple[float, list[tuple[int, int]], Float64]]:
     """The poses in their order, without near duplicates of better ones."""
     distinct: list[tuple[float, list[tuple[int, int]], Float64]] = []
-    for one in poses:
-        gaps = [se3.inverse(other[2]) @ one[2] for other in distinct]
-        if all(np.linalg.norm(gap[:3, 3]) > 0.05 * depth or se3.angle(gap) > 0.1 for gap in gaps):
-            distinct.append(one)
-        if len(distinct) == _JUDGED:
+    for candidate in poses:
+        deltas = [se3.inverse(other[2]) @ candidate[2] for other in distinct]
+        if all(np.linalg.norm(d[:3, 3]) > 0.05 * depth or se3.angle(d) > 0.1 for d in deltas):
+            distinct.append(candidate)
+        if len(distinct) == _MAX_CANDIDATES:
             break
     return distinct

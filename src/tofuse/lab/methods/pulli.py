@@ -13,7 +13,13 @@ from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
 from tofuse.lab.methods.compatibility import Boundary
-from tofuse.lab.methods.multiview import Cloud, Pairs, Relaxing, resolution_of, rotation_to
+from tofuse.lab.methods.multiview import (
+    Cloud,
+    Pairs,
+    RelaxationMethod,
+    optimal_rotation,
+    resolution_of,
+)
 from tofuse.parts import part
 from tofuse.registration.icp import Icp
 from tofuse.registration.rejectors import MaxDistance
@@ -21,13 +27,13 @@ from tofuse.registration.selectors import All
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PointToPlane
 
-# Points that represent a pair's alignment, and max updates of a view.
-_MATES, _TURNS = 200, 200
+# Approximate number of concrete pairs per registered pair of views, and max updates of a view.
+_PAIRS_PER_CONSTRAINT, _MAX_UPDATES = 200, 200
 
 
 @part("refinement", "pulli", label="validated")
 @dataclass(frozen=True)
-class Pulli(Relaxing):
+class Pulli(RelaxationMethod):
     """Registers overlapping views pairwise, once; then distributes the residual errors.
 
     The alignment of a pair is stored as *concrete pairs*: points of one view and their transformed
@@ -49,84 +55,86 @@ class Pulli(Relaxing):
     tolerance: float = 1e-3
 
     def relax(self, poses: Float64, pairs: Sequence[Pairs], clouds: Sequence[Cloud]) -> Float64:
-        """See `Relaxing.relax`."""
-        unit = resolution_of(clouds)
+        """See `RelaxationMethod.relax`."""
+        resolution = resolution_of(clouds)
         icp = Icp(
-            unit,
+            resolution,
             source=All(),
             target=All(),
             rejectors=(MaxDistance(self.reach), Boundary()),
             metric=PointToPlane(),
             stopping=SmallStep(),
         )
-        mates = []
+        constraints = []
         for p in pairs:
             if p.i > p.j:
                 continue
             guess = se3.inverse(poses[p.j]) @ poses[p.i]
             try:
-                found = icp.register(
+                registration = icp.register(
                     clouds[p.i].view, clouds[p.j].view, guess, np.random.default_rng(0)
                 )
             except RegistrationError:
                 continue
-            some = p.p_i[:: max(1, len(p.p_i) // _MATES)]
-            there = transform_points(found.T_target_source, some)
-            mates.append(Pairs(p.i, p.j, some, there, np.full_like(some, np.nan)))
-        return spread(poses, mates, self.tolerance * unit)
+            sample = p.p_i[:: max(1, len(p.p_i) // _PAIRS_PER_CONSTRAINT)]
+            transformed = transform_points(registration.T_target_source, sample)
+            constraints.append(Pairs(p.i, p.j, sample, transformed, np.full_like(sample, np.nan)))
+        return distribute_errors(poses, constraints, self.tolerance * resolution)
 
 
-def spread(poses: Float64, mates: Sequence[Pairs], tolerance: float) -> Float64:
+def distribute_errors(poses: Float64, constraints: Sequence[Pairs], tolerance: float) -> Float64:
     """Align views by concrete pairs, one view at a time, until none moves by `tolerance` (m)."""
     n = len(poses)
-    of: list[list[Pairs]] = [[m for m in mates if k in (m.i, m.j)] for k in range(n)]
+    constraints_of: list[list[Pairs]] = [
+        [c for c in constraints if k in (c.i, c.j)] for k in range(n)
+    ]
     out = poses.copy()
-    first = max(range(n), key=lambda k: (len(of[k]), -k))
+    first = max(range(n), key=lambda k: (len(constraints_of[k]), -k))
     active, dormant = {first}, set(range(n)) - {first}
     while dormant:
-        links = {k: sum(_other(m, k) in active for m in of[k]) for k in dormant}
+        links = {k: sum(_other(c, k) in active for c in constraints_of[k]) for k in dormant}
         view = max(sorted(dormant), key=lambda k: links[k])
         dormant.remove(view)
         active.add(view)
-        queue, turns = deque([view]), 0
-        while queue and turns < _TURNS * n:
-            turns += 1
+        queue, updates = deque([view]), 0
+        while queue and updates < _MAX_UPDATES * n:
+            updates += 1
             k = queue.popleft()
-            moved = _aligned(k, out, [m for m in of[k] if _other(m, k) in active])
-            shift = _shift(k, out[k], moved, of[k])
-            out[k] = moved
-            if shift > tolerance:
-                waiting = set(queue)
-                neighbours = sorted({_other(m, k) for m in of[k]} & active - waiting)
+            updated = _align_view(k, out, [c for c in constraints_of[k] if _other(c, k) in active])
+            displacement = _displacement(k, out[k], updated, constraints_of[k])
+            out[k] = updated
+            if displacement > tolerance:
+                queued = set(queue)
+                neighbours = sorted({_other(c, k) for c in constraints_of[k]} & active - queued)
                 queue.extend(neighbours)
     return out
 
 
-def _other(mates: Pairs, k: int) -> int:
-    return mates.j if mates.i == k else mates.i
+def _other(pairs: Pairs, k: int) -> int:
+    return pairs.j if pairs.i == k else pairs.i
 
 
-def _aligned(k: int, poses: Float64, mates: Sequence[Pairs]) -> Float64:
-    """Pose (4, 4) of view k that best aligns its points with their mates."""
-    if not mates:
+def _align_view(k: int, poses: Float64, constraints: Sequence[Pairs]) -> Float64:
+    """Pose (4, 4) of view k that best satisfies the constraints."""
+    if not constraints:
         return np.asarray(poses[k])
-    own = np.concatenate([m.p_i if m.i == k else m.p_j for m in mates])
-    there = np.concatenate(
-        [transform_points(poses[_other(m, k)], m.p_j if m.i == k else m.p_i) for m in mates]
+    own_points = np.concatenate([c.p_i if c.i == k else c.p_j for c in constraints])
+    other_points = np.concatenate(
+        [transform_points(poses[_other(c, k)], c.p_j if c.i == k else c.p_i) for c in constraints]
     )
-    a, b = own.mean(0), there.mean(0)
+    a, b = own_points.mean(0), other_points.mean(0)
     T = np.eye(4)
-    T[:3, :3] = rotation_to((own - a).T @ (there - b))
+    T[:3, :3] = optimal_rotation((own_points - a).T @ (other_points - b))
     T[:3, 3] = b - T[:3, :3] @ a
     return T
 
 
-def _shift(k: int, before: Float64, after: Float64, mates: Sequence[Pairs]) -> float:
-    own = [m.p_i if m.i == k else m.p_j for m in mates]
+def _displacement(k: int, before: Float64, after: Float64, constraints: Sequence[Pairs]) -> float:
+    own_points = [c.p_i if c.i == k else c.p_j for c in constraints]
     return max(
         (
             float(np.abs(transform_points(before, p) - transform_points(after, p)).max())
-            for p in own
+            for p in own_points
         ),
         default=0.0,
     )

@@ -18,10 +18,10 @@ from tofuse.registration.pairs import in_scales
 from tofuse.registration.surface_metrics import TangentPlanes
 
 # Factor of mu per round (Yang et al. 2020, remark 5).
-_FACTOR = 1.4
-_ROUNDS = 100
+_MU_FACTOR = 1.4
+_MAX_ROUNDS = 100
 # Truncation of the general loss, for a proper distribution (Chebrolu et al. 2021), in scales.
-_CUT = 10.0
+_TRUNCATION = 10.0
 
 
 @part("metric", "gnc", label="validated")
@@ -49,22 +49,22 @@ class Graduated(Bounded, Metric):
 
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.motion`."""
-        return self._solved(matches, alignment)[0]
+        return self._solve(matches, alignment)[0]
 
     def information(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.information`; of the inliers."""
-        _, weighted = self._solved(matches, alignment)
+        _, weighted = self._solve(matches, alignment)
         return PointToPoint().information(weighted.keep(weighted.weights() > 0), alignment)
 
-    def _solved(self, matches: Matches, alignment: Alignment) -> tuple[Float64, Matches]:
+    def _solve(self, matches: Matches, alignment: Alignment) -> tuple[Float64, Matches]:
         c2 = (self.inlier * alignment.resolution) ** 2
         p = alignment.transformed[matches.source]
         q = alignment.target.points[matches.target]
-        given = matches.weights()
-        weighted = replace(matches, weight=given)
+        weights = matches.weights()
+        weighted = replace(matches, weight=weights)
         motion = PointToPoint().motion(weighted, alignment)
         mu = 0.0
-        for _ in range(_ROUNDS):
+        for _ in range(_MAX_ROUNDS):
             r2 = ((transform_points(motion, p) - q) ** 2).sum(1)
             if mu == 0:
                 largest = float(r2.max())
@@ -73,11 +73,11 @@ class Graduated(Bounded, Metric):
                 mu = c2 / (2 * largest - c2)
             w = np.sqrt(c2 / np.maximum(r2, 1e-300) * mu * (mu + 1)) - mu
             w = np.where(r2 >= (mu + 1) / mu * c2, 0.0, np.clip(w, 0.0, 1.0))
-            weighted = replace(matches, weight=given * w)
+            weighted = replace(matches, weight=weights * w)
             motion = PointToPoint().motion(weighted, alignment)
             if np.all((w == 0) | (w == 1)):
                 break
-            mu *= _FACTOR
+            mu *= _MU_FACTOR
         return motion, weighted
 
 
@@ -98,7 +98,7 @@ class Adaptive(TangentPlanes):
     def weights(self, residual: Float64, resolution: float) -> Float64:
         """See `TangentPlanes.weights`."""
         x = in_scales(residual, resolution)
-        a = shape_of(x)
+        a = estimate_shape(x)
         return np.asarray((x * x / abs(a - 2) + 1) ** (a / 2 - 1)) if a < 2 else np.ones(len(x))
 
 
@@ -112,12 +112,12 @@ def general_loss(x: Float64, shape: float) -> Float64:
     return np.asarray(b / shape * ((x * x / b + 1) ** (shape / 2) - 1))
 
 
-def shape_of(x: Float64) -> float:
+def estimate_shape(x: Float64) -> float:
     """Return the maximum-likelihood shape for residuals x (in scales)."""
     shapes, normalisers = _distributions()
-    inside = np.minimum(np.abs(x), _CUT)
+    truncated = np.minimum(np.abs(x), _TRUNCATION)
     cost = [
-        float(general_loss(inside, float(a)).mean()) + float(z)
+        float(general_loss(truncated, float(a)).mean()) + float(z)
         for a, z in zip(shapes, normalisers, strict=True)
     ]
     return float(shapes[int(np.argmin(cost))])
@@ -127,7 +127,7 @@ def shape_of(x: Float64) -> float:
 def _distributions() -> tuple[Float64, Float64]:
     """Shapes, and the logarithm of the integral of exp(-rho) up to the truncation for each."""
     shapes = np.r_[np.arange(-10, -2, 1.0), np.arange(-2, 2.01, 0.25)]
-    x = np.linspace(-_CUT, _CUT, 4001)
+    x = np.linspace(-_TRUNCATION, _TRUNCATION, 4001)
     step = x[1] - x[0]
     return shapes, np.array(
         [np.log(np.exp(-general_loss(x, float(a))).sum() * step) for a in shapes]

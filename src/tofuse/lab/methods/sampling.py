@@ -48,8 +48,8 @@ class Voxel(Bounded, Selector):
         """See `Selector.select`; draws nothing."""
         points = view.points.astype(np.float64) / self.size
         cell = np.floor(points)
-        off = ((points - cell - 0.5) ** 2).sum(1)
-        order = np.lexsort((off, cell[:, 2], cell[:, 1], cell[:, 0]))
+        distance2 = ((points - cell - 0.5) ** 2).sum(1)
+        order = np.lexsort((distance2, cell[:, 2], cell[:, 1], cell[:, 0]))
         cell = cell[order]
         first = np.ones(len(order), bool)
         first[1:] = (cell[1:] != cell[:-1]).any(1)
@@ -68,7 +68,7 @@ class NormalSpace(Bounded, Selector):
     Attributes
     ----------
     points
-        How many.
+        Number of points.
     buckets
         Number along each side of a cube map's faces, 6 buckets^2 in total.
     neighbours
@@ -82,19 +82,19 @@ class NormalSpace(Bounded, Selector):
     def select(self, view: Frame, rng: np.random.Generator) -> Int64:
         """See `Selector.select`."""
         normals = normals_at(view, np.arange(len(view)), self.neighbours)
-        usable = np.flatnonzero(np.isfinite(normals).all(1))
-        if len(usable) <= self.points:
-            return usable
-        order = rng.permutation(len(usable))
-        bucket = _bucket(normals[usable[order]], self.buckets)
+        valid = np.flatnonzero(np.isfinite(normals).all(1))
+        if len(valid) <= self.points:
+            return valid
+        order = rng.permutation(len(valid))
+        bucket = _bucket(normals[valid[order]], self.buckets)
         # The k-th draw from every bucket comes before the (k + 1)-th from any.
         by_bucket = np.argsort(bucket, kind="stable")
         counts = np.bincount(bucket)
         starts = np.cumsum(counts) - counts
-        turn = np.empty(len(usable), np.int64)
-        turn[by_bucket] = np.arange(len(usable)) - np.repeat(starts, counts)
-        chosen = np.argsort(turn, kind="stable")[: self.points]
-        return np.sort(usable[order[chosen]])
+        rank = np.empty(len(valid), np.int64)
+        rank[by_bucket] = np.arange(len(valid)) - np.repeat(starts, counts)
+        selected = np.argsort(rank, kind="stable")[: self.points]
+        return np.sort(valid[order[selected]])
 
 
 def _bucket(normals: Float64, side: int) -> Int64:
@@ -121,7 +121,7 @@ class IntensityGradient(Bounded, Selector):
     Attributes
     ----------
     points
-        How many.
+        Number of points.
     """
 
     points: Annotated[int, Bounds(1)] = 1000
@@ -140,8 +140,8 @@ class IntensityGradient(Bounded, Selector):
                 where=f"frame {view.index}",
                 remedy="use the selector 'random'",
             )
-        usable = view.valid & (view.amplitude_image > 0)
-        image = np.where(usable, np.log(np.where(usable, view.amplitude_image, 1)), np.nan)
+        valid = view.valid & (view.amplitude_image > 0)
+        image = np.where(valid, np.log(np.where(valid, view.amplitude_image, 1)), np.nan)
         gradient = np.zeros(image.shape)
         gradient[1:-1, 1:-1] = np.hypot(
             image[1:-1, 2:] - image[1:-1, :-2], image[2:, 1:-1] - image[:-2, 1:-1]

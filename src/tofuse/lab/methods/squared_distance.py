@@ -35,15 +35,15 @@ class SquaredDistance(SurfaceMetric):
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.motion`."""
         pairs = surface_pairs(matches, alignment)
-        kept = with_normals(matches, alignment)
-        W = approximant(kept, alignment)
-        turn = alignment.T_target_source[:3, :3]
+        usable = with_normals(matches, alignment)
+        W = approximant(usable, alignment)
+        R = alignment.T_target_source[:3, :3]
         H, g, _ = matrix_sums(
-            pairs.points, pairs.residual, np.einsum("ji,njk,kl->nil", turn, W, turn), pairs.weight
+            pairs.points, pairs.residual, np.einsum("ji,njk,kl->nil", R, W, R), pairs.weight
         )
-        field = solve(H, g, pairs.size)
-        speed = float(np.linalg.norm(field[3:]))
-        return pairs.motion(field * (math.atan(speed) / speed) if speed > 0 else field)
+        velocity = solve(H, g, pairs.size)
+        speed = float(np.linalg.norm(velocity[3:]))
+        return pairs.motion(velocity * (math.atan(speed) / speed) if speed > 0 else velocity)
 
     def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: at convergence the sum is that of point-to-plane."""
@@ -56,11 +56,13 @@ def approximant(matches: Matches, alignment: Alignment) -> Float64:
     ``F_d(x) = (x - q)^T W (x - q)`` with q the target point and W the result.
     """
     j = matches.target
-    bending = neighbourhood(alignment.target).bending
+    principal = neighbourhood(alignment.target).principal_curvatures
     n = alignment.target.normals[j]
     d = ((alignment.transformed[matches.source] - alignment.target.points[j]) * n).sum(1)
-    bent = d[:, None] * bending.curvature[j]
-    weight = np.divide(bent, bent - 1, out=np.zeros_like(bent), where=bent < 0)
-    tangents = bending.directions[j]
-    along: Float64 = np.einsum("nt,nti,ntj->nij", weight, tangents, tangents)
-    return along + n[:, :, None] * n[:, None]
+    d_curvature = d[:, None] * principal.curvature[j]
+    weight = np.divide(
+        d_curvature, d_curvature - 1, out=np.zeros_like(d_curvature), where=d_curvature < 0
+    )
+    tangents = principal.directions[j]
+    tangential: Float64 = np.einsum("nt,nti,ntj->nij", weight, tangents, tangents)
+    return tangential + n[:, :, None] * n[:, None]

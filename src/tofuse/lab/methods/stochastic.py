@@ -46,10 +46,10 @@ class Stochastic(Bounded, Optimiser):
             return Optimisation(graph, tuple(history), True)
         descent = _Descent(graph)
         for t in range(1, self.rounds + 1):
-            here = graph.with_poses(descent.round(1 / t))
-            if here.chi2() < min(history):
-                best = here
-            history.append(here.chi2())
+            current = graph.with_poses(descent.round(1 / t))
+            if current.chi2() < min(history):
+                best = current
+            history.append(current.chi2())
         if history[-1] > min(history):
             history.append(min(history))  # return to the best
         return Optimisation(best, tuple(history), False)
@@ -61,45 +61,47 @@ class _Descent:
         self.R, self.t = graph.poses[:, :3, :3].copy(), graph.poses[:, :3, 3].copy()
         ends = np.sort(graph.edges, axis=1)
         order = np.lexsort((np.arange(len(ends)), ends[:, 0] - ends[:, 1]))
-        turned = graph.edges[:, 0] > graph.edges[:, 1]
-        Z = np.where(turned[:, None, None], se3.inverse(graph.measurements), graph.measurements)
+        flipped = graph.edges[:, 0] > graph.edges[:, 1]
+        Z = np.where(flipped[:, None, None], se3.inverse(graph.measurements), graph.measurements)
         self.edges = [(int(ends[k, 0]), int(ends[k, 1]), Z[k]) for k in order]
-        trace = np.trace(graph.information[:, :3, :3], axis1=1, axis2=2) / 3
-        turn = np.trace(graph.information[:, 3:, 3:], axis1=1, axis2=2) / 3
-        self.weight = [(float(trace[k]), float(turn[k])) for k in order]
-        # Stiffness of each step: the sum over the edges across it.
-        self.stiff = np.zeros((n, 2))
+        w_t = np.trace(graph.information[:, :3, :3], axis1=1, axis2=2) / 3
+        w_R = np.trace(graph.information[:, 3:, 3:], axis1=1, axis2=2) / 3
+        self.weight = [(float(w_t[k]), float(w_R[k])) for k in order]
+        # Stiffness of each step: the total weight of the edges that span it.
+        self.stiffness = np.zeros((n, 2))
         for (i, j, _), w in zip(self.edges, self.weight, strict=True):
-            self.stiff[i + 1 : j + 1] += w
-        used = self.stiff > 0
-        self.softest = np.array([self.stiff[used[:, k], k].min() for k in range(2)])
+            self.stiffness[i + 1 : j + 1] += w
+        constrained = self.stiffness > 0
+        self.min_stiffness = np.array(
+            [self.stiffness[constrained[:, k], k].min() for k in range(2)]
+        )
 
     def round(self, rate: float) -> Float64:
         """Satisfy each edge once; returns the poses (N, 4, 4)."""
-        for (i, j, Z), (move, turn) in zip(self.edges, self.weight, strict=True):
+        for (i, j, Z), (w_t, w_R) in zip(self.edges, self.weight, strict=True):
             steps = slice(i + 1, j + 1)
-            soft = 1 / self.stiff[steps]
+            compliance = 1 / self.stiffness[steps]
             # The fraction of the error to correct, and its distribution.
-            gain = np.minimum(1.0, rate * (j - i) * np.array([move, turn]) / self.softest)
-            along = np.cumsum(soft, axis=0) / soft.sum(0)
+            gain = np.minimum(1.0, rate * (j - i) * np.array([w_t, w_R]) / self.min_stiffness)
+            fractions = np.cumsum(compliance, axis=0) / compliance.sum(0)
             error = se3.so3_log(self.R[i] @ Z[:3, :3] @ self.R[j].T)
             pivot = self.t[j].copy()
-            last = self._turn(steps, gain[1] * along[:, 1:] * error)
+            last = self._rotate(steps, gain[1] * fractions[:, 1:] * error)
             self.R[j + 1 :] = last @ self.R[j + 1 :]
             self.t[j + 1 :] = (self.t[j + 1 :] - pivot) @ last.T + self.t[j]
-            shift = self.R[i] @ Z[:3, 3] + self.t[i] - self.t[j]
-            self.t[steps] += gain[0] * along[:, :1] * shift
-            self.t[j + 1 :] += gain[0] * shift
+            translation = self.R[i] @ Z[:3, 3] + self.t[i] - self.t[j]
+            self.t[steps] += gain[0] * fractions[:, :1] * translation
+            self.t[j + 1 :] += gain[0] * translation
         poses = np.tile(np.eye(4), (len(self.t), 1, 1))
         poses[:, :3, :3], poses[:, :3, 3] = self.R, self.t
         return np.asarray(se3.orthonormalise(poses))
 
-    def _turn(self, steps: slice, turns: Float64) -> Float64:
+    def _rotate(self, steps: slice, rotations: Float64) -> Float64:
         """Rotate poses by world vectors (k, 3), and steps with them; returns the last rotation."""
-        R = se3.so3_exp(turns)
-        before = np.concatenate([np.eye(3)[None], R[:-1]])
+        R = se3.so3_exp(rotations)
+        previous = np.concatenate([np.eye(3)[None], R[:-1]])
         steps_t = np.diff(self.t[steps.start - 1 : steps.stop], axis=0)
-        moved = (before @ steps_t[..., None])[..., 0]
-        self.t[steps] = self.t[steps.start - 1] + np.cumsum(moved, axis=0)
+        rotated = (previous @ steps_t[..., None])[..., 0]
+        self.t[steps] = self.t[steps.start - 1] + np.cumsum(rotated, axis=0)
         self.R[steps] = R @ self.R[steps]
         return np.asarray(R[-1])

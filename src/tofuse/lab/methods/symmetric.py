@@ -58,12 +58,12 @@ class Symmetric(SurfaceMetric):
         half = np.eye(4)
         if tangent > 0:
             half[:3, :3] = se3.so3_exp(x[3:] * (angle / tangent))
-        shift, to, back = np.eye(4), np.eye(4), np.eye(4)
-        shift[:3, 3] = x[:3] * math.cos(angle)
-        to[:3, 3] = pairs.centre + centre
-        back[:3, 3] = -to[:3, 3]
+        translation, T_centre, T_uncentre = np.eye(4), np.eye(4), np.eye(4)
+        translation[:3, 3] = x[:3] * math.cos(angle)
+        T_centre[:3, 3] = pairs.centre + centre
+        T_uncentre[:3, 3] = -T_centre[:3, 3]
         T = pairs.T_target_source
-        return T @ to @ half @ shift @ half @ back @ se3.inverse(T)
+        return T @ T_centre @ half @ translation @ half @ T_uncentre @ se3.inverse(T)
 
     def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: along the mean normal."""

@@ -223,16 +223,16 @@ class Tricp(Bounded, Registrar):
             return self.parts(self.overlap).register(source, target, guess, rng)
         # The same points for every overlap, to keep psi free of sampling noise.
         seed = int(rng.integers(2**62))
-        tried: dict[float, tuple[float, Registration]] = {}
+        results: dict[float, tuple[float, Registration]] = {}
 
         def psi(overlap: float) -> float:
-            if overlap not in tried:
-                again = np.random.default_rng([seed])
-                found = self.parts(overlap).register(source, target, guess, again)
+            if overlap not in results:
+                same_rng = np.random.default_rng([seed])
+                registration = self.parts(overlap).register(source, target, guess, same_rng)
                 floor = (1e-6 * self.resolution) ** 2
-                value = max(found.rms_m**2, floor) * overlap ** -(1 + self.preference)
-                tried[overlap] = (value, found)
-            return tried[overlap][0]
+                value = max(registration.rms_m**2, floor) * overlap ** -(1 + self.preference)
+                results[overlap] = (value, registration)
+            return results[overlap][0]
 
         grid = [float(x) for x in np.linspace(self.smallest, 1, 6)]
         best = min(range(len(grid)), key=lambda k: psi(grid[k]))
@@ -244,7 +244,7 @@ class Tricp(Bounded, Registrar):
                 high = b
             else:
                 low = a
-        return min(tried.values(), key=lambda each: each[0])[1]
+        return min(results.values(), key=lambda result: result[0])[1]
 
 
 @part("registration", "iccp", label="validated")

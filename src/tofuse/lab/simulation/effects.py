@@ -79,9 +79,9 @@ class Effects:
             raise InputError(f"is {self.noise!r}", where="noise", remedy="use poisson or other")
 
     @classmethod
-    def none(cls, **on: Any) -> Self:
+    def none(cls, **enabled: Any) -> Self:
         """Return an ideal camera except for the effects given by name."""
-        return cls(**({name: _off(name) for name in SWITCHES} | on))
+        return cls(**({name: _disabled(name) for name in SWITCHES} | enabled))
 
     def without(self, *names: str) -> Self:
         """Return these effects with the named ones switched off; "all" means every one.
@@ -98,14 +98,14 @@ class Effects:
                     where="effects",
                     remedy=f"use all, or some of {list(SWITCHES)}",
                 )
-        chosen = SWITCHES if "all" in names else names
-        return replace(self, **{name: _off(name) for name in chosen})
+        disabled = SWITCHES if "all" in names else names
+        return replace(self, **{name: _disabled(name) for name in disabled})
 
 
 SWITCHES = tuple(field.name for field in fields(Effects) if field.name != "noise")
 
 
-def _off(name: str) -> Any:
+def _disabled(name: str) -> Any:
     return False if isinstance(getattr(Effects, name), bool) else 0.0
 
 
@@ -118,7 +118,7 @@ class Flag(IntFlag):
     NO_RETURN = 1
     """No surface along the ray."""
     UNDER_EXPOSED = 2
-    """So weak that the camera gives its lowest confidence, or drops the pixel."""
+    """So weak that the camera reports its lowest confidence, or drops the pixel."""
     SATURATED = 4
     """A bucket overflowed in at least one phase image."""
     MIXED = 8
@@ -135,4 +135,4 @@ class Flag(IntFlag):
     MIRROR = 256
     """More than a tenth of the light was reflected by a mirror."""
     PASSING = 512
-    """On a thing that moves through the scene; no error of the camera."""
+    """On a distractor that moves through the scene; not an error of the camera."""

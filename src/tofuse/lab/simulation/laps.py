@@ -1,4 +1,4 @@
-"""Pose graph of a camera that walks the same lap again and again, while its odometry drifts."""
+"""Pose graph of a camera carried along the same lap repeatedly, with drifting odometry."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from tofuse.posegraph.graph import PoseGraph
 
 
 def drifting_laps(count: int, per_lap: int, degrees: float) -> tuple[PoseGraph, Float64]:
-    """Simulate the pose graph of a camera that walks in a circle, 4 m across, again and again.
+    """Simulate the pose graph of a camera carried around a circle of 4 m diameter repeatedly.
 
-    One step of each lap is uncertain, and wrong by 1.1 m and by `degrees`, always in the same
-    direction. Four loops of each lap to earlier ones are accurate: half of them, between views from
-    the same pose, to 0.1 mm.
+    One step of each lap is uncertain, and has an error of 1.1 m and `degrees`, always in the same
+    direction. Four loops of each lap with earlier ones are accurate: about half of them to 0.1 mm,
+    the others to 3 mm.
 
     Parameters
     ----------
@@ -28,15 +28,17 @@ def drifting_laps(count: int, per_lap: int, degrees: float) -> tuple[PoseGraph, 
     The graph, with poses by odometry alone, and the true poses (N, 4, 4).
     """
     rng = np.random.default_rng(0)
-    turn = np.zeros((per_lap, 6))
-    turn[:, 5] = 2 * np.pi * np.arange(per_lap) / per_lap
-    lap = se3.exp(turn)
-    lap[:, :3, 3] = 2.0 * np.stack([np.cos(turn[:, 5]), np.sin(turn[:, 5]), 0 * turn[:, 5]], 1)
+    twists = np.zeros((per_lap, 6))
+    twists[:, 5] = 2 * np.pi * np.arange(per_lap) / per_lap
+    lap = se3.exp(twists)
+    lap[:, :3, 3] = 2.0 * np.stack(
+        [np.cos(twists[:, 5]), np.sin(twists[:, 5]), 0 * twists[:, 5]], 1
+    )
     n = count * per_lap
     truth = lap[np.arange(n) % per_lap]
-    wrong = np.arange(n - 1) % per_lap == per_lap // 3
+    uncertain = np.arange(n - 1) % per_lap == per_lap // 3
     noise = rng.normal(size=(n - 1, 6)) * 2e-3
-    noise[wrong] = [0.6, 0, 0.9, 0, np.radians(degrees), 0]
+    noise[uncertain] = [0.6, 0, 0.9, 0, np.radians(degrees), 0]
     steps = se3.inverse(truth[:-1]) @ truth[1:] @ se3.exp(noise)
     poses = [truth[0]]
     for step in steps:
@@ -47,7 +49,7 @@ def drifting_laps(count: int, per_lap: int, degrees: float) -> tuple[PoseGraph, 
     sigma = np.where(rng.random(len(j)) < 0.5, 3e-3, 1e-4)
     loops = se3.inverse(truth[i]) @ truth[j]
     loops = loops @ se3.exp(rng.normal(size=(len(j), 6)) * sigma[:, None])
-    sigma = np.concatenate([np.where(wrong, 0.3, 2e-3), sigma])
+    sigma = np.concatenate([np.where(uncertain, 0.3, 2e-3), sigma])
     graph = PoseGraph(
         np.arange(n),
         se3.orthonormalise(np.array(poses)),

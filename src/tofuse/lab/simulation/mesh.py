@@ -40,11 +40,11 @@ class Mesh:
         f = np.asarray(faces, np.int64).reshape(-1, 3)
         return cls(np.asarray(vertices, float).reshape(-1, 3), f, np.zeros(len(f), np.int64))
 
-    def moved(self, T: ArrayLike) -> Self:
+    def transformed(self, T: ArrayLike) -> Self:
         """Return the mesh transformed by a rigid motion (4, 4)."""
         return replace(self, vertices=se3.transform(T, self.vertices))
 
-    def shifted(self, x: float, y: float, z: float) -> Self:
+    def translated(self, x: float, y: float, z: float) -> Self:
         """Return the mesh translated by a vector in m."""
         return replace(self, vertices=self.vertices + np.array([x, y, z]))
 
@@ -85,7 +85,7 @@ def corner_normals(mesh: Mesh, crease_rad: float = CREASE_RAD) -> Float64:
     Each corner takes the area-weighted mean of the triangles that share its vertex and whose
     normals are within the crease angle of its own.
     """
-    flat = face_normals(mesh)
+    normals = face_normals(mesh)
     c = mesh.corners()
     area = 0.5 * np.linalg.norm(np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), axis=1)
     vertex = mesh.faces.ravel()
@@ -93,17 +93,17 @@ def corner_normals(mesh: Mesh, crease_rad: float = CREASE_RAD) -> Float64:
     count = np.bincount(vertex, minlength=len(mesh.vertices))
     start = np.cumsum(count) - count
     # All pairs (corner, triangle at the same vertex).
-    reps = count[vertex]
-    corner = np.repeat(np.arange(len(vertex)), reps)
-    within = np.arange(len(corner)) - np.repeat(np.cumsum(reps) - reps, reps)
+    repeats = count[vertex]
+    corner = np.repeat(np.arange(len(vertex)), repeats)
+    within = np.arange(len(corner)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
     other = order[start[vertex[corner]] + within] // 3
-    near = np.einsum("ij,ij->i", flat[corner // 3], flat[other]) > np.cos(crease_rad)
-    weight = np.where(near, area[other], 0.0)
+    within_crease = np.einsum("ij,ij->i", normals[corner // 3], normals[other]) > np.cos(crease_rad)
+    weight = np.where(within_crease, area[other], 0.0)
     total = np.zeros((len(vertex), 3))
-    np.add.at(total, corner, weight[:, None] * flat[other])
+    np.add.at(total, corner, weight[:, None] * normals[other])
     length = np.linalg.norm(total, axis=1, keepdims=True)
-    own = np.repeat(flat, 3, axis=0)
-    out = np.where(length > 1e-12, total / np.where(length > 0, length, 1.0), own)
+    face_normal = np.repeat(normals, 3, axis=0)
+    out = np.where(length > 1e-12, total / np.where(length > 0, length, 1.0), face_normal)
     return out.reshape(-1, 3, 3)
 
 
@@ -149,10 +149,10 @@ def grid(points: ArrayLike, *, closed: bool = False) -> Mesh:
     flat = p.reshape(-1, 3)
     _, keep, welded = np.unique(np.round(flat, 9), axis=0, return_index=True, return_inverse=True)
     faces = welded.reshape(-1)[faces]
-    good = (
+    nondegenerate = (
         (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     )
-    return Mesh.of(flat[keep], faces[good])
+    return Mesh.of(flat[keep], faces[nondegenerate])
 
 
 def lathe(profile: ArrayLike, segments: int = 16) -> Mesh:
@@ -183,7 +183,7 @@ def rod(
     T = np.eye(4)
     T[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
     T[:3, 3] = a
-    return lathe([(0, 0), (radius, 0), (tip, length), (0, length)], segments).moved(T)
+    return lathe([(0, 0), (radius, 0), (tip, length), (0, length)], segments).transformed(T)
 
 
 def superellipsoid(

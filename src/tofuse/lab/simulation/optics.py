@@ -16,10 +16,10 @@ from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.simulation.scene import Scene
 from tofuse.sensor.frequencies import SPEED_OF_LIGHT
 
-# Offset in m of secondary rays from their surface, against self-intersection.
-_LIFT = 1e-4
-# Depth tolerance in m of the shadow test.
-_SHADOW = 0.005
+# Offset of secondary rays from their surface, against self-intersection.
+_RAY_OFFSET_M = 1e-4
+# Depth tolerance of the shadow test.
+_SHADOW_BIAS_M = 0.005
 # Highlight of a perfect mirror at normal incidence, relative to a white wall; and its width.
 _HIGHLIGHT, _HIGHLIGHT_RAD = 40.0, 0.03
 # Chosen for a sampling error of the range of about a millimetre.
@@ -52,8 +52,8 @@ class RayGrid:
     @property
     def centre(self) -> tuple[slice, slice]:
         """Slices of the samples at the pixel centres."""
-        pick = slice(self.window // 2, None, self.stride)
-        return pick, pick
+        samples = slice(self.window // 2, None, self.stride)
+        return samples, samples
 
 
 @cache
@@ -129,10 +129,10 @@ def trace(
     """
     origin = T_room_camera[:3, 3]
     rays = directions @ T_room_camera[:3, :3].T
-    seen: Bool = np.isfinite(rays @ np.ones(3))
-    rays[~seen] = (0.0, 0.0, 1.0)
+    valid: Bool = np.isfinite(rays @ np.ones(3))
+    rays[~valid] = (0.0, 0.0, 1.0)
     hits = scene.cast(origin, rays, T_room_bodies)
-    distance: Float64 = np.where(seen, hits.distance.astype(float), np.inf)
+    distance: Float64 = np.where(valid, hits.distance.astype(float), np.inf)
     hit = np.isfinite(distance)
     safe = np.where(hit, np.maximum(distance, 1e-3), 1.0)
     normals = hits.normal.astype(float)
@@ -142,34 +142,38 @@ def trace(
     direct = diffuse * cosine / safe**2
     points = origin + safe[:, None] * rays
     points[~hit] = np.inf
-    shiny = np.flatnonzero(mirror > 0.01)
-    if len(shiny) == 0:
+    specular = np.flatnonzero(mirror > 0.01)
+    if len(specular) == 0:
         return Returns(
             direct[:, None], 2 * safe[:, None], diffuse, distance, points, normals, hits.surface
         )
     strength = np.zeros((len(rays), 3))
     path = np.zeros((len(rays), 3))
     strength[:, 0], path[:, 0] = direct, 2 * safe
-    g, r, n, d = mirror[shiny], safe[shiny], normals[shiny], rays[shiny]
-    tilt = np.arccos(cosine[shiny])
+    g, r, n, d = mirror[specular], safe[specular], normals[specular], rays[specular]
+    incidence = np.arccos(cosine[specular])
     # The mirrored light source is at twice the distance.
-    strength[shiny, 0] += g * _HIGHLIGHT / (4 * r**2) * np.exp(-((tilt / _HIGHLIGHT_RAD) ** 2))
-    onward = d - 2 * (d * n).sum(1, keepdims=True) * n
-    start = points[shiny] + _LIFT * n
-    second = scene.cast(start, onward, T_room_bodies)
-    found = np.isfinite(second.distance)
-    s = np.where(found, second.distance, 1.0).astype(float)
-    y = start + s[:, None] * onward
+    strength[specular, 0] += (
+        g * _HIGHLIGHT / (4 * r**2) * np.exp(-((incidence / _HIGHLIGHT_RAD) ** 2))
+    )
+    reflected = d - 2 * (d * n).sum(1, keepdims=True) * n
+    start = points[specular] + _RAY_OFFSET_M * n
+    second = scene.cast(start, reflected, T_room_bodies)
+    hit2 = np.isfinite(second.distance)
+    s = np.where(hit2, second.distance, 1.0).astype(float)
+    y = start + s[:, None] * reflected
     n2 = second.normal.astype(float)
-    albedo = np.where(found, second.albedo * (1 - second.gloss), 0.0)
-    arriving = np.clip(-(n2 * onward).sum(1), 0, 1)
-    strength[shiny, 1] = g * g * albedo * arriving / (r + s) ** 2
-    path[shiny, 1] = 2 * (r + s)
-    lit, length = lit_by(scene, origin, y, n2, T_room_bodies)
+    albedo = np.where(hit2, second.albedo * (1 - second.gloss), 0.0)
+    cosine2 = np.clip(-(n2 * reflected).sum(1), 0, 1)
+    strength[specular, 1] = g * g * albedo * cosine2 / (r + s) ** 2
+    path[specular, 1] = 2 * (r + s)
+    irradiance, length = direct_irradiance(scene, origin, y, n2, T_room_bodies)
     # Illuminated from the light source, not along the ray.
-    lit *= _beam(model, (y - origin) @ T_room_camera[:3, :3]) / _beam(model, directions[shiny])
-    strength[shiny, 2] = g * albedo * lit
-    path[shiny, 2] = r + s + length
+    irradiance *= _beam(model, (y - origin) @ T_room_camera[:3, :3]) / _beam(
+        model, directions[specular]
+    )
+    strength[specular, 2] = g * albedo * irradiance
+    path[specular, 2] = r + s + length
     return Returns(strength, path, diffuse, distance, points, normals, hits.surface)
 
 
@@ -181,7 +185,7 @@ def _mirrored(gloss: Float64, cosine: Float64) -> Float64:
     return gloss * (gloss + (1 - gloss) * (1 - cosine) ** 5)
 
 
-def lit_by(
+def direct_irradiance(
     scene: Scene,
     lamp: Float64,
     points: Float64,
@@ -194,21 +198,21 @@ def lit_by(
     toward = toward / length[:, None]
     cosine = np.clip(-(normals * toward).sum(1), 0, 1)
     nearest = scene.cast(lamp, toward, T_room_bodies).distance
-    clear = nearest > length - _SHADOW - 0.002 * length
-    return np.where(clear, cosine / length**2, 0.0), length
+    visible = nearest > length - _SHADOW_BIAS_M - 0.002 * length
+    return np.where(visible, cosine / length**2, 0.0), length
 
 
 def pixel_phasors(grid: RayGrid, returns: Returns, frequency: float) -> Float64:
     """Direct light in each pixel, (H, W, 7) in the channels of `lab.kernels.phasor`."""
-    return _pooled(grid, returns.strength, returns.path, frequency)
+    return _pool(grid, returns.strength, returns.path, frequency)
 
 
 def bounce_weights(grid: RayGrid, returns: Returns, frequency: float) -> Float64:
     """Response (H, W, 7) of pixels to light arriving at their surface: half a path is added."""
-    return _pooled(grid, returns.diffuse[:, None], returns.path[:, :1] / 2, frequency)
+    return _pool(grid, returns.diffuse[:, None], returns.path[:, :1] / 2, frequency)
 
 
-def _pooled(grid: RayGrid, strength: Float64, path: Float64, frequency: float) -> Float64:
+def _pool(grid: RayGrid, strength: Float64, path: Float64, frequency: float) -> Float64:
     wave_number = 2 * np.pi * frequency / SPEED_OF_LIGHT
     rows, columns = grid.directions.shape[:2]
     fine = np.empty((rows * columns, phasor.CHANNELS))
@@ -222,7 +226,7 @@ def _pooled(grid: RayGrid, strength: Float64, path: Float64, frequency: float) -
     return out
 
 
-def off_plane(grid: RayGrid, returns: Returns) -> Float64:
+def plane_deviation(grid: RayGrid, returns: Returns) -> Float64:
     """Largest distance (H, W) in m of a pixel's sub-rays from the plane at its centre."""
     rows, columns = grid.directions.shape[:2]
     points = returns.points.reshape(rows, columns, 3)
@@ -230,12 +234,13 @@ def off_plane(grid: RayGrid, returns: Returns) -> Float64:
     height = (rows - grid.window) // grid.stride + 1
     out = np.zeros((height, (columns - grid.window) // grid.stride + 1))
     run_chunks(
-        lambda a, b: phasor.off_plane(points, normals, grid.window, grid.stride, a, b, out), height
+        lambda a, b: phasor.plane_deviation(points, normals, grid.window, grid.stride, a, b, out),
+        height,
     )
     return out
 
 
-def bounced_light(
+def single_bounce_light(
     scene: Scene,
     model: CameraModel,
     points: Float64,
@@ -266,8 +271,8 @@ def bounced_light(
     For each frequency (H, W, 7) in the channels of `lab.kernels.phasor`.
     """
     step = max(4, points.shape[1] // 44)
-    pick = (slice(step // 2, None, step), slice(step // 2, None, step))
-    x, n = points[pick], normals[pick]
+    samples = (slice(step // 2, None, step), slice(step // 2, None, step))
+    x, n = points[samples], normals[samples]
     shape = x.shape[:2]
     lamp = T_room_camera[:3, 3]
     hit = np.isfinite(x[..., 0])
@@ -275,23 +280,27 @@ def bounced_light(
     paths = np.zeros((*shape, _BOUNCE_RAYS))
     if hit.any():
         n_hit = n[hit]
-        start = x[hit] + _LIFT * n_hit
+        start = x[hit] + _RAY_OFFSET_M * n_hit
         rays = np.einsum("kc,ncd->nkd", _hemisphere(_BOUNCE_RAYS), _frames(n_hit))
         starts = np.repeat(start, _BOUNCE_RAYS, axis=0)
         rays = rays.reshape(-1, 3)
         second = scene.cast(starts, rays, T_room_bodies)
-        found = np.isfinite(second.distance)
-        s = np.where(found, second.distance, 1.0).astype(float)
+        hit2 = np.isfinite(second.distance)
+        s = np.where(hit2, second.distance, 1.0).astype(float)
         y = starts + s[:, None] * rays
-        lit, length = lit_by(scene, lamp, y, second.normal.astype(float), T_room_bodies)
+        irradiance, length = direct_irradiance(
+            scene, lamp, y, second.normal.astype(float), T_room_bodies
+        )
         beam = _beam(model, (y - lamp) @ T_room_camera[:3, :3])
-        mirror = _mirrored(second.gloss.astype(float), np.clip(lit * length**2, 0, 1)) * gloss
-        albedo = np.where(found, second.albedo * (1 - mirror), 0.0)
-        strengths[hit] = (albedo * lit * beam).reshape(-1, _BOUNCE_RAYS) / _BOUNCE_RAYS
+        mirror = (
+            _mirrored(second.gloss.astype(float), np.clip(irradiance * length**2, 0, 1)) * gloss
+        )
+        albedo = np.where(hit2, second.albedo * (1 - mirror), 0.0)
+        strengths[hit] = (albedo * irradiance * beam).reshape(-1, _BOUNCE_RAYS) / _BOUNCE_RAYS
         paths[hit] = (length + s).reshape(-1, _BOUNCE_RAYS)
-    seen = np.isfinite(points[..., 0])
-    beam = np.ones(seen.shape)
-    beam[seen] = _beam(model, (points[seen] - lamp) @ T_room_camera[:3, :3])
+    valid = np.isfinite(points[..., 0])
+    beam = np.ones(valid.shape)
+    beam[valid] = _beam(model, (points[valid] - lamp) @ T_room_camera[:3, :3])
     out = []
     for frequency in model.frequencies:
         wave_number = 2 * np.pi * frequency / SPEED_OF_LIGHT
@@ -305,12 +314,12 @@ def bounced_light(
             coarse,
         )
         # Points relative to the lens: the plane tolerance grows with the range.
-        light = _upsampled(coarse.reshape(*shape, -1), x - lamp, n, points - lamp, normals, step)
+        light = _upsample(coarse.reshape(*shape, -1), x - lamp, n, points - lamp, normals, step)
         out.append(light / beam[..., None])
     return out
 
 
-def _upsampled(
+def _upsample(
     coarse: Float64, x: Float64, n: Float64, points: Float64, normals: Float64, step: int
 ) -> Float64:
     out = np.empty((*points.shape[:2], coarse.shape[2]))
@@ -341,8 +350,8 @@ def _hemisphere(count: int) -> Float64:
     """Fixed cosine-weighted directions (count, 3) about z (a spiral)."""
     k = np.arange(count)
     radius = np.sqrt((k + 0.5) / count)
-    turn = k * np.pi * (3 - np.sqrt(5))
-    return np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - radius**2)], -1)
+    phi = k * np.pi * (3 - np.sqrt(5))
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), np.sqrt(1 - radius**2)], -1)
 
 
 def _frames(normals: Float64) -> Float64:
@@ -354,7 +363,7 @@ def _frames(normals: Float64) -> Float64:
 
 
 def combine(weights: Float64, light: Float64) -> Float64:
-    """Pixel's light after a bounce, (H, W, 7): weights times arriving light per harmonic."""
+    """Light of a pixel after a bounce, (H, W, 7): weights times arriving light, per harmonic."""
     out = weights * light
     for c in (1, 3, 5):
         a = weights[..., c] + 1j * weights[..., c + 1]
@@ -363,8 +372,8 @@ def combine(weights: Float64, light: Float64) -> Float64:
     return out
 
 
-def blurred(images: Float64, sigma_px: float) -> Float64:
-    """Images (..., H, W) after a Gaussian blur of sigma_px."""
+def gaussian_blur(images: Float64, sigma_px: float) -> Float64:
+    """Images (..., H, W) after a Gaussian blur with standard deviation `sigma_px`."""
     if sigma_px == 0:
         return images
     radius = int(np.ceil(3 * sigma_px))
@@ -385,8 +394,12 @@ class LensScatter:
         self.fraction = fraction
         step = max(4, width // 44)
         self._parts = [
-            (mass, _spread(height, step, sigma * width), _spread(width, step, sigma * width))
-            for mass, sigma in ((0.5, 0.06), (0.5, 0.25))
+            (
+                w,
+                _blur_operators(height, step, sigma * width),
+                _blur_operators(width, step, sigma * width),
+            )
+            for w, sigma in ((0.5, 0.06), (0.5, 0.25))
         ]
 
     def __call__(self, image: Float64) -> Float64:
@@ -394,22 +407,22 @@ class LensScatter:
         if self.fraction == 0:
             return image
         out = (1 - self.fraction) * image
-        for mass, (up_rows, down_rows), (up_columns, down_columns) in self._parts:
+        for w, (up_rows, down_rows), (up_columns, down_columns) in self._parts:
             # einsum, not a matrix product: BLAS may sum differently with more threads.
             small = np.einsum("iv,vu->iu", down_rows, image)
             small = np.einsum("iu,ju->ij", small, down_columns)
             large = np.einsum("vi,ij->vj", up_rows, small)
-            out += self.fraction * mass * np.einsum("vj,uj->vu", large, up_columns)
+            out += self.fraction * w * np.einsum("vj,uj->vu", large, up_columns)
         return out
 
 
-def _spread(size: int, step: int, sigma: float) -> tuple[Float64, Float64]:
-    """Linear interpolation (size, n) after block sums and a Gaussian (n, size)."""
+def _blur_operators(size: int, step: int, sigma: float) -> tuple[Float64, Float64]:
+    """Operators up (size, n) and down (n, size): blur at n nodes, and linear interpolation."""
     nodes = np.arange(-(-size // step))
     pixels = np.arange(size)
     sums = (pixels // step == nodes[:, None]).astype(float)
-    away = (nodes[:, None] - nodes) * step
-    blur = np.exp(-0.5 * (away / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
+    distance = (nodes[:, None] - nodes) * step
+    blur = np.exp(-0.5 * (distance / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
     position = np.clip((pixels - (step - 1) / 2) / step, 0, len(nodes) - 1)
     up = np.maximum(0, 1 - np.abs(position[:, None] - nodes))
     return up, blur @ sums

@@ -1,8 +1,8 @@
 """Distractors that pass through the view of a moving camera: a walking person, a sliding box.
 
-They cross the image periodically from side to side, at mid-pass at the distance where they cover a
-given fraction of it, and are far below the floor in between. The camera's true poses are relative
-to the room and not affected.
+They cross the image periodically from side to side, at a distance at which they cover a given
+fraction of it at mid-pass, and are far below the floor between passes. The camera's true poses are
+relative to the room and not affected.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ Kind = Literal["person", "box"]
 
 CARTON = Material("carton", 0.45, 0.25, "print", (0.2, 0.2, 0.2))
 
-# Their position between passes.
-_AWAY = np.eye(4)
-_AWAY[2, 3] = -100.0
-_NEAREST_M = 0.6
-# Largest distance relative to that of the background.
-_CLEAR = 0.75
+# Pose between passes.
+_T_HIDDEN = np.eye(4)
+_T_HIDDEN[2, 3] = -100.0
+_MIN_DISTANCE_M = 0.6
+# Max distance relative to that of the background.
+_BACKGROUND_RATIO = 0.75
 _SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2)
 _LIMB_RAD, _GAIT_HZ = 0.42, 0.9
 _MARGIN_RAD = 0.05
@@ -54,9 +54,9 @@ class Passing:
     seconds
         Time to cross the image.
     period_s
-        Time from the begin of one pass to that of the next.
+        Time from the start of one pass to that of the next.
     start_s
-        Begin of the first pass, after the first frame.
+        Start of the first pass, after the first frame.
     """
 
     kind: Kind = "person"
@@ -88,7 +88,7 @@ class _Part:
     joint: Float64 = field(default_factory=lambda: np.zeros(3))
     swing: float = 0.0
 
-    def T_thing_part(self, t: float) -> Float64:
+    def T_body_part(self, t: float) -> Float64:
         """(4, 4) pose in the body's frame at time t in s of its gait."""
         angle = self.swing * _LIMB_RAD * np.sin(2 * np.pi * _GAIT_HZ * t)
         T = paths.rotation([0, angle, 0])
@@ -97,25 +97,25 @@ class _Part:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pass:
-    """One crossing on the floor: from one border of the view over its middle to the other."""
+class _Crossing:
+    """One crossing on the floor: from one border of the view through its middle to the other."""
 
     start: float
     end: float
-    places: Float64  # (3, 2) in m, at the begin, the middle and the end
+    waypoints: Float64  # (3, 2) in m, at the start, the middle and the end
 
-    def T_room_thing(self, t: float) -> Float64:
+    def T_room_body(self, t: float) -> Float64:
         """(4, 4) pose at time t in s, facing the direction of motion."""
         u = (t - self.start) / (self.end - self.start)
         weights = np.array([(1 - u) * (1 - 2 * u), 4 * u * (1 - u), u * (2 * u - 1)])
         slopes = np.array([4 * u - 3, 4 - 8 * u, 4 * u - 1])
-        along = slopes @ self.places
-        T = paths.rotation([0, 0, np.arctan2(along[1], along[0])])
-        T[:2, 3] = weights @ self.places
+        velocity = slopes @ self.waypoints
+        T = paths.rotation([0, 0, np.arctan2(velocity[1], velocity[0])])
+        T[:2, 3] = weights @ self.waypoints
         return T
 
 
-def enter(
+def add_distractor(
     scene: Scene,
     sequence: Sequence,
     model: CameraModel,
@@ -137,7 +137,7 @@ def enter(
     first, last
         Times in s of the first and the last frame.
     seed
-        Seed of the side from which it enters.
+        Seed for the side from which it enters.
     texture
         False gives it the uniform albedo.
 
@@ -145,71 +145,73 @@ def enter(
     -------
     The extended scene and sequence.
     """
-    materials, whole = _person() if passing.kind == "person" else _box()
-    span = passing.seconds
+    materials, unscaled = _person() if passing.kind == "person" else _box()
+    duration = passing.seconds
     starts = np.arange(first + passing.start_s, last, passing.period_s)
-    middles = starts + span / 2
+    mid_times = starts + duration / 2
     view = _View.of(model)
-    farthest = [_clear(scene, sequence, view, t) for t in middles]
+    max_distances = [_max_distance(scene, sequence, view, t) for t in mid_times]
     for scale in _SCALES:
         # A box keeps its height, or it would be below the field of view.
         size = np.full(3, scale) if passing.kind == "person" else np.array([scale, scale, 1.0])
-        parts = [_scaled(part, size) for part in whole]
+        parts = [_scaled(part, size) for part in unscaled]
         bodies = [Body(part.mesh) for part in parts]
 
-        def covered(t: float, distance: float, parts: list[_Part], bodies: list[Body]) -> float:
-            place = _ahead(sequence.T_room_camera(t), distance, 0.0)
+        def coverage(t: float, distance: float, parts: list[_Part], bodies: list[Body]) -> float:
+            position = _ahead(sequence.T_room_camera(t), distance, 0.0)
             T = paths.rotation([0, 0, _heading(sequence.T_room_camera(t)) + np.pi / 2])
-            T[:2, 3] = place
-            return view.covered(
-                sequence.T_room_camera(t), bodies, [T @ p.T_thing_part(0) for p in parts]
+            T[:2, 3] = position
+            return view.coverage(
+                sequence.T_room_camera(t), bodies, [T @ p.T_body_part(0) for p in parts]
             )
 
-        least = [covered(t, far, parts, bodies) for t, far in zip(middles, farthest, strict=True)]
-        if not least or np.median(least) <= passing.fraction:
+        coverages = [
+            coverage(t, far, parts, bodies) for t, far in zip(mid_times, max_distances, strict=True)
+        ]
+        if not coverages or np.median(coverages) <= passing.fraction:
             break
     side = 1 if np.random.default_rng([seed, 5]).random() < 0.5 else -1
-    passes = []
-    for k, (t, far) in enumerate(zip(middles, farthest, strict=True)):
-        near, distance = _NEAREST_M, far
+    crossings = []
+    for k, (t, far) in enumerate(zip(mid_times, max_distances, strict=True)):
+        lower, upper = _MIN_DISTANCE_M, far
         for _ in range(10):
-            middle = 0.5 * (near + distance)
-            if covered(t, middle, parts, bodies) < passing.fraction:
-                distance = middle
+            midpoint = 0.5 * (lower + upper)
+            if coverage(t, midpoint, parts, bodies) < passing.fraction:
+                upper = midpoint
             else:
-                near = middle
-        reach = max(np.hypot(*(part.mesh.vertices[:, :2].T)).max() for part in parts)
+                lower = midpoint
+        body_radius = max(np.hypot(*(part.mesh.vertices[:, :2].T)).max() for part in parts)
         # Beyond the border by half its width, so that it enters the view gradually.
-        out = view.half_angle + np.arctan2(reach, distance) + _MARGIN_RAD
-        places = [
-            _ahead(sequence.T_room_camera(s), distance, angle)
+        border_angle = view.half_angle + np.arctan2(body_radius, upper) + _MARGIN_RAD
+        waypoints = [
+            _ahead(sequence.T_room_camera(s), upper, angle)
             for s, angle in zip(
-                (t - span / 2, t, t + span / 2),
-                np.array([1, 0, -1]) * out * side * (-1) ** k,
+                (t - duration / 2, t, t + duration / 2),
+                np.array([1, 0, -1]) * border_angle * side * (-1) ** k,
                 strict=True,
             )
         ]
-        passes.append(_Pass(t - span / 2, t + span / 2, np.array(places)))
+        crossings.append(_Crossing(t - duration / 2, t + duration / 2, np.array(waypoints)))
 
     def path_of(part: _Part) -> paths.Path:
         def path(t: float) -> Float64:
-            for one in passes:
-                if one.start <= t <= one.end:
-                    return one.T_room_thing(t) @ part.T_thing_part(t)
-            return _AWAY.copy()
+            for crossing in crossings:
+                if crossing.start <= t <= crossing.end:
+                    return crossing.T_room_body(t) @ part.T_body_part(t)
+            return _T_HIDDEN.copy()
 
         return path
 
-    shown = materials if texture else [m.uniform() for m in materials]
+    surface_materials = materials if texture else [m.uniform() for m in materials]
     return (
-        scene.with_passing(shown, [part.mesh for part in parts]),
+        scene.with_passing(surface_materials, [part.mesh for part in parts]),
         sequence.with_passing([path_of(part) for part in parts]),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Coarse unit rays (N, 3) of a camera; and half of its horizontal field of view."""
+    """Coarse unit rays (N, 3) of a camera, and half of its horizontal field of view."""
 
     rays: Float64
     half_angle: float
@@ -224,7 +226,7 @@ class _View:
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         return cls(rays, float(np.arctan(np.abs(xy[:, 0]).max())))
 
-    def covered(
+    def coverage(
         self, T_room_camera: Float64, bodies: SequenceOf[Body], poses: SequenceOf[Float64]
     ) -> float:
         """Fraction of the image covered by bodies at poses T_room_body."""
@@ -236,13 +238,15 @@ class _View:
         return float(np.isfinite(nearest).mean())
 
 
-def _clear(scene: Scene, sequence: Sequence, view: _View, t: float) -> float:
+def _max_distance(scene: Scene, sequence: Sequence, view: _View, t: float) -> float:
     """Largest distance in m of a pass: in front of most of the visible surfaces."""
     T = sequence.T_room_camera(t)
     hits = scene.cast(T[:3, 3], view.rays @ T[:3, :3].T, sequence.T_room_bodies(t))
-    away = hits.distance * view.rays[:, 2]
-    seen = away[np.isfinite(away)]
-    return max(_CLEAR * float(np.median(seen)), _NEAREST_M) if len(seen) else 2.0
+    depth = hits.distance * view.rays[:, 2]
+    visible = depth[np.isfinite(depth)]
+    return (
+        max(_BACKGROUND_RATIO * float(np.median(visible)), _MIN_DISTANCE_M) if len(visible) else 2.0
+    )
 
 
 def _heading(T_room_camera: Float64) -> float:
@@ -262,27 +266,27 @@ def _scaled(part: _Part, size: Float64) -> _Part:
 def _person() -> tuple[list[Material], list[_Part]]:
     """Parts of a standing person of 1.76 m facing +x: trunk and head, legs, arms."""
     shirt, trousers, skin, hair = range(4)
-    rod, egg = meshes.rod, meshes.superellipsoid
+    rod, ellipsoid = meshes.rod, meshes.superellipsoid
 
     def joined(*parts: tuple[int, Mesh]) -> Mesh:
         return meshes.joined([part.of_surface(surface) for surface, part in parts])
 
     trunk = joined(
-        (shirt, egg((0.25, 0.42, 0.62), (0.6, 0.8), (12, 24)).shifted(0, 0, 1.20)),
-        (trousers, egg((0.26, 0.36, 0.28), (0.7, 0.8), (10, 20)).shifted(0, 0, 0.93)),
+        (shirt, ellipsoid((0.25, 0.42, 0.62), (0.6, 0.8), (12, 24)).translated(0, 0, 1.20)),
+        (trousers, ellipsoid((0.26, 0.36, 0.28), (0.7, 0.8), (10, 20)).translated(0, 0, 0.93)),
         (skin, rod((0, 0, 1.45), (0.01, 0, 1.58), 0.055)),
-        (skin, egg((0.20, 0.16, 0.24), (1, 1), (12, 20)).shifted(0.02, 0, 1.64)),
-        (hair, egg((0.20, 0.18, 0.18), (1, 1), (10, 18)).shifted(-0.005, 0, 1.67)),
+        (skin, ellipsoid((0.20, 0.16, 0.24), (1, 1), (12, 20)).translated(0.02, 0, 1.64)),
+        (hair, ellipsoid((0.20, 0.18, 0.18), (1, 1), (10, 18)).translated(-0.005, 0, 1.67)),
     )
     leg = joined(
         (trousers, rod((0, 0, 0.03), (0.01, 0, -0.42), 0.085, 0.06)),
         (trousers, rod((0.01, 0, -0.42), (0, 0, -0.84), 0.06, 0.045)),
-        (hair, egg((0.28, 0.10, 0.09), (0.6, 0.6)).shifted(0.05, 0, -0.865)),
+        (hair, ellipsoid((0.28, 0.10, 0.09), (0.6, 0.6)).translated(0.05, 0, -0.865)),
     )
     arm = joined(
         (shirt, rod((0, 0, 0.04), (0, 0, -0.28), 0.055, 0.042)),
         (shirt, rod((0, 0, -0.28), (0.05, 0, -0.52), 0.042, 0.03)),
-        (skin, egg((0.06, 0.09, 0.17)).shifted(0.07, 0, -0.60)),
+        (skin, ellipsoid((0.06, 0.09, 0.17)).translated(0.07, 0, -0.60)),
     )
     parts = [_Part(trunk)]
     for side in (-1, 1):

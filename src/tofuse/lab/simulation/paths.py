@@ -72,7 +72,7 @@ def smooth_step(u: float) -> float:
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
 
-def there_and_back(
+def out_and_back(
     T_room_camera: Float64, length_m: float, seconds: float, outward_fraction: float = 0.38
 ) -> Path:
     """Translate along the camera's +x axis by `length_m` and back, faster on the way out."""

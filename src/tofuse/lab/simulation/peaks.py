@@ -64,7 +64,7 @@ def peaks_cameras() -> Float64:
     return T
 
 
-def peaks_seen() -> list[Intp]:
+def peaks_visible() -> list[Intp]:
     """Ascending rows of `peaks_points` visible to each camera: the 2500 nearest to it."""
     points = peaks_points()
     distances = [np.linalg.norm(points - T[:3, 3], axis=1) for T in peaks_cameras()]
@@ -92,9 +92,9 @@ def peaks_views(sigma: float, seed: int) -> tuple[list[CloudFrame], Float64]:
     points = peaks_points()
     T_object_camera = peaks_cameras()
     views = []
-    for k, (T, rows) in enumerate(zip(T_object_camera, peaks_seen(), strict=True)):
-        seen = se3.transform(se3.inverse(T), points[rows])
-        noise = np.random.default_rng([seed, k]).normal(size=seen.shape)
-        cloud = (seen + sigma * noise).astype(np.float32)
+    for k, (T, rows) in enumerate(zip(T_object_camera, peaks_visible(), strict=True)):
+        points_camera = se3.transform(se3.inverse(T), points[rows])
+        noise = np.random.default_rng([seed, k]).normal(size=points_camera.shape)
+        cloud = (points_camera + sigma * noise).astype(np.float32)
         views.append(CloudFrame(k, float(k), cloud))
     return views, se3.inverse(T_object_camera[0]) @ T_object_camera

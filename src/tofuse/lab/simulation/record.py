@@ -1,4 +1,4 @@
-"""A whole simulated recording: in memory, or as a native folder with its ground truth."""
+"""Simulated recordings: in memory, or as a native folder with the ground truth."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.accelerometer import accelerations
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
-from tofuse.lab.simulation.passing import Passing, enter
+from tofuse.lab.simulation.passing import Passing, add_distractor
 from tofuse.lab.simulation.peaks import peaks_cameras, peaks_points, peaks_views
-from tofuse.lab.simulation.render import Rendered, render
+from tofuse.lab.simulation.render import RenderedFrame, render
 from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
@@ -36,7 +36,7 @@ _DEFAULT = Effects()
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class RecordingPlan:
     """A planned recording.
 
     Attributes
@@ -64,9 +64,9 @@ class Plan:
     @property
     def correction(self) -> DepthCorrection:
         """The factory correction of the camera."""
-        return sensor.calibrated(self.model, self.effects)
+        return sensor.factory_correction(self.model, self.effects)
 
-    def frames(self, progress: Progress | None) -> Iterator[Rendered]:
+    def frames(self, progress: Progress | None) -> Iterator[RenderedFrame]:
         """Render the frames, numbered from 0."""
         for k, raw in enumerate(self.raw):
             rendered = render(
@@ -94,7 +94,7 @@ def plan(
     texture: bool = True,
     axis_offset_m: float = 0.0,
     passing: Passing | None = None,
-) -> Plan:
+) -> RecordingPlan:
     """Plan a recording; see `simulate` for the parameters.
 
     Raises
@@ -116,11 +116,11 @@ def plan(
     raw = np.arange(first, sequence.frames, stride)[:frames]
     if passing is not None:
         times = raw[[0, -1]] / sequence.frame_rate_hz
-        built, sequence = enter(
+        built, sequence = add_distractor(
             built, sequence, model, passing, first=times[0], last=times[1], seed=seed,
             texture=texture,
         )  # fmt: skip
-    return Plan(built, sequence, model, effects, seed, raw)
+    return RecordingPlan(built, sequence, model, effects, seed, raw)
 
 
 def simulate_recording(
@@ -145,10 +145,10 @@ def simulate_recording(
     """
     if scene == "peaks":
         views, poses = peaks_views(sigma_m, seed)
-        kept = slice(None, frames and frames * (every or 1), every)
-        chosen = [replace(view, index=k) for k, view in enumerate(views[kept])]
-        return Recording.of(ArraySource(chosen, poses[kept]), "simulated peaks", "simulated")
-    made = plan(
+        selection = slice(None, frames and frames * (every or 1), every)
+        selected = [replace(view, index=k) for k, view in enumerate(views[selection])]
+        return Recording.of(ArraySource(selected, poses[selection]), "simulated peaks", "simulated")
+    planned = plan(
         scene,
         camera=camera,
         seed=seed,
@@ -160,12 +160,14 @@ def simulate_recording(
         axis_offset_m=axis_offset_m,
         passing=passing,
     )
-    factory = made.correction if correction else None
-    taken = [
-        rendered.frame if factory is None else _corrected(factory, rendered.frame)
-        for rendered in made.frames(progress)
+    factory_correction = planned.correction if correction else None
+    images = [
+        rendered.frame
+        if factory_correction is None
+        else _corrected(factory_correction, rendered.frame)
+        for rendered in planned.frames(progress)
     ]
-    source = ArraySource(taken, made.poses, metadata=_metadata(made, correction))
+    source = ArraySource(images, planned.poses, metadata=_metadata(planned, correction))
     return Recording.of(source, f"simulated {scene}", "simulated")
 
 
@@ -236,7 +238,7 @@ def simulate(
     """
     if scene == "peaks":
         return _write_peaks(Path(out), seed, sigma_m, every, frames)
-    made = plan(
+    planned = plan(
         scene,
         camera=camera,
         seed=seed,
@@ -248,11 +250,11 @@ def simulate(
         axis_offset_m=axis_offset_m,
         passing=passing,
     )
-    return write(made, out, correction=correction, imu=imu, progress=progress)
+    return write(planned, out, correction=correction, imu=imu, progress=progress)
 
 
 def write(
-    made: Plan,
+    planned: RecordingPlan,
     out: str | Path,
     *,
     correction: bool = True,
@@ -260,35 +262,35 @@ def write(
     progress: Progress | None = None,
 ) -> Path:
     """Render a planned recording and write it as a native folder; see `simulate`."""
-    model, effects, seed = made.model, made.effects, made.seed
+    model, effects, seed = planned.model, planned.effects, planned.seed
     writer = RecordingWriter(
         out,
         model.camera,
         depth_unit_m=model.depth_unit_m,
         depth_kind=model.depth_kind,
-        frame_rate_hz=made.sequence.frame_rate_hz,
+        frame_rate_hz=planned.sequence.frame_rate_hz,
         ambiguity_m=model.ambiguity_m,
         confidence_max=model.confidence_max,
         amplitude_kind=model.amplitude_kind,
     )
     truth = writer.folder / "truth"
     flags, depths = make_folder(truth / "flags"), make_folder(truth / "depth")
-    for k, rendered in enumerate(made.frames(progress)):
+    for k, rendered in enumerate(planned.frames(progress)):
         writer.add(rendered.frame)
         write_png(flags / f"{k:06d}.png", rendered.flags)
         counts = np.round(rendered.depth.astype(float) / model.depth_unit_m)
         write_png(depths / f"{k:06d}.png", np.where(counts < 65535, counts, 0).astype(np.uint16))
-    vertices, faces = made.scene.truth_mesh()
-    T = made.sequence.T_world_truth(made.raw[0] / made.sequence.frame_rate_hz)
+    vertices, faces = planned.scene.truth_mesh()
+    T = planned.sequence.T_world_truth(planned.raw[0] / planned.sequence.frame_rate_hz)
     write_ply(
         truth / "surface.ply",
         GeometryRecord(se3.transform(T, vertices), faces=faces.astype(np.int32)),
     )
-    times = made.raw / made.sequence.frame_rate_hz
+    times = planned.raw / planned.sequence.frame_rate_hz
     return writer.finish(
-        groundtruth=made.poses,
-        correction=made.correction if correction else None,
-        imu=accelerations(made.sequence, times[0], times[-1], seed) if imu else None,
+        groundtruth=planned.poses,
+        correction=planned.correction if correction else None,
+        imu=accelerations(planned.sequence, times[0], times[-1], seed) if imu else None,
         frames={
             "integration_us": np.full(len(times), round(model.integration_s * 1e6)),
             "drift_m": np.array([sensor.drift(model, t) for t in times]) * effects.thermal_drift,
@@ -309,15 +311,15 @@ def _write_peaks(
     return writer.finish(groundtruth=recording.reference)
 
 
-def _corrected(factory: DepthCorrection, frame: RangeFrame) -> RangeFrame:
-    depth = corrected_depth(factory, frame.camera, frame.depth, frame.depth_kind)
+def _corrected(correction: DepthCorrection, frame: RangeFrame) -> RangeFrame:
+    depth = corrected_depth(correction, frame.camera, frame.depth, frame.depth_kind)
     return replace(frame, depth=depth)
 
 
-def _metadata(made: Plan, correction: bool) -> dict[str, object]:
-    model = made.model
-    found = {
-        "frame_rate_hz": made.sequence.frame_rate_hz,
+def _metadata(planned: RecordingPlan, correction: bool) -> dict[str, object]:
+    model = planned.model
+    metadata = {
+        "frame_rate_hz": planned.sequence.frame_rate_hz,
         "ambiguity_m": model.ambiguity_m,
         "confidence_max": model.confidence_max,
         "amplitude_kind": model.amplitude_kind,
@@ -325,4 +327,4 @@ def _metadata(made: Plan, correction: bool) -> dict[str, object]:
         "depth_kind": model.depth_kind,
         "corrected": correction,
     }
-    return {key: value for key, value in found.items() if value is not None}
+    return {key: value for key, value in metadata.items() if value is not None}

@@ -16,13 +16,13 @@ from tofuse.recordings.depth_counts import INVALID_DEPTH, depth_from_counts
 from tofuse.recordings.frames import RangeFrame
 
 _DEFAULT = Effects()
-_NOTABLE_M = 0.003
+_FLAG_THRESHOLD_M = 0.003
 _MIXED_M, _MIXED_FRACTION = 0.02, 0.01
 _MIRROR_FRACTION = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Rendered:
+class RenderedFrame:
     """A frame as the camera reports it, and its ground truth.
 
     Attributes
@@ -63,7 +63,7 @@ def render(
     *,
     effects: Effects = _DEFAULT,
     seed: int = 0,
-) -> Rendered:
+) -> RenderedFrame:
     """Render raw frame `index` of a sequence, at the time index / frame rate.
 
     The result depends neither on the other frames rendered nor on the number of threads.
@@ -74,7 +74,7 @@ def render(
         (sequence.T_room_camera(t), sequence.T_room_bodies(t))
         for t in (*tap_times(model, time_s), time_s)
     ]
-    still = not effects.smear or all(_same(pose, poses[-1]) for pose in poses)
+    static = not effects.smear or all(_same_poses(pose, poses[-1]) for pose in poses)
 
     def light(pose: tuple[Float64, Float64 | None], rays: optics.RayGrid) -> _Light:
         returns = optics.trace(
@@ -87,30 +87,30 @@ def render(
         ]
         return _Light(np.stack(direct), np.stack(weights), returns)
 
-    taps = [light(poses[-1], grid)] if still else [light(pose, grid) for pose in poses[:-1]]
-    middle = taps[0].returns if still else None
-    pick = grid
-    if middle is None:
-        pick = optics.ray_grid(model, False)
-        middle = optics.trace(
-            scene, model, pick.directions.reshape(-1, 3), *poses[-1], gloss=effects.gloss
+    taps = [light(poses[-1], grid)] if static else [light(pose, grid) for pose in poses[:-1]]
+    centre_returns = taps[0].returns if static else None
+    centre_grid = grid
+    if centre_returns is None:
+        centre_grid = optics.ray_grid(model, False)
+        centre_returns = optics.trace(
+            scene, model, centre_grid.directions.reshape(-1, 3), *poses[-1], gloss=effects.gloss
         )
-    shape = pick.directions.shape
-    distance = middle.distance.reshape(shape[:2])[pick.centre]
+    shape = centre_grid.directions.shape
+    distance = centre_returns.distance.reshape(shape[:2])[centre_grid.centre]
     bounced = None
     if effects.multipath:
-        points = middle.points.reshape(shape)[pick.centre]
-        normals = middle.normals.reshape(shape)[pick.centre]
-        bounced = optics.bounced_light(
+        points = centre_returns.points.reshape(shape)[centre_grid.centre]
+        normals = centre_returns.normals.reshape(shape)[centre_grid.centre]
+        bounced = optics.single_bounce_light(
             scene, model, points, normals, *poses[-1], gloss=effects.gloss
         )
 
-    parts = _phase_images(model, effects, taps, bounced)
-    exposure = parts.exposure(model, effects, scene.ambient)
+    phase_images = _phase_images(model, effects, taps, bounced)
+    exposure = phase_images.exposure(model, effects, scene.ambient)
     rng = np.random.default_rng([seed, index])
     measured = sensor.expose(model, effects, exposure, rng)
     expected = sensor.expose(model, effects, exposure, None)
-    ranges = _offset(model, effects, measured.range_m, time_s)
+    ranges = _add_offsets(model, effects, measured.range_m, time_s)
     if not effects.wrap:
         periods = np.round(
             (np.where(np.isfinite(distance), distance, ranges) - ranges) / model.period_m
@@ -118,18 +118,18 @@ def render(
         ranges = np.maximum(ranges + periods * model.period_m, 0)
 
     measured = sensor.Measurement(ranges, measured.amplitude, measured.saturated)
-    flags = parts.flags(model, effects)
+    flags = phase_images.flags(model, effects)
     flags |= _pixel_flags(model, grid, taps, distance, ranges, expected)
-    surface = middle.surface.reshape(shape[:2])[pick.centre]
+    surface = centre_returns.surface.reshape(shape[:2])[centre_grid.centre]
     flags |= _bit(np.isin(surface, list(scene.passing_surfaces)), Flag.PASSING)
-    return Rendered(
+    return RenderedFrame(
         _frame(model, effects, measured, index, time_s),
-        _recorded(model, np.where(np.isfinite(distance), distance, 0)),
+        _in_depth_kind(model, np.where(np.isfinite(distance), distance, 0)),
         flags,
     )
 
 
-def _same(a: tuple[Float64, Float64 | None], b: tuple[Float64, Float64 | None]) -> bool:
+def _same_poses(a: tuple[Float64, Float64 | None], b: tuple[Float64, Float64 | None]) -> bool:
     return all(
         (x is None and y is None)
         or (x is not None and y is not None and np.abs(x - y).max() < 1e-12)
@@ -143,7 +143,7 @@ class _PhaseImages:
 
     Attributes
     ----------
-    sharp, direct, lit
+    sharp, direct, combined
         (F, 4, H, W) correlations of direct light, before and after the lens blur, and including
         single-bounce light.
     total
@@ -156,7 +156,7 @@ class _PhaseImages:
 
     sharp: Float64
     direct: Float64
-    lit: Float64
+    combined: Float64
     total: Float64
     albedo: Float64
     unsmeared: Complex128 | None
@@ -172,7 +172,7 @@ class _PhaseImages:
     def exposure(self, model: CameraModel, effects: Effects, ambient: float) -> sensor.Exposure:
         background = ambient * self.albedo * np.sqrt(model.transmission)
         return sensor.Exposure(
-            self.scattered(model, effects, self.lit),
+            self.scattered(model, effects, self.combined),
             self.scattered(model, effects, self.total),
             background,
         )
@@ -180,18 +180,18 @@ class _PhaseImages:
     def flags(self, model: CameraModel, effects: Effects) -> UInt16:
         """Bits of the effects that are determined by the light alone."""
         out = np.zeros(self.direct.shape[2:], np.uint16)
-        lit = sensor.phasor_of(self.lit[0])
+        combined = sensor.phasor_of(self.combined[0])
         direct = sensor.phasor_of(self.direct[0])
         if effects.mixed_pixels:
             sharp = sensor.phasor_of(self.sharp[0])
-            out |= _bit(_apart(model, direct, sharp, _MIXED_M), Flag.MIXED)
+            out |= _bit(_ranges_differ(model, direct, sharp, _MIXED_M), Flag.MIXED)
         if effects.multipath:
-            out |= _bit(_apart(model, lit, direct), Flag.MULTIPATH)
+            out |= _bit(_ranges_differ(model, combined, direct), Flag.MULTIPATH)
         if self.unsmeared is not None:
-            out |= _bit(_apart(model, direct, self.unsmeared), Flag.SMEAR)
+            out |= _bit(_ranges_differ(model, direct, self.unsmeared), Flag.SMEAR)
         if effects.scatter > 0:
-            scattered = sensor.phasor_of(self.scattered(model, effects, self.lit[:1])[0])
-            out |= _bit(_apart(model, scattered, lit), Flag.SCATTER)
+            scattered = sensor.phasor_of(self.scattered(model, effects, self.combined[:1])[0])
+            out |= _bit(_ranges_differ(model, scattered, combined), Flag.SCATTER)
         return out
 
 
@@ -199,10 +199,12 @@ def _bit(mask: Bool, flag: Flag) -> UInt16:
     return np.where(mask, np.uint16(flag), np.uint16(0))
 
 
-def _apart(model: CameraModel, a: Complex128, b: Complex128, limit_m: float = _NOTABLE_M) -> Bool:
+def _ranges_differ(
+    model: CameraModel, a: Complex128, b: Complex128, limit_m: float = _FLAG_THRESHOLD_M
+) -> Bool:
     """Mask of phasors whose ranges differ by more than `limit_m`; False where one is zero."""
-    turn = np.abs(np.angle(a * np.conj(b))) / (2 * np.pi) * model.period_m
-    return (turn > limit_m) & (np.abs(a) > 0) & (np.abs(b) > 0)
+    difference = np.abs(np.angle(a * np.conj(b))) / (2 * np.pi) * model.period_m
+    return (difference > limit_m) & (np.abs(a) > 0) & (np.abs(b) > 0)
 
 
 def _phase_images(
@@ -211,31 +213,33 @@ def _phase_images(
     harmonics = sensor.scaled_harmonics(model, effects)
     count, (height, width) = len(model.frequencies), taps[0].direct.shape[1:3]
     direct = np.empty((count, sensor.TAPS, height, width))
-    lit, total = np.empty_like(direct), np.empty_like(direct)
+    combined, total = np.empty_like(direct), np.empty_like(direct)
     for f in range(count):
         for k in range(sensor.TAPS):
             light = taps[k if len(taps) > 1 else 0]
             direct[f, k] = sensor.correlate(light.direct[f], k, harmonics)
-            lit[f, k], total[f, k] = direct[f, k], light.direct[f, ..., 0]
+            combined[f, k], total[f, k] = direct[f, k], light.direct[f, ..., 0]
             if bounced is not None:
-                extra = optics.combine(light.weights[f], bounced[f])
-                lit[f, k] += sensor.correlate(extra, k, harmonics)
-                total[f, k] += extra[..., 0]
+                indirect = optics.combine(light.weights[f], bounced[f])
+                combined[f, k] += sensor.correlate(indirect, k, harmonics)
+                total[f, k] += indirect[..., 0]
     sharp = direct
     if effects.mixed_pixels:
-        direct, lit, total = (optics.blurred(x, model.blur_px) for x in (direct, lit, total))
+        direct, combined, total = (
+            optics.gaussian_blur(x, model.blur_px) for x in (direct, combined, total)
+        )
     unsmeared = None
     if len(taps) > 1:
         light = np.mean([tap.direct[0] for tap in taps], axis=0)
         static = np.stack([sensor.correlate(light, k, harmonics) for k in range(sensor.TAPS)])
         if effects.mixed_pixels:
-            static = optics.blurred(static, model.blur_px)
+            static = optics.gaussian_blur(static, model.blur_px)
         unsmeared = sensor.phasor_of(static)
     albedo = taps[len(taps) // 2].weights[0, ..., 0]
-    return _PhaseImages(sharp, direct, lit, total, albedo, unsmeared)
+    return _PhaseImages(sharp, direct, combined, total, albedo, unsmeared)
 
 
-def _offset(model: CameraModel, effects: Effects, ranges: Float64, time_s: float) -> Float64:
+def _add_offsets(model: CameraModel, effects: Effects, ranges: Float64, time_s: float) -> Float64:
     """Add the range offsets of pixels and thermal drift, which wrap with the phase."""
     ranges = ranges + effects.pixel_offsets * sensor.pixel_offsets(model)
     ranges += effects.thermal_drift * sensor.drift(model, time_s)
@@ -252,13 +256,13 @@ def _pixel_flags(
 ) -> UInt16:
     hit = np.isfinite(distance)
     out = _bit(~hit, Flag.NO_RETURN)
-    weakest = max(model.minimum_amplitude, *model.confidence_thresholds[:1], 0.0)
-    out |= _bit(expected.amplitude < weakest, Flag.UNDER_EXPOSED)
+    min_amplitude = max(model.minimum_amplitude, *model.confidence_thresholds[:1], 0.0)
+    out |= _bit(expected.amplitude < min_amplitude, Flag.UNDER_EXPOSED)
     out |= _bit(expected.saturated, Flag.SATURATED)
     if grid.window > 1:
-        off = np.max([optics.off_plane(grid, tap.returns) for tap in taps], axis=0)
+        deviation = np.max([optics.plane_deviation(grid, tap.returns) for tap in taps], axis=0)
         limit = np.maximum(_MIXED_M, _MIXED_FRACTION * np.where(hit, distance, 0))
-        out |= _bit(off > limit, Flag.MIXED)
+        out |= _bit(deviation > limit, Flag.MIXED)
     # Half of the shortest ambiguity period.
     out |= _bit(
         hit & (np.abs(ranges - np.where(hit, distance, 0)) > model.period_m / 2), Flag.WRAPPED
@@ -267,14 +271,14 @@ def _pixel_flags(
     for tap in taps:
         strength = tap.returns.strength
         if strength.shape[1] > 1:
-            whole = strength.sum(1)
-            part = strength[:, 1:].sum(1) / np.where(whole > 0, whole, 1)
-            fine = part.reshape(grid.directions.shape[:2])
-            fraction = np.maximum(fraction, fine[grid.centre])
+            total = strength.sum(1)
+            specular = strength[:, 1:].sum(1) / np.where(total > 0, total, 1)
+            fine_fraction = specular.reshape(grid.directions.shape[:2])
+            fraction = np.maximum(fraction, fine_fraction[grid.centre])
     return out | _bit(fraction > _MIRROR_FRACTION, Flag.MIRROR)
 
 
-def _recorded(model: CameraModel, radial: Float64) -> Float32:
+def _in_depth_kind(model: CameraModel, radial: Float64) -> Float32:
     if model.depth_kind == "z":
         radial = radial / ray_lengths(model.camera)
     return np.where(np.isfinite(radial), radial, 0).astype(np.float32)
@@ -287,7 +291,7 @@ def _frame(
     index: int,
     time_s: float,
 ) -> RangeFrame:
-    depth = np.where(measured.saturated, 0, _recorded(model, measured.range_m))
+    depth = np.where(measured.saturated, 0, _in_depth_kind(model, measured.range_m))
     if effects.under_exposure:
         depth = np.where(measured.amplitude < model.minimum_amplitude, 0, depth)
     counts = np.round(depth / model.depth_unit_m)

@@ -14,7 +14,7 @@ from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.paths import Path, look_at, rotation
-from tofuse.lab.simulation.record import Plan
+from tofuse.lab.simulation.record import RecordingPlan
 from tofuse.recordings.correction_file import corrected_depth
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
@@ -49,26 +49,26 @@ class Mount:
     def sequence(self, rig: scenes.Sequence) -> scenes.Sequence:
         """Return the rig's sequence as seen by this camera."""
 
-        def later(path: Path) -> Path:
+        def delayed(path: Path) -> Path:
             return lambda t: path(t + self.time_offset_s)
 
         return replace(
             rig,
             frame_rate_hz=self.frame_rate_hz,
             camera_path=lambda t: rig.camera_path(t + self.time_offset_s) @ self.T_rig_camera,
-            object_path=None if rig.object_path is None else later(rig.object_path),
-            passing_paths=tuple(map(later, rig.passing_paths)),
+            object_path=None if rig.object_path is None else delayed(rig.object_path),
+            passing_paths=tuple(map(delayed, rig.passing_paths)),
         )
 
 
-def around(
+def camera_ring(
     centre: SequenceOf[float], radius: float, height: float, count: int, first_rad: float = np.pi
 ) -> list[Float64]:
     """(4, 4) T_room_camera of `count` cameras evenly spaced around a point, facing it."""
     angles = first_rad + 2 * np.pi * np.arange(count) / count
-    at = np.asarray(centre, float)
+    target = np.asarray(centre, float)
     offsets = [np.array([radius * np.cos(a), radius * np.sin(a), height]) for a in angles]
-    return [look_at(at + offset, at) for offset in offsets]
+    return [look_at(target + offset, target) for offset in offsets]
 
 
 def relative(T_room_camera: SequenceOf[Float64]) -> list[Float64]:
@@ -88,27 +88,30 @@ def simulate_rig(
     effects: Effects = _DEFAULT,
     seed: int = 0,
 ) -> list[Recording]:
-    """Record with every camera of a rig, in memory; noise differs between them.
+    """Simulate a recording of each camera of a rig, in memory; their noise is independent.
 
     Parameters
     ----------
     scene, sequence
         The scene, and the motion of the rig (the sequence's camera) and of all bodies.
     first_s
-        Start in s of the rig's time; timestamps are those of the cameras' own clocks.
+        Start in s, by the rig's clock; timestamps are those of the cameras' own clocks.
     frames, every
         Images per camera, and the stride.
     """
     recordings = []
     for k, mount in enumerate(mounts):
-        own = mount.sequence(sequence)
-        begin = int(np.ceil((first_s - mount.time_offset_s) * mount.frame_rate_hz - 1e-9))
-        raw = begin + every * np.arange(frames)
-        made = Plan(scene, own, mount.model, effects, 1000 * seed + k, raw)
-        taken = [_recorded(made, mount, rendered.frame) for rendered in made.frames(None)]
+        camera_sequence = mount.sequence(sequence)
+        first = int(np.ceil((first_s - mount.time_offset_s) * mount.frame_rate_hz - 1e-9))
+        raw = first + every * np.arange(frames)
+        planned = RecordingPlan(scene, camera_sequence, mount.model, effects, 1000 * seed + k, raw)
+        images = [
+            _apply_camera_errors(planned, mount, rendered.frame)
+            for rendered in planned.frames(None)
+        ]
         source = ArraySource(
-            taken,
-            made.poses,
+            images,
+            planned.poses,
             metadata={
                 "frame_rate_hz": mount.frame_rate_hz,
                 "ambiguity_m": mount.model.ambiguity_m,
@@ -120,19 +123,19 @@ def simulate_rig(
     return recordings
 
 
-def _recorded(made: Plan, mount: Mount, frame: RangeFrame) -> RangeFrame:
+def _apply_camera_errors(planned: RecordingPlan, mount: Mount, frame: RangeFrame) -> RangeFrame:
     """Apply the factory correction to an image, and add this camera's bias."""
-    depth = corrected_depth(made.correction, frame.camera, frame.depth, frame.depth_kind)
+    depth = corrected_depth(planned.correction, frame.camera, frame.depth, frame.depth_kind)
     if mount.depth_offset_m:
-        along = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
-        depth = np.where(depth > 0, depth + mount.depth_offset_m * along, 0).astype(np.float32)
+        scale = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
+        depth = np.where(depth > 0, depth + mount.depth_offset_m * scale, 0).astype(np.float32)
     return replace(frame, depth=depth)
 
 
 def wander(
     centre: SequenceOf[float], radii: SequenceOf[float], seconds: float, tilt_rad: float = 0.25
 ) -> Path:
-    """Path of a rig carried round a room: an ellipse, one full turn, oscillating tilt.
+    """Path of a rig carried around a room: an ellipse, with varying heading, tilt and height.
 
     Parameters
     ----------
@@ -143,15 +146,15 @@ def wander(
     tilt_rad
         Amplitude of roll and pitch.
     """
-    middle = np.asarray(centre, float)
+    mean_position = np.asarray(centre, float)
 
     def path(t: float) -> Float64:
         u = 2 * np.pi * t / seconds
-        around = [radii[0] * np.cos(u), radii[1] * np.sin(u), 0.12 * np.sin(2.3 * u)]
-        at = np.add(middle, around)
+        offset = [radii[0] * np.cos(u), radii[1] * np.sin(u), 0.12 * np.sin(2.3 * u)]
+        position = np.add(mean_position, offset)
         heading = u + 0.5 * np.sin(1.7 * u)
-        ahead = np.add(at, [np.cos(heading), np.sin(heading), 0.0])
-        T = look_at(at, ahead)
+        target = np.add(position, [np.cos(heading), np.sin(heading), 0.0])
+        T = look_at(position, target)
         tilts = tilt_rad * np.array([np.sin(3.1 * u + 0.4), 0.0, np.sin(2.3 * u)])
         return np.asarray(T @ rotation([tilts[0], 0, 0]) @ rotation([0, 0, tilts[2]]), np.float64)
 

@@ -27,7 +27,7 @@ from tofuse.lab.simulation.mesh import Mesh
 from tofuse.lab.simulation.paths import Path
 from tofuse.lab.simulation.texture import Material
 
-# Small enough to occupy all threads, large enough to amortise their start.
+# Small enough to occupy all threads, large enough to amortise the overhead of a chunk.
 _RAYS_PER_CHUNK = 4096
 
 
@@ -73,7 +73,7 @@ class Body:
     def cast(
         self, origins: Float64, directions: Float64, distance: Float64
     ) -> tuple[Int32, Float64]:
-        """Shorten `distance` (N,) where the body is nearer; return faces (-1: none), weights."""
+        """Reduce `distance` (N,) where the body is nearer; return faces (-1: none) and weights."""
         face = np.full(len(directions), -1, np.int32)
         weights = np.zeros((len(directions), 2))
         bvh.cast_rays(
@@ -198,22 +198,22 @@ class Scene:
 
         def chunk(a: int, b: int) -> None:
             rays = np.ascontiguousarray(directions[a:b], np.float64)
-            starts = np.ascontiguousarray(
+            room_origins = np.ascontiguousarray(
                 origins if len(origins) != size else origins[a:b], np.float64
             )
             nearest = np.full(b - a, np.inf)
             out = Shading(normal[a:b], albedo[a:b], gloss[a:b], surface[a:b])
-            face, weights = self._room.cast(starts, rays, nearest)
+            face, weights = self._room.cast(room_origins, rays, nearest)
             textures = Textures(self._rows, *self._noise)
-            hits = Rays(starts, rays, nearest, face, weights)
+            hits = Rays(room_origins, rays, nearest, face, weights)
             self._room.shade(textures, hits, np.eye(3), out)
             for body, T in zip(bodies, poses, strict=True):
                 T_body_room = se3.inverse(T)
-                own = np.ascontiguousarray(se3.transform(T_body_room, starts))
-                turned = np.ascontiguousarray(rays @ T_body_room[:3, :3].T)
-                face, weights = body.cast(own, turned, nearest)
+                body_origins = np.ascontiguousarray(se3.transform(T_body_room, room_origins))
+                body_directions = np.ascontiguousarray(rays @ T_body_room[:3, :3].T)
+                face, weights = body.cast(body_origins, body_directions, nearest)
                 R = np.ascontiguousarray(T[:3, :3])
-                hits = Rays(own, turned, nearest, face, weights)
+                hits = Rays(body_origins, body_directions, nearest, face, weights)
                 body.shade(textures, hits, R, out)
             distance[a:b] = nearest
 
@@ -350,7 +350,7 @@ class SceneOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class ScenePlan:
     """Output of a scene's builder, from which `build` makes a scene and a sequence."""
 
     materials: SequenceOf[Material]
@@ -404,7 +404,7 @@ def build(
             remedy="leave it at 0",
         )
     options = SceneOptions(name, seed, kind.frames / FRAME_RATE_HZ, axis_offset_m)
-    plan: Plan = importlib.import_module(f"tofuse.lab.simulation.scenes.{kind.module}").plan(
+    plan: ScenePlan = importlib.import_module(f"tofuse.lab.simulation.scenes.{kind.module}").plan(
         options
     )
     scene = Scene(

@@ -97,23 +97,23 @@ def expose(
     a, b = buckets
     saturated: Bool = np.zeros(a.shape[2:], bool)
     if effects.saturation:
-        full = np.maximum(a, b) >= model.full_well_electrons
-        saturated = np.asarray(full.any((0, 1)))
+        overflow = np.maximum(a, b) >= model.full_well_electrons
+        saturated = np.asarray(overflow.any((0, 1)))
         a, b = np.minimum(a, model.full_well_electrons), np.minimum(b, model.full_well_electrons)
     fraction = (a + b) / (2 * model.full_well_electrons)
     read = (a - b) * (1 - effects.amplitude_nonlinearity * model.compression * fraction)
     phasors = phasor_of(np.moveaxis(read, 1, 0))
     amplitude = np.abs(phasors[0]) * model.counts_per_electron
-    return Measurement(unwrapped(model, phasors), amplitude, saturated)
+    return Measurement(unwrapped_range(model, phasors), amplitude, saturated)
 
 
-def unwrapped(model: CameraModel, phasors: Complex128) -> Float64:
+def unwrapped_range(model: CameraModel, phasors: Complex128) -> Float64:
     """Range (H, W) in m of phasors (F, H, W): the fine one's, unwrapped by the coarse one."""
-    turns = np.mod(np.angle(phasors) / (2 * np.pi), 1)
-    fine = turns[0] * model.period_m
+    cycles = np.mod(np.angle(phasors) / (2 * np.pi), 1)
+    fine = cycles[0] * model.period_m
     if model.unwrap_hz is None:
         return fine
-    coarse = turns[1] * model.ambiguity_m
+    coarse = cycles[1] * model.ambiguity_m
     periods = np.round((coarse - fine) / model.period_m)
     return np.mod(fine + periods * model.period_m, model.ambiguity_m)
 
@@ -138,7 +138,8 @@ def _noisy(
     tails = np.sqrt(3 / rng.chisquare(5, shape))
     gain = _noise_gain(shape) * tails
     a, b = (
-        mean + gain * np.sqrt(mean + read**2) * _alike(rng, mean.shape) for mean in (mean_a, mean_b)
+        mean + gain * np.sqrt(mean + read**2) * _correlated_noise(rng, mean.shape)
+        for mean in (mean_a, mean_b)
     )
     return a, b
 
@@ -146,11 +147,11 @@ def _noisy(
 @cache
 def _noise_gain(shape: tuple[int, ...]) -> Float64:
     """Factor on the noise of each pixel, log-normal with mean square 1."""
-    spread = 0.35
-    return np.exp(np.random.default_rng([90210]).normal(0, spread, shape) - spread**2)
+    sigma = 0.35
+    return np.exp(np.random.default_rng([90210]).normal(0, sigma, shape) - sigma**2)
 
 
-def _alike(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
+def _correlated_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
     """Normal noise of unit variance, half of which is correlated with the neighbours."""
     own, other = rng.normal(size=shape), rng.normal(size=shape)
     shifts = [np.roll(other, shift, (-2, -1)) for shift in ((0, 0), (0, 1), (1, 0), (1, 1))]
@@ -171,7 +172,7 @@ def drift(model: CameraModel, time_s: float) -> float:
     return model.drift_m * (1 - float(np.exp(-max(time_s, 0.0) / model.drift_time_s)))
 
 
-def calibrated(model: CameraModel, effects: Effects) -> DepthCorrection:
+def factory_correction(model: CameraModel, effects: Effects) -> DepthCorrection:
     """Calibrate the camera: return its factory correction.
 
     All pixels measure a series of known ranges without noise, scattering or multipath, which gives
@@ -180,17 +181,17 @@ def calibrated(model: CameraModel, effects: Effects) -> DepthCorrection:
     per_period = 96
     count = per_period * round(model.ambiguity_m / model.period_m)
     true = (np.arange(count) + 0.5) / count * model.ambiguity_m
-    measured = _of_known_range(model, effects, true)
+    measured = _measure_known_range(model, effects, true)
     bias = np.mod(measured - true + model.ambiguity_m / 2, model.ambiguity_m)
     bias -= model.ambiguity_m / 2
     order = np.argsort(measured)
     knots, curve = measured[order], bias[order]
-    keep = np.concatenate([[True], np.diff(knots) > 0])
+    increasing = np.concatenate([[True], np.diff(knots) > 0])
     offsets = effects.pixel_offsets * pixel_offsets(model)
-    return DepthCorrection(knots[keep], curve[keep], offsets.astype(np.float32))
+    return DepthCorrection(knots[increasing], curve[increasing], offsets.astype(np.float32))
 
 
-def _of_known_range(model: CameraModel, effects: Effects, true: Float64) -> Float64:
+def _measure_known_range(model: CameraModel, effects: Effects, true: Float64) -> Float64:
     harmonics = scaled_harmonics(model, effects)
     phasors = []
     for frequency in model.frequencies:
@@ -203,7 +204,7 @@ def _of_known_range(model: CameraModel, effects: Effects, true: Float64) -> Floa
             -1,
         )
         phasors.append(phasor_of(np.stack([correlate(light, k, harmonics) for k in range(TAPS)])))
-    return unwrapped(model, np.stack(phasors))
+    return unwrapped_range(model, np.stack(phasors))
 
 
 def scaled_harmonics(model: CameraModel, effects: Effects) -> tuple[float, float]:

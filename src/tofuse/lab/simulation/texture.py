@@ -68,11 +68,11 @@ def parameter_rows(materials: Sequence[Material], seed: int) -> Float64:
     """(S, 10) parameters of the surfaces; each pattern has its own offset in the noise."""
     rows = np.zeros((len(materials), kernels.COLUMNS))
     for k, material in enumerate(materials):
-        shift = np.random.default_rng([seed, 2, k]).uniform(0.0, 97.0, 3)
+        offset = np.random.default_rng([seed, 2, k]).uniform(0.0, 97.0, 3)
         rows[k, kernels.ALBEDO] = material.albedo
         rows[k, kernels.CONTRAST] = 0.0 if material.pattern == "plain" else material.contrast
         rows[k, kernels.SCALE : kernels.SCALE + 3] = material.scale_m
         rows[k, kernels.KIND] = _KINDS[material.pattern]
         rows[k, kernels.GLOSS] = material.gloss
-        rows[k, kernels.SHIFT : kernels.SHIFT + 3] = shift
+        rows[k, kernels.OFFSET : kernels.OFFSET + 3] = offset
     return rows

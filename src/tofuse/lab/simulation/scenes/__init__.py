@@ -1,1 +1,1 @@
-"""The scenes: one module for each group, with a function `plan` that lays it out."""
+"""The scenes: one module for each group, whose function `plan` builds it."""

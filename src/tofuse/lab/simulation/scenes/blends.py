@@ -84,19 +84,19 @@ def surface_net(shape: Shape, low: ArrayLike, high: ArrayLike, step: float) -> M
                 window: list[slice] = [slice(None)] * 3
                 window[j] = slice(dj, cells[j] + dj)
                 window[k] = slice(dk, cells[k] + dk)
-                here, at = cut[tuple(window)], fraction[tuple(window)]
-                crossings += here
-                total[..., axis] += at
-                total[..., j] += dj * here
-                total[..., k] += dk * here
+                crossed, position = cut[tuple(window)], fraction[tuple(window)]
+                crossings += crossed
+                total[..., axis] += position
+                total[..., j] += dj * crossed
+                total[..., k] += dk * crossed
         quads.append(_quads(cut, inside, index, axis))
     used = np.flatnonzero(crossings.ravel())
     corner = np.stack(np.unravel_index(used, cells), -1)
     vertices = start + step * (corner + total.reshape(-1, 3)[used] / crossings.ravel()[used, None])
-    vertices = projected(shape, vertices, step)
-    number = np.full(index.size, -1)
-    number[used] = np.arange(len(used))
-    q = number[np.concatenate(quads)]
+    vertices = project_to_surface(shape, vertices, step)
+    vertex_index = np.full(index.size, -1)
+    vertex_index[used] = np.arange(len(used))
+    q = vertex_index[np.concatenate(quads)]
     # Split along the shorter diagonal.
     p = vertices[q]
     short = np.linalg.norm(p[:, 0] - p[:, 2], axis=1) <= np.linalg.norm(p[:, 1] - p[:, 3], axis=1)
@@ -110,29 +110,29 @@ def _quads(cut: Bool, inside: Bool, index: Int64, axis: int) -> Int64:
     j, k = (axis + 1) % 3, (axis + 2) % 3
     window: list[slice] = [slice(None)] * 3
     window[j], window[k] = slice(1, -1), slice(1, -1)
-    where = np.argwhere(cut[tuple(window)])
-    where[:, [j, k]] += 1
-    around = []
+    edges = np.argwhere(cut[tuple(window)])
+    edges[:, [j, k]] += 1
+    cells = []
     for dj, dk in ((-1, -1), (0, -1), (0, 0), (-1, 0)):
-        cell = where.copy()
+        cell = edges.copy()
         cell[:, j] += dj
         cell[:, k] += dk
-        around.append(index[tuple(cell.T)])
-    quads = np.stack(around, -1)
-    outward = inside[tuple(where.T)]
+        cells.append(index[tuple(cell.T)])
+    quads = np.stack(cells, -1)
+    outward = inside[tuple(edges.T)]
     return np.where(outward[:, None], quads, quads[:, ::-1])
 
 
-def projected(shape: Shape, vertices: Float64, step: float) -> Float64:
+def project_to_surface(shape: Shape, vertices: Float64, step: float) -> Float64:
     """Project vertices onto the surface along its gradient, by at most half a cell."""
-    moved = vertices
+    points = vertices
     h = 1e-4
     for _ in range(3):
         slope = np.stack(
-            [(shape(moved + e) - shape(moved - e)) / (2 * h) for e in h * np.eye(3)], -1
+            [(shape(points + e) - shape(points - e)) / (2 * h) for e in h * np.eye(3)], -1
         )
         norm2 = np.maximum((slope * slope).sum(-1), 0.05)
-        moved = moved - (shape(moved) / norm2)[:, None] * slope
-    away = moved - vertices
-    length = np.linalg.norm(away, axis=-1, keepdims=True)
-    return vertices + away * np.minimum(1.0, 0.5 * step / np.maximum(length, 1e-12))
+        points = points - (shape(points) / norm2)[:, None] * slope
+    displacement = points - vertices
+    length = np.linalg.norm(displacement, axis=-1, keepdims=True)
+    return vertices + displacement * np.minimum(1.0, 0.5 * step / np.maximum(length, 1e-12))

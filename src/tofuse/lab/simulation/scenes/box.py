@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
-from tofuse.lab.simulation.scene import Plan, SceneOptions
+from tofuse.lab.simulation.scene import SceneOptions, ScenePlan
 from tofuse.lab.simulation.scenes.composition import Assembly, studio
 from tofuse.lab.simulation.texture import Material
 
@@ -16,7 +16,7 @@ BOX = Material("box", 0.8, 0.03, "noise", (0.12, 0.12, 0.12))
 STEEL = Material("stand", 0.35, 0.0, "plain", gloss=0.2)
 
 
-def plan(options: SceneOptions) -> Plan:
+def plan(options: SceneOptions) -> ScenePlan:
     """Lay out the box, turning about the room's z axis."""
     still = Assembly([])
     studio(still)
@@ -27,7 +27,7 @@ def plan(options: SceneOptions) -> Plan:
     turning.add(STEEL, meshes.rod((0, 0, BOTTOM - 0.012), (0, 0, BOTTOM), 0.08, segments=20))
     # High enough above the top face to see it well, but the sides not foreshortened.
     camera = paths.look_at((-DISTANCE, 0, 1.68), (0, 0, BOTTOM + HEIGHT / 2 - 0.01))
-    return Plan(
+    return ScenePlan(
         turning.materials,
         still.mesh(),
         paths.still(camera),

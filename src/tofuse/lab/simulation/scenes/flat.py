@@ -16,7 +16,7 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
-from tofuse.lab.simulation.scene import Plan, SceneOptions
+from tofuse.lab.simulation.scene import SceneOptions, ScenePlan
 from tofuse.lab.simulation.scenes import furniture, household
 from tofuse.lab.simulation.scenes.composition import Assembly, placed
 from tofuse.lab.simulation.texture import Material
@@ -67,47 +67,47 @@ def T_flat_room(room: int) -> Float64:
     return paths.rotation([0, 0, room * np.pi / 2]) @ corner
 
 
-def plan(options: SceneOptions) -> Plan:
+def plan(options: SceneOptions) -> ScenePlan:
     """Lay out the flat."""
     assembly = Assembly([])
     alike = options.name == "flat-alike"
     for room in range(ROOMS):
         rng = np.random.default_rng([options.seed, 3, room])
-        look = 0 if alike else room
+        style = 0 if alike else room
         T = T_flat_room(room)
-        _walls(assembly, SIDES[look], FLOORS[look], T)
-        _doorway(assembly, SIDES[look], T)
+        _walls(assembly, SIDES[style], FLOORS[style], T)
+        _doorway(assembly, SIDES[style], T)
         furnish = _study if alike else _FURNISHED[room]
         furnish(assembly, T, rng, room)
     path = _walk(options.seconds, np.random.default_rng([options.seed, 4]))
-    return Plan(assembly.materials, assembly.mesh(), path, ambient=0.3)
+    return ScenePlan(assembly.materials, assembly.mesh(), path, ambient=0.3)
 
 
 def _walls(assembly: Assembly, side: Material, floor: Material, T: Float64) -> None:
     """Add floor, ceiling and walls, with openings in the walls at +x and +y."""
     a, h, d = HALF, HEIGHT, DOOR / 2
     quad = meshes.quad
-    assembly.add(floor, quad((-a, -a, 0), (2 * a, 0, 0), (0, 2 * a, 0)).moved(T))
-    assembly.add(CEILING, quad((-a, -a, h), (0, 2 * a, 0), (2 * a, 0, 0)).moved(T))
+    assembly.add(floor, quad((-a, -a, 0), (2 * a, 0, 0), (0, 2 * a, 0)).transformed(T))
+    assembly.add(CEILING, quad((-a, -a, h), (0, 2 * a, 0), (2 * a, 0, 0)).transformed(T))
     parts = [
         quad((-a, -a, 0), (0, 2 * a, 0), (0, 0, h)),
         quad((-a, -a, 0), (0, 0, h), (2 * a, 0, 0)),
     ]
-    beside = a - d
+    beside_door = a - d
     for start, along in (((a, -a, 0), (0, 1, 0)), ((-a, a, 0), (1, 0, 0))):
         p, u = np.array(start, float), np.array(along, float)
         up = np.array([0, 0, 1.0])
         parts += [
-            quad(p, beside * u, h * up),
-            quad(p + (beside + DOOR) * u, beside * u, h * up),
-            quad(p + beside * u + DOOR_TOP * up, DOOR * u, (h - DOOR_TOP) * up),
+            quad(p, beside_door * u, h * up),
+            quad(p + (beside_door + DOOR) * u, beside_door * u, h * up),
+            quad(p + beside_door * u + DOOR_TOP * up, DOOR * u, (h - DOOR_TOP) * up),
         ]
-    assembly.add(side, *(part.moved(T) for part in parts))
-    foot = [
+    assembly.add(side, *(part.transformed(T) for part in parts))
+    skirting = [
         meshes.box_between((-a, -a, 0), (-a + 0.012, a, 0.08)),
         meshes.box_between((-a, -a, 0), (a, -a + 0.012, 0.08)),
     ]
-    assembly.add(CASING, *(part.moved(T) for part in foot))
+    assembly.add(CASING, *(part.transformed(T) for part in skirting))
 
 
 def _doorway(assembly: Assembly, side: Material, T: Float64) -> None:
@@ -119,14 +119,14 @@ def _doorway(assembly: Assembly, side: Material, T: Float64) -> None:
         meshes.quad((a, -d, 0), (WALL, 0, 0), (0, DOOR, 0)),
         meshes.quad((a, -d, top), (WALL, 0, 0), (0, DOOR, 0)),
     ]
-    assembly.add(side, *(part.moved(T) for part in lining))
+    assembly.add(side, *(part.transformed(T) for part in lining))
     for x in (a - 0.02, a + WALL):
         posts = [
             meshes.box_between((x, -d - 0.07, 0), (x + 0.02, -d, top + 0.07)),
             meshes.box_between((x, d, 0), (x + 0.02, d + 0.07, top + 0.07)),
             meshes.box_between((x, -d, top), (x + 0.02, d, top + 0.07)),
         ]
-        assembly.add(CASING, *(part.moved(T) for part in posts))
+        assembly.add(CASING, *(part.transformed(T) for part in posts))
 
 
 def _poster(
@@ -134,21 +134,23 @@ def _poster(
 ) -> None:
     """Hang a poster on the wall at -x."""
     low, high = (-HALF, at, 1.55 - size[1] / 2), (-HALF + 0.006, at + size[0], 1.55 + size[1] / 2)
-    assembly.add(POSTERS[room], meshes.box_between(low, high).moved(T))
+    assembly.add(POSTERS[room], meshes.box_between(low, high).transformed(T))
 
 
 def _study(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) -> None:
     """Furnish with desk, chair, shelf and plant at slightly random poses."""
 
-    def near(x: float, y: float, yaw: float) -> Float64:
-        off = rng.normal(0.0, 0.03, 2)
-        return T @ placed((x + off[0], y + off[1]), yaw + np.deg2rad(rng.normal(0.0, 3.0)))
+    def jittered(x: float, y: float, yaw: float) -> Float64:
+        jitter = rng.normal(0.0, 0.03, 2)
+        return T @ placed((x + jitter[0], y + jitter[1]), yaw + np.deg2rad(rng.normal(0.0, 3.0)))
 
-    furniture.desk(assembly, near(-1.70, -0.15, 0.0))
-    furniture.chair(assembly, FABRICS[0], near(-1.12, -0.25, np.deg2rad(200 + rng.normal(0, 15))))
-    household.shelf(assembly, near(0.70, -HALF + 0.08, np.pi / 2), rng)
-    furniture.plant(assembly, near(-1.75, -1.75, 0.0), rng)
-    household.cabinet(assembly, household.OAK, near(1.95, 1.45, np.pi), (0.42, 1.0, 0.9))
+    furniture.desk(assembly, jittered(-1.70, -0.15, 0.0))
+    furniture.chair(
+        assembly, FABRICS[0], jittered(-1.12, -0.25, np.deg2rad(200 + rng.normal(0, 15)))
+    )
+    household.shelf(assembly, jittered(0.70, -HALF + 0.08, np.pi / 2), rng)
+    furniture.plant(assembly, jittered(-1.75, -1.75, 0.0), rng)
+    household.cabinet(assembly, household.OAK, jittered(1.95, 1.45, np.pi), (0.42, 1.0, 0.9))
     _poster(assembly, T, 0, -0.9 + rng.normal(0, 0.04), (0.7, 0.5))
 
 
@@ -197,22 +199,22 @@ def _walk(seconds: float, rng: np.random.Generator) -> paths.Path:
         T = T_flat_room(room)
         for k, (x, y, yaw) in enumerate(_WALK):
             # Waypoints vary between rooms, but little in the doorways.
-            off = rng.normal(0.0, 0.02 if k == 0 else 0.08, 2)
-            points.append(se3.transform(T, np.array([[x + off[0], y + off[1], EYE]]))[0])
-            turn = rng.normal(0.0, 2.0 if k == 0 else 5.0)
-            yaws.append(np.deg2rad(yaw + turn) + room * np.pi / 2)
+            jitter = rng.normal(0.0, 0.02 if k == 0 else 0.08, 2)
+            points.append(se3.transform(T, np.array([[x + jitter[0], y + jitter[1], EYE]]))[0])
+            yaw_jitter = rng.normal(0.0, 2.0 if k == 0 else 5.0)
+            yaws.append(np.deg2rad(yaw + yaw_jitter) + room * np.pi / 2)
     # Begin in the middle of room 0.
     first = 2
     points = points[first:] + points[:first]
     yaws = yaws[first:] + [yaw + 2 * np.pi for yaw in yaws[:first]]
     points, yaws = [*points, points[0]], [*yaws, yaws[0] + 2 * np.pi]
-    places, yaw_rad = np.array(points), np.array(yaws)
+    positions, yaw_rad = np.array(points), np.array(yaws)
     # Constant speed, but slower where the camera turns.
-    effort = np.linalg.norm(np.diff(places, axis=0), axis=1) + 0.6 * np.abs(np.diff(yaw_rad))
+    effort = np.linalg.norm(np.diff(positions, axis=0), axis=1) + 0.6 * np.abs(np.diff(yaw_rad))
     times = seconds * np.concatenate([[0.0], np.cumsum(effort)]) / effort.sum()
-    place = CubicSpline(times, places, bc_type="periodic")
-    even = 2 * np.pi * times / seconds
-    facing = CubicSpline(times, yaw_rad - even, bc_type="periodic")
+    position = CubicSpline(times, positions, bc_type="periodic")
+    mean_rotation = 2 * np.pi * times / seconds
+    facing = CubicSpline(times, yaw_rad - mean_rotation, bc_type="periodic")
     rate = 4 * np.pi * round(0.85 * seconds) / seconds  # of steps
 
     def path(t: float) -> Float64:
@@ -221,7 +223,7 @@ def _walk(seconds: float, rng: np.random.Generator) -> paths.Path:
         tilt = -0.14 + 0.06 * np.sin(2 * np.pi * 5 * t / seconds) + 0.006 * np.sin(rate * t + 1)
         c, s = np.cos(heading), np.sin(heading)
         sway = 0.008 * np.sin(rate * t / 2)
-        p = place(t % seconds) + np.array([-sway * s, sway * c, bob])
+        p = position(t % seconds) + np.array([-sway * s, sway * c, bob])
         T = paths.look_at(p, p + np.array([c, s, np.tan(tilt)]))
         return T @ paths.rotation([0, 0, 0.012 * np.sin(rate * t / 2)])
 

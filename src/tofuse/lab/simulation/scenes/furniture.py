@@ -36,14 +36,14 @@ def star_base() -> list[Mesh]:
 def cushion() -> Mesh:
     """Seat of 0.48 x 0.49 m with a sloping front edge; its top is at z = 0.50."""
 
-    def fall(p: Float64) -> Float64:
+    def sloped(p: Float64) -> Float64:
         q = p.copy()
         q[:, 2] -= 0.9 * np.maximum(p[:, 0] - 0.08, 0.0) ** 2
         q[:, 2] -= 0.010 * np.cos(np.clip(p[:, 1] / 0.22, -1, 1) * np.pi / 2) * (p[:, 2] > 0)
         return q
 
     seat = meshes.superellipsoid((0.48, 0.49, 0.085), (0.45, 0.45), (10, 24))
-    return seat.warped(fall).shifted(0, 0, 0.46)
+    return seat.warped(sloped).translated(0, 0, 0.46)
 
 
 def backrest() -> Mesh:
@@ -57,7 +57,7 @@ def backrest() -> Mesh:
         return np.stack([x + 0.9 * y * y + lean + lumbar, y, z], -1)
 
     panel = meshes.superellipsoid((0.44, 0.52, 0.06), (0.5, 0.4), (10, 28))
-    return panel.warped(curve).shifted(-0.235, 0, 0.84)
+    return panel.warped(curve).translated(-0.235, 0, 0.84)
 
 
 def chair(assembly: Assembly, fabric: Material, T: Float64, *, arms: bool = True) -> None:
@@ -73,14 +73,14 @@ def chair(assembly: Assembly, fabric: Material, T: Float64, *, arms: bool = True
             frame.append(meshes.box((0.06, 0.18, 0.018), (-0.02, 0.20 * side, 0.425)))
             frame.append(meshes.rod((-0.02, y, 0.42), (-0.03, y, 0.655), 0.02, 0.018, 8))
             pad = meshes.superellipsoid((0.27, 0.075, 0.035), (0.5, 0.5), (6, 16))
-            frame.append(pad.shifted(0.01, y, 0.67))
-    assembly.add(PLASTIC, *(part.moved(T) for part in frame))
+            frame.append(pad.translated(0.01, y, 0.67))
+    assembly.add(PLASTIC, *(part.transformed(T) for part in frame))
     column = [
         meshes.rod((0, 0, 0.12), (0, 0, 0.28), 0.028),
         meshes.rod((0, 0, 0.28), (0, 0, 0.40), 0.016),
     ]
-    assembly.add(CHROME, *(part.moved(T) for part in column))
-    assembly.add(fabric, cushion().moved(T), backrest().moved(T))
+    assembly.add(CHROME, *(part.transformed(T) for part in column))
+    assembly.add(fabric, cushion().transformed(T), backrest().transformed(T))
 
 
 WOOD = Material("desk", 0.42, 0.2, "wood", (0.9, 0.9, 0.05))
@@ -103,7 +103,7 @@ def desk(assembly: Assembly, T: Float64) -> None:
     top = 0.73
 
     def add(material: Material, *parts: Mesh) -> None:
-        assembly.add(material, *(part.moved(T) for part in parts))
+        assembly.add(material, *(part.transformed(T) for part in parts))
 
     add(WOOD, meshes.box_between((-0.375, -0.8, top - 0.03), (0.375, 0.8, top)))
     add(WOOD, meshes.box_between((-0.34, -0.74, 0.35), (-0.32, 0.74, top - 0.03)))
@@ -123,28 +123,35 @@ def desk(assembly: Assembly, T: Float64) -> None:
         for z in (0.19, 0.38, 0.57)
     ]
     add(METAL, *handles)
-    turn = np.eye(4)
-    turn[:2, :2] = [[0.97, 0.243], [-0.243, 0.97]]
-    turn[:2, :2] /= np.sqrt(0.97**2 + 0.243**2)
-    turn[:3, 3] = (-0.12, -0.05, top)
+    T_desk_monitor = np.eye(4)
+    T_desk_monitor[:2, :2] = [[0.97, 0.243], [-0.243, 0.97]]
+    T_desk_monitor[:2, :2] /= np.sqrt(0.97**2 + 0.243**2)
+    T_desk_monitor[:3, 3] = (-0.12, -0.05, top)
     screen = [meshes.box((0.012, 0.50, 0.30), (0.024, 0, 0.29))]
     case = [
         meshes.box((0.036, 0.54, 0.34), (0, 0, 0.29)),
         meshes.box((0.03, 0.06, 0.16), (-0.02, 0, 0.09)),
-        meshes.superellipsoid((0.20, 0.26, 0.02), (0.3, 0.8), (6, 20)).shifted(-0.01, 0, 0.012),
+        meshes.superellipsoid((0.20, 0.26, 0.02), (0.3, 0.8), (6, 20)).translated(-0.01, 0, 0.012),
     ]
-    add(SCREEN, *(part.moved(turn) for part in screen))
-    add(CASE, *(part.moved(turn) for part in case))
+    add(SCREEN, *(part.transformed(T_desk_monitor) for part in screen))
+    add(CASE, *(part.transformed(T_desk_monitor) for part in case))
     add(KEYS, meshes.box((0.15, 0.44, 0.02), (0.18, -0.08, top + 0.011)))
-    add(CASE, meshes.superellipsoid((0.11, 0.065, 0.04), (0.7, 0.8)).shifted(0.2, 0.24, top + 0.02))
+    add(
+        CASE,
+        meshes.superellipsoid((0.11, 0.065, 0.04), (0.7, 0.8)).translated(0.2, 0.24, top + 0.02),
+    )
     add(PAPER, meshes.box((0.297, 0.21, 0.012), (0.14, -0.52, top + 0.006)))
     height = top
-    for k, (material, thick) in enumerate(zip(BOOKS, (0.035, 0.022, 0.045, 0.028), strict=True)):
-        size = (0.24 - 0.02 * k, 0.17 - 0.01 * k, thick)
-        add(material, meshes.box(size, (-0.12 + 0.01 * k, 0.55 - 0.015 * k, height + thick / 2)))
-        height += thick
+    for k, (material, thickness) in enumerate(
+        zip(BOOKS, (0.035, 0.022, 0.045, 0.028), strict=True)
+    ):
+        size = (0.24 - 0.02 * k, 0.17 - 0.01 * k, thickness)
+        add(
+            material, meshes.box(size, (-0.12 + 0.01 * k, 0.55 - 0.015 * k, height + thickness / 2))
+        )
+        height += thickness
     mug = [(0, 0), (0.036, 0), (0.041, 0.095), (0.036, 0.095), (0.032, 0.012), (0, 0.012)]
-    add(CERAMIC, meshes.lathe(mug, 20).shifted(0.12, 0.42, top))
+    add(CERAMIC, meshes.lathe(mug, 20).translated(0.12, 0.42, top))
     angle = np.linspace(-1.9, 1.9, 9)
     ring = np.stack([0 * angle, 0.05 + 0.03 * np.cos(angle), 0.05 + 0.03 * np.sin(angle)], -1)
     ring += (0.12, 0.41, top)
@@ -182,8 +189,8 @@ def leaf(length: float, width: float, droop: float) -> Mesh:
 def plant(assembly: Assembly, T: Float64, rng: np.random.Generator, leaves: int = 34) -> None:
     """Add a potted plastic plant, 1.1 m high: stems that fan out, with broad leaves."""
     pot = [(0, 0), (0.12, 0), (0.165, 0.27), (0.175, 0.27), (0.175, 0.30), (0.155, 0.30)]
-    assembly.add(POT, meshes.lathe([*pot, (0.15, 0.26)], 28).moved(T))
-    assembly.add(SOIL, meshes.lathe([(0.152, 0.262), (0, 0.275)], 20).moved(T))
+    assembly.add(POT, meshes.lathe([*pot, (0.15, 0.26)], 28).transformed(T))
+    assembly.add(SOIL, meshes.lathe([(0.152, 0.262), (0, 0.275)], 20).transformed(T))
     stems: list[Mesh] = []
     foliage: list[Mesh] = []
     golden = np.pi * (3 - np.sqrt(5))
@@ -204,7 +211,7 @@ def plant(assembly: Assembly, T: Float64, rng: np.random.Generator, leaves: int 
         forward = c * out + [0, 0, s]
         pose[:3, :3] = np.stack([forward, across, np.cross(forward, across)], 1)
         pose[:3, 3] = tip
-        foliage.append(blade.moved(pose))
+        foliage.append(blade.transformed(pose))
     stems.append(meshes.rod((0, 0, 0.25), (0, 0, 0.72), 0.014, 0.008, 8))
-    assembly.add(STEM, *(part.moved(T) for part in stems))
-    assembly.add(LEAF, *(part.moved(T) for part in foliage))
+    assembly.add(STEM, *(part.transformed(T) for part in stems))
+    assembly.add(LEAF, *(part.transformed(T) for part in foliage))

@@ -23,25 +23,25 @@ SPINES = [
 
 
 def _add(assembly: Assembly, material: Material, T: Float64, *parts: Mesh) -> None:
-    assembly.add(material, *(part.moved(T) for part in parts))
+    assembly.add(material, *(part.transformed(T) for part in parts))
 
 
 def sofa(assembly: Assembly, fabric: Material, T: Float64, width: float = 1.7) -> None:
     """Add a sofa, 0.85 m deep and 0.85 m high."""
     half = width / 2
-    soft = (0.25, 0.3)
+    roundness = (0.25, 0.3)
     parts = [
         meshes.box_between((-0.40, -half, 0.08), (0.40, half, 0.30)),
-        meshes.superellipsoid((0.26, width, 0.62), soft).shifted(-0.30, 0, 0.55),
+        meshes.superellipsoid((0.26, width, 0.62), roundness).translated(-0.30, 0, 0.55),
     ]
     for side in (-1, 1):
-        arm = meshes.superellipsoid((0.82, 0.20, 0.55), soft)
-        parts.append(arm.shifted(0, side * (half - 0.08), 0.34))
+        arm = meshes.superellipsoid((0.82, 0.20, 0.55), roundness)
+        parts.append(arm.translated(0, side * (half - 0.08), 0.34))
         seat = meshes.superellipsoid((0.62, half - 0.18, 0.18), (0.3, 0.3))
-        parts.append(seat.shifted(0.10, side * (half - 0.16) / 2, 0.37))
+        parts.append(seat.translated(0.10, side * (half - 0.16) / 2, 0.37))
     _add(assembly, fabric, T, *parts)
     pillow = meshes.superellipsoid((0.14, 0.42, 0.40), (0.7, 0.6))
-    _add(assembly, QUILT, T, pillow.shifted(-0.12, 0.24 * width, 0.62))
+    _add(assembly, QUILT, T, pillow.translated(-0.12, 0.24 * width, 0.62))
 
 
 def bed(assembly: Assembly, T: Float64) -> None:
@@ -58,10 +58,10 @@ def bed(assembly: Assembly, T: Float64) -> None:
             for y in (-0.46, 0.40)
         ),
     )
-    mattress = meshes.superellipsoid((1.96, 0.93, 0.22), (0.25, 0.25)).shifted(0, 0, 0.40)
-    pillow = meshes.superellipsoid((0.45, 0.70, 0.16), (0.7, 0.5)).shifted(-0.68, 0.02, 0.56)
+    mattress = meshes.superellipsoid((1.96, 0.93, 0.22), (0.25, 0.25)).translated(0, 0, 0.40)
+    pillow = meshes.superellipsoid((0.45, 0.70, 0.16), (0.7, 0.5)).translated(-0.68, 0.02, 0.56)
     _add(assembly, LINEN, T, mattress, pillow)
-    quilt = meshes.superellipsoid((1.25, 1.02, 0.20), (0.5, 0.3)).shifted(0.36, 0.01, 0.46)
+    quilt = meshes.superellipsoid((1.25, 1.02, 0.20), (0.5, 0.3)).translated(0.36, 0.01, 0.46)
     _add(assembly, QUILT, T, quilt)
 
 
@@ -86,16 +86,18 @@ def shelf(
         meshes.box_between((0, -half, 0), (0.008, half, top)),
     )
     for k in range(boards - 1):
-        at, end = -half + 0.03, half - 0.03 - rng.uniform(0.0, 0.35)
+        left, end = -half + 0.03, half - 0.03 - rng.uniform(0.0, 0.35)
         while True:
-            thick = rng.uniform(0.018, 0.06)
-            if at + thick > end:
+            thickness = rng.uniform(0.018, 0.06)
+            if left + thickness > end:
                 break
             low = 0.06 + pitch * k
-            deep, high = rng.uniform(0.14, 0.24), rng.uniform(0.18, 0.29)
-            book = meshes.box_between((0.01, at, low), (deep, at + thick - 0.002, low + high))
+            depth, height = rng.uniform(0.14, 0.24), rng.uniform(0.18, 0.29)
+            book = meshes.box_between(
+                (0.01, left, low), (depth, left + thickness - 0.002, low + height)
+            )
             _add(assembly, SPINES[int(rng.integers(len(SPINES)))], T, book)
-            at += thick
+            left += thickness
 
 
 def table(
@@ -115,26 +117,28 @@ def table(
     ]
     _add(assembly, wood, T, top, *legs)
     bowl = [(0, 0.0), (0.06, 0.0), (0.15, 0.07), (0.145, 0.075), (0.05, 0.012), (0, 0.012)]
-    _add(assembly, LINEN, T, meshes.lathe(bowl, 20).shifted(0.05, -0.1, height))
+    _add(assembly, LINEN, T, meshes.lathe(bowl, 20).translated(0.05, -0.1, height))
 
 
 def cabinet(
     assembly: Assembly, wood: Material, T: Float64, size: tuple[float, float, float]
 ) -> None:
     """Add a closed cabinet with two doors (depth, width, height); its back is at x = 0."""
-    deep, width, high = size
+    depth, width, height = size
     half = width / 2
-    _add(assembly, wood, T, meshes.box_between((0, -half, 0.06), (deep - 0.02, half, high)))
+    _add(assembly, wood, T, meshes.box_between((0, -half, 0.06), (depth - 0.02, half, height)))
     _add(
         assembly,
         wood,
         T,
-        meshes.box_between((deep - 0.02, -half + 0.005, 0.07), (deep, -0.004, high - 0.01)),
-        meshes.box_between((deep - 0.02, 0.004, 0.07), (deep, half - 0.005, high - 0.01)),
+        meshes.box_between((depth - 0.02, -half + 0.005, 0.07), (depth, -0.004, height - 0.01)),
+        meshes.box_between((depth - 0.02, 0.004, 0.07), (depth, half - 0.005, height - 0.01)),
     )
-    at = 0.5 * high
+    handle_z = 0.5 * height
     handles = [
-        meshes.rod((deep + 0.03, y, at - 0.1), (deep + 0.03, y, at + 0.1), 0.008, segments=8)
+        meshes.rod(
+            (depth + 0.03, y, handle_z - 0.1), (depth + 0.03, y, handle_z + 0.1), 0.008, segments=8
+        )
         for y in (-0.05, 0.05)
     ]
     _add(assembly, IRON, T, *handles)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
-from tofuse.lab.simulation.scene import Plan, SceneOptions
+from tofuse.lab.simulation.scene import SceneOptions, ScenePlan
 from tofuse.lab.simulation.scenes.composition import Assembly, shell
 from tofuse.lab.simulation.texture import Material
 
@@ -15,7 +15,7 @@ CRATE = Material("crate", 0.5, 0.2, "wood", (0.4, 0.1, 0.1))
 CEILING = Material("ceiling", 0.75, 0.05, "tiles", (0.6, 0.6, 0.6))
 
 
-def plan(options: SceneOptions) -> Plan:
+def plan(options: SceneOptions) -> ScenePlan:
     """Lay out one of the simple scenes."""
     assembly = Assembly([])
     camera = paths.look_at((0, 0, 1.2), (0, 1, 1.2))
@@ -38,4 +38,4 @@ def plan(options: SceneOptions) -> Plan:
     else:
         shell(assembly, (-1, -2, 0), (1, 10, 2.4), [SIDE, SIDE, WALL, WALL], FLOOR, CEILING)
         path = paths.sway(camera, (0.0, 0.0, 1.5, 0.0, 0.1, 0.0), 2 * options.seconds)
-    return Plan(assembly.materials, assembly.mesh(), path)
+    return ScenePlan(assembly.materials, assembly.mesh(), path)

@@ -6,7 +6,7 @@ import numpy as np
 
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
-from tofuse.lab.simulation.scene import Plan, SceneOptions
+from tofuse.lab.simulation.scene import SceneOptions, ScenePlan
 from tofuse.lab.simulation.scenes import furniture
 from tofuse.lab.simulation.scenes.composition import Assembly, placed, shell
 from tofuse.lab.simulation.texture import Material
@@ -22,7 +22,7 @@ POSTER = Material("poster", 0.55, 0.35, "print", (0.25, 0.25, 0.25))
 CALENDAR = Material("calendar", 0.65, 0.3, "tiles", (0.06, 0.06, 0.06))
 
 
-def plan(options: SceneOptions) -> Plan:
+def plan(options: SceneOptions) -> ScenePlan:
     """Lay out the office: the camera looks along +y and slides along +x."""
     assembly = Assembly([])
     shell(assembly, (-3, -1.5, 0), (3, 3.0, 2.6), [WALL] * 4, FLOOR, CEILING)
@@ -35,5 +35,5 @@ def plan(options: SceneOptions) -> Plan:
     rng = np.random.default_rng([options.seed, 3])
     furniture.plant(assembly, placed((-0.98, 2.25), 0.0), rng)
     camera = paths.look_at((-RAIL_LENGTH / 2, 0, 1.15), (-RAIL_LENGTH / 2, 2.4, 0.80))
-    path = paths.there_and_back(camera, RAIL_LENGTH, options.seconds)
-    return Plan(assembly.materials, assembly.mesh(), path, ambient=0.3)
+    path = paths.out_and_back(camera, RAIL_LENGTH, options.seconds)
+    return ScenePlan(assembly.materials, assembly.mesh(), path, ambient=0.3)

@@ -6,7 +6,7 @@ import numpy as np
 
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
-from tofuse.lab.simulation.scene import Plan, SceneOptions
+from tofuse.lab.simulation.scene import SceneOptions, ScenePlan
 from tofuse.lab.simulation.scenes import furniture
 from tofuse.lab.simulation.scenes.composition import Assembly, shell
 from tofuse.lab.simulation.texture import Material
@@ -34,7 +34,7 @@ FABRICS = [
 ]
 
 
-def plan(options: SceneOptions) -> Plan:
+def plan(options: SceneOptions) -> ScenePlan:
     """Lay out the room."""
     assembly = Assembly([])
     x, y = LENGTH / 2, WIDTH / 2
@@ -51,7 +51,7 @@ def plan(options: SceneOptions) -> Plan:
         _chairs(assembly, np.random.default_rng([options.seed, 3]))
     camera = paths.look_at((0, 0, CAMERA_HEIGHT), (1, 0.2, CAMERA_HEIGHT))
     path = paths.camera_turn(camera, options.seconds, options.axis_offset_m)
-    return Plan(assembly.materials, assembly.mesh(), path, ambient=0.4)
+    return ScenePlan(assembly.materials, assembly.mesh(), path, ambient=0.4)
 
 
 def _fittings(assembly: Assembly) -> None:
@@ -81,17 +81,17 @@ def _fittings(assembly: Assembly) -> None:
         assembly.add(CASING, between((x - 0.03, -half - 0.06, a), (x, half + 0.06, b)))
     sill = between((x - 0.05, -half - 0.12, low - 0.09), (x, half + 0.12, low - 0.06))
     assembly.add(CASING, sill)
-    tall, thick = 0.09, 0.012
+    skirting_height, skirting_depth = 0.09, 0.012
     assembly.add(
         SKIRTING,
-        between((-x, y - thick, 0), (x, y, tall)),
-        between((-x, -y, 0), (left - 0.07, -y + thick, tall)),
-        between((right + 0.07, -y, 0), (x, -y + thick, tall)),
-        between((-x, -y, 0), (-x + thick, y, tall)),
-        between((x - thick, -y, 0), (x, y, tall)),
+        between((-x, y - skirting_depth, 0), (x, y, skirting_height)),
+        between((-x, -y, 0), (left - 0.07, -y + skirting_depth, skirting_height)),
+        between((right + 0.07, -y, 0), (x, -y + skirting_depth, skirting_height)),
+        between((-x, -y, 0), (-x + skirting_depth, y, skirting_height)),
+        between((x - skirting_depth, -y, 0), (x, y, skirting_height)),
     )
-    for at in (-2.2, 0.4, 2.5):
-        assembly.add(SOCKET, between((at, y - 0.008, 0.28), (at + 0.15, y, 0.36)))
+    for left_edge in (-2.2, 0.4, 2.5):
+        assembly.add(SOCKET, between((left_edge, y - 0.008, 0.28), (left_edge + 0.15, y, 0.36)))
     assembly.add(SOCKET, between((1.10, -y, 1.02), (1.18, -y + 0.008, 1.10)))
     assembly.add(SOCKET, between((-1.9, -y, 0.28), (-1.75, -y + 0.008, 0.36)))
     assembly.add(POSTER, between((-1.75, y - 0.005, 0.75), (-1.05, y, 1.70)))
@@ -103,10 +103,10 @@ def _fittings(assembly: Assembly) -> None:
 def _chairs(assembly: Assembly, rng: np.random.Generator) -> None:
     """Add seven chairs evenly around the camera, roughly facing it."""
     for k, fabric in enumerate(FABRICS):
-        around = 2 * np.pi * (k + 0.35) / CHAIRS
+        azimuth = 2 * np.pi * (k + 0.35) / CHAIRS
         # Evenly in angle, so that one is always visible, on an ellipse clear of the walls.
-        c, s = np.cos(around), np.sin(around)
+        c, s = np.cos(azimuth), np.sin(azimuth)
         position = np.array([c, s]) / np.hypot(c / 2.15, s / 1.12)
-        T = paths.rotation([0, 0, around + np.pi + rng.uniform(-0.9, 0.9)])
+        T = paths.rotation([0, 0, azimuth + np.pi + rng.uniform(-0.9, 0.9)])
         T[:2, 3] = position
         furniture.chair(assembly, fabric, T, arms=k % 3 != 1)

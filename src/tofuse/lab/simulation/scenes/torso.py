@@ -8,7 +8,7 @@ from tofuse.arrays import Float64
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.mesh import Mesh
-from tofuse.lab.simulation.scene import Plan, SceneOptions
+from tofuse.lab.simulation.scene import SceneOptions, ScenePlan
 from tofuse.lab.simulation.scenes import blends, furniture
 from tofuse.lab.simulation.scenes.blends import Shape, ellipsoid, limb
 from tofuse.lab.simulation.scenes.composition import Assembly, studio
@@ -77,25 +77,29 @@ def person() -> tuple[Mesh, list[Material]]:
 
     def distances(p: Float64) -> Float64:
         """Distance (4, V) in m of points to the nearest part of each material."""
-        return np.stack([np.min([s(p) for s, _, m in parts if m is own], 0) for own in materials])
+        return np.stack(
+            [np.min([s(p) for s, _, m in parts if m is material], 0) for material in materials]
+        )
 
-    vertices = blends.projected(shape, _snapped(mesh, distances(mesh.vertices)), GRID)
+    vertices = blends.project_to_surface(
+        shape, _snap_to_borders(mesh, distances(mesh.vertices)), GRID
+    )
     mesh = Mesh(vertices, mesh.faces, mesh.surface)
     return Mesh(vertices, mesh.faces, distances(mesh.corners().mean(1)).argmin(0)), materials
 
 
-def _snapped(mesh: Mesh, distance: Float64) -> Float64:
-    """Move vertices next to a border between materials onto it, to smooth it."""
+def _snap_to_borders(mesh: Mesh, distance: Float64) -> Float64:
+    """Move vertices next to a border between materials onto the border, to smooth it."""
     label = distance.argmin(0)
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     edges = np.concatenate([edges, edges[:, ::-1]])
     a, b = edges[label[edges[:, 0]] != label[edges[:, 1]]].T
     # Difference of the distances to both materials, at either end: 0 on the border.
-    at_a = distance[label[b], a] - distance[label[a], a]
-    at_b = distance[label[b], b] - distance[label[a], b]
-    fraction = at_a / np.maximum(at_a - at_b, 1e-12)
-    near = fraction <= 0.5
-    a, b, fraction = a[near], b[near], fraction[near]
+    difference_a = distance[label[b], a] - distance[label[a], a]
+    difference_b = distance[label[b], b] - distance[label[a], b]
+    fraction = difference_a / np.maximum(difference_a - difference_b, 1e-12)
+    nearer_to_border = fraction <= 0.5
+    a, b, fraction = a[nearer_to_border], b[nearer_to_border], fraction[nearer_to_border]
     step = fraction[:, None] * (mesh.vertices[b] - mesh.vertices[a])
     # The last assignment of a vertex prevails: the shortest step.
     order = np.argsort(-np.linalg.norm(step, axis=1), kind="stable")
@@ -104,7 +108,7 @@ def _snapped(mesh: Mesh, distance: Float64) -> Float64:
     return vertices
 
 
-def plan(options: SceneOptions) -> Plan:
+def plan(options: SceneOptions) -> ScenePlan:
     """Lay out the person, turning about the room's z axis."""
     still = Assembly([])
     studio(still)
@@ -113,13 +117,13 @@ def plan(options: SceneOptions) -> Plan:
     turning = Assembly(still.materials)
     mesh, materials = person()
     turning.add_mixed(materials, mesh)
-    seat = meshes.superellipsoid((0.42, 0.42, 0.08), (0.4, 0.8), (8, 28)).shifted(0.03, 0, 0.445)
+    seat = meshes.superellipsoid((0.42, 0.42, 0.08), (0.4, 0.8), (8, 28)).translated(0.03, 0, 0.445)
     turning.add(SEAT, seat)
     camera = paths.look_at((-DISTANCE, 0, 0.98), (0, 0, 0.96))
     # Facing the camera first.
     facing = paths.rotation([0, 0, np.pi])
     turn = paths.object_turn(options.seconds)
-    return Plan(
+    return ScenePlan(
         turning.materials,
         still.mesh(),
         paths.still(camera),
