@@ -35,8 +35,9 @@ def batch_benchmark() -> Iterator:
         # Workers look up the functions of this module by their names.
         known = [str(Path(__file__).parent), str(HELPERS), os.environ.get("PYTHONPATH", "")]
         patch.setenv("PYTHONPATH", os.pathsep.join(known))
-        # Shorter than the half minute that a scheduler waits for a killed worker to connect.
-        patch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "3s")
+        # Shorter than the half minute that a scheduler waits for a killed worker to connect, and
+        # long enough for a busy machine.
+        patch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "8s")
         import batch
 
         yield batch
