@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,10 +12,16 @@ from aligned_surfaces import OPTIONS, path, surfaces
 from tofuse.evaluation.trajectory import displacement
 from tofuse.geometry import se3
 from tofuse.kernels import pair_equations as kernels
-from tofuse.posegraph.calibration_check import check_calibration, proposal
+from tofuse.posegraph.calibration_check import (
+    CalibrationCheck,
+    check_calibration,
+    proposal,
+    significance_of,
+)
 from tofuse.posegraph.camera_response import response
 from tofuse.posegraph.joint_alignment import Refined, align_pairs, refine
-from tofuse.posegraph.loop_drift import Gap, Loop, longest_loop
+from tofuse.posegraph.loop_drift import COARSE_TO_FINE, Gap, Loop, longest_loop
+from tofuse.posegraph.pair_equations import Round
 from tofuse.posegraph.pose_priors import Priors
 from tofuse.posegraph.view_store import SampledView
 
@@ -97,6 +104,30 @@ def test_focal_length_error_scales_sideways_motion() -> None:
     sideways = truth[:, :2, 3] - truth[:, :2, 3].mean(0)
     expected = 0.01 * np.sqrt((sideways**2).sum(1).mean())
     assert 0.01 * found.motion["focal"][0] == pytest.approx(expected, rel=0.05)
+
+
+def test_estimate_converges_in_errors_too() -> None:
+    """Poses may rest while the error still changes."""
+    views, refined = kept(0.06)
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    rounds = (*COARSE_TO_FINE[:-1], Round(100, 0.0, 0.0))
+    options = replace(OPTIONS, rounds=rounds, convergence=1e-4, shared=0.0)
+    converged = refine(
+        views, refined.poses, options, calibrate=[kernels.OFFSET], pairs=refined.pairs
+    )
+    assert found.errors["offset"] == pytest.approx(converged.errors[kernels.OFFSET], abs=1e-4)
+
+
+def test_few_views_need_larger_error() -> None:
+    # Student's t with 7 degrees of freedom, one-sided probability 3.17e-5.
+    assert significance_of(8) == pytest.approx(8.47, abs=0.01)
+    assert significance_of(100_000) == pytest.approx(4.0, abs=0.01)
+    assert CalibrationCheck(
+        errors={"offset": 0.05}, sigmas={"offset": 0.01}, significance=significance_of(100)
+    ).large
+    assert not CalibrationCheck(
+        errors={"offset": 0.05}, sigmas={"offset": 0.01}, significance=significance_of(8)
+    ).large
 
 
 def test_few_views_raise_no_alarm():
