@@ -102,7 +102,8 @@ def simulate_rig(
     recordings = []
     for k, mount in enumerate(mounts):
         camera_sequence = mount.sequence(sequence)
-        first = int(np.ceil((first_s - mount.time_offset_s) * mount.frame_rate_hz - 1e-9))
+        first_own_s = max(first_s - mount.time_offset_s, 0.0)  # a recording has no earlier frame
+        first = int(np.ceil(first_own_s * mount.frame_rate_hz - 1e-9))
         raw = first + every * np.arange(frames)
         planned = RecordingPlan(scene, camera_sequence, mount.model, effects, 1000 * seed + k, raw)
         images = [
