@@ -523,3 +523,27 @@ def test_depth_errors_are_not_attributed_to_lens(tmp_path) -> None:
     recording = without_multipath(tmp_path, "corridor", "ifm-o3r", every=12)
     found = tofuse.inspect(recording).findings
     assert not {f.code for f in found if f.severity == "severe"}
+
+
+@pytest.mark.parametrize(
+    ("unit", "found"), [(1.0, []), (1e3, [1e3]), (1e6, [1e6]), (1e9, [1e9]), (1e-9, [1.0])]
+)
+def test_timestamps_in_another_unit_are_reported(unit, found) -> None:
+    frames = [replace(image(1.0, k), timestamp=unit * k / 30) for k in range(8)]
+    reported = tofuse.inspect(of(frames), quick=True).findings
+    assert [f.evidence["factor"] for f in reported if f.code == "time_unit"] == found
+
+
+def test_numbers_as_timestamps_are_not_reported() -> None:
+    frames = [replace(image(1.0, k), timestamp=float(k)) for k in range(8)]
+    assert "time_unit" not in codes(frames)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [2.0, 3.0])
+def test_focal_length_of_larger_images_is_estimated(turn, factor) -> None:
+    camera = turn[0].camera
+    wrong = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+    reported = tofuse.inspect(of(seen_by(turn, wrong))).findings
+    (found,) = [f for f in reported if f.code == "focal_length"]
+    assert found.evidence["factor"] * factor == pytest.approx(1, abs=0.1)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import made_arrays as made
+import tofuse
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.recordings.frames import RangeFrame
@@ -106,3 +107,11 @@ def test_real_zense(shared_data: Path) -> None:
     stack = np.stack(depths)
     sigma = stack.std(0)[np.isfinite(stack).all(0)]
     np.testing.assert_allclose(np.percentile(sigma, [5, 50, 95]), [0.005, 0.010, 0.053], rtol=0.2)
+
+
+def test_dates_are_converted_to_seconds() -> None:
+    K = [[50.0, 0, 31.5], [0, 50.0, 23.5], [0, 0, 1]]
+    times = np.datetime64("2024-01-01T00:00:00", "us") + 40_000 * np.arange(3)
+    recording = tofuse.from_arrays(np.ones((3, 48, 64)), K, timestamps=times)
+    np.testing.assert_allclose(np.diff(recording.timestamps), 0.04, atol=1e-6)
+    assert recording.timestamps[0] == 1704067200

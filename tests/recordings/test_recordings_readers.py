@@ -454,3 +454,16 @@ def test_rgb_packed_in_a_float_field(tmp_path: Path) -> None:
     frame = open_recording(tmp_path / "a.pcd")[0]
     assert frame.color is not None
     assert (frame.color == [0x11, 0x22, 0x33]).all()
+
+
+@pytest.mark.parametrize("missing", [1, 3])
+def test_missing_colour_image_of_tum_costs_only_colour(tmp_path: Path, missing: int) -> None:
+    folder = tmp_path / "freiburg1"
+    make_tum(folder)
+    for file in sorted((folder / "rgb").iterdir())[:missing]:
+        file.unlink()
+    recording = open_recording(folder)
+    frames = [recording[k] for k in range(3)]
+    assert sum(f.color_image is None for f in frames) == missing
+    text = "only 2 of 3 frames have colour" if missing == 1 else "none of the colour images exists"
+    assert any(text in w for w in recording.warnings)

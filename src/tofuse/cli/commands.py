@@ -498,7 +498,8 @@ def inspect(arguments: argparse.Namespace) -> int:
         console.print(f"[{color}]{finding.severity}:[/] {finding.code}: {escaped(finding.text)}")
         console.print(f"  {escaped(finding.remedy)}")
     if not inspection.findings:
-        console.print("[green]No problems found.[/]")
+        other = " other" if inspection.notes else ""
+        console.print(f"[green]No{other} problems found.[/]")
     if arguments.sheet is not None:
         console.print(f"see {escaped(str(arguments.sheet))}")
     return 0

@@ -336,27 +336,27 @@ class RayTable:
         target = points[..., :2] / z[..., None]
         uv = self.fit.project(points)
         limits = np.array([self.width - 1.0, self.height - 1.0])
-        for _ in range(8):
-            base = np.clip(np.nan_to_num(np.floor(uv)), 0, limits - 1).astype(np.intp)
-            i, j = base[..., 1], base[..., 0]
-            f = uv - base
-            r00, r10 = self._filled[i, j], self._filled[i, j + 1]
-            r01, r11 = self._filled[i + 1, j], self._filled[i + 1, j + 1]
-            fu, fv = f[..., :1], f[..., 1:]
-            along_u = (r10 - r00) * (1 - fv) + (r11 - r01) * fv
-            along_v = (r01 - r00) * (1 - fu) + (r11 - r10) * fu
-            error = (
-                r00
-                + (r10 - r00) * fu
-                + (r01 - r00) * fv
-                + (r00 - r10 - r01 + r11) * fu * fv
-                - target
-            )
-            det = along_u[..., 0] * along_v[..., 1] - along_u[..., 1] * along_v[..., 0]
-            with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"):  # diverges for points that the camera does not see
+            for _ in range(8):
+                base = np.clip(np.nan_to_num(np.floor(uv)), 0, limits - 1).astype(np.intp)
+                i, j = base[..., 1], base[..., 0]
+                f = uv - base
+                r00, r10 = self._filled[i, j], self._filled[i, j + 1]
+                r01, r11 = self._filled[i + 1, j], self._filled[i + 1, j + 1]
+                fu, fv = f[..., :1], f[..., 1:]
+                along_u = (r10 - r00) * (1 - fv) + (r11 - r01) * fv
+                along_v = (r01 - r00) * (1 - fu) + (r11 - r10) * fu
+                error = (
+                    r00
+                    + (r10 - r00) * fu
+                    + (r01 - r00) * fv
+                    + (r00 - r10 - r01 + r11) * fu * fv
+                    - target
+                )
+                det = along_u[..., 0] * along_v[..., 1] - along_u[..., 1] * along_v[..., 0]
                 du = (along_v[..., 1] * error[..., 0] - along_v[..., 0] * error[..., 1]) / det
                 dv = (along_u[..., 0] * error[..., 1] - along_u[..., 1] * error[..., 0]) / det
-            uv = uv - np.stack([du, dv], -1)
+                uv = uv - np.stack([du, dv], -1)
         return uv
 
 

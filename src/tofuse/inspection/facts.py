@@ -13,6 +13,8 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.noise import family_of
 from tofuse.recordings.recording import Recording
 
+_MAX_DURATION_S = 1e6  # longer ones are implausible, and perhaps astronomical
+
 
 def facts_of(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
     """Return facts about a recording by name, as text, from a sample of its frames."""
@@ -42,7 +44,9 @@ def _time(recording: Recording) -> str:
         return "unknown, as there are no timestamps"
     step = float(np.median(np.diff(times)))
     rate = f", {1 / step:.1f} frames per second" if step > 0 else ""
-    return f"{times[-1] - times[0]:.2f} s{rate}"
+    duration = float(times[-1] - times[0])
+    is_plausible = abs(duration) < _MAX_DURATION_S
+    return f"{duration:.2f} s{rate}" if is_plausible else f"{duration:.3g} s"
 
 
 def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:

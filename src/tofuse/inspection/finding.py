@@ -24,6 +24,7 @@ CODES: dict[str, tuple[Severity, str]] = {
     "color_unregistered": ("severe", "Colour is declared as registered to depth, and is not."),
     "time_unsorted": ("severe", "Timestamps decrease."),
     "phase_wrap": ("severe", "Surfaces beyond the ambiguity range appear too close."),
+    "time_unit": ("warning", "Intervals of frames are implausible, or in another unit."),
     "time_repeated": ("warning", "Timestamps are repeated."),
     "frames_missing": ("warning", "The timestamps have gaps."),
     "frames_repeated": ("warning", "Images are identical to the previous one."),

@@ -8,7 +8,7 @@ lengths, and the one with the best agreement is correct. Pure translation is not
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,12 +25,17 @@ from tofuse.registration.surface_options import SurfaceOptions
 _DESIRED_ROTATION, _MIN_ROTATION = 0.25, np.radians(4.0)
 _MAX_GAP = 60  # frames between views
 _MIN_PAIRS, _MAX_PAIRS = 6, 12
-# Logarithms of the tested factors of the rays.
-_LOG_SCALES = np.array([-0.42, -0.28, -0.14, 0.0, 0.14, 0.28, 0.42])
+# Logarithms of the tested factors of the rays: multiples of the coarse step, for intrinsics of
+# other resolutions (a third to three times the size), and around the best of these.
+_COARSE_STEP, _COARSE_STEPS = 0.42, 4
+_FINE = np.array([-0.42, -0.28, -0.14, 0.0, 0.14, 0.28, 0.42])
 _NOMINAL = 3
 # Minimum lead in score, also in standard errors, and significance of the scale.
 _MIN_LEAD, _MIN_LEAD_SIGMAS, _MIN_SIGMAS = 0.015, 1.5, 3.0
 _MIN_LOG_SCALE, _MIN_SCORE, _MIN_MEAN_SCORE = 0.08, 0.5, 0.75
+# Minimum lead of a coarse scale over the nominal one and those at the ends: without, views agree
+# under any.
+_MIN_COARSE_LEAD = 0.045
 
 
 def check_focal(sample: Sample) -> Iterator[Finding]:
@@ -39,29 +44,23 @@ def check_focal(sample: Sample) -> Iterator[Finding]:
         return
     if any(check_kind(sample)):
         return
-    pairs = _rotated_pairs(sample)
-    if len(pairs) < _MIN_PAIRS:
-        return
-    scores = np.array([_scores(pair) for pair in pairs])
-    # Views that are inconsistent under all focal lengths have a different fault.
-    scores = scores[scores.max(1) > _MIN_SCORE]
+    centre = _coarse_estimate(sample)
+    scores = _consistent([_scores(pair) for pair in _rotated_pairs(sample, centre)])
     if len(scores) < _MIN_PAIRS:
         return
     best = int(scores.mean(0).argmax())
     # At either end it may not be a maximum; with low scores it is not significant.
-    if best in (0, _NOMINAL, len(_LOG_SCALES) - 1) or scores[:, best].mean() < _MIN_MEAN_SCORE:
+    if best in (0, len(_FINE) - 1) or scores[:, best].mean() < _MIN_MEAN_SCORE:
         return
-    lead = scores[:, best] - scores[:, _NOMINAL]
-    error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
+    if not centre and not _leads(scores, best, _NOMINAL, _MIN_LEAD):
+        return
     # Jackknife over the pairs (Efron 1982), at the same maximum.
     peaks = np.array(
         [_parabola_peak(np.delete(scores, k, 0).mean(0), best) for k in range(len(scores))]
     )
     sigma = float(np.sqrt((len(peaks) - 1) * peaks.var()))
-    log_scale = _parabola_peak(scores.mean(0), best)
-    if lead.mean() > max(_MIN_LEAD, _MIN_LEAD_SIGMAS * error) and abs(log_scale) > max(
-        _MIN_LOG_SCALE, _MIN_SIGMAS * sigma
-    ):
+    log_scale = centre + _parabola_peak(scores.mean(0), best)
+    if abs(log_scale) > max(_MIN_LOG_SCALE, _MIN_SIGMAS * sigma):
         factor = float(np.exp(-log_scale))
         yield wrong_focal(factor, factor * max(sigma, 0.01), "frames disagree")
 
@@ -71,18 +70,52 @@ def _parabola_peak(score: Float64, best: int) -> float:
     a, b, c = score[best - 1 : best + 2]
     curvature = a - 2 * b + c
     shift = 0.0 if curvature >= 0 else 0.5 * (a - c) / curvature
-    return float(_LOG_SCALES[best] + np.clip(shift, -1.0, 1.0) * (_LOG_SCALES[1] - _LOG_SCALES[0]))
+    return float(_FINE[best] + np.clip(shift, -1.0, 1.0) * (_FINE[1] - _FINE[0]))
 
 
-def _rotated_pairs(sample: Sample) -> list[Pair]:
-    """Pairs of views with enough rotation between them."""
+def _leads(scores: Float64, best: int, other: int, min_lead: float) -> bool:
+    """Whether one focal length has significantly better scores (N, M) than another."""
+    lead = scores[:, best] - scores[:, other]
+    error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
+    return float(lead.mean()) > max(min_lead, _MIN_LEAD_SIGMAS * error)
+
+
+def _consistent(scores: Sequence[Sequence[float]]) -> Float64:
+    """Scores (N, M) of the pairs that are consistent under any of M focal lengths.
+
+    The others have a different fault.
+    """
+    return np.array([row for row in scores if max(row) > _MIN_SCORE])
+
+
+def _coarse_estimate(sample: Sample) -> float:
+    """The best of the coarse scales; 0.0, the stated focal length, if no other is better."""
+    scores = _consistent([_coarse_scores(pair) for pair in _shifted_pairs(sample)])
+    if len(scores) < _MIN_PAIRS:
+        return 0.0
+    best = int(scores.mean(0).argmax())
+    mean = scores.mean(0)
+    is_better = _leads(scores, best, _COARSE_STEPS, _MIN_COARSE_LEAD) and (
+        mean[best] - max(mean[0], mean[-1]) > _MIN_COARSE_LEAD
+    )
+    return (best - _COARSE_STEPS) * _COARSE_STEP if is_better else 0.0
+
+
+def _coarse_scores(pair: Pair) -> list[float]:
+    """Score under each of the coarse scales, each aligned from the pose under the previous one."""
+    smaller, larger = [pair], [pair]
+    for _ in range(_COARSE_STEPS):
+        smaller.append(_rescaled(smaller[-1], -_COARSE_STEP))
+        larger.append(_rescaled(larger[-1], _COARSE_STEP))
+    return [p.alignment.score for p in (*smaller[:0:-1], *larger)]
+
+
+def _shifted_pairs(sample: Sample) -> list[Pair]:
+    """Pairs of views between which the image moves: rotations are known only at the true scale."""
     pairs = []
     for step in sample.pairs[:_MAX_PAIRS]:
-        if not step.fits:
-            continue
-        desired = _DESIRED_ROTATION * field_of_view(step.first)
-        gap = int(np.clip(np.round(desired / max(step.angle, 1e-4)), 1, _MAX_GAP))
-        if gap * step.angle < _MIN_ROTATION:
+        gap = int(np.clip(np.round(_DESIRED_ROTATION / max(step.shift, 1e-4)), 1, _MAX_GAP))
+        if not step.fits or gap * step.shift < 0.5 * _DESIRED_ROTATION:
             continue
         pair = step if gap == 1 else _pair_at_gap(sample, step, gap)
         if pair is not None:
@@ -90,7 +123,24 @@ def _rotated_pairs(sample: Sample) -> list[Pair]:
     return pairs
 
 
-def _pair_at_gap(sample: Sample, step: Pair, gap: int) -> Pair | None:
+def _rotated_pairs(sample: Sample, log_scale: float) -> list[Pair]:
+    """Pairs of views with enough rotation between them, under a scale."""
+    pairs = []
+    for nominal in sample.pairs[:_MAX_PAIRS]:
+        step = _rescaled(nominal, log_scale) if log_scale else nominal
+        if not step.fits:
+            continue
+        desired = _DESIRED_ROTATION * field_of_view(step.first)
+        gap = int(np.clip(np.round(desired / max(step.angle, 1e-4)), 1, _MAX_GAP))
+        if gap * step.angle < _MIN_ROTATION:
+            continue
+        pair = step if gap == 1 else _pair_at_gap(sample, step, gap, log_scale)
+        if pair is not None:
+            pairs.append(pair)
+    return pairs
+
+
+def _pair_at_gap(sample: Sample, step: Pair, gap: int, log_scale: float = 0.0) -> Pair | None:
     """The pair of the same first frame and one `gap` frames later, or earlier near the end."""
     recording = sample.recording
     position = int(np.searchsorted(recording.indices, sample.frames[step.i].index))
@@ -102,23 +152,25 @@ def _pair_at_gap(sample: Sample, step: Pair, gap: int) -> Pair | None:
         frame = recording.image(k)
         if frame is not None and len(frame):
             second = prepare_view(frame, SurfaceOptions(columns=VIEW_COLUMNS))
-            return aligned_pair(step.first, second, step.i, k)
+            return aligned_pair(step.first, _scaled(second, log_scale), step.i, k)
     return None
 
 
 def _scores(pair: Pair) -> list[float]:
-    """Alignment score of the views under each of the focal lengths."""
-    scores = []
-    for log_scale in _LOG_SCALES:
-        scale = float(np.exp(log_scale))
-        first, second = _scaled(pair.first, scale), _scaled(pair.second, scale)
-        T_first_second = aligned(second, first, pair.T_first_second).T_world_source
-        scores.append(aligned(second, first, T_first_second).score)
-    return scores
+    """Alignment score of the views under each of the fine scales."""
+    return [_rescaled(pair, log_scale).alignment.score for log_scale in _FINE]
 
 
-def _scaled(view: PreparedView, scale: float) -> PreparedView:
+def _rescaled(pair: Pair, log_scale: float) -> Pair:
+    """The pair with scaled rays, aligned again."""
+    first, second = _scaled(pair.first, log_scale), _scaled(pair.second, log_scale)
+    T_first_second = aligned(second, first, pair.T_first_second).T_world_source
+    return Pair(pair.i, pair.j, first, second, aligned(second, first, T_first_second))
+
+
+def _scaled(view: PreparedView, log_scale: float) -> PreparedView:
     """The view with its rays (x/z, y/z) multiplied by a factor."""
+    scale = float(np.exp(log_scale))
     rays = view.rays * np.float32(scale)
     planes, albedo = view.planes.copy(), view.albedo.copy()
     planes[..., :2] /= np.float32(scale)

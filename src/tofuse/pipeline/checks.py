@@ -492,9 +492,11 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
     if check.undetermined:
         text = (
             "The recording does not determine the camera's focal length: the stated accuracy "
-            "assumes that the calibration is right. An error of 1% would move the poses by "
-            f"{length(0.01 * check.motion['focal'][0])}."
+            "assumes that the calibration is right."
         )
+        motion = length(0.01 * check.motion["focal"][0])
+        if motion.strip("0. m"):  # else the views give no estimate
+            text += f" An error of 1% would move the poses by {motion}."
     elif check.unconfirmed:
         correction = proposal(check.unconfirmed, check.best)
         qualifier = (

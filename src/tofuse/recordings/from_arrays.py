@@ -52,7 +52,7 @@ def from_arrays(
     confidence
         (N, H, W) uint8, higher is better.
     timestamps
-        (N,) s; 30 images per second unless given.
+        (N,) s, or datetime64; 30 images per second unless given.
     reference
         (N, 4, 4) T_world_camera, NaN where unknown; used only for comparison.
     odometry
@@ -191,7 +191,7 @@ def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
 def _times(timestamps: ArrayLike | None, count: int) -> Float64:
     if timestamps is None:
         return np.arange(count) / 30
-    times = np.asarray(timestamps, float)
+    times = _seconds(np.asarray(timestamps))
     if times.shape != (count,) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise InputError(
             "must be one finite number for each image, ascending",
@@ -199,6 +199,15 @@ def _times(timestamps: ArrayLike | None, count: int) -> Float64:
             remedy="use seconds",
         )
     return times
+
+
+def _seconds(times: NDArray[Any]) -> Float64:
+    """Timestamps as numbers; dates and durations in seconds since the epoch, or since zero."""
+    if times.dtype.kind not in "mM":
+        return times.astype(float)
+    missing = np.isnat(times)
+    ns = times.astype(f"{times.dtype.kind}8[ns]").astype(np.int64)
+    return np.where(missing, np.nan, ns // 10**9 + ns % 10**9 / 1e9)
 
 
 def _poses(name: str, values: ArrayLike | None, count: int) -> Float64 | None:

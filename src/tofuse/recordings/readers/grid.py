@@ -200,7 +200,7 @@ class _Frames:
         if (
             len(points) > count
             or len(np.unique(pixel)) < len(pixel)
-            or np.mean(on_ray) < _MIN_ON_RAYS
+            or np.count_nonzero(on_ray) < _MIN_ON_RAYS * len(on_ray)
         ):
             raise InputError(
                 f"has {len(points)} points, not {self.raster.width} x {self.raster.height}, and "

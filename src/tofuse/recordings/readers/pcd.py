@@ -12,7 +12,7 @@ from tofuse.geometry.cameras import Camera
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import CloudFileSource, required_files, sniff_clouds
 from tofuse.recordings.frames import CloudFrame, Frame
-from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
+from tofuse.recordings.organised import SAMPLES, common_camera, find_raster, organised_frame
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import cloud_frame, to_float32
 
@@ -83,6 +83,13 @@ def _camera(files: list[Path]) -> Camera | None:
         if not pcd.organised or pcd.viewpoint[:3].any():
             return None
         images.append(_image(pcd))
+        points = images[-1].reshape(-1, 3)
+        if find_raster(points, pcd.width) is None and find_raster(points, pcd.height) is not None:
+            raise InputError(
+                f"has WIDTH {pcd.width} and HEIGHT {pcd.height}, but rows of {pcd.height} points",
+                where=file,
+                remedy="swap WIDTH and HEIGHT",
+            )
     return common_camera(images)
 
 

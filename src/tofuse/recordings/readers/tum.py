@@ -65,7 +65,10 @@ class Tum(Reader):
             # A depth image without a colour image takes that of a neighbour: only for display.
             pairs = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
             if (pairs >= 0).any():
-                color = [color_files[k] if k >= 0 else None for k in pairs]
+                exists = [is_file(file) for file in color_files]
+                color = [color_files[k] if k >= 0 and exists[k] else None for k in pairs]
+                if not any(color):
+                    warnings.append("none of the colour images exists: colour is ignored")
             else:
                 warnings.append(
                     f"no depth image has a colour image within {COLOR_LIMIT_S} s: colour is ignored"
