@@ -135,6 +135,9 @@ def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
     assert within == (0.0, pytest.approx(by_array + 0.01))
     with pytest.raises(tofuse.InputError, match="shape"):
         tofuse.evaluate(result.trajectory[:, :3], poses)
+    for wrong in (2 * poses, poses @ np.diag([-1, 1, 1, 1]), poses.transpose(0, 2, 1)):
+        with pytest.raises(tofuse.InputError, match=r"estimate\[\d\]: "):
+            tofuse.evaluate(wrong, poses)
     with pytest.raises(tofuse.InputError, match="no reference"):
         tofuse.load(tmp_path / "out").evaluate()
 
@@ -235,6 +238,8 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
         ({"timestamps": [0, 1, 1, 2, 3, 4]}, "timestamps"),
         ({"timestamps": [0, 1]}, "timestamps"),
         ({"reference": np.eye(4)}, "reference"),
+        ({"reference": 2 * np.tile(np.eye(4), (6, 1, 1))}, "reference[0]"),
+        ({"odometry": [["x"]]}, "odometry"),
     ],
 )
 def test_inconsistent_arrays_are_rejected(arrays, change, named):

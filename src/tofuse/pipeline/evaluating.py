@@ -16,6 +16,7 @@ from tofuse.errors import InputError
 from tofuse.evaluation.consistency import Consistency, map_consistency, poses_of_frames
 from tofuse.evaluation.trajectory import TrajectoryError, evaluate_trajectory
 from tofuse.files.trajectory_formats import Clock, TimedPoses, read_poses
+from tofuse.geometry import se3
 from tofuse.recordings.open import open_recording, read_reference
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import is_result
@@ -147,9 +148,7 @@ def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corr
 def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:
     if isinstance(source, str | Path):
         return read_reference(source) if is_reference else read_poses(source)
-    poses = np.asarray(source, float)
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
-        raise InputError(f"has shape {poses.shape}", where=name, remedy="pass (N, 4, 4) poses")
+    poses = se3.check_poses(source, where=name)
     return TimedPoses(poses, frames=np.arange(len(poses)))
 
 

@@ -387,15 +387,7 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64
         where = str(path)
         poses = _read(path).of_frames(recording.timestamps, recording.indices)
     else:
-        poses = np.array(trajectory, float)
-        if poses.shape != (len(recording), 4, 4):
-            raise InputError(
-                f"has shape {poses.shape}, for {len(recording)} frames",
-                where=where,
-                remedy="pass one (4, 4) pose for each frame, NaN where there is none",
-            )
-        for T in poses[np.isfinite(poses).all((1, 2))]:
-            se3.check_pose(T, where=where)
+        poses = se3.check_poses(trajectory, where=where, count=len(recording))
     n_posed = int(np.isfinite(poses).all((1, 2)).sum())
     if n_posed < 2:
         raise InputError(

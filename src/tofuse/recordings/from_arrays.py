@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable
+from tofuse.geometry.se3 import check_poses
 from tofuse.recordings.depth_counts import INVALID_DEPTH
 from tofuse.recordings.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
@@ -202,11 +203,4 @@ def _times(timestamps: ArrayLike | None, count: int) -> Float64:
 
 
 def _poses(name: str, values: ArrayLike | None, count: int) -> Float64 | None:
-    if values is None:
-        return None
-    poses = np.asarray(values, float)
-    if poses.shape != (count, 4, 4):
-        raise InputError(
-            f"has shape {poses.shape}", where=name, remedy=f"pass ({count}, 4, 4) T_world_camera"
-        )
-    return poses
+    return None if values is None else check_poses(values, where=name, count=count)

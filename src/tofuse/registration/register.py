@@ -13,7 +13,6 @@ from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.any_pair import MIN_POINTS, AnyPair
 from tofuse.registration.base import Registrar, Registration
 
-_MAX_COORDINATE_M = 1e9
 # Clouds with a larger distance are in different frames.
 _MAX_FRAME_DISTANCE_M = 1e4
 
@@ -140,7 +139,7 @@ def _cloud(points: ArrayLike, name: str) -> Float64:
             where=name,
             remedy=f"use {MIN_POINTS} or more",
         )
-    if np.abs(finite).max() > _MAX_COORDINATE_M:
+    if np.abs(finite).max() > se3.MAX_COORDINATE_M:
         raise InputError(
             f"has coordinates up to {np.abs(finite).max():.0e} m", where=name, remedy="use metres"
         )
