@@ -240,6 +240,9 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
         ({"reference": np.eye(4)}, "reference"),
         ({"reference": 2 * np.tile(np.eye(4), (6, 1, 1))}, "reference[0]"),
         ({"odometry": [["x"]]}, "odometry"),
+        ({"depth_kind": "Z"}, "depth_kind: is 'Z'; use one of z, range"),
+        ({"depth_kind": None}, "depth_kind: is None"),
+        ({"amplitude_kind": "x"}, "use one of raw, range_compensated, ir"),
     ],
 )
 def test_inconsistent_arrays_are_rejected(arrays, change, named):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Literal, Protocol, Self
+from typing import Literal, Protocol, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -149,6 +149,13 @@ class RangeFrame:
         return f"RangeFrame {self.index}: {size} at {self.timestamp:.3f} s, {len(self):,} valid"
 
     def __post_init__(self) -> None:
+        for kind, known in (("depth_kind", DepthKind), ("amplitude_kind", AmplitudeKind)):
+            if getattr(self, kind) not in get_args(known):
+                raise InputError(
+                    f"is {getattr(self, kind)!r}",
+                    where=f"frame {self.index}: {kind}",
+                    remedy=f"use one of {', '.join(get_args(known))}",
+                )
         shape = (self.camera.height, self.camera.width)
         for name in IMAGES:
             image = getattr(self, name)
