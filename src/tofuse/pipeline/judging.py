@@ -23,6 +23,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounds
 from tofuse.errors import InputError
 from tofuse.evaluation.consistency import Consistency, map_consistency
 from tofuse.evaluation.cross_view import CrossViewConsistency, compare_views, prepare_for_comparison
@@ -34,6 +35,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.motion import Moment, find_jumps
+from tofuse.parts import check_number
 from tofuse.pipeline.checks import (
     accuracy_reasons,
     coverage_reasons,
@@ -131,7 +133,7 @@ class Judgement:
 
 def judge(
     recording: Recording,
-    trajectory: str | Path | Float64,
+    trajectory: str | Path | Float64 | Reconstruction,
     *,
     tolerance_m: float | None = None,
     threads: int | None = None,
@@ -144,7 +146,7 @@ def judge(
     recording
         Range images, as of `tofuse.open`.
     trajectory
-        A file of any format of `files.trajectory_formats`, the folder of a result, a recording with
+        A file of any format of `files.trajectory_formats`, a result or its folder, a recording with
         poses, or (N, 4, 4) T_world_camera of the frames, NaN where there is none. Timed poses are
         assigned to the nearest frames in time, within 20 ms.
     tolerance_m
@@ -160,6 +162,8 @@ def judge(
         If fewer than two frames have a pose, or the recording contains clouds.
     """
     progress = progress or Silent()
+    if tolerance_m is not None:
+        check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
     poses = poses_for(recording, trajectory)
     kind = view_kind(recording)
     # External sensors do not measure these poses, and images are compared with the stated camera.
@@ -202,7 +206,7 @@ def judge(
             *coverage_reasons(records, sum(r.status == "tracked" for r in records)),
             *_reasons(
                 poses, accuracy, deviation, initial_support, refined_support, refined, tolerance_m
-            )
+            ),
         ]
     )
     return Judgement(
@@ -395,7 +399,7 @@ def _read(path: Path) -> TimedPoses:
             raise no_trajectory from None
 
 
-def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64:
+def poses_for(recording: Recording, trajectory: str | Path | Float64 | Reconstruction) -> Float64:
     """Return the (N, 4, 4) poses of a recording's frames, NaN where there is none; see `judge`.
 
     Raises
@@ -408,6 +412,9 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64
         path = Path(trajectory)
         where = str(path)
         poses = _read(path).of_frames(recording.timestamps, recording.indices)
+    elif isinstance(trajectory, Reconstruction):
+        timed = TimedPoses(trajectory.trajectory, timestamps=trajectory.timestamps)
+        poses = timed.of_frames(recording.timestamps, recording.indices)
     else:
         poses = se3.check_poses(trajectory, where=where, count=len(recording))
     n_posed = int(np.isfinite(poses).all((1, 2)).sum())

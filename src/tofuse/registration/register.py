@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounds
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.kernels.blas import one_blas_thread
+from tofuse.parts import check_number
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.any_pair import MIN_POINTS, AnyPair
 from tofuse.registration.base import Registrar, Registration
@@ -65,6 +67,7 @@ def register(
         If too few points correspond, an image is empty, or the median depths of two images differ
         more than fourfold.
     """
+    check_number(seed, Bounds(0), "seed", whole=True)
     start = None if guess is None else se3.check_pose(guess, where="guess")
     rng = np.random.default_rng([seed, 0])
     if isinstance(source, RangeFrame | CloudFrame) or isinstance(target, RangeFrame | CloudFrame):
