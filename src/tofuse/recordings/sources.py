@@ -226,6 +226,8 @@ def cloud_frame(
             points = points - shift
         measured &= (np.abs(points) < MAX_COORDINATE_M).all(1)
         origin = None if origin is None else origin - shift
+    if not measured.all():
+        points = np.where(measured[:, None], points, 0)
     frame = CloudFrame(
         index,
         timestamp,
