@@ -87,8 +87,9 @@ def check_number(value: Any, allowed: Bounds, name: str, *, whole: bool = False)
     if whole:
         fits = fits and isinstance(value, numbers.Integral)
     if not fits or (int(value) if whole else float(value)) not in allowed:
-        kind = "a whole number" if whole else "a number"
-        raise InputError(f"is {value!r}", where=name, remedy=f"pass {kind}, {allowed}")
+        remedy = f"pass a {'whole' if whole else 'finite'} number"
+        bounds = "" if allowed == Bounds() else f", {allowed}"
+        raise InputError(f"is {value!r}", where=name, remedy=remedy + bounds)
 
 
 def to_dict(obj: Any) -> Any:
