@@ -30,7 +30,7 @@ class Bounds:
             return False
         if self.exclusive:
             return self.low < value < self.high
-        return self.low <= value <= self.high and math.isfinite(value)
+        return self.low <= value <= self.high and abs(value) < math.inf
 
     def __str__(self) -> str:
         if self.low == -math.inf and self.high == math.inf:

@@ -16,12 +16,14 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import numbers
 import pkgutil
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
+from tofuse.bounds import Bounds
 from tofuse.errors import InputError
 
 T = TypeVar("T")
@@ -65,6 +67,29 @@ def registered(kind: str) -> dict[str, type]:
 def name_of(obj: object) -> str:
     """Return the name under which a part was registered."""
     return str(type(obj).part_name)  # type: ignore[attr-defined]
+
+
+def check_number(value: Any, allowed: Bounds, name: str, *, whole: bool = False) -> None:
+    """Raise InputError for an argument that is no number, or outside the bounds.
+
+    Parameters
+    ----------
+    value
+        The argument; NumPy's numbers are accepted.
+    allowed
+        Its bounds.
+    name
+        Its name.
+    whole
+        Whether it has to be a whole number.
+    """
+    fits = not isinstance(value, bool) and isinstance(value, numbers.Integral | numbers.Real)
+    if whole:
+        fits = fits and isinstance(value, numbers.Integral)
+    if not fits or (int(value) if whole else float(value)) not in allowed:
+        remedy = f"pass a {'whole' if whole else 'finite'} number"
+        bounds = "" if allowed == Bounds() else f", {allowed}"
+        raise InputError(f"is {value!r}", where=name, remedy=remedy + bounds)
 
 
 def to_dict(obj: Any) -> Any:

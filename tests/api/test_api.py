@@ -129,12 +129,17 @@ def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
     by_array = tofuse.evaluate(result.trajectory, poses).error.ate_rms_m
     assert by_array == pytest.approx(result.evaluate().error.ate_rms_m)
     result.save(tmp_path / "out")
+    assert tofuse.evaluate(result, poses, recording=result.source).error.ate_rms_m == by_array
+    assert tofuse.evaluate(result, result).error.ate_rms_m < 1e-6
     by_file = tofuse.evaluate(tmp_path / "out", tmp_path / "out" / "trajectory.txt")
     assert by_file.error.ate_rms_m < 1e-6
     within = tofuse.evaluate(result.trajectory, poses, reference_error_m=0.01).ate_interval_m
     assert within == (0.0, pytest.approx(by_array + 0.01))
     with pytest.raises(tofuse.InputError, match="shape"):
         tofuse.evaluate(result.trajectory[:, :3], poses)
+    for wrong in (2 * poses, poses @ np.diag([-1, 1, 1, 1]), poses.transpose(0, 2, 1)):
+        with pytest.raises(tofuse.InputError, match=r"estimate\[\d\]: "):
+            tofuse.evaluate(wrong, poses)
     with pytest.raises(tofuse.InputError, match="no reference"):
         tofuse.load(tmp_path / "out").evaluate()
 
@@ -235,6 +240,15 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
         ({"timestamps": [0, 1, 1, 2, 3, 4]}, "timestamps"),
         ({"timestamps": [0, 1]}, "timestamps"),
         ({"reference": np.eye(4)}, "reference"),
+        ({"reference": 2 * np.tile(np.eye(4), (6, 1, 1))}, "reference[0]"),
+        ({"odometry": [["x"]]}, "odometry"),
+        ({"depth_kind": "Z"}, "depth_kind: is 'Z'; use one of z, range"),
+        ({"timestamps": list("abcdef")}, "timestamps"),
+        ({"timestamps": np.arange(6).astype("datetime64[ms]")}, "timestamps"),
+        ({"depth_unit_m": "0.001"}, "depth_unit_m"),
+        ({"camera": [[70, 0.5, 40], [0, 70, 30], [0, 0, 1]]}, "skew"),
+        ({"depth_kind": None}, "depth_kind: is None"),
+        ({"amplitude_kind": "x"}, "use one of raw, range_compensated, ir"),
     ],
 )
 def test_inconsistent_arrays_are_rejected(arrays, change, named):
@@ -242,6 +256,62 @@ def test_inconsistent_arrays_are_rejected(arrays, change, named):
     with pytest.raises(tofuse.InputError) as error:
         tofuse.from_arrays(given.pop("depth"), given.pop("camera"), **given)
     assert named in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"index": "0"}, "index"),
+        ({"timestamp": np.nan}, "timestamp"),
+        ({"timestamp": None}, "timestamp"),
+        ({"camera": None}, "camera"),
+        ({"depth": [[1.0]]}, "depth"),
+        ({"depth": np.ones(60)}, "depth"),
+        ({"amplitude_image": "x"}, "amplitude_image"),
+    ],
+)
+def test_unusable_frames_are_rejected(arrays, change, named):
+    camera = tofuse.Pinhole(80, 60, 70, 70, 39.5, 29.5)
+    given = {"index": 0, "timestamp": 0.0, "camera": camera, "depth": arrays[0][0], **change}
+    with pytest.raises(tofuse.InputError, match=named):
+        tofuse.RangeFrame(**given)
+
+
+def test_infinite_amplitude_is_saturated(arrays):
+    amplitude = np.full((6, 60, 80), 100.0)
+    amplitude[0, 0, :2] = [np.inf, -np.inf]
+    frame = tofuse.from_arrays(*arrays[:2], amplitude=amplitude)[0]
+    assert frame.amplitude_image[0, :3].tolist() == [65535, 0, 100]
+
+
+def test_wrong_arguments_are_named(arrays, result, tmp_path):
+    recording = tofuse.from_arrays(*arrays[:2])
+    far = np.full((20, 3), 1e20, np.float32)
+    for call, named in (
+        (lambda: tofuse.open(None), "path: is a NoneType"),
+        (lambda: tofuse.open([tmp_path]), "path: is a list"),
+        (lambda: tofuse.load(None), "folder: "),
+        (lambda: result.save(None), "folder: "),
+        (lambda: tofuse.merge([result, result]), r"results: is a Result.*save\(folder\)"),
+        (lambda: tofuse.merge([], tolerance_m="x"), "tolerance_m: "),
+        (lambda: tofuse.judge(recording, arrays[2], tolerance_m=-1), "tolerance_m: is -1"),
+        (lambda: tofuse.judge(recording, arrays[2], threads=0), "threads: is 0"),
+        (lambda: tofuse.reconstruct(recording, threads=0), "threads: is 0"),
+        (lambda: tofuse.reconstruct(recording, seed=-1), "seed: is -1"),
+        (lambda: tofuse.register(recording[0], recording[1], seed=1.5), "seed: is 1.5"),
+        (lambda: tofuse.Mapper().push(arrays[0][0]), "frame: is a ndarray"),
+        (lambda: tofuse.CloudFrame(0, 0.0, far), r"coordinates up to 1e\+20"),
+    ):
+        with pytest.raises(tofuse.InputError, match=named):
+            call()
+
+
+def test_slice_of_recording_is_recording(arrays):
+    recording = tofuse.from_arrays(*arrays[:2])
+    assert recording[1:5:2].indices.tolist() == [1, 3]
+    assert recording[-2:].indices.tolist() == [4, 5]
+    with pytest.raises(tofuse.InputError, match="leaves none"):
+        recording[3:3]
 
 
 @pytest.mark.parametrize("suffix", ["glb", "gltf", "ply", "obj", "stl"])

@@ -64,6 +64,8 @@ def test_comments_blank_lines_and_scaled_quaternions_are_accepted(tmp_path: Path
         ("1 0 0 zero 0 0 0 1", "zero"),
         ("nan 0 0 0 0 0 0 1", "not finite"),
         ("1 0 0 inf 0 0 0 1", "not finite"),
+        ("1 nan nan nan 0 0 0 1", "not finite.*whole pose"),
+        ("1 0 0 1e160 0 0 0 1", "coordinate beyond 1e"),
         ("1 0 0 0 0 0 0 0", "not of unit length"),
         ("1 0 0 0 3 0 0 1", "not of unit length"),
     ],
@@ -73,6 +75,14 @@ def test_bad_lines_are_reported(tmp_path: Path, line: str, words: str) -> None:
     with pytest.raises(InputError, match=words) as caught:
         read_tum(tmp_path / "t.txt")
     assert "t.txt, line 3" in str(caught.value)
+
+
+def test_poses_of_nan_are_left_out(tmp_path: Path) -> None:
+    nan = " nan" * 7
+    (tmp_path / "t.txt").write_text(f"0 0 0 0 0 0 0 1\n1{nan}\n2 0 0 0 0 0 0 1\n3 {nan}\n")
+    times, poses = read_tum(tmp_path / "t.txt")
+    assert times.tolist() == [0, 2]
+    np.testing.assert_array_equal(poses, [np.eye(4)] * 2)
 
 
 def test_association_is_nearest_within_limit() -> None:

@@ -117,6 +117,10 @@ BAD = {
     "words.txt": (b"a b c d e f g h\n", "could not convert|is no number|a"),
     "kitti-short.txt": (b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0\n", "line 2"),
     "kitti-scaled.txt": (b"2 0 0 0 0 2 0 0 0 0 2 0\n", "no rotation"),
+    "kitti-nan.txt": (b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 nan 0 1 0 0 0 0 1 0\n", "line 2.*finite"),
+    "kitti-far.txt": (b"1 0 0 0 0 1 0 1e30 0 0 1 0\n", "line 1: has a coordinate of 1e"),
+    "euroc-nan.csv": (b"1500000000000000000,0,0,0,nan,0,0,0\n", "line 1.*finite"),
+    "images-far.txt": (b"1 1 0 0 0 0 1e300 0 1 a1.png\n", "line 1: .*coordinate"),
     "short.log": (b"0 0 1\n1 0 0 0\n0 1 0 0\n", "not 5 for each pose"),
     "huge.log": (b"9" * 5000 + b" 0 1" + b"\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "names frame"),
     "huge.json": (
@@ -150,6 +154,12 @@ def test_bad_file_is_rejected(name: str, tmp_path: Path) -> None:
 def test_wrong_array_shape_is_rejected(shape, tmp_path: Path) -> None:
     np.save(tmp_path / "p.npy", np.zeros(shape))
     with pytest.raises(InputError, match="shape"):
+        read_poses(tmp_path / "p.npy")
+
+
+def test_array_of_transposed_poses_is_rejected(tmp_path: Path) -> None:
+    np.save(tmp_path / "p.npy", POSES.transpose(0, 2, 1))
+    with pytest.raises(InputError, match=r"p.npy, pose \d: .*stored by columns"):
         read_poses(tmp_path / "p.npy")
 
 

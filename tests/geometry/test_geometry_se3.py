@@ -133,6 +133,7 @@ def test_orthonormalise_gives_nearest_rotation(xi: np.ndarray, noise: np.ndarray
         lambda T: T * 1e300,
         lambda T: T @ np.diag([1, 1, -1, 1]),
         lambda T: T + np.array([[0] * 4] * 3 + [[1, 0, 0, 0]]),
+        lambda T: T + np.array([[0, 0, 0, 1e160]] + [[0] * 4] * 3),
     ],
 )
 def test_check_pose_rejects_non_rigid_matrices(change) -> None:
@@ -140,6 +141,15 @@ def test_check_pose_rejects_non_rigid_matrices(change) -> None:
     np.testing.assert_array_equal(se3.check_pose(T), T)
     with pytest.raises(InputError, match="pose"):
         se3.check_pose(change(T))
+
+
+def test_transposed_poses_are_recognised() -> None:
+    T = se3.exp([1, 2, 3, 0.1, 0.2, 0.3])
+    with pytest.raises(InputError, match=r"given\[1\]: .*seems to be stored by columns"):
+        se3.check_poses([np.eye(4), T.T], where="given")
+    unknown = np.array(T)
+    unknown[:3] = np.nan
+    assert np.isnan(se3.check_poses([T, unknown], where="given")[1]).all()
 
 
 unit_quaternions = (

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from tofuse.errors import InputError
 from tofuse.kernels.threads import (
     chunk_bounds,
     job_pool,
@@ -107,8 +108,8 @@ def test_thread_count_is_restored() -> None:
     assert thread_count() == before
     with threads(None):
         assert thread_count() == before
-    for wrong in (0, -1):
-        with pytest.raises(ValueError, match="at least 1"):
+    for wrong in (0, -1, 1.5, "2"):
+        with pytest.raises(InputError, match=r"threads: .*1 or more"):
             set_thread_count(wrong)
     assert thread_count() == before
 

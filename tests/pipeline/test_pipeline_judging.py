@@ -21,7 +21,7 @@ from tofuse.files.trajectory import write_tum
 from tofuse.geometry import se3
 from tofuse.odometry.given import GivenPoses
 from tofuse.pipeline.config import from_method
-from tofuse.pipeline.judging import device_sentence, poses_for, with_odometry
+from tofuse.pipeline.judging import device_sentence, poses_for, sentence, with_odometry
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.refinement import NoRefinement
 from tofuse.recordings.phones import POSES_BY
@@ -128,9 +128,18 @@ def test_frames_without_pose_stay_without(recording, truth) -> None:
     some = truth.copy()
     some[[2, 5]] = np.nan
     found = tofuse.judge(recording, some)
-    assert found.verdict == "good"
+    assert [r.code for r in found.reasons] == ["lost_frames"]
     assert np.flatnonzero(np.isnan(found.displacement_m)).tolist() == [2, 5]
     assert found.to_dict()["frames"] == 6
+
+
+def test_poses_of_few_frames_fail(recording, truth) -> None:
+    some = truth.copy()
+    some[2:] = np.nan
+    found = tofuse.judge(recording, some)
+    assert found.verdict == "failed"
+    assert [r.code for r in found.reasons] == ["few_poses", "lost_frames"]
+    assert ", poses of 2 of 8 frames; refined: " in sentence(found, "poses.txt")
 
 
 def test_given_poses_are_kept_without_refinement(recording, truth) -> None:
@@ -143,7 +152,7 @@ def test_given_poses_are_kept_without_refinement(recording, truth) -> None:
 
 
 def test_unusable_poses_are_refused(recording, truth, tmp_path) -> None:
-    with pytest.raises(InputError, match="for 8 frames"):
+    with pytest.raises(InputError, match=r"pass \(8, 4, 4\)"):
         tofuse.judge(recording, truth[:5])
     one = np.full_like(truth, np.nan)
     one[3] = np.eye(4)

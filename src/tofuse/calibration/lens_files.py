@@ -19,12 +19,10 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import read_bytes, read_text
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable
-from tofuse.recordings.camera_file import checked_lens
+from tofuse.recordings.camera_file import MAX_SKEW_PX, checked_lens
 
 _MAX_BYTES = 64 << 20
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?"
-# Maximum displacement of a pixel by skew that is neglected.
-_MAX_SKEW_PX = 0.005
 _MATLAB = ("fc", "cc", "alpha_c", "kc", "nx", "ny")
 _CALLAB = ("A", "k1", "k2", "k3", "p1", "p2", "width", "height")
 _ROS_MODELS = {
@@ -312,7 +310,7 @@ def _lens(
     if any(extra):
         table = _opencv_rays(camera, skew, k)
         return table, ("thin prism or tilted sensor: the lens becomes a table of rays",)
-    if abs(skew) * size[1] / camera.fy > _MAX_SKEW_PX:
+    if abs(skew) * size[1] / camera.fy > MAX_SKEW_PX:
         if not abs(skew) <= camera.fx:
             raise InputError(f"is {skew}", where=f"{path}: skew", remedy="use 0, or pixels")
         return _skewed_rays(camera, skew), (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import os
 import re
 import struct
 import tomllib
@@ -45,6 +46,28 @@ def input_error(error: OSError, path: str | Path) -> InputError:
         error.errno or 0, (f"can't be read ({error.strerror or error})", "check the file")
     )
     return InputError(problem, where=path, remedy=remedy)
+
+
+def path_of(value: object, name: str, remedy: str) -> Path:
+    """Return an argument of the user as a path.
+
+    Parameters
+    ----------
+    value
+        The argument.
+    name
+        Its name.
+    remedy
+        What to pass instead.
+
+    Raises
+    ------
+    InputError
+        If it is no path.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(f"is a {type(value).__name__}, not a path", where=name, remedy=remedy)
+    return Path(value)
 
 
 def required_package(name: str, extra: str | None, where: str | Path) -> Any:

@@ -14,6 +14,7 @@ from tofuse.files.atomic import write_text
 from tofuse.files.reading import read_text
 from tofuse.files.tables import exact
 from tofuse.geometry.quaternion import from_matrix, length, to_pose
+from tofuse.geometry.se3 import MAX_COORDINATE_M
 
 ASSOCIATION_LIMIT_S = 0.02
 
@@ -24,13 +25,12 @@ def read_tum(path: str | Path) -> tuple[Float64, Float64]:
     Returns
     -------
     (N,) timestamps in s and (N, 4, 4) T_world_camera, in file order. Comments after '#' and empty
-    lines are skipped; quaternions are normalised.
+    lines are skipped, and so are poses of NaN only; quaternions are normalised.
 
     Raises
     ------
     InputError
-        Naming file and line, if a line isn't 8 finite numbers or its quaternion isn't of unit
-        length.
+        Naming file and line, if a line isn't 8 numbers, or its pose can't be used.
     """
     rows: list[list[float]] = []
     numbers: list[int] = []
@@ -42,12 +42,14 @@ def read_tum(path: str | Path) -> tuple[Float64, Float64]:
             raise InputError(str(error), where=where, remedy=_TUM) from error
         if len(row) != 8:
             raise InputError(f"has {len(row)} numbers", where=where, remedy=_TUM)
-        if not np.isfinite(row).all():
-            raise InputError("contains a number that is not finite", where=where, remedy=_TUM)
+        if not np.isfinite(row[0]):
+            raise InputError("has a timestamp that is not finite", where=where, remedy=_TUM)
         rows.append(row)
         numbers.append(number)
     table = np.array(rows, float).reshape(-1, 8)
-    return table[:, 0], poses_of_rows(table[:, 4:], table[:, 1:4], path, numbers)
+    poses = poses_of_rows(table[:, 4:], table[:, 1:4], path, numbers)
+    known = np.isfinite(poses[:, 0, 0])
+    return table[known, 0], poses[known]
 
 
 _TUM = "write 'timestamp tx ty tz qx qy qz qw'"
@@ -62,7 +64,7 @@ def rows_of(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def poses_of_rows(q_xyzw: Float64, t: Float64, path: str | Path, numbers: Sequence[int]) -> Float64:
-    """Return poses (N, 4, 4) of rows of a file.
+    """Return poses (N, 4, 4) of rows of a file; NaN for rows without any finite number.
 
     Parameters
     ----------
@@ -74,16 +76,34 @@ def poses_of_rows(q_xyzw: Float64, t: Float64, path: str | Path, numbers: Sequen
     Raises
     ------
     InputError
-        If a quaternion is not of unit length.
+        If only some numbers of a row are finite, a quaternion is not of unit length, or a
+        coordinate is implausibly large.
     """
-    deviation = np.abs(length(q_xyzw) - 1)
-    if (deviation > 0.1).any():
-        raise InputError(
+    finite = np.isfinite(np.column_stack([q_xyzw, t]))
+    unknown = ~finite.any(1)  # programs write NaN where tracking failed
+    for bad, problem, remedy in (
+        (
+            ~finite.all(1) & ~unknown,
+            "contains a number that is not finite",
+            "write NaN for the whole pose, or remove it",
+        ),
+        (
+            ~unknown & (np.abs(length(q_xyzw) - 1) > 0.1),
             "contains a quaternion that is not of unit length",
-            where=f"{path}, line {numbers[int(np.argmax(deviation > 0.1))]}",
-            remedy="normalise it",
-        )
-    return to_pose(q_xyzw, t)
+            "normalise it",
+        ),
+        (
+            ~unknown & (np.abs(t) > MAX_COORDINATE_M).any(1),
+            f"contains a coordinate beyond {MAX_COORDINATE_M:.0e} m",
+            "use metres, or remove the pose",
+        ),
+    ):
+        if bad.any():
+            line = numbers[int(np.argmax(bad))]
+            raise InputError(problem, where=f"{path}, line {line}", remedy=remedy)
+    poses = np.full((len(t), 4, 4), np.nan)
+    poses[~unknown] = to_pose(q_xyzw[~unknown], t[~unknown])
+    return poses
 
 
 def write_tum(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) -> None:

@@ -159,7 +159,7 @@ def _tum(_rows: _Rows, path: Path) -> TimedPoses:
 
 
 def _numbers(rows: _Rows, path: Path, count: int) -> tuple[Float64, list[int]]:
-    """(N, count) first numbers of the rows and their lines, without rows that are not finite."""
+    """(N, count) first numbers of the rows, and their lines."""
     table, lines = [], []
     for number, cells in rows:
         try:
@@ -171,13 +171,28 @@ def _numbers(rows: _Rows, path: Path, count: int) -> tuple[Float64, list[int]]:
                 f"has {len(row)} numbers, the first line {count} or more",
                 where=f"{path}, line {number}",
             )
-        if np.isfinite(row).all():  # programs write NaN where tracking failed
-            table.append(row)
-            lines.append(number)
+        table.append(row)
+        lines.append(number)
     return np.array(table, float).reshape(-1, count), lines
 
 
+def _known(
+    poses: Sequence[Float64] | Float64, timestamps: Float64 | None = None, frames: Any = None
+) -> TimedPoses:
+    """Leave out poses that are NaN, which programs write where tracking failed."""
+    stacked = np.reshape(poses, (-1, 4, 4))
+    known = np.isfinite(stacked[:, 0, 0])
+    return TimedPoses(
+        stacked[known],
+        None if timestamps is None else timestamps[known],
+        None if frames is None else np.array(frames, np.intp)[known],
+    )
+
+
 def _rigid(T: Float64, where: str) -> Float64:
+    """Check a pose, and orthonormalise its rotation; NaN if no number is finite."""
+    if T.shape == (4, 4) and se3.is_unknown(T):
+        return np.full((4, 4), np.nan)
     return se3.orthonormalise(se3.check_pose(T, where=where))
 
 
@@ -185,20 +200,19 @@ def _euroc(rows: _Rows, path: Path) -> TimedPoses:
     """Lines of ns, x y z, qw qx qy qz, and possibly more, as in EuRoC's ground truth."""
     table, lines = _numbers(rows, path, 8)
     poses = poses_of_rows(table[:, [5, 6, 7, 4]], table[:, 1:4], path, lines)
-    return TimedPoses(poses, timestamps=1e-9 * table[:, 0])
+    if not np.isfinite(table[:, 0]).all():
+        line = lines[int(np.argmin(np.isfinite(table[:, 0])))]
+        raise InputError("has a timestamp that is not finite", where=f"{path}, line {line}")
+    return _known(poses, timestamps=1e-9 * table[:, 0])
 
 
 def _kitti(rows: _Rows, path: Path) -> TimedPoses:
     """Lines of 3 x 4 matrices, one for each frame."""
+    table, lines = _numbers(rows, path, 12)
     out = np.tile(np.eye(4), (len(rows), 1, 1))
-    frames = []
-    for k, (number, cells) in enumerate(rows):
-        table, _ = _numbers([(number, cells)], path, 12)
-        if len(table):
-            out[k, :3] = table.reshape(3, 4)
-            out[k] = _rigid(out[k], f"{path}, line {number}")
-            frames.append(k)
-    return TimedPoses(out[frames], frames=np.array(frames, np.intp))
+    out[:, :3] = table.reshape(-1, 3, 4)
+    poses = [_rigid(T, f"{path}, line {line}") for T, line in zip(out, lines, strict=True)]
+    return _known(poses, frames=range(len(out)))
 
 
 def _log(rows: _Rows, path: Path) -> TimedPoses:
@@ -212,10 +226,9 @@ def _log(rows: _Rows, path: Path) -> TimedPoses:
         table, _ = _numbers(rows[k + 1 : k + 5], path, 4)
         if not (head[0].isdecimal() and len(head[0]) <= _DIGITS):
             raise InputError(f"names frame {head[0][:40]!r}", where=where)
-        if len(table) == 4:
-            poses.append(_rigid(table, where))
-            frames.append(int(head[0]))
-    return TimedPoses(_stacked(poses), frames=np.array(frames, np.intp))
+        poses.append(_rigid(table, where))
+        frames.append(int(head[0]))
+    return _known(poses, frames=frames)
 
 
 def _colmap(rows: _Rows, path: Path) -> TimedPoses:
@@ -225,7 +238,7 @@ def _colmap(rows: _Rows, path: Path) -> TimedPoses:
     table, lines = _numbers(images, path, 8)
     T_camera_world = poses_of_rows(table[:, [2, 3, 4, 1]], table[:, 5:8], path, lines)
     names = [cells[9] for _, cells in images]
-    return TimedPoses(se3.inverse(T_camera_world), frames=_frame_numbers(names, path))
+    return _known(se3.inverse(T_camera_world), frames=_frame_numbers(names, path))
 
 
 def _transforms(text: str, path: Path) -> TimedPoses:
@@ -247,7 +260,7 @@ def _transforms(text: str, path: Path) -> TimedPoses:
             raise InputError("has no 'transform_matrix' of 4 x 4", where=where) from error
         poses.append(_rigid(T, where) @ OPENGL)
         names.append(str(frame.get("file_path", k)))
-    return TimedPoses(_stacked(poses), frames=_frame_numbers(names, path))
+    return _known(poses, frames=_frame_numbers(names, path))
 
 
 def _numpy(path: Path) -> TimedPoses:
@@ -262,14 +275,9 @@ def _numpy(path: Path) -> TimedPoses:
     if table.ndim != 3 or table.shape[1:] not in ((4, 4), (3, 4)) or table.dtype.kind not in "fiu":
         raise InputError(f"is of shape {table.shape}", where=path, remedy="write (N, 4, 4)")
     out = np.tile(np.eye(4), (len(table), 1, 1))
-    out[:, :3] = table[:, :3]
-    frames = np.flatnonzero(np.isfinite(out).all((1, 2)))
-    poses = [_rigid(out[k], f"{path}, pose {k}") for k in frames]
-    return TimedPoses(_stacked(poses), frames=frames)
-
-
-def _stacked(poses: Sequence[Float64]) -> Float64:
-    return np.stack(poses) if poses else np.zeros((0, 4, 4))
+    out[:, : table.shape[1]] = table
+    poses = [_rigid(T, f"{path}, pose {k}") for k, T in enumerate(out)]
+    return _known(poses, frames=range(len(out)))
 
 
 def _frame_numbers(names: Sequence[str], path: Path) -> Intp:

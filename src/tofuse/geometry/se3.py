@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 
+MAX_COORDINATE_M = 1e9  # larger coordinates are considered damaged
 _SMALL = 1e-4  # rad; below it the series are exact to float64
 
 
@@ -267,5 +268,50 @@ def check_pose(T: ArrayLike, *, where: str = "pose") -> Float64:
     if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise InputError("has no rotation in its upper left 3x3 block", where=where)
     if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise InputError("has a last row other than 0 0 0 1", where=where)
+        # Of a transposed pose the last column is 0 0 0 1.
+        remedy = None if T[:3, 3].any() else "transpose it: it seems to be stored by columns"
+        raise InputError("has a last row other than 0 0 0 1", where=where, remedy=remedy)
+    if np.abs(T[:3, 3]).max() > MAX_COORDINATE_M:
+        raise InputError(
+            f"has a coordinate of {np.abs(T[:3, 3]).max():.3g} m",
+            where=where,
+            remedy="use metres, or remove the pose",
+        )
     return T
+
+
+def is_unknown(T: ArrayLike) -> bool:
+    """Whether the upper three rows of T (4, 4) have no finite number: there is no pose."""
+    return not np.isfinite(np.asarray(T, float)[:3]).any()
+
+
+def check_poses(poses: ArrayLike, *, where: str, count: int | None = None) -> Float64:
+    """Return poses of the user as a float64 (N, 4, 4) array, NaN where there is none.
+
+    Parameters
+    ----------
+    poses
+        (N, 4, 4), NaN where there is none.
+    where
+        Name of the argument, for errors.
+    count
+        The required N, if any.
+
+    Raises
+    ------
+    InputError
+        If the shape differs, or a pose is not a rigid motion.
+    """
+    remedy = f"pass ({'N' if count is None else count}, 4, 4) T_world_camera, NaN where unknown"
+    try:
+        out = np.array(poses, float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError("is not an array of numbers", where=where, remedy=remedy) from error
+    if out.ndim != 3 or out.shape[1:] != (4, 4) or count not in (None, len(out)):
+        raise InputError(f"has shape {out.shape}", where=where, remedy=remedy)
+    for k, T in enumerate(out):
+        if is_unknown(T):
+            out[k] = np.nan
+        else:
+            check_pose(T, where=f"{where}[{k}]")
+    return out

@@ -13,7 +13,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
+from tofuse.bounds import Bounds
 from tofuse.kernels.cores import usable_cores
+from tofuse.parts import check_number
 
 R = TypeVar("R")
 
@@ -32,8 +34,7 @@ def thread_count() -> int:
 def set_thread_count(count: int) -> None:
     """Use `count` (1 or more) threads from now on."""
     global _thread_count
-    if count < 1:
-        raise ValueError("the number of threads must be at least 1")
+    check_number(count, Bounds(1), "threads", whole=True)
     _thread_count = count
 
 

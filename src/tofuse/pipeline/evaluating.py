@@ -16,12 +16,14 @@ from tofuse.errors import InputError
 from tofuse.evaluation.consistency import Consistency, map_consistency, poses_of_frames
 from tofuse.evaluation.trajectory import TrajectoryError, evaluate_trajectory
 from tofuse.files.trajectory_formats import Clock, TimedPoses, read_poses
+from tofuse.geometry import se3
 from tofuse.recordings.open import open_recording, read_reference
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import is_result
 from tofuse.results.run_json import frame_clock, read_run_json, run_json_checked
+from tofuse.results.types import Reconstruction
 
-Poses = str | Path | Float64
+Poses = str | Path | Float64 | Reconstruction
 
 _TRAJECTORY = "trajectory.txt"  # of a result
 
@@ -74,8 +76,9 @@ def evaluate(
     Parameters
     ----------
     estimate, reference
-        A file or folder of any supported format (a result, a recording with a reference), or
-        (N, 4, 4) T_world_camera of the frames of the recording, NaN where there is none.
+        A file or folder of any supported format (a result, a recording with a reference), a
+        result in memory, or (N, 4, 4) T_world_camera of the frames of the recording, NaN where
+        there is none.
     recording
         Provides the timestamps of frames if the files don't, and images whose map consistency is
         measured.
@@ -132,6 +135,8 @@ def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corr
     """Return the correctors of the result that the poses belong to; none without a result."""
     if config is not None:
         return CameraErrors.made_with(config)
+    if isinstance(estimate, Reconstruction):
+        return CameraErrors.made_with(estimate.config)
     if not isinstance(estimate, str | Path):
         return ()
     folder = Path(estimate)
@@ -147,9 +152,9 @@ def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corr
 def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:
     if isinstance(source, str | Path):
         return read_reference(source) if is_reference else read_poses(source)
-    poses = np.asarray(source, float)
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
-        raise InputError(f"has shape {poses.shape}", where=name, remedy="pass (N, 4, 4) poses")
+    if isinstance(source, Reconstruction):
+        return TimedPoses(source.trajectory, timestamps=source.timestamps)
+    poses = se3.check_poses(source, where=name)
     return TimedPoses(poses, frames=np.arange(len(poses)))
 
 
@@ -157,7 +162,7 @@ def _timed(
     timed: TimedPoses, source: Poses, clock: Clock | None, name: str
 ) -> tuple[Float64, Float64]:
     """Return times (N,) and poses (N, 4, 4); those of an array are of the recording's frames."""
-    if isinstance(source, str | Path) or clock is None:
+    if isinstance(source, str | Path | Reconstruction) or clock is None:
         return timed.timed(clock, name)
     if len(timed.poses) != len(clock[0]):
         raise InputError(

@@ -23,6 +23,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounds
 from tofuse.errors import InputError
 from tofuse.evaluation.consistency import Consistency, map_consistency
 from tofuse.evaluation.cross_view import CrossViewConsistency, compare_views, prepare_for_comparison
@@ -34,7 +35,13 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.motion import Moment, find_jumps
-from tofuse.pipeline.checks import accuracy_reasons, cross_view_reasons, tolerance_of
+from tofuse.parts import check_number
+from tofuse.pipeline.checks import (
+    accuracy_reasons,
+    coverage_reasons,
+    cross_view_reasons,
+    tolerance_of,
+)
 from tofuse.pipeline.config import Config, check_views, from_method
 from tofuse.pipeline.priors import with_odometry
 from tofuse.pipeline.progress import Progress, Silent
@@ -52,7 +59,7 @@ from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
 from tofuse.results.ranges import Range, in_words, runs_of
 from tofuse.results.run_json import accuracy_json, plain, reasons_json
-from tofuse.results.types import Reason, Reconstruction, Verdict
+from tofuse.results.types import FrameRecord, Reason, Reconstruction, Verdict
 from tofuse.results.verdict import ranked, verdict_of
 
 Views = Sequence[PosedView[PreparedView]]
@@ -126,7 +133,7 @@ class Judgement:
 
 def judge(
     recording: Recording,
-    trajectory: str | Path | Float64,
+    trajectory: str | Path | Float64 | Reconstruction,
     *,
     tolerance_m: float | None = None,
     threads: int | None = None,
@@ -139,7 +146,7 @@ def judge(
     recording
         Range images, as of `tofuse.open`.
     trajectory
-        A file of any format of `files.trajectory_formats`, the folder of a result, a recording with
+        A file of any format of `files.trajectory_formats`, a result or its folder, a recording with
         poses, or (N, 4, 4) T_world_camera of the frames, NaN where there is none. Timed poses are
         assigned to the nearest frames in time, within 20 ms.
     tolerance_m
@@ -155,6 +162,8 @@ def judge(
         If fewer than two frames have a pose, or the recording contains clouds.
     """
     progress = progress or Silent()
+    if tolerance_m is not None:
+        check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
     poses = poses_for(recording, trajectory)
     kind = view_kind(recording)
     # External sensors do not measure these poses, and images are compared with the stated camera.
@@ -191,11 +200,13 @@ def judge(
         deviation = _deviation(poses, refined, views)
     distances = _distances(poses, refined.trajectory)
     accuracy = _accuracy(distances, poses, refined)
+    records = _records(poses, refined)
     reasons = ranked(
         [
+            *coverage_reasons(records, sum(r.status == "tracked" for r in records)),
             *_reasons(
                 poses, accuracy, deviation, initial_support, refined_support, refined, tolerance_m
-            )
+            ),
         ]
     )
     return Judgement(
@@ -327,7 +338,22 @@ def sentence(judgement: Judgement, name: str) -> str:
     given_bound = bound(judgement.accuracy, diagonal)
     refined_bound = bound(judgement.refined.diagnostics.accuracy, diagonal)
     label = "refined" if judgement.started else "tracked again"
-    return f"{name}: {given_bound}; {label}: {refined_bound}.{_agreement(judgement.deviation)}"
+    statuses = [r.status for r in _records(judgement.poses, judgement.refined)]
+    posed, lost = statuses.count("tracked"), statuses.count("lost")
+    return (
+        f"{name}: {given_bound}, poses of {posed} of {posed + lost} frames; {label}: "
+        f"{refined_bound}.{_agreement(judgement.deviation)}"
+    )
+
+
+def _records(poses: Float64, refined: Reconstruction) -> list[FrameRecord]:
+    """Readable frames with a given pose as "tracked", those without one as "lost"."""
+    return [
+        f if f.status == "skipped" else replace(f, status="tracked" if posed else "lost")
+        for f, posed in zip(
+            refined.diagnostics.frames, np.isfinite(poses[:, 0, 0]).tolist(), strict=True
+        )
+    ]
 
 
 def _agreement(deviation: Deviation | None) -> str:
@@ -373,7 +399,7 @@ def _read(path: Path) -> TimedPoses:
             raise no_trajectory from None
 
 
-def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64:
+def poses_for(recording: Recording, trajectory: str | Path | Float64 | Reconstruction) -> Float64:
     """Return the (N, 4, 4) poses of a recording's frames, NaN where there is none; see `judge`.
 
     Raises
@@ -386,16 +412,11 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64
         path = Path(trajectory)
         where = str(path)
         poses = _read(path).of_frames(recording.timestamps, recording.indices)
+    elif isinstance(trajectory, Reconstruction):
+        timed = TimedPoses(trajectory.trajectory, timestamps=trajectory.timestamps)
+        poses = timed.of_frames(recording.timestamps, recording.indices)
     else:
-        poses = np.array(trajectory, float)
-        if poses.shape != (len(recording), 4, 4):
-            raise InputError(
-                f"has shape {poses.shape}, for {len(recording)} frames",
-                where=where,
-                remedy="pass one (4, 4) pose for each frame, NaN where there is none",
-            )
-        for T in poses[np.isfinite(poses).all((1, 2))]:
-            se3.check_pose(T, where=where)
+        poses = se3.check_poses(trajectory, where=where, count=len(recording))
     n_posed = int(np.isfinite(poses).all((1, 2)).sum())
     if n_posed < 2:
         raise InputError(

@@ -7,11 +7,13 @@ from dataclasses import replace
 from typing import Any
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounds
 from tofuse.errors import InputError
 from tofuse.files.memory import give_back
 from tofuse.kernels.threads import serial_chunks, thread_count, threads
 from tofuse.odometry.base import Step
 from tofuse.odometry.motion import Moment
+from tofuse.parts import check_number
 from tofuse.pipeline.assembly import Assembly
 from tofuse.pipeline.background_queue import BackgroundQueue
 from tofuse.pipeline.checkpoint import NoCheckpoints, Stages
@@ -24,7 +26,7 @@ from tofuse.pipeline.preparation import FilteredFrame, Preparation, Prepared
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.view_store import PosedView
-from tofuse.recordings.frames import Frame
+from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.types import FrameRecord, Reconstruction
 
@@ -60,6 +62,7 @@ class Mapper:
         loops: Sequence[PriorLoop] = (),
         progress: Progress | None = None,
     ) -> None:
+        check_number(seed, Bounds(0), "seed", whole=True)
         self.config = from_method(config) if isinstance(config, str) else config
         self._method = config if isinstance(config, str) else None
         self.seed = seed
@@ -289,6 +292,12 @@ class Mapper:
 
     def _check(self, frame: Frame) -> None:
         self._check_open()
+        if not isinstance(frame, RangeFrame | CloudFrame):
+            raise InputError(
+                f"is a {type(frame).__name__}, not a frame",
+                where="frame",
+                remedy="pass a RangeFrame or a CloudFrame",
+            )
         self._intake.check_order(frame.index)
         kind = kind_of(frame)
         if self._intake.check_kind(frame):

@@ -16,10 +16,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounds
 from tofuse.evaluation.trajectory import align
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses, StatedPose, StatedPoses
+from tofuse.parts import check_number
 from tofuse.pipeline.checkpoint import NoCheckpoints
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
@@ -100,6 +102,8 @@ def merge(
         If a folder is not a result, or its recording is missing or has changed.
     """
     progress = progress or Silent()
+    if tolerance_m is not None:
+        check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
     sessions = read_sessions(results, threads, progress)
     config = merged_config(sessions)
     if tolerance_m is not None:

@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
+from tofuse.files.reading import path_of
 from tofuse.odometry.base import Status
 from tofuse.odometry.given import GivenPoses, StatedPose
 from tofuse.odometry.keyframes import Keyframes
@@ -75,7 +76,10 @@ def read_sessions(
         If a folder contains no result, its recording is missing, has changed or contains clouds;
         or if a result was given twice, or only one session.
     """
-    folders = [Path(each) for each in results]
+    folders = [
+        path_of(each, "results", "pass folders, to which result.save(folder) writes results")
+        for each in results
+    ]
     for a, b in combinations(folders, 2):
         if a.resolve() == b.resolve():
             raise InputError("is given twice", where=b, remedy="pass each result once")

@@ -26,6 +26,7 @@ _PERIODS_M = (0.01, 1e5)
 
 SCHEMA = 1
 MAX_SLOPE = 1e4  # of a ray: 89.99 degrees off the axis
+MAX_SKEW_PX = 0.005  # a smaller displacement of pixels by skew is neglected
 AMPLITUDE_KINDS = ("raw", "range_compensated", "ir")
 
 _METRES = "the metres of one count, such as 0.001"
@@ -482,6 +483,38 @@ def image_size(width: float, height: float, where: str | Path) -> tuple[int, int
     if not (2 <= width <= 16384 and 2 <= height <= 16384):
         raise InputError(f"is {width:g} x {height:g}", where=where, remedy="give pixels")
     return int(width), int(height)
+
+
+def pinhole_values(K: Float64, height: int, where: str | Path) -> dict[str, float]:
+    """Return fx, fy, cx and cy of a matrix K (3, 3).
+
+    Parameters
+    ----------
+    K
+        The matrix.
+    height
+        Of the images, in pixels: it decides whether a skew is negligible.
+    where
+        The file or argument, for errors.
+
+    Raises
+    ------
+    InputError
+        If it is not such a matrix, or has skew, which a pinhole camera has not.
+    """
+    if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)) or K[1, 0] != 0:
+        raise InputError(
+            f"is not a matrix K: {K.tolist()}" if K.size < 20 else f"has shape {K.shape}",
+            where=where,
+            remedy="use [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the depth images",
+        )
+    if abs(K[0, 1]) * height > MAX_SKEW_PX * abs(K[1, 1]):
+        raise InputError(
+            f"has a skew of {K[0, 1]:.3g} px",
+            where=where,
+            remedy="use the rays of the pixels (rays, RayTable), or 0 if it is negligible",
+        )
+    return {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
 
 
 def checked_lens(

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.arrays import Float32
+from tofuse.geometry.se3 import MAX_COORDINATE_M
 
 INVALID_DEPTH = 65535
 MAX_COUNTS = 65535
-MAX_COORDINATE_M = 1e9  # larger coordinates are considered damaged
 
 
 def depth_from_counts(counts: NDArray[np.generic], unit_m: float) -> Float32:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Literal, Protocol, Self
+from typing import Literal, Protocol, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.arrays import Bool, Float32, Float64, UInt8
+from tofuse.bounds import Bounds
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import (
     Camera,
@@ -22,6 +23,8 @@ from tofuse.geometry.cameras import (
     unknown_rays,
     z_from_range,
 )
+from tofuse.geometry.se3 import MAX_COORDINATE_M
+from tofuse.parts import check_number
 
 DepthKind = Literal["z", "range"]
 AmplitudeKind = Literal["raw", "range_compensated", "ir"]
@@ -149,10 +152,37 @@ class RangeFrame:
         return f"RangeFrame {self.index}: {size} at {self.timestamp:.3f} s, {len(self):,} valid"
 
     def __post_init__(self) -> None:
+        _check_frame(self)
+        if not isinstance(self.camera, Camera):
+            raise InputError(
+                f"is a {type(self.camera).__name__}, not a camera",
+                where=f"frame {self.index}: camera",
+                remedy="pass a camera, such as tofuse.Pinhole",
+            )
+        for kind, known in (("depth_kind", DepthKind), ("amplitude_kind", AmplitudeKind)):
+            if getattr(self, kind) not in get_args(known):
+                raise InputError(
+                    f"is {getattr(self, kind)!r}",
+                    where=f"frame {self.index}: {kind}",
+                    remedy=f"use one of {', '.join(get_args(known))}",
+                )
         shape = (self.camera.height, self.camera.width)
         for name in IMAGES:
             image = getattr(self, name)
-            if image is not None and image.shape[:2] != shape:
+            if image is None:
+                continue
+            ndim = 3 if name in ("color_image", "normal_image") else 2
+            if (
+                not isinstance(image, np.ndarray)
+                or image.ndim != ndim
+                or image.dtype.kind not in "biuf"
+            ):
+                raise InputError(
+                    f"is a {type(image).__name__}, not an array of numbers with {ndim} axes",
+                    where=f"frame {self.index}: {name}",
+                    remedy="pass a NumPy array",
+                )
+            if image.shape[:2] != shape:
                 raise InputError(
                     f"{name} is {image.shape[1]} x {image.shape[0]}, the camera "
                     f"{shape[1]} x {shape[0]}",
@@ -165,6 +195,10 @@ class RangeFrame:
         if not valid.all():
             depth = np.where(valid, depth, np.float32(0))
         object.__setattr__(self, "depth", depth)
+        amplitude = self.amplitude_image
+        if amplitude is not None and np.isinf(amplitude).any():
+            clipped = np.clip(amplitude, 0, SATURATED_AMPLITUDE)
+            object.__setattr__(self, "amplitude_image", clipped)
 
     @cached_property
     def valid(self) -> Bool:
@@ -262,11 +296,19 @@ class CloudFrame:
     origin: Float64 = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        if self.points.ndim != 2 or self.points.shape[1] != 3:
+        _check_frame(self)
+        if np.ndim(self.points) != 2 or np.shape(self.points)[1] != 3:
             raise InputError(
-                f"points have shape {self.points.shape}",
+                f"points have shape {np.shape(self.points)}",
                 where=f"frame {self.index}",
                 remedy="pass an (N, 3) array",
+            )
+        largest = np.abs(self.points).max(initial=0)
+        if largest > MAX_COORDINATE_M:
+            raise InputError(
+                f"points have coordinates up to {largest:.0e} m",
+                where=f"frame {self.index}",
+                remedy="use metres, and leave out invalid points",
             )
 
     @classmethod
@@ -311,3 +353,9 @@ class CloudFrame:
 
 
 Frame = RangeFrame | CloudFrame
+
+
+def _check_frame(frame: Frame) -> None:
+    """Raise InputError for an index or a timestamp that no frame can have."""
+    check_number(frame.index, Bounds(), "index of a frame", whole=True)
+    check_number(frame.timestamp, Bounds(), f"frame {frame.index}: timestamp")

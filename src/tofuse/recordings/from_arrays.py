@@ -9,8 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounds
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable
+from tofuse.geometry.se3 import check_poses
+from tofuse.parts import check_number
+from tofuse.recordings.camera_file import pinhole_values
 from tofuse.recordings.depth_counts import INVALID_DEPTH
 from tofuse.recordings.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
@@ -145,8 +149,7 @@ def _to_metres(
 ) -> Callable[[NDArray[Any]], Float64]:
     is_integer = images[0].dtype.kind in "iub"
     scale = unit_m if unit_m is not None else (_MILLIMETRES if is_integer else 1.0)
-    if not (np.isfinite(scale) and scale > 0):
-        raise InputError(f"is {scale}", where="depth_unit_m", remedy="use metres, above 0")
+    check_number(scale, Bounds(0, exclusive=True), "depth_unit_m")
     if unit_m is None and not is_integer:
         sample = np.concatenate([image[::7, ::7].ravel() for image in images[:8]])
         sample = sample[np.isfinite(sample) & (sample > 0)]
@@ -179,19 +182,14 @@ def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
         raise InputError(
             "is neither a camera nor a matrix", where="camera", remedy="pass K (3, 3)"
         ) from error
-    if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)) or K[1, 0] != 0:
-        raise InputError(
-            f"is not a matrix K: {K.tolist()}" if K.size < 20 else f"has shape {K.shape}",
-            where="camera",
-            remedy="pass [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the depth images",
-        )
-    return Pinhole(width, height, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+    return Pinhole(width, height, **pinhole_values(K, height, "camera"))
 
 
 def _times(timestamps: ArrayLike | None, count: int) -> Float64:
     if timestamps is None:
         return np.arange(count) / 30
-    times = _seconds(np.asarray(timestamps))
+    times = np.asarray(timestamps)
+    times = _seconds(times) if times.dtype.kind in "iufmM" else np.full(count, np.nan)
     if times.shape != (count,) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise InputError(
             "must be one finite number for each image, ascending",
@@ -211,11 +209,4 @@ def _seconds(times: NDArray[Any]) -> Float64:
 
 
 def _poses(name: str, values: ArrayLike | None, count: int) -> Float64 | None:
-    if values is None:
-        return None
-    poses = np.asarray(values, float)
-    if poses.shape != (count, 4, 4):
-        raise InputError(
-            f"has shape {poses.shape}", where=name, remedy=f"pass ({count}, 4, 4) T_world_camera"
-        )
-    return poses
+    return None if values is None else check_poses(values, where=name, count=count)

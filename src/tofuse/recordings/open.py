@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.files.reading import input_error, is_folder, list_folder
+from tofuse.files.reading import input_error, is_folder, list_folder, path_of
 from tofuse.files.trajectory_formats import TimedPoses, read_poses
 from tofuse.parts import discover, name_of, registered
 from tofuse.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
@@ -72,6 +72,8 @@ def open_recording(
         If the format is ambiguous (with the evidence, and the option to select it), or nothing can
         be read.
     """
+    for path in paths:
+        path_of(path, "path", "pass a path, or several: tofuse.open(a, b)")
     if not paths:
         raise InputError("no recording was given", remedy="pass a path")
     _check_depths(min_depth, max_depth)

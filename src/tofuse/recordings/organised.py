@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tofuse.arrays import Bool, Float32, UInt8
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera, RayTable
-from tofuse.recordings.depth_counts import MAX_COORDINATE_M
+from tofuse.geometry.se3 import MAX_COORDINATE_M
 from tofuse.recordings.frames import RangeFrame
 
 SAMPLES = 8

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +77,8 @@ class ArraySource:
 class Recording:
     """A sequence of frames, read lazily.
 
-    ``len(recording)``, ``recording[k]`` and iteration give the selected frames. Iteration reads
+    ``len(recording)``, ``recording[k]`` and iteration give the selected frames, and
+    ``recording[a:b:n]`` is a recording of fewer frames. Iteration reads
     ahead on another thread, and raises for an unreadable frame when its turn comes; `read_all`
     yields the error in its place instead.
 
@@ -119,7 +120,15 @@ class Recording:
     def __len__(self) -> int:
         return len(self.indices)
 
-    def __getitem__(self, k: int) -> Frame:
+    @overload
+    def __getitem__(self, k: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, k: slice) -> Recording: ...
+
+    def __getitem__(self, k: int | slice) -> Frame | Recording:
+        if isinstance(k, slice):
+            return self.select(k.start or 0, k.stop, 1 if k.step is None else k.step)
         return self.source.read(int(self.indices[k]))
 
     def __iter__(self) -> Iterator[Frame]:

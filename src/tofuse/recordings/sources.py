@@ -17,8 +17,7 @@ from tofuse.files.ply import read_ply
 from tofuse.files.reading import is_file
 from tofuse.files.tables import read_numbers
 from tofuse.files.trajectory import associated_poses, read_tum
-from tofuse.geometry.se3 import check_pose, orthonormalise
-from tofuse.recordings.depth_counts import MAX_COORDINATE_M
+from tofuse.geometry.se3 import MAX_COORDINATE_M, check_pose, orthonormalise
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.recording import Source
 
@@ -227,6 +226,8 @@ def cloud_frame(
             points = points - shift
         measured &= (np.abs(points) < MAX_COORDINATE_M).all(1)
         origin = None if origin is None else origin - shift
+    if not measured.all():
+        points = np.where(measured[:, None], points, 0)
     frame = CloudFrame(
         index,
         timestamp,

@@ -6,14 +6,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.arrays import Float64
+from tofuse.bounds import Bounds
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.kernels.blas import one_blas_thread
+from tofuse.parts import check_number
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.any_pair import MIN_POINTS, AnyPair
 from tofuse.registration.base import Registrar, Registration
 
-_MAX_COORDINATE_M = 1e9
 # Clouds with a larger distance are in different frames.
 _MAX_FRAME_DISTANCE_M = 1e4
 
@@ -66,6 +67,7 @@ def register(
         If too few points correspond, an image is empty, or the median depths of two images differ
         more than fourfold.
     """
+    check_number(seed, Bounds(0), "seed", whole=True)
     start = None if guess is None else se3.check_pose(guess, where="guess")
     rng = np.random.default_rng([seed, 0])
     if isinstance(source, RangeFrame | CloudFrame) or isinstance(target, RangeFrame | CloudFrame):
@@ -140,7 +142,7 @@ def _cloud(points: ArrayLike, name: str) -> Float64:
             where=name,
             remedy=f"use {MIN_POINTS} or more",
         )
-    if np.abs(finite).max() > _MAX_COORDINATE_M:
+    if np.abs(finite).max() > se3.MAX_COORDINATE_M:
         raise InputError(
             f"has coordinates up to {np.abs(finite).max():.0e} m", where=name, remedy="use metres"
         )

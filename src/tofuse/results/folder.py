@@ -21,7 +21,7 @@ from typing import Self
 from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import UNFINISHED
 from tofuse.files.locking import Claim
-from tofuse.files.reading import read_text
+from tofuse.files.reading import path_of, read_text
 from tofuse.files.staging import (
     Names,
     check_interrupted,
@@ -126,7 +126,7 @@ class OutputFolder:
             If it contains anything but an earlier result, or a result and `overwrite` is not set,
             or another process writes into it, or it can't be written.
         """
-        self.path = Path(path)
+        self.path = path_of(path, "folder", "pass the path of a folder")
         self._contract = contract or RESULT
         self._names = self._contract.names
         self._staging = self.path / STAGING

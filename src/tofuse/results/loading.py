@@ -9,6 +9,7 @@ import numpy as np
 
 from tofuse.errors import InputError
 from tofuse.files.ply import read_ply
+from tofuse.files.reading import path_of
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.mesh import Mesh, mesh_of
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
@@ -46,7 +47,7 @@ def load_result(folder: str | Path) -> Reconstruction:
     InputError
         If it is not an output folder, or its files are damaged or of different runs.
     """
-    folder = Path(folder)
+    folder = path_of(folder, "folder", "pass the folder of a result")
     finish_interrupted(folder)
     if not folder.is_dir() or not is_result(folder):
         raise InputError(

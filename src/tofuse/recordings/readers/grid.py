@@ -16,9 +16,9 @@ from tofuse.files.ply import read_ply
 from tofuse.files.reading import is_file, is_folder, read_text
 from tofuse.files.tables import parse_numbers
 from tofuse.geometry.cameras import Camera
+from tofuse.geometry.se3 import MAX_COORDINATE_M
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import CloudFileSource, cloud_files, required_files
-from tofuse.recordings.depth_counts import MAX_COORDINATE_M
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.organised import (
     SAMPLES,

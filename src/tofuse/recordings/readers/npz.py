@@ -21,6 +21,7 @@ from tofuse.recordings.camera_file import (
     MAX_SLOPE,
     checked_lens,
     load_camera,
+    pinhole_values,
 )
 from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
@@ -170,7 +171,7 @@ class NpzSource(FileSource):
         K = self._floats(arrays, "K")
         if K.shape != (3, 3):
             raise self._error("K", f"has shape {K.shape}", "save (3, 3)")
-        values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        values: dict[str, Any] = {**pinhole_values(K, height, f"{self.path}: K")}
         distortion = np.zeros(0)
         if "distortion" in arrays:
             distortion = self._floats(arrays, "distortion").ravel()
