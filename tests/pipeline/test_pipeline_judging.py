@@ -128,18 +128,10 @@ def test_frames_without_pose_stay_without(recording, truth) -> None:
     some = truth.copy()
     some[[2, 5]] = np.nan
     found = tofuse.judge(recording, some)
-    assert [r.code for r in found.reasons] == ["lost_frames"]
+    assert found.verdict == "good"
+    assert ", poses of 6 of 8 frames; refined: " in sentence(found, "poses.txt")
     assert np.flatnonzero(np.isnan(found.displacement_m)).tolist() == [2, 5]
     assert found.to_dict()["frames"] == 6
-
-
-def test_poses_of_few_frames_fail(recording, truth) -> None:
-    some = truth.copy()
-    some[2:] = np.nan
-    found = tofuse.judge(recording, some)
-    assert found.verdict == "failed"
-    assert [r.code for r in found.reasons] == ["few_poses", "lost_frames"]
-    assert ", poses of 2 of 8 frames; refined: " in sentence(found, "poses.txt")
 
 
 def test_given_poses_are_kept_without_refinement(recording, truth) -> None:

@@ -162,7 +162,7 @@ def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
     """Return the verdict and its reasons, each code once, the most severe first."""
     reasons = ranked(
         [
-            *coverage_reasons(evidence.records, sum(evidence.in_main)),
+            *_poses(evidence),
             *_connections(evidence),
             *_motion(evidence),
             *_depths(evidence),
@@ -178,18 +178,10 @@ def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
     return verdict_of(reasons), reasons
 
 
-def coverage_reasons(records: Sequence[FrameRecord], main: int) -> Iterator[Reason]:
-    """Yield reasons if frames are unreadable, have no pose, or are outside the main model.
-
-    Parameters
-    ----------
-    records
-        All frames of the recording.
-    main
-        Number of those in the main model.
-    """
-    readable = [r for r in records if r.status != "skipped"]
+def _poses(e: Evidence) -> Iterator[Reason]:
+    readable = [r for r in e.records if r.status != "skipped"]
     posed = [r for r in readable if r.status != "lost"]
+    main = sum(e.in_main)
     # A single frame is no model if there are other, unconnected ones.
     scattered = main == 1 and len(posed) > 1
     if 2 * main < len(readable) or scattered:
@@ -197,12 +189,12 @@ def coverage_reasons(records: Sequence[FrameRecord], main: int) -> Iterator[Reas
             text = f"Only {main} of {len(readable)} readable frames are in the main model."
         else:
             text = f"{len(readable) - main} of {len(readable)} readable frames have no pose."
-        yield Reason("few_poses", ((records[0].index, records[-1].index),), text)
-    lost = ranges_with_status(records, "lost")
+        yield Reason("few_poses", e.full_range, text)
+    lost = ranges_with_status(e.records, "lost")
     if lost:
         text = f"{_sentence(lost)} {'has' if is_single(lost) else 'have'} no pose."
         yield Reason("lost_frames", lost, text)
-    skipped = ranges_with_status(records, "skipped")
+    skipped = ranges_with_status(e.records, "skipped")
     if skipped:
         yield Reason("unreadable_frames", skipped, f"{_sentence(skipped)} could not be read.")
     if len(posed) == 1:

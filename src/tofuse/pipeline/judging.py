@@ -36,12 +36,7 @@ from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.motion import Moment, find_jumps
 from tofuse.parts import check_number
-from tofuse.pipeline.checks import (
-    accuracy_reasons,
-    coverage_reasons,
-    cross_view_reasons,
-    tolerance_of,
-)
+from tofuse.pipeline.checks import accuracy_reasons, cross_view_reasons, tolerance_of
 from tofuse.pipeline.config import Config, check_views, from_method
 from tofuse.pipeline.priors import with_odometry
 from tofuse.pipeline.progress import Progress, Silent
@@ -59,7 +54,7 @@ from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
 from tofuse.results.ranges import Range, in_words, runs_of
 from tofuse.results.run_json import accuracy_json, plain, reasons_json
-from tofuse.results.types import FrameRecord, Reason, Reconstruction, Verdict
+from tofuse.results.types import Reason, Reconstruction, Verdict
 from tofuse.results.verdict import ranked, verdict_of
 
 Views = Sequence[PosedView[PreparedView]]
@@ -200,10 +195,8 @@ def judge(
         deviation = _deviation(poses, refined, views)
     distances = _distances(poses, refined.trajectory)
     accuracy = _accuracy(distances, poses, refined)
-    records = _records(poses, refined)
     reasons = ranked(
         [
-            *coverage_reasons(records, sum(r.status == "tracked" for r in records)),
             *_reasons(
                 poses, accuracy, deviation, initial_support, refined_support, refined, tolerance_m
             ),
@@ -338,22 +331,12 @@ def sentence(judgement: Judgement, name: str) -> str:
     given_bound = bound(judgement.accuracy, diagonal)
     refined_bound = bound(judgement.refined.diagnostics.accuracy, diagonal)
     label = "refined" if judgement.started else "tracked again"
-    statuses = [r.status for r in _records(judgement.poses, judgement.refined)]
-    posed, lost = statuses.count("tracked"), statuses.count("lost")
+    readable = [f.status != "skipped" for f in judgement.refined.diagnostics.frames]
+    posed = np.isfinite(judgement.poses[readable, 0, 0])
     return (
-        f"{name}: {given_bound}, poses of {posed} of {posed + lost} frames; {label}: "
+        f"{name}: {given_bound}, poses of {posed.sum()} of {len(posed)} frames; {label}: "
         f"{refined_bound}.{_agreement(judgement.deviation)}"
     )
-
-
-def _records(poses: Float64, refined: Reconstruction) -> list[FrameRecord]:
-    """Readable frames with a given pose as "tracked", those without one as "lost"."""
-    return [
-        f if f.status == "skipped" else replace(f, status="tracked" if posed else "lost")
-        for f, posed in zip(
-            refined.diagnostics.frames, np.isfinite(poses[:, 0, 0]).tolist(), strict=True
-        )
-    ]
 
 
 def _agreement(deviation: Deviation | None) -> str:
