@@ -259,7 +259,17 @@ class LoopRecord:
     def of(
         cls, pair: tuple[int, int], accepted: bool, reason: str, registration: Registration
     ) -> LoopRecord:
-        """Return the decision on a registration of the views of frames `pair` (i, j)."""
+        """Return the decision on a registration of two views.
+
+        Parameters
+        ----------
+        pair
+            Indices (i, j) of their frames.
+        accepted, reason
+            The decision, and why.
+        registration
+            The registration.
+        """
         return cls(
             *pair,
             accepted,
