@@ -154,13 +154,15 @@ def test_quoted_content_is_truncated(tmp_path) -> None:
 
 def test_absurd_numbers_beside_images_cause_no_numpy_warnings(recording) -> None:
     """Pytest turns warnings into errors."""
+    rows = "".join(f"{0.01 * k},1e308,1e308,1e308,1e308,0,0\n" for k in range(50))
+    (recording / "imu.csv").write_text("t,ax,ay,az,gx,gy,gz\n" + rows)
+    assert not any(isinstance(item, InputError) for item in tofuse.open(recording).read_all())
     path = recording / "groundtruth.txt"
     lines = path.read_text().splitlines()
     words = lines[-1].split()
     path.write_text("\n".join([*lines[:-1], " ".join([words[0], "1e300", *words[2:]])]) + "\n")
-    rows = "".join(f"{0.01 * k},1e308,1e308,1e308,1e308,0,0\n" for k in range(50))
-    (recording / "imu.csv").write_text("t,ax,ay,az,gx,gy,gz\n" + rows)
-    assert not any(isinstance(item, InputError) for item in tofuse.open(recording).read_all())
+    with pytest.raises(InputError, match="contains a coordinate beyond"):
+        tofuse.open(recording)
 
 
 def test_special_files_are_not_read_for_timestamps(tmp_path: Path) -> None:

@@ -236,8 +236,8 @@ def render(
     counts = Counter(j.findings[METHODS[0]].outcome for j in judged)
     return _template().render(
         version=__version__,
-        style=_read_template("tofuse.report", "style.css")
-        + _read_template("tofuse.lab.experiments", "style.css"),
+        style=_template_text("tofuse.report", "style.css")
+        + _template_text("tofuse.lab.experiments", "style.css"),
         judged=judged,
         methods=METHODS,
         counts=counts,
@@ -249,7 +249,7 @@ def render(
     )
 
 
-def _read_template(package: str, name: str) -> str:
+def _template_text(package: str, name: str) -> str:
     return (resources.files(package) / "templates" / name).read_text(encoding="utf-8")
 
 
@@ -260,4 +260,4 @@ def _template() -> Template:
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    return environment.from_string(_read_template("tofuse.lab.experiments", "experiments.html.j2"))
+    return environment.from_string(_template_text("tofuse.lab.experiments", "experiments.html.j2"))
