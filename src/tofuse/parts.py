@@ -83,9 +83,8 @@ def check_number(value: Any, allowed: Bounds, name: str, *, whole: bool = False)
     whole
         Whether it has to be a whole number.
     """
-    fits = not isinstance(value, bool) and isinstance(value, numbers.Integral | numbers.Real)
-    if whole:
-        fits = fits and isinstance(value, numbers.Integral)
+    kind = numbers.Integral if whole else numbers.Real
+    fits = isinstance(value, kind) and not isinstance(value, bool)
     if not fits or (int(value) if whole else float(value)) not in allowed:
         remedy = f"pass a {'whole' if whole else 'finite'} number"
         bounds = "" if allowed == Bounds() else f", {allowed}"

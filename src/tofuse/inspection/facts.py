@@ -40,7 +40,7 @@ def _time(recording: Recording) -> str:
     times = recording.timestamps
     if len(times) < 2:
         return "a single frame"
-    if np.array_equal(times, recording.indices):  # numbered by the reader
+    if not recording.has_timestamps:
         return "unknown, as there are no timestamps"
     step = float(np.median(np.diff(times)))
     rate = f", {1 / step:.1f} frames per second" if step > 0 else ""

@@ -112,15 +112,11 @@ def _coarse_scores(pair: Pair) -> list[float]:
 
 def _shifted_pairs(sample: Sample) -> list[Pair]:
     """Pairs of views between which the image moves: rotations are known only at the true scale."""
-    pairs = []
-    for step in sample.pairs[:_MAX_PAIRS]:
-        gap = int(np.clip(np.round(_DESIRED_ROTATION / max(step.shift, 1e-4)), 1, _MAX_GAP))
-        if not step.fits or gap * step.shift < 0.5 * _DESIRED_ROTATION:
-            continue
-        pair = step if gap == 1 else _pair_at_gap(sample, step, gap)
-        if pair is not None:
-            pairs.append(pair)
-    return pairs
+    pairs = [
+        _wider(sample, step, step.shift, _DESIRED_ROTATION, 0.5 * _DESIRED_ROTATION)
+        for step in sample.pairs[:_MAX_PAIRS]
+    ]
+    return [pair for pair in pairs if pair is not None]
 
 
 def _rotated_pairs(sample: Sample, log_scale: float) -> list[Pair]:
@@ -128,19 +124,27 @@ def _rotated_pairs(sample: Sample, log_scale: float) -> list[Pair]:
     pairs = []
     for nominal in sample.pairs[:_MAX_PAIRS]:
         step = _rescaled(nominal, log_scale) if log_scale else nominal
-        if not step.fits:
-            continue
         desired = _DESIRED_ROTATION * field_of_view(step.first)
-        gap = int(np.clip(np.round(desired / max(step.angle, 1e-4)), 1, _MAX_GAP))
-        if gap * step.angle < _MIN_ROTATION:
-            continue
-        pair = step if gap == 1 else _pair_at_gap(sample, step, gap, log_scale)
-        if pair is not None:
-            pairs.append(pair)
-    return pairs
+        pairs.append(_wider(sample, step, step.angle, desired, _MIN_ROTATION, log_scale))
+    return [pair for pair in pairs if pair is not None]
 
 
-def _pair_at_gap(sample: Sample, step: Pair, gap: int, log_scale: float = 0.0) -> Pair | None:
+def _wider(
+    sample: Sample,
+    step: Pair,
+    motion: float,
+    desired: float,
+    minimum: float,
+    log_scale: float = 0.0,
+) -> Pair | None:
+    """The pair of frames so far apart that a step's motion adds up; None if that is too little."""
+    gap = int(np.clip(np.round(desired / max(motion, 1e-4)), 1, _MAX_GAP))
+    if not step.fits or gap * motion < minimum:
+        return None
+    return step if gap == 1 else _pair_at_gap(sample, step, gap, log_scale)
+
+
+def _pair_at_gap(sample: Sample, step: Pair, gap: int, log_scale: float) -> Pair | None:
     """The pair of the same first frame and one `gap` frames later, or earlier near the end."""
     recording = sample.recording
     position = int(np.searchsorted(recording.indices, sample.frames[step.i].index))

@@ -495,7 +495,7 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
             "assumes that the calibration is right."
         )
         motion = length(0.01 * check.motion["focal"][0])
-        if motion.strip("0. m"):  # else the views give no estimate
+        if motion != length(0.0):  # else the views give no estimate
             text += f" An error of 1% would move the poses by {motion}."
     elif check.unconfirmed:
         correction = proposal(check.unconfirmed, check.best)

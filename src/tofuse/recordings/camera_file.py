@@ -514,6 +514,10 @@ def pinhole_values(K: Float64, height: int, where: str | Path) -> dict[str, floa
             where=where,
             remedy="use the rays of the pixels (rays, RayTable), or 0 if it is negligible",
         )
+    return _lens_values(K)
+
+
+def _lens_values(K: Float64) -> dict[str, float]:
     return {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
 
 
@@ -569,8 +573,7 @@ def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pin
     InputError
         See `checked_lens`.
     """
-    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    return checked_lens(Pinhole, size, {name: float(v) for name, v in values.items()}, where)
+    return checked_lens(Pinhole, size, _lens_values(K), where)
 
 
 def _color(get: _Fields) -> ColorCamera | None:

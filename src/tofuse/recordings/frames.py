@@ -197,8 +197,8 @@ class RangeFrame:
         object.__setattr__(self, "depth", depth)
         amplitude = self.amplitude_image
         if amplitude is not None and np.isinf(amplitude).any():
-            clipped = np.clip(amplitude, 0, SATURATED_AMPLITUDE)
-            object.__setattr__(self, "amplitude_image", clipped)
+            amplitude = np.nan_to_num(amplitude, nan=np.nan, posinf=SATURATED_AMPLITUDE, neginf=0)
+            object.__setattr__(self, "amplitude_image", amplitude)
 
     @cached_property
     def valid(self) -> Bool:

@@ -143,6 +143,11 @@ class Recording:
         return self.source.timestamps[self.indices]
 
     @property
+    def has_timestamps(self) -> bool:
+        """Whether frames have times: readers take the frame numbers where there are none."""
+        return not np.array_equal(self.timestamps, self.indices)
+
+    @property
     def reference(self) -> Float64 | None:
         """(M, 4, 4) T_world_camera for comparison, NaN where unknown; or None."""
         return None if self.source.reference is None else self.source.reference[self.indices]
