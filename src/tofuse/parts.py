@@ -198,15 +198,21 @@ def _dataclass_from_dict(cls: type, data: Mapping[str, Any], where: str) -> Any:
         raise InputError(
             f"unknown option {unknown[0]!r}", where=where, remedy=f"use one of {list(fields)}"
         )
+    missing = [name for name, f in fields.items() if name not in data and not _has_default(f)]
+    if missing:
+        raise InputError(f"{missing[0]!r} is missing", where=where, remedy=f"add {missing[0]}")
     values = {
         key: from_dict(hints[key], value, where=_inside(where, key)) for key, value in data.items()
     }
     try:
         return cls(**values)
-    except TypeError as error:
-        raise InputError(f"is incomplete ({error})", where=where) from error
     except ValueError as error:
         raise InputError(str(error), where=where) from error
+
+
+def _has_default(field: dataclasses.Field[Any]) -> bool:
+    missing = dataclasses.MISSING
+    return field.default is not missing or field.default_factory is not missing
 
 
 def _inside(where: str, key: str) -> str:

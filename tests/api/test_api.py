@@ -291,6 +291,8 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.open([tmp_path]), "path: is a list"),
         (lambda: tofuse.load(None), "folder: "),
         (lambda: result.save(None), "folder: "),
+        (lambda: result.mesh.save(None), r"path: is a NoneType.*ends in one of \.glb"),
+        (lambda: result.cloud.save(3), r"path: is a int.*ends in one of \.ply"),
         (lambda: tofuse.merge([result, result]), r"results: is a Result.*save\(folder\)"),
         (lambda: tofuse.merge([], tolerance_m="x"), "tolerance_m: "),
         (lambda: tofuse.judge(recording, arrays[2], tolerance_m=-1), "tolerance_m: is -1"),

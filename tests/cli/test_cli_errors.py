@@ -217,6 +217,7 @@ USAGE: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     "depth a word": ((*RUN, "--max-depth", "far"), ("--max-depth", "'far'"), "tofuse run: "),
     "depth negative": ((*RUN, "--min-depth", "-1"), ("--min-depth", "-1"), "tofuse run: "),
     "depth infinite": ((*RUN, "--max-depth", "inf"), ("--max-depth", "inf"), "tofuse run: "),
+    "memory of a byte": ((*RUN, "--memory", "1"), ("--memory", "1 bytes", "500 MB"), "tofuse: "),
     "unknown guess": ((*RUN, "--guess", "luck"), ("--guess", "'luck'"), "tofuse run: "),
     "depths swapped": (
         (*RUN, "--min-depth", "3", "--max-depth", "2"),
@@ -326,6 +327,7 @@ CONFIGS: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown part": ("[[filters]]\npart = 'magic'", ("filters[0]", "'magic'", "'median'")),
     "part of no name": ("[[filters]]\nk = 3", ("filters[0]", "None", "'median'")),
     "part of odd name": ("[[filters]]\npart = [1]", ("filters[0]", "[1]", "'median'")),
+    "option without default": ("[[filters]]\npart = 'mask'", ("filters[0]", "'image' is missing")),
     "number for a part": ("odometry = 3", ("odometry", "is 3", "'sequential'")),
     "number for a list": ("filters = 3", ("filters", "is 3", "list")),
     "table for a list": ("[filters]\npart = 'median'", ("filters", "list")),

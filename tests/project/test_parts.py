@@ -88,7 +88,7 @@ def test_duplicate_part_names_are_refused() -> None:
         ({}, r"no test-shape called None; .*'round', 'square'"),
         (3, r"my\.toml: is 3; write a table with a part, one of \['round', 'square'\]"),
         (None, r"my\.toml: is None"),
-        ({"part": "square"}, r"my\.toml: is incomplete .*corner"),
+        ({"part": "square"}, r"my\.toml: .corner. is missing; add corner"),
         ({"part": "square", "corner": 3}, r"my\.toml: corner: is 3; write a list"),
         ({"part": "square", "corner": [1]}, r"my\.toml: corner: has 1 values; use 2"),
         ({"part": "square", "corner": [1, "b"]}, r"my\.toml: corner\[1\]: is 'b'"),

@@ -21,7 +21,7 @@ from damaged_files import make_native, make_pcd, make_ply, make_slam6d, make_xyz
 from made_recordings import make_7scenes, make_redwood, make_sr4000, make_tum
 from ros_bags import COUNTS, TOPIC, Bag, orbbec, real_sense
 from tofuse.errors import InputError
-from tofuse.geometry.cameras import BrownConrady, RayTable
+from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording, readers
 
@@ -61,7 +61,7 @@ def own_lenses(folder: Path) -> Path:
     (folder / "a" / "correction.npz").unlink()
     (folder / "a" / "rays").mkdir()
     for k in range(3):
-        np.save(folder / "a" / "rays" / f"{k:06d}.npy", np.zeros((30, 40, 2), np.float32))
+        np.save(folder / "a" / "rays" / f"{k:06d}.npy", Pinhole(40, 30, 35, 35, 19.5, 14.5).rays())
     return folder / "a"
 
 

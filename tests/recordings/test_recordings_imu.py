@@ -87,6 +87,15 @@ def test_gravity_of_native_recordings_and_selections(tmp_path: Path):
     assert any("gravity is unknown" in warning for warning in joined.warnings)
 
 
+def test_samples_of_zero_leave_gravity_unknown(tmp_path: Path):
+    zeros = columns(np.arange(4) / 10, np.zeros((4, 3)))
+    recording = open_recording(folder(tmp_path / "a", zeros))
+    assert recording.gravity is not None
+    assert not np.isfinite(recording.gravity).any()
+    (warning,) = recording.warnings
+    assert warning.endswith("imu.csv: has no samples other than zero near the time of any frame")
+
+
 def test_simulated_accelerometer_gives_camera_tilt(tmp_path: Path):
     from tofuse.lab.simulation.accelerometer import accelerations
     from tofuse.lab.simulation.record import plan

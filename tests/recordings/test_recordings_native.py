@@ -330,10 +330,16 @@ def test_unsorted_and_repeated_timestamps_warn(tmp_path: Path) -> None:
     assert "frames 1 and 2 have the same timestamp" in NativeSource(folder).warnings[0]
 
 
-def test_rays_of_wrong_shape(tmp_path: Path) -> None:
+def test_unusable_rays(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
-    np.save(folder / "rays.npy", np.zeros((30, 41, 2), np.float32))
+    np.save(folder / "rays.npy", PINHOLE.rays()[:, [0, *range(40)]])
     with pytest.raises(InputError, match=r"is 41 x 30, camera.json says 40 x 30"):
+        NativeSource(folder)
+    np.save(folder / "rays.npy", np.zeros((30, 40, 2), np.float32))
+    with pytest.raises(InputError, match="all rays are the same"):
+        NativeSource(folder)
+    np.save(folder / "rays.npy", np.full((30, 40, 2), np.nan, np.float32))
+    with pytest.raises(InputError, match="no pixel has a ray"):
         NativeSource(folder)
     np.save(folder / "rays.npy", np.zeros((30, 40), np.float32))
     with pytest.raises(InputError, match="shape"):

@@ -252,3 +252,12 @@ def test_demo_does_not_replace_recording_with_foreign_files(tmp_path, theirs) ->
     ):
         pass
     assert os.path.lexists(recording / ("depth/000000.png" if theirs == "link" else theirs))
+
+
+def test_dangling_link_is_named(tmp_path) -> None:
+    link = tmp_path / "out"
+    link.symlink_to(tmp_path / "missing" / "folder")
+    with pytest.raises(OutputError, match=r"out: is a link to .*folder, which doesn't exist"):
+        OutputFolder(link)
+    assert link.is_symlink()
+    assert list(tmp_path.iterdir()) == [link]

@@ -18,7 +18,7 @@ from tofuse.files.las import write_las, write_laz
 from tofuse.files.obj import write_obj
 from tofuse.files.pcd import write_pcd
 from tofuse.files.ply import write_ply
-from tofuse.files.reading import required_package
+from tofuse.files.reading import path_of, required_package
 from tofuse.files.stl import write_stl
 from tofuse.files.usdz import write_usdz
 from tofuse.fusion.colors import display_colors
@@ -54,14 +54,14 @@ def save(record: GeometryRecord, path: str | Path, R_up_world: Float64 = _R_GLTF
         If the file can't be written.
     """
     formats = _CLOUDS if record.faces is None else _MESHES
-    write = formats.get(Path(path).suffix.lower())
+    suffixes = ", ".join(formats)
+    file = path_of(path, "path", f"pass the path of a file that ends in one of {suffixes}")
+    write = formats.get(file.suffix.lower())
     if write is None:
         raise InputError(
-            f"has the suffix {Path(path).suffix!r}",
-            where=path,
-            remedy=f"use one of {', '.join(formats)}",
+            f"has the suffix {file.suffix!r}", where=file, remedy=f"use one of {suffixes}"
         )
-    write(record, path, R_up_world)
+    write(record, file, R_up_world)
 
 
 def to_trimesh(record: GeometryRecord) -> Any:

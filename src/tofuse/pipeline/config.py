@@ -27,6 +27,8 @@ from tofuse.results.run_json import read_run_json
 
 ViewKind = Literal["range", "cloud"]
 
+MIN_MEMORY_MB = 500  # of a run
+
 
 @dataclass(frozen=True)
 class Config(Bounded):
@@ -84,7 +86,7 @@ class Config(Bounded):
     joining: Joining = Joining()  # noqa: RUF009 - immutable
     self_calibration: bool = True
     tolerance_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
-    memory_mb: Annotated[int, Bounds(500, 10_000_000)] = 2000
+    memory_mb: Annotated[int, Bounds(MIN_MEMORY_MB, 10_000_000)] = 2000
 
     @property
     def window(self) -> int:

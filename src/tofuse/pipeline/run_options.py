@@ -8,7 +8,14 @@ from typing import Any, Literal
 
 from tofuse.corrections.raw_amplitude import range_and_amplitude
 from tofuse.errors import InputError
-from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
+from tofuse.pipeline.config import (
+    MIN_MEMORY_MB,
+    Config,
+    ViewKind,
+    changed,
+    from_method,
+    read_changes,
+)
 from tofuse.pipeline.paint import TEXTURE
 from tofuse.pipeline.priors import Prior
 from tofuse.recordings.opening import OpeningOptions
@@ -87,6 +94,12 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
     config = options.applied(config)
     if options.memory is not None:
         megabytes = options.memory // 1_000_000
+        if megabytes < MIN_MEMORY_MB:
+            raise InputError(
+                f"is {options.memory:,} bytes",
+                where="--memory",
+                remedy=f"allow {MIN_MEMORY_MB} MB or more, e.g. --memory 2GB",
+            )
         config = changed(config, {"memory_mb": megabytes}, where="--memory")
     leading_filters: list[dict[str, Any]] = []
     if options.min_depth is not None or options.max_depth is not None:

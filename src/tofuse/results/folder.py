@@ -297,6 +297,12 @@ def _recover(folder: Path, contract: Contract) -> None:
 
 
 def _output_error(path: Path, error: OSError) -> OutputError:
+    if path.is_symlink() and not path.exists():
+        return OutputError(
+            f"is a link to {os.readlink(path)}, which doesn't exist",
+            where=path,
+            remedy="create its target, or pass another --out",
+        )
     return OutputError(
         f"can't be written ({error.strerror or error})",
         where=path,

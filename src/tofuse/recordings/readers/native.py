@@ -280,7 +280,9 @@ class NativeSource(FileSource):
                 f"{path}: has no columns timestamp, ax, ay, az, so gravity is unknown"
             )
         elif not np.isfinite(self.gravity).any():
-            self.warnings.append(f"{path}: has no samples near the time of any frame")
+            self.warnings.append(
+                f"{path}: has no samples other than zero near the time of any frame"
+            )
 
     def _count_error(self, where: Path, count: str) -> InputError:
         return InputError(
