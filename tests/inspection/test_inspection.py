@@ -316,7 +316,7 @@ FAULTS = {
 
 @pytest.mark.slow
 def test_good_recording_has_no_findings(turn) -> None:
-    assert codes(turn, quick=False) == set()
+    assert codes(turn) == set()
     assert codes(colored(turn, 0), quick=False) == set()
     ranges = [replace(f, depth=f.radial_range, depth_kind="range") for f in turn]
     assert codes(ranges) == set()
@@ -486,7 +486,7 @@ def test_real_recordings_have_only_true_findings(shared_data) -> None:
         "slam6d_scans", *explained,
     ):  # fmt: skip
         # The focal length is checked where a camera that rotates measures z.
-        quick = name not in ("kinectv2_loop/recording", "iphone_stray")
+        quick = name != "kinectv2_loop/recording"
         reported = {f.code for f in tofuse.inspect(shared_data / name, quick=quick).findings}
         assert reported <= explained.get(name, set()) | {"static"}, name
 
