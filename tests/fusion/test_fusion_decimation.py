@@ -78,7 +78,7 @@ def turned_away(whole: Mesh, small: Mesh) -> float:
     return float(area[away].sum() / area.sum())
 
 
-@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
+@pytest.mark.parametrize("scale", [0.01, 100.0])
 def test_edge_collapse_is_more_accurate_than_clustering(scale: float) -> None:
     whole = hills()
     whole = replace(whole, vertices=(scale * whole.vertices).astype(np.float32))

@@ -5,7 +5,7 @@ import numpy as np
 from tofuse.geometry.cameras import Pinhole
 from tofuse.recordings.frames import RangeFrame
 
-CAMERA = Pinhole(128, 96, 90.0, 90.0, 63.5, 47.5)
+CAMERA = Pinhole(96, 72, 67.5, 67.5, 47.5, 35.5)
 
 
 # Planes n . x = d of a heap of tilted boards on a floor, nearest hit counts: normal, offset, and
@@ -22,11 +22,11 @@ BOARDS = (
 def looked_at(
     T_room_camera: np.ndarray, rng: np.random.Generator, offset: float, boards=BOARDS
 ) -> RangeFrame:
-    rays = np.concatenate([CAMERA.rays().astype(float), np.ones((96, 128, 1))], 2)
+    rays = np.concatenate([CAMERA.rays().astype(float), np.ones((72, 96, 1))], 2)
     lengths = np.linalg.norm(rays, axis=2)
     directions = rays @ T_room_camera[:3, :3].T
     origin = T_room_camera[:3, 3]
-    z = np.full((96, 128), np.inf)
+    z = np.full((72, 96), np.inf)
     for normal, d, half in boards:
         n = np.array(normal) / np.linalg.norm(normal)
         facing = directions @ n

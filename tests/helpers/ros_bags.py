@@ -6,6 +6,7 @@ import gc
 import importlib
 import struct
 import warnings
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +31,24 @@ TOPIC = "/camera/depth/image_rect_raw"
 DEPTH_LENS = Pinhole(16, 12, 20.0, 21.0, 7.5, 5.5)
 
 
+@cache
+def typestore(name: str) -> Any:
+    """The message types of a ROS version, which take a while to make, and those of tf2."""
+    typesys = importlib.import_module("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores[name])
+    if "tf2_msgs/msg/TFMessage" not in store.types:
+        text = "geometry_msgs/TransformStamped[] transforms"
+        store.register(typesys.get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+    return store
+
+
 class Bag:
     """Writes messages to a bag of a kind."""
 
     def __init__(self, folder: Path, kind: str, compression: str | None = None) -> None:
         pytest.importorskip("rosbags", reason="the package rosbags is not installed")
         self.kind = kind
-        self.store = importlib.import_module("rosbags.typesys").get_typestore(
-            importlib.import_module("rosbags.typesys").Stores[
-                "ROS1_NOETIC" if kind == "ros1" else "ROS2_HUMBLE"
-            ]
-        )
+        self.store = typestore("ROS1_NOETIC" if kind == "ros1" else "ROS2_HUMBLE")
         if kind == "ros1":
             self.path = folder / "a.bag"
             self.writer = importlib.import_module("rosbags.rosbag1").Writer(self.path)
@@ -56,10 +64,6 @@ class Bag:
             self.writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
         self.writer.open()
         self.connections: dict[str, Any] = {}
-        if "tf2_msgs/msg/TFMessage" not in self.store.types:
-            parse = importlib.import_module("rosbags.typesys").get_types_from_msg
-            text = "geometry_msgs/TransformStamped[] transforms"
-            self.store.register(parse(text, "tf2_msgs/msg/TFMessage"))
 
     def make(self, name: str, *values: Any) -> Any:
         return self.store.types[name](*values)

@@ -19,13 +19,13 @@ from tofuse.lab.experiments.statements import _straighter as straighter
 @pytest.fixture(scope="module")
 def peaks_page(tmp_path_factory):
     out = tmp_path_factory.mktemp("experiments") / "peaks"
-    return run_experiments(out, cases=("peaks",), seeds=2)
+    return run_experiments(out, cases=("peaks",), seeds=1)
 
 
 @pytest.fixture(scope="module")
 def rail_page(tmp_path_factory):
     out = tmp_path_factory.mktemp("experiments") / "rail"
-    return run_experiments(out, cases=("rail",), limit=12, draws=1)
+    return run_experiments(out, cases=("rail",), limit=8, draws=1)
 
 
 def read(page):
@@ -67,7 +67,7 @@ def test_sweep_is_judged_by_its_errors():
 
 def test_peaks_case_gives_page_and_results(peaks_page):
     data = read(peaks_page)
-    assert (data["kind"], data["parameters"]["seeds"]) == ("experiments", 2)
+    assert (data["kind"], data["parameters"]["seeds"]) == ("experiments", 1)
     assert data["cases"] == {}
     assert {s["section"] for s in data["statements"]} == {"5.6"}
     error = data["peaks"]["position_m"]
@@ -88,7 +88,7 @@ def test_scene_is_run_with_all_variants(rail_page):
     assert len(runs) == len(ways) == 2 * 3 * 2
     assert {r["stride"] for r in runs} == {3, 5, 7}
     for run in runs:
-        assert run["frames"] == run["with_pose"] == -(-12 // run["stride"])
+        assert run["frames"] == run["with_pose"] == -(-8 // run["stride"])
         assert run["before"]["end_error_m"] < 0.1
     # With the true poses the same frames lie on the true surface.
     assert data["cases"]["rail"]["true_poses"]["surface_error_m"] < 0.03
@@ -99,14 +99,6 @@ def test_scene_is_run_with_all_variants(rail_page):
     text = rail_page.read_text(encoding="utf-8")
     assert "Translation of the camera" in text
     assert not re.search(r"\bnan\b", re.sub(r"data:[^\"']+", "", text), re.IGNORECASE)
-
-
-@pytest.mark.slow
-def test_same_seed_gives_same_result(peaks_page, tmp_path):
-    again = run_experiments(tmp_path / "again", cases=("peaks",), seeds=2)
-    first, second = read(peaks_page), read(again)
-    del first["seconds"], second["seconds"]
-    assert first == second
 
 
 def test_only_earlier_experiments_are_overwritten(peaks_page, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ def rock(n, seed):
     return d * radius[:, None] + MIDDLE
 
 
+@cache
 def ring(noise=0.002):
     """A rock seen from all round, in views of 140 degrees each; true poses, clouds."""
     T, clouds = [], []
@@ -82,17 +84,6 @@ def motions(n, seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
-def test_closed_chain_error_is_reduced(method):
-    T, clouds = ring()
-    start = drifted(T)
-    after = relax_poses(replace(method, points=2000), [Cloud.of(c) for c in clouds], start)
-    np.testing.assert_allclose(after[0], T[0], atol=1e-9)
-    before, left = errors_of(start, T), errors_of(after, T)
-    assert left.max() < 0.25 * before.max()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
 def test_refinement_corrects_drift(method):
     T, clouds = ring()
     start = drifted(T)
@@ -103,6 +94,7 @@ def test_refinement_corrects_drift(method):
     assert found.kept
     assert found.views == VIEWS
     assert found.support[1] > found.support[0]
+    np.testing.assert_allclose(found.poses[0], T[0], atol=1e-9)
     assert errors_of(found.poses, T).max() < 0.25 * errors_of(start, T).max()
 
 

@@ -155,12 +155,12 @@ def test_axis_offset_moves_optical_centre_on_circle():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", [n for n in SCENES if n != "flat-alike"])  # moves as flat does
 def test_motion_is_smooth_and_slow(built, name):
     _, sequence = built[name]
-    t = np.arange(0, sequence.frames / 30, 1 / 120)
+    t = np.arange(0, sequence.frames / 30, 1 / 60)
     poses = np.array([sequence.T_world_camera(s) for s in t])
-    steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) * 120
+    steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) * 60
     turning = np.linalg.norm(steps[:, 3:], axis=1)
     assert turning.max() < np.deg2rad(60)
     assert np.abs(np.diff(steps, axis=0)).max() < 0.1  # no jumps in velocity

@@ -25,6 +25,7 @@ from made_cwipc import (
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.geometry.se3 import inverse, transform
+from tofuse.pipeline import run as run_module
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.rig_folder import rig_file_in
@@ -71,16 +72,19 @@ def test_earlier_versions_and_file_names(folder: Path, version: int) -> None:
     np.testing.assert_allclose(source.rig.cameras[1].T_rig_camera, expected_pose(), atol=1e-9)
 
 
+@pytest.fixture(scope="module")
+def realsense_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bag")
+    return ros_bags.real_sense(folder, "ros1", "None", name="Intel RealSense D455", color="rgb8")
+
+
 @pytest.mark.parametrize("mapping", [None, 1, 0, -1])
-def test_realsense_pose_depends_on_mapping(tmp_path: Path, mapping: int | None) -> None:
+def test_realsense_pose_depends_on_mapping(
+    realsense_bag: Path, tmp_path: Path, mapping: int | None
+) -> None:
     """Without a mapping of depth to colour, the trafo is of the depth camera."""
-    pytest.importorskip("rosbags")
     for serial in SERIALS:
-        (tmp_path / serial).mkdir()
-        path = ros_bags.real_sense(
-            tmp_path / serial, "ros1", "None", name="Intel RealSense D455", color="rgb8"
-        )
-        shutil.copy(path, tmp_path / f"{serial}.bag")
+        shutil.copy(realsense_bag, tmp_path / f"{serial}.bag")
     filtering = {} if mapping is None else {"filtering": {"map_color_to_depth": mapping}}
     data = config(type="realsense_playback", **filtering)
     for row in data["camera"]:
@@ -202,7 +206,13 @@ def test_damaged_folders_raise_only_package_errors(folder: Path, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_rig_is_reconstructed_by_one_command(folder: Path, tmp_path: Path, capfd) -> None:
+def test_rig_is_reconstructed_by_one_command(
+    folder: Path, tmp_path: Path, capfd, monkeypatch
+) -> None:
+    # The report of a rig has tests of its own.
+    monkeypatch.setattr(
+        run_module, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
+    )
     out = tmp_path / "model"
     assert main(["run", str(folder), "--out", str(out)]) == 0, capfd.readouterr().err
     written = json.loads((out / "run.json").read_text())

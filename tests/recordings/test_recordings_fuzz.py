@@ -35,7 +35,7 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "xyz": make_xyz,
     "slam6d": make_slam6d,
 }
-ROUNDS = {"tum": 12, "7scenes": 12, "redwood": 12}
+ROUNDS = 12  # `benchmarks/attack.py` runs any number
 
 
 @pytest.mark.slow
@@ -45,8 +45,7 @@ def test_damage_raises_only_package_errors(tmp_path: Path, name: str) -> None:
     MAKERS[name](original)
     assert open_recording(original).format == name
     refused = unread = whole = longest = 0
-    rounds = ROUNDS.get(name, 50)
-    for k in range(rounds):
+    for k in range(ROUNDS):
         rng = np.random.default_rng([30, len(name), k])
         copy = tmp_path / "copy" / "freiburg1"
         shutil.copytree(original, copy)
@@ -68,4 +67,4 @@ def test_damage_raises_only_package_errors(tmp_path: Path, name: str) -> None:
     assert longest == 1
     assert refused + unread > 0
     assert whole > 0
-    assert refused + unread < 3 * rounds
+    assert refused + unread < 3 * ROUNDS

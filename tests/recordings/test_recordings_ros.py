@@ -68,9 +68,8 @@ def test_depth_images(tmp_path: Path, kind: str) -> None:
         assert frame.timestamp == recording.timestamps[k]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_metres_and_a_fisheye(tmp_path: Path, kind: str) -> None:
-    bag = Bag(tmp_path, kind)
+def test_metres_and_a_fisheye(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros1")
     bag.info("/tof/depth/camera_info", "equidistant", (0.1, 0.01, 0.001, 0.0001))
     image = (COUNTS[0] / 1000).astype(np.float32)
     image[0, 0] = np.nan
@@ -217,9 +216,8 @@ def test_realsense_bags(tmp_path: Path, kind: str) -> None:
         np.testing.assert_array_equal(frame.amplitude_image, COUNTS[k] % 250)
 
 
-@pytest.mark.parametrize("kind", ["ros1", "ros2"])
-def test_realsense_stereo_and_lenses(tmp_path: Path, kind: str) -> None:
-    path = real_sense(tmp_path, kind, "Inverse Brown Conrady", name="Intel RealSense D435")
+def test_realsense_stereo_and_lenses(tmp_path: Path) -> None:
+    path = real_sense(tmp_path, "ros2", "Inverse Brown Conrady", name="Intel RealSense D435")
     frame = open_recording(path)[0]
     assert isinstance(frame, RangeFrame)
     assert frame.amplitude_image is None  # infrared of another viewpoint
@@ -303,7 +301,7 @@ def test_damaged_bags_of_manufacturers(tmp_path: Path, maker: str) -> None:
     else:
         path = orbbec(tmp_path, (0.0,) * 8, color="jpeg", R=T_COLOR[:3, :3])
     content, seen = path.read_bytes(), np.zeros(3, int)
-    for k in range(40):
+    for k in range(15):
         damage([path], np.random.default_rng([102, k]))
         seen += read_through(path, f"{maker}-bag")
         if path.is_dir():
@@ -336,7 +334,7 @@ def test_damage_raises_only_package_errors(tmp_path: Path, kind: str) -> None:
     files = sorted(p for p in tmp_path.rglob("*") if p.is_file())
     contents = [p.read_bytes() for p in files]
     seen = np.zeros(3, int)
-    for k in range(40):
+    for k in range(15):
         damage(files, np.random.default_rng([101, k]))
         seen += read_through(path, "ros")
         for file, content in zip(files, contents, strict=True):
@@ -363,7 +361,7 @@ HOSTILE: dict[str, tuple[str, Callable[[Path], object]]] = {
             + "".join(f"a{k + 1}: &a{k + 1} {{<<: [*a{k}, *a{k}]}}\n" for k in range(40))
         ),
     ),
-    "brackets": ("nested too deeply", lambda bag: (bag / "metadata.yaml").write_text("[" * 10**5)),
+    "brackets": ("nested too deeply", lambda bag: (bag / "metadata.yaml").write_text("[" * 10**4)),
     "too long": (
         "more than the limit of 16 MiB",
         lambda bag: os.truncate(bag / "metadata.yaml", 1 << 30),
@@ -552,8 +550,7 @@ def color_at(k: int) -> np.ndarray:
     return np.stack([8 * u, 10 * v, np.full_like(u, 50 + k)], -1).astype(np.uint8)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize(("kind", "compressed"), [("ros1", False), ("ros2", True), ("mcap", False)])
 def test_colour_of_separate_camera(tmp_path: Path, kind: str, compressed: bool) -> None:
     """Posed by tf_static, over intermediate frames; each point has the colour at its projection."""
     bag = Bag(tmp_path, kind)
@@ -611,7 +608,7 @@ def test_colour_without_pose_is_ignored(tmp_path: Path) -> None:
     assert any(f"colour is ignored: the relation of {COLOR_TOPIC}" in w for w in recording.warnings)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["ros1", "ros2"])  # names with and without a slash
 def test_poses_from_tf(tmp_path: Path, kind: str) -> None:
     """Odometry below a map that corrects it; poses are interpolated between messages."""
     bag = Bag(tmp_path, kind)

@@ -16,6 +16,7 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.lab.simulation.record import plan
 from tofuse.odometry.pairwise import Pairwise
@@ -31,7 +32,7 @@ from tofuse.registration.viewpoint import RangeSphere, as_image, rendered, viewp
 ANYWHERE = se3.exp([1.0, -0.7, 0.4, 1.9, 0.3, -1.0])
 
 
-def scanned(at, heading, count=60_000, seed=0, name="flat"):
+def scanned(at, heading, count=20_000, seed=0, name="flat"):
     """A scan with equal angles, z up, at a place of a simulated flat: its pose and points."""
     built, _ = scenes.build(name, seed=0)
     rows = int(np.sqrt(count / 2))
@@ -58,7 +59,7 @@ def scans():
 @pytest.fixture(scope="module")
 def frames():
     """Two images of a furnished room, and the second one's pose in the first."""
-    made = plan("room", every=16, frames=2)
+    made = plan("room", every=16, frames=2, effects=Effects().without("multipath", "gloss"))
     rendered = [r.frame for r in made.frames(None)]
     return rendered[0], rendered[1], se3.inverse(made.poses[0]) @ made.poses[1]
 
@@ -257,9 +258,15 @@ def test_evidence_without_free_space_depends_on_margin():
 # Registration
 
 
-def test_scans_with_any_heading(scans):
-    source, target, true = scans
-    found = tofuse.register(source, target)
+@pytest.fixture(scope="module")
+def registered(scans):
+    """The second scan registered to the first, by one thread."""
+    with threads(1):
+        return tofuse.register(*scans[:2])
+
+
+def test_scans_with_any_heading(scans, registered):
+    (source, _, true), found = scans, registered
     assert off(found.T_target_source, true, source)[0] < 0.02
     assert off(found.T_target_source, true, source)[1] < 0.5
     assert found.believed
@@ -285,7 +292,7 @@ def test_clouds_of_different_density(scans):
         assert off(found.T_target_source, T, pair[0])[1] < 1.5
 
 
-@pytest.mark.parametrize("scale", [0.01, 1.0, 20.0])
+@pytest.mark.parametrize("scale", [0.01, 20.0])
 def test_registration_is_independent_of_scale(scans, scale):
     source, target, true = scans
     scaled = true.copy()
@@ -323,7 +330,7 @@ def test_ambiguous_corridor_is_rejected():
     assert len(found.unobservable) >= 1
 
 
-@pytest.mark.parametrize("scale", [0.001, 0.01, 1000.0])
+@pytest.mark.parametrize("scale", [0.001, 1000.0])
 def test_different_units_are_reported(scans, scale):
     source, target, _ = scans
     found = tofuse.register(source * scale, target)
@@ -332,9 +339,9 @@ def test_different_units_are_reported(scans, scale):
     assert "unit" in found.reason
 
 
-@pytest.mark.parametrize("scale", [0.001, 100.0])
-def test_different_units_are_reported_without_an_accepted_pose(scale):
+def test_different_units_are_reported_without_an_accepted_pose():
     """A square room fits in four ways, so that no scale is accepted."""
+    scale = 100.0
     walls, other = (box_walls(4000, seed, 0.003, "xyz") for seed in (0, 1))
     with pytest.raises(RegistrationError, match="check the units of both clouds") as caught:
         tofuse.register(other * scale, walls)
@@ -350,14 +357,11 @@ def test_guess_resolves_symmetry():
     assert off(found.T_target_source, np.eye(4), other)[0] < 0.01
 
 
-def test_result_is_independent_of_threads(scans):
-    source, target, _ = scans
-    found = []
-    for count in (1, 2):
-        with threads(count):
-            found.append(tofuse.register(source, target))
-    np.testing.assert_array_equal(found[0].T_target_source, found[1].T_target_source)
-    assert found[0].probability == found[1].probability
+def test_result_is_independent_of_threads(scans, registered):
+    with threads(2):
+        found = tofuse.register(*scans[:2])
+    np.testing.assert_array_equal(found.T_target_source, registered.T_target_source)
+    assert found.probability == registered.probability
 
 
 def test_degenerate_clouds_are_not_accepted():

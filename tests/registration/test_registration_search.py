@@ -415,14 +415,14 @@ def test_result_is_independent_of_threads(pair):
 def test_albedo_resolves_geometric_ambiguity():
     """Bare textured walls, 27 degrees apart."""
     effects = Effects.none(shot_noise=True)
-    recording = simulate_recording("empty-room", every=30, frames=9, effects=effects).select(3)
+    recording = simulate_recording("empty-room", every=30, frames=7, effects=effects).select(3)
     views = [prepare_view(frame, SurfaceOptions()) for frame in recording]
     dark = [
         prepare_view(replace(frame, amplitude_image=None), SurfaceOptions()) for frame in recording
     ]
     poses = recording.reference
     right = {"with": 0, "without": 0}
-    for k in range(5):
+    for k in range(3):
         true = se3.inverse(poses[k]) @ poses[k + 1]
         assert 20 < np.degrees(se3.angle(true)) < 30
         for name, seen_by in (("with", views), ("without", dark)):
@@ -431,8 +431,8 @@ def test_albedo_resolves_geometric_ambiguity():
             right[name] += metres < 0.1 and degrees < 3
             if name == "with":
                 assert found.agreement.clash < 0.01
-    assert right["with"] == 5
-    assert right["without"] < 4
+    assert right["with"] == 3
+    assert right["without"] < 3
 
 
 def test_empty_view_is_not_searched(pair):

@@ -67,7 +67,7 @@ def falling(frame: RangeFrame, exponent: float) -> RangeFrame:
     return replace(frame, amplitude_image=light, amplitude_kind="raw")
 
 
-@pytest.mark.parametrize("exponent", [0.0, 4.0, 8.0])
+@pytest.mark.parametrize("exponent", [0.0, 8.0])
 def test_amplitude_falloff_is_estimated(pair, far, exponent):
     """A pattern that is fixed to the camera neither biases the pose nor contradicts it."""
     views = [surface(falling(frame, exponent)) for frame in pair]
@@ -90,7 +90,7 @@ def test_covariance_covers_error(far):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("quarters", [1, 2, 3])
+@pytest.mark.parametrize("quarters", [1, 2])
 def test_camera_on_its_side_is_found(quarters):
     # Outside the exhaustive search, whose poses are upright.
     image = seen(at(-0.3, 0.4, 0.4), 1)

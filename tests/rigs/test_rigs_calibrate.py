@@ -43,8 +43,8 @@ def camera(k: int, frames: list[RangeFrame]) -> Camera:
     return Camera(f"cam{k}", Recording.of(ArraySource(frames), f"cam{k}", "array"))
 
 
-def written(folder: Path, count: int = 2) -> Path:
-    for k in range(3):
+def written(folder: Path, count: int = 2, cameras: int = 3) -> Path:
+    for k in range(cameras):
         writer = RecordingWriter(folder / f"cam{k}", CAMERA, frame_rate_hz=30.0, depth_unit_m=2e-4)
         for frame in images(k, count):
             writer.add(frame)
@@ -70,7 +70,7 @@ def test_static_cameras_are_calibrated_from_one_instant(calibrated: Calibration)
 
 @pytest.mark.slow
 def test_camera_without_overlap_is_named() -> None:
-    wall = RangeFrame(0, 0.0, CAMERA, np.full((96, 128), 1.7, np.float32), "z", None)
+    wall = RangeFrame(0, 0.0, CAMERA, np.full((72, 96), 1.7, np.float32), "z", None)
     cameras = [camera(0, images(0)), camera(1, images(1)), camera(2, [wall])]
     found = calibrate_cameras(cameras, ["a", "b", "c"])
     assert [c.name for c in found.rig.cameras] == ["cam0", "cam1"]
@@ -101,12 +101,13 @@ def test_names_distinguish_cameras() -> None:
 
 @pytest.mark.slow
 def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = written(tmp_path / "rig")
-    cameras = [str(folder / f"cam{k}") for k in range(3)]
+    # Two cameras: from three on, each could be the wrong one, which takes much longer.
+    folder = written(tmp_path / "rig", cameras=2)
+    cameras = [str(folder / f"cam{k}") for k in range(2)]
     out = folder / "rig.json"
     assert main(["rig", "calibrate", *cameras, "--out", str(out)]) == 0
-    assert "cam2" in capsys.readouterr().out
-    assert [c.name for c in read_rig(out).cameras] == ["cam0", "cam1", "cam2"]
+    assert "cam1" in capsys.readouterr().out
+    assert [c.name for c in read_rig(out).cameras] == ["cam0", "cam1"]
     # It is not overwritten by default.
     assert main(["rig", "calibrate", *cameras, "--out", str(out)]) == 2
     capsys.readouterr()
@@ -115,13 +116,13 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     checked = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert not any(c["moved"] for c in checked["cameras"])
 
-    assert main(["rig", "check", str(out), *cameras[:2]]) == 2
-    assert "3 cameras" in capsys.readouterr().err
+    assert main(["rig", "check", str(out), *cameras[:1]]) == 2
+    assert "2 cameras" in capsys.readouterr().err
 
     # The folder opens like a recording, and gives one model.
     recording = open_recording(folder)
     assert recording.format == "rig"
-    assert len(recording) == 6
+    assert len(recording) == 4
     assert main(["run", str(folder), "--out", str(tmp_path / "model"), "--voxel", "3cm"]) == 0
     times, poses = read_tum(tmp_path / "model" / "rig_trajectory.txt")
     assert len(times) == 2
@@ -136,20 +137,20 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert not run_json["reasons"]
     report = (tmp_path / "model" / "report.html").read_text()
     assert '<section id="rig">' in report
-    assert "cam1, cam2</td>" in report
-    assert ">cam2</text>" in report or ">cam2<" in report
+    assert "cam0, cam1</td>" in report
+    assert ">cam1</text>" in report or ">cam1<" in report
 
     # The camera of each frame is stated: in the file, in the report and in the viewer.
     run_json = json.loads((tmp_path / "model" / "run.json").read_text())["rig"]
-    assert run_json == {"cameras": ["cam0", "cam1", "cam2"], "of_frames": [0, 1, 2, 0, 1, 2]}
+    assert run_json == {"cameras": ["cam0", "cam1"], "of_frames": [0, 1, 0, 1]}
     assert tofuse.load(tmp_path / "model").recording["rig"] == run_json
     page = (tmp_path / "model" / "report.html").read_text(encoding="utf-8")
     assert re.findall(r'background:(rgb\(.*?\))"></i>(cam\d)', page) == [
-        (f"rgb{color}".replace(" ", ""), f"cam{k}") for k, color in enumerate(CAMERA_COLORS[:3])
+        (f"rgb{color}".replace(" ", ""), f"cam{k}") for k, color in enumerate(CAMERA_COLORS[:2])
     ]
     shown = read_content(tmp_path / "model").rig
     assert shown is not None
-    assert shown.names == ("cam0", "cam1", "cam2")
+    assert shown.names == ("cam0", "cam1")
     assert shown.of_frames.tolist() == run_json["of_frames"]
 
 

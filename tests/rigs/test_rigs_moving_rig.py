@@ -22,7 +22,7 @@ from tofuse.rigs.rig_trajectory import refined
 from tofuse.rigs.run import reconstruct_rig
 
 CLOCK = 0.012
-COUNT = 25
+COUNT = 18
 # Boards on all sides, which constrain each camera.
 BOARDS = (
     *ROOM,

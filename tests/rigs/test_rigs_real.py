@@ -1,4 +1,4 @@
-"""Five Azure Kinects from unknown poses, one image each."""
+"""Azure Kinects at unknown poses, one image each."""
 
 import json
 
@@ -15,7 +15,8 @@ from tofuse.rigs.joint import View, disagreements
 @pytest.mark.slow
 def test_surfaces_agree_better_than_under_reference_poses(shared_data) -> None:
     folder = shared_data / "azure_kinect_rig"
-    paths = sorted(p for p in folder.iterdir() if p.is_dir())
+    # Three of the five, to save time.
+    paths = sorted(p for p in folder.iterdir() if p.is_dir())[:3]
     cameras = open_cameras(paths)
     rig = calibrate_cameras(cameras, paths).rig
     assert not rig.unplaced
