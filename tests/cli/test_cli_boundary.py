@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import made_exports
+from light_report import STUB
 from paths import BENCHMARKS
 from tofuse import cli
 from tofuse.cli import main, run_command
@@ -51,15 +52,6 @@ TOGETHER = (
 # The report takes half of a run, and is drawn where fonts and caches may be missing: few file
 # handles, and no home.
 _WITH_REPORT = ("12 file handles", "together")
-_LIGHT_REPORT = """
-import types
-def write(*of_a_run):
-    for name in ("report.html", "view.npz"):
-        (of_a_run[-1] / name).write_text(name)
-stub = types.ModuleType("tofuse.pipeline.report_files")
-stub.write_report_files = write
-sys.modules[stub.__name__] = stub
-"""
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs limits and paths of Linux")
 
@@ -91,7 +83,7 @@ def test_hostile_environments_give_result_or_one_line_error(
     known = {environment.name: environment for environment in ENVIRONMENTS}
     environment = together([known[n] for n in TOGETHER]) if name == "together" else known[name]
     if name not in _WITH_REPORT:
-        environment = replace(environment, setup=_LIGHT_REPORT + environment.setup)
+        environment = replace(environment, setup=STUB + environment.setup)
     outcome = attempt(environment, clouds, tmp_path, "--method", "thesis")
     assert outcome.faults == (), outcome.stderr
 
