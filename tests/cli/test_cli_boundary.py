@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 import made_exports
+from light_report import STUB
 from paths import BENCHMARKS
 from tofuse import cli
 from tofuse.cli import main, run_command
@@ -22,7 +24,7 @@ from tofuse.kernels import cores, jit
 from tofuse.lab.simulation.record import simulate
 
 sys.path.insert(0, str(BENCHMARKS))
-from attacks.environments import ENVIRONMENTS, attempt
+from attacks.environments import ENVIRONMENTS, Environment, attempt
 
 # One of each kind; `benchmarks/attack.py` runs all of them.
 CHOSEN = (
@@ -35,15 +37,21 @@ CHOSEN = (
     "all closed",
     "JSON lines to a full disk",
     "a reader that leaves",
-    "Windows-1252",
+    "the output folder is read-only",
+    "SIGINT at tracking",
+    "SIGTERM at moves",
+    "SIGTERM at the end",
+)
+# These are independent of each other, so that one run is enough.
+TOGETHER = (
+    "stdin closed",
     "a name in ASCII streams",
     "a home that can't be written",
     "a clock that goes backwards",
-    "the output folder is read-only",
-    "SIGTERM at tracking",
-    "SIGINT at moves",
-    "SIGTERM at the end",
 )
+# The report takes half of a run, and is drawn where fonts and caches may be missing: few file
+# handles, and no home.
+_WITH_REPORT = ("12 file handles", "together")
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs limits and paths of Linux")
 
@@ -53,14 +61,29 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate("peaks", tmp_path_factory.mktemp("peaks") / "rec", frames=2)
 
 
+def together(several: list[Environment]) -> Environment:
+    """One environment with the properties of several, in all of which a run works."""
+    assert {e.must for e in several} == {"work"}
+    return Environment(
+        "together",
+        setup="".join(e.setup for e in several),
+        shell=" ".join(e.shell for e in several),
+        variables=tuple(v for e in several for v in e.variables),
+        folder=next(e.folder for e in several if e.folder != "out"),
+    )
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CHOSEN)
+@pytest.mark.parametrize("name", [*CHOSEN, "together"])
 def test_hostile_environments_give_result_or_one_line_error(
     name: str, clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Kernels are not compiled anew where the home can't be written; see test_kernels_jit.py.
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(Path(jit.cache_folder()).parent))
-    (environment,) = [e for e in ENVIRONMENTS if e.name == name]
+    known = {environment.name: environment for environment in ENVIRONMENTS}
+    environment = together([known[n] for n in TOGETHER]) if name == "together" else known[name]
+    if name not in _WITH_REPORT:
+        environment = replace(environment, setup=STUB + environment.setup)
     outcome = attempt(environment, clouds, tmp_path, "--method", "thesis")
     assert outcome.faults == (), outcome.stderr
 
@@ -84,9 +107,6 @@ def test_unwritable_stdout_is_reported(clouds: Path) -> None:
         "tofuse: standard output: can't be written (no space left on device)\n",
     )
     assert shell("tofuse --help > /dev/full")[0] == 2
-    status, stderr = shell(f"tofuse inspect {clouds} | true; exit ${{PIPESTATUS[0]}}")
-    assert status in (0, 141)  # it may be read before the reader ends
-    assert "Traceback" not in stderr
     status, stderr = shell("{ sleep 1; tofuse --help; } | true; exit ${PIPESTATUS[0]}")
     assert (status, stderr) == (141, "")
 

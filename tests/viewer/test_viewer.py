@@ -18,12 +18,14 @@ import numpy as np
 import pytest
 
 from browser import changed, chromium, watched
+from light_report import write_light_report
 from report_results import make_room
 from tofuse.cli import main
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.geometry.quaternion import to_matrix
+from tofuse.pipeline import run as run_module
 from tofuse.pipeline.progress import Silent
 from tofuse.pipeline.run import run
 from tofuse.pipeline.run_options import Options
@@ -328,19 +330,20 @@ class Recorder(Silent):
 
 @pytest.mark.slow
 @needs_viser
-def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser):
+def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser, monkeypatch):
     from tofuse.pipeline.progress import CombinedProgress
     from tofuse.viewer.live_view import LiveView
     from tofuse.viewer.server import address
 
     same = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply")
+    quick = {"end": 4, "method": "thesis"}
     recorder = Recorder()
     server = serve()
     try:
         live = LiveView(server)
         began = time.perf_counter()
         watched_run = run(
-            [room_recording], Options(out=tmp_path / "a", end=4), CombinedProgress(recorder, live)
+            [room_recording], Options(out=tmp_path / "a", **quick), CombinedProgress(recorder, live)
         )
         assert live.first_seconds <= time.perf_counter() - began
         # The first frame is shown before any stage begins, and then each one with its pose.
@@ -362,7 +365,8 @@ def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, br
             seen.check()
     finally:
         stop(server)
-    run([room_recording], Options(out=tmp_path / "b", end=4))
+    monkeypatch.setattr(run_module, "write_report_files", write_light_report)
+    run([room_recording], Options(out=tmp_path / "b", **quick))
     for name in same:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert json.loads((tmp_path / "a/run.json").read_text())["schema"] == 1
