@@ -246,6 +246,12 @@ PLAUSIBLE = {
 }
 
 
+# Images with amplitudes in one scene, depth alone in the other.
+BOTH_KINDS = pytest.mark.parametrize(
+    ("scene", "amplitude"), [("room", True), ("corner", False)], ids=["lit", "depth alone"]
+)
+
+
 def tracked_with_bad_frame(request, scene, amplitude, damage):
     sequence = request.getfixturevalue(scene)
     frames = list(sequence.frames) if amplitude else unlit(sequence.frames)
@@ -253,9 +259,8 @@ def tracked_with_bad_frame(request, scene, amplitude, damage):
     return run(frames), sequence.poses
 
 
-@pytest.mark.parametrize("amplitude", [True, False], ids=["lit", "depth alone"])
+@BOTH_KINDS
 @pytest.mark.parametrize("damage", UNUSABLE.values(), ids=UNUSABLE.keys())
-@pytest.mark.parametrize("scene", ["room", "corner"])
 def test_unusable_image_is_lost(request, scene, damage, amplitude):
     steps, poses = tracked_with_bad_frame(request, scene, amplitude, damage)
     assert_lost(steps[BAD])
@@ -264,9 +269,8 @@ def test_unusable_image_is_lost(request, scene, damage, amplitude):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("amplitude", [True, False], ids=["lit", "depth alone"])
+@BOTH_KINDS
 @pytest.mark.parametrize("damage", NONSENSE.values(), ids=NONSENSE.keys())
-@pytest.mark.parametrize("scene", ["room", "corner"])
 def test_corrupted_image_stays_unconnected(request, scene, damage, amplitude):
     steps, poses = tracked_with_bad_frame(request, scene, amplitude, damage)
     found = components(steps)
@@ -281,9 +285,8 @@ def test_corrupted_image_stays_unconnected(request, scene, damage, amplitude):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("damage", PLAUSIBLE.values(), ids=PLAUSIBLE.keys())
-@pytest.mark.parametrize("scene", ["room", "corner"])
-def test_plausible_wrong_image_does_not_affect_other_poses(request, scene, damage):
-    steps, poses = tracked_with_bad_frame(request, scene, True, damage)
+def test_plausible_wrong_image_does_not_affect_other_poses(request, damage):
+    steps, poses = tracked_with_bad_frame(request, "room", True, damage)
     # Poses before it are correct; those after it are mutually consistent.
     assert components(steps)[:BAD] == [0] * BAD
     assert None not in components(steps)

@@ -128,7 +128,7 @@ def test_result_is_independent_of_threads(there_and_back, joined) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("after", [6, 12, 20])
+@pytest.mark.parametrize("after", [6, 20])
 def test_restored_copy_gives_same_result(there_and_back, joined, after) -> None:
     _, frames = there_and_back
     result, _ = joined
@@ -206,9 +206,8 @@ def test_few_frames_of_another_scene_get_no_model() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [2, 4])
-def test_unordered_views_are_joined(seed) -> None:
-    places = np.random.default_rng(seed).permutation(range(0, 24, 2)).tolist()
+def test_unordered_views_are_joined() -> None:
+    places = np.random.default_rng(2).permutation(range(0, 24, 2)).tolist()
     result, _ = run(in_order(frames_of(places)))
     rows = np.flatnonzero(result.has_pose).tolist()
     assert len(rows) >= 10

@@ -101,8 +101,8 @@ def test_wrong_poses_deviate_more_from_measurements(recording, truth, of_truth, 
 
 @pytest.mark.slow
 def test_tolerance_decides_verdict(recording, truth) -> None:
-    near = truth.copy()
-    near[:, :3, 3] += 0.004 * np.random.default_rng(3).standard_normal((8, 3))
+    recording, near = recording.select(every=2), truth[::2].copy()
+    near[:, :3, 3] += 0.004 * np.random.default_rng(3).standard_normal((4, 3))
     assert tofuse.judge(recording, near, tolerance_m=0.05).verdict == "good"
     (reason,) = tofuse.judge(recording, near, tolerance_m=0.004).reasons
     assert reason.code == "uncertain_poses"

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import made_sessions
 from made_rooms import OTHER, seen
-from made_sessions import HERE, THERE, made_result, made_result_of, quick
+from made_sessions import made_result, made_result_of, quick
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.files.trajectory import read_tum
@@ -34,6 +35,8 @@ from tofuse.results.run_json import read_run_json
 from tofuse.results.session_words import session_sentences
 from written_run_json import run_json
 
+HERE, THERE = made_sessions.HERE[::2], made_sessions.THERE[::2]
+N = len(HERE)
 TRUE = np.array([*HERE, *THERE])
 
 
@@ -115,16 +118,16 @@ def test_overlap_and_probability_are_reported(both) -> None:
 
 def test_run_json_states_session_of_each_frame(both, results) -> None:
     data = run_json(both)
-    assert [frame["session"] for frame in data["frames"]] == [0] * 12 + [1] * 12
+    assert [frame["session"] for frame in data["frames"]] == [0] * N + [1] * N
     assert [s["name"] for s in data["sessions"]] == ["here", "there"]
     assert [s["result"] for s in data["sessions"]] == [str(results[k]) for k in ("here", "there")]
-    assert [s["first"] for s in data["sessions"]] == [0, 12]
+    assert [s["first"] for s in data["sessions"]] == [0, N]
     assert data["session_pairs"][0]["joined"]
 
 
 def test_flat_of_same_plan_is_not_joined(results) -> None:
     found = merged(results["here"], results["elsewhere"], searches=4)
-    assert found.has_pose.tolist() == [True] * 12 + [False] * 12
+    assert found.has_pose.tolist() == [True] * N + [False] * N
     (pair,) = found.session_pairs
     assert not pair.joined
     assert (pair.links, pair.probability, pair.support) == (0, None, None)
@@ -143,7 +146,7 @@ def test_first_session_stays_main_if_others_are_larger(results, pair) -> None:
     """And merged results can be merged again: joined sessions stay joined."""
     found = merged(results["elsewhere"], pair, searches=3)
     assert [s.name for s in found.sessions] == ["elsewhere", "here", "there"]
-    assert found.has_pose.tolist() == [True] * 12 + [False] * 24
+    assert found.has_pose.tolist() == [True] * N + [False] * 2 * N
     assert "few_poses" not in {reason.code for reason in found.diagnostics.reasons}
     assert found.diagnostics.verdict == "degraded"
     assert [s.T_main_session is None for s in found.sessions] == [False, True, True]
@@ -160,7 +163,7 @@ def test_first_session_stays_main_if_others_are_larger(results, pair) -> None:
 @pytest.mark.slow
 def test_loops_of_earlier_merge_are_registered_again(both, results, pair) -> None:
     sessions = read_sessions([results["elsewhere"], pair], 2, Silent())
-    across = [(p.i, p.j) for p in both.diagnostics.loops if p.accepted and p.i < 12 <= p.j]
+    across = [(p.i, p.j) for p in both.diagnostics.loops if p.accepted and p.i < N <= p.j]
     assert len(across) >= 2
     assert sessions[0].links == ()
     assert set(sessions[1].links) == set(across)
@@ -169,7 +172,7 @@ def test_loops_of_earlier_merge_are_registered_again(both, results, pair) -> Non
     config = replace(config, loops=replace(config.loops, per_view=0))
     found = merge_sessions(sessions, config, threads=2)
     (apart,) = [c.result for c in found.components if not c.connected]
-    closed = {(p.i - 12, p.j - 12) for p in apart.diagnostics.loops if p.accepted}
+    closed = {(p.i - N, p.j - N) for p in apart.diagnostics.loops if p.accepted}
     assert closed == set(across)
     codes = {reason.code for reason in apart.diagnostics.reasons}
     assert "loop_rejected" not in codes
@@ -193,15 +196,15 @@ def test_command_writes_result(results, tmp_path, monkeypatch, capsys) -> None:
 
     def painting(mesh, views, poses, size):
         painted.append(len(views))
-        return textured(mesh, views, poses, size)
+        return textured(mesh, views, poses, size // 8)  # a small texture
 
     monkeypatch.setattr(paint, "textured", painting)
     assert main([*words, "--threads", "2", "--texture"]) == 0
     assert "here and there overlap" in capsys.readouterr().out
-    assert painted == [24]  # views of both
+    assert painted == [2 * N]  # views of both
     assert (out / "mesh.obj").exists()
     times, poses = read_tum(out / "trajectory.txt")
-    assert len(poses) == 24
+    assert len(poses) == 2 * N
     assert (np.diff(times) > 0).all()
     data = json.loads((out / "run.json").read_text())
     assert [s["name"] for s in data["sessions"]] == ["here", "there"]
@@ -228,7 +231,7 @@ def test_bad_input_is_refused_in_one_line(results, tmp_path) -> None:
     refused([here, tmp_path / "nothing"], "doesn't exist")
     refused([here, tmp_path], "no run.json")
     copied(here, tmp_path)
-    refused([here, tmp_path / "out"], "same recording", "12 frames are in both")
+    refused([here, tmp_path / "out"], "same recording", f"{N} frames are in both")
 
 
 def test_missing_recording_is_named_with_remedy(results, tmp_path) -> None:
@@ -255,7 +258,7 @@ def test_changed_recording_is_refused(results, tmp_path) -> None:
 def test_results_of_clouds_are_refused(results, tmp_path) -> None:
     writer = RecordingWriter(tmp_path / "clouds", None, frame_rate_hz=10.0)
     points = np.random.default_rng(0).uniform(1, 2, (50, 3)).astype(np.float32)
-    for k in range(12):
+    for k in range(N):
         writer.add(CloudFrame(k, k / 10, points))
     writer.finish()
     again = copied(results["there"], tmp_path)
@@ -271,8 +274,8 @@ def test_result_that_stores_only_the_path_of_its_recording(results, tmp_path) ->
     run = json.loads((again / "run.json").read_text())
     changed_run_json(again, input=run["input"] | {"opening": None})
     _, session = read_sessions([results["here"], again], 1, Silent())
-    assert len(session.recording) == 12
-    assert len(session.posed) == 12
+    assert len(session.recording) == N
+    assert len(session.posed) == N
 
 
 @pytest.mark.slow
@@ -285,11 +288,11 @@ def test_joined_and_selected_recordings_are_merged(results, tmp_path) -> None:
     of_both = {**result.recording, "opening": opening.to_dict()}
     write_result(replace(result, recording=of_both), OutputFolder(tmp_path / "both"))
     sessions = read_sessions([tmp_path / "both", results["elsewhere"]], 1, Silent())
-    assert sessions[0].recording.indices.tolist() == list(range(1, 24, 2))
+    assert sessions[0].recording.indices.tolist() == list(range(1, 2 * N, 2))
     joined, firsts = merging.joined_recording(sessions)
-    assert firsts == [0, 24]
-    assert [part["frames"] for part in joined.metadata["parts"]] == [12, 12, 12]
-    assert joined.indices.tolist() == [*range(1, 24, 2), *range(24, 36)]
+    assert firsts == [0, 2 * N]
+    assert [part["frames"] for part in joined.metadata["parts"]] == [N, N, N]
+    assert joined.indices.tolist() == [*range(1, 2 * N, 2), *range(2 * N, 3 * N)]
 
 
 @pytest.mark.parametrize(
@@ -334,7 +337,7 @@ def test_recording_is_added_to_map(results, tmp_path, monkeypatch, capsys) -> No
 @pytest.mark.slow
 def test_separate_parts_of_result_stay_separate_or_are_joined(results, tmp_path) -> None:
     """A recording that continues elsewhere after a dark frame, and a session of that place."""
-    first, second = HERE[5:], THERE[5:]
+    first, second = made_sessions.HERE[5:], made_sessions.THERE[5:]
     frames = [
         *(seen(T, 400 + k) for k, T in enumerate(first)),
         *(seen(T, 420 + k, boxes=OTHER) for k, T in enumerate(second)),
@@ -345,19 +348,19 @@ def test_separate_parts_of_result_stay_separate_or_are_joined(results, tmp_path)
     assert run_status(mixed) == ["tracked"] * 7 + ["lost"] + ["tracked"] * 7
 
     found = merged(results["there"], mixed, searches=4)
-    assert found.has_pose.tolist() == [True] * 12 + [True] * 7 + [False] * 8
-    lost = found.diagnostics.frames[19]
+    assert found.has_pose.tolist() == [True] * (N + 7) + [False] * 8
+    lost = found.diagnostics.frames[N + 7]
     assert lost.status == "lost"
     assert "valid points" in lost.reason
     off = se3.inverse(THERE[0]) @ np.array([*THERE, *first])
-    error = np.linalg.norm(off[:, :3, 3] - found.trajectory[:19, :3, 3], axis=1)
+    error = np.linalg.norm(off[:, :3, 3] - found.trajectory[: N + 7, :3, 3], axis=1)
     assert error.max() < 0.005
     assert found.sessions[1].T_main_session is not None
     (apart,) = [c for c in found.components if not c.connected]
-    assert apart.frames == ((20, 26),)
+    assert apart.frames == ((N + 8, N + 14),)
 
     found = merged(results["elsewhere"], mixed, searches=4)
-    assert found.has_pose.tolist() == [True] * 12 + [False] * 8 + [True] * 7
+    assert found.has_pose.tolist() == [True] * N + [False] * 8 + [True] * 7
     off = se3.inverse(THERE[0]) @ np.array([*THERE, *second])
     error = np.linalg.norm(off[:, :3, 3] - found.trajectory[found.has_pose, :3, 3], axis=1)
     assert error.max() < 0.005

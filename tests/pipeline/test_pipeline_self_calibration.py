@@ -199,30 +199,23 @@ def test_bound_without_loop_includes_focal_length_error(recording) -> None:
 
 
 # A sweep to both sides and back, which closes loops without a full turn.
-SWEEP = np.linspace(0, 2 * np.pi, 60)
-SWEPT = np.tile(np.eye(4), (60, 1, 1))
+SWEEP = np.linspace(0, 2 * np.pi, 30)
+SWEPT = np.tile(np.eye(4), (30, 1, 1))
 SWEPT[:, :3, :3] = se3.exp(
     np.outer(1.2 * np.sin(SWEEP), [0, 0, 0, 0, 1, 0])
     + np.outer(0.15 * np.sin(2 * SWEEP), [0, 0, 0, 1, 0, 0])
 )[:, :3, :3]
 SWEPT[:, :3, 3] = np.stack([0.4 * np.sin(SWEEP), 0.1 * np.sin(SWEEP), 0.4 * (np.cos(SWEEP) - 1)], 1)
-WIDE = BrownConrady(100, 100, 50.0, 50.0, 49.5, 49.5)
+WIDE = BrownConrady(64, 64, 32.0, 32.0, 31.5, 31.5)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("true", "errors", "corrected"),
     [
-        ({"fx": 50.5, "fy": 50.5}, {"focal": -0.01}, False),
-        ({"fx": 49.85, "fy": 49.85}, {"focal": 0.003}, False),
-        ({"fx": 49.5, "fy": 49.5}, {"focal": 0.01}, False),
-        ({"fx": 49.0, "fy": 49.0}, {"focal": 0.02}, True),
-        ({"cx": 49.01}, {"center_x": 0.01}, False),
-        ({"cx": 48.5}, {"center_x": 0.02}, True),
-        ({"cy": 51.01}, {"center_y": -0.03}, True),
-        ({"k1": -0.003}, {"distortion": 0.003}, False),
+        ({"fx": 31.68, "fy": 31.68}, {"focal": 0.01}, False),
+        ({"cy": 32.46}, {"center_y": -0.03}, True),
         ({"k1": -0.02}, {"distortion": 0.02}, True),
-        ({"k1": 0.03}, {"distortion": -0.03}, True),
     ],
 )
 def test_wrong_intrinsics_are_corrected_or_part_of_bound(true, errors, corrected) -> None:

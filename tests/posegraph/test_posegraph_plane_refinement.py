@@ -26,13 +26,12 @@ def nudged(poses, size, seed=0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sigma", [0.04, 0.1])
-def test_peaks_error_is_near_bound(sigma):
-    """From the drift of the thesis's method, and from random errors."""
+def test_peaks_error_is_near_bound():
+    """From the drift of the thesis's method; `benchmarks/peaks.py` has more noise levels."""
+    sigma = 0.04
     views, truth = peaks_views(sigma, 1)
     thesis = run_peaks(sigma, 1)
-    start = thesis.poses_optimised if sigma < 0.05 else nudged(truth, 0.3)
-    found = refine_clouds([v.points for v in views], start, PlaneOptions())
+    found = refine_clouds([v.points for v in views], thesis.poses_optimised, PlaneOptions())
     error = PoseErrors.of(found.poses, truth).position.mean()
     assert error < 1.5 * peaks_bound(sigma)
     assert error < thesis.optimised.position.mean() / 4
@@ -47,7 +46,7 @@ def test_peaks_error_is_near_bound(sigma):
 @pytest.mark.slow
 def test_result_is_independent_of_threads():
     views, truth = peaks_views(0.05, 0)
-    clouds, start = [v.points[::2] for v in views[:8]], nudged(truth[:8], 0.05)
+    clouds, start = [v.points[::2] for v in views[:5]], nudged(truth[:5], 0.05)
     found = []
     for count in (1, 2, 3):
         with threads(count):
