@@ -8,7 +8,7 @@ import pytest
 from hypothesis import settings
 
 # The same examples each time, however long one of them takes on a busy machine.
-settings.register_profile("tests", deadline=None, derandomize=True)
+settings.register_profile("tests", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("tests")
 
 
