@@ -22,7 +22,7 @@ from tofuse.registration.view_descriptor import (
     similar_views,
 )
 
-COUNT = 28
+COUNT = 40
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def swing() -> tuple[list, np.ndarray]:
 def test_submaps_match_refinement_of_all_views(swing) -> None:
     views, truth = swing
     start = drifted(truth)
-    whole, parts = (refined(Joint(submap=n), views, start) for n in (COUNT, 10))
+    whole, parts = (refined(Joint(submap=n), views, start) for n in (COUNT, 14))
     assert parts.kept
     assert away(start, truth) > 0.15
     assert away(whole.poses, truth) < 0.004
