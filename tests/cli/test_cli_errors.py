@@ -217,7 +217,11 @@ USAGE: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     "depth a word": ((*RUN, "--max-depth", "far"), ("--max-depth", "'far'"), "tofuse run: "),
     "depth negative": ((*RUN, "--min-depth", "-1"), ("--min-depth", "-1"), "tofuse run: "),
     "depth infinite": ((*RUN, "--max-depth", "inf"), ("--max-depth", "inf"), "tofuse run: "),
-    "memory of a byte": ((*RUN, "--memory", "1"), ("--memory", "1 bytes", "500 MB"), "tofuse: "),
+    "memory of a byte": (
+        (*RUN, "--memory", "1"),
+        ("--memory", "is less than 500 MB", "2GB"),
+        "tofuse: ",
+    ),
     "unknown guess": ((*RUN, "--guess", "luck"), ("--guess", "'luck'"), "tofuse run: "),
     "depths swapped": (
         (*RUN, "--min-depth", "3", "--max-depth", "2"),

@@ -564,9 +564,7 @@ def test_phone_notebook_runs_on_phone_scan(
 def test_judging_notebook_detects_drift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     # Those that need many rays per pixel; noise remains.
-    simulate_less(monkeypatch, "mixed_pixels", "multipath", "smear", frames=8)
+    simulate_less(monkeypatch, "mixed_pixels", "multipath", "smear", frames=16)
     names = run_notebook(JUDGING)
     moved = {k: float(np.nanmax(j.displacement_m)) for k, j in names["judgements"].items()}
-    # The last of the 8 poses has drifted by 35 mm.
-    assert moved["drifted"] > 0.01
-    assert moved["true"] < 0.005
+    assert moved["drifted"] > 0.03 > moved["true"]

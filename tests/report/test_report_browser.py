@@ -161,7 +161,7 @@ def test_section_cuts_and_is_reset(browser, report):
             panel.locator("input").nth(k).fill("500")
             assert changed(covered, rested(seen)) > 0.02, k
             panel.get_by_role("button").click()
-        assert changed(covered, rested(seen)) < 0.002
+            assert changed(covered, rested(seen)) < 0.002
         page.get_by_role("button", name="Section").click()
         assert changed(whole, rested(seen)) < 0.002
         seen.check()

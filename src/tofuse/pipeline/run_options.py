@@ -96,9 +96,9 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
         megabytes = options.memory // 1_000_000
         if megabytes < MIN_MEMORY_MB:
             raise InputError(
-                f"is {options.memory:,} bytes",
+                f"is less than {MIN_MEMORY_MB} MB",
                 where="--memory",
-                remedy=f"allow {MIN_MEMORY_MB} MB or more, e.g. --memory 2GB",
+                remedy="allow more, e.g. --memory 2GB",
             )
         config = changed(config, {"memory_mb": megabytes}, where="--memory")
     leading_filters: list[dict[str, Any]] = []

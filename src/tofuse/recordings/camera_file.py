@@ -356,14 +356,15 @@ def read_rays(path: Path) -> RayTable:
         if table.ndim != 3 or table.shape[2] != 2:
             raise ValueError(f"shape {table.shape}, not (H, W, 2)")
         rays = np.array(table, float)
-        if (np.abs(rays[np.isfinite(rays)]) > MAX_SLOPE).any():
+        finite = np.isfinite(rays)
+        if (np.abs(rays[finite]) > MAX_SLOPE).any():
             raise ValueError("rays at 90 degrees from the optical axis or more")
-        directions = rays[np.isfinite(rays).all(2)]
+        directions = rays[finite.all(2)]
         if not len(directions):
             raise ValueError("no pixel has a ray")
         if len(directions) > 1 and not np.ptp(directions, axis=0).any():
             raise ValueError("all rays are the same")
-        return RayTable(np.where(np.isfinite(rays), rays, np.nan).astype(np.float32))
+        return RayTable(np.where(finite, rays, np.nan).astype(np.float32))
     except OSError as error:
         raise input_error(error, path) from error
     except InputError as error:
