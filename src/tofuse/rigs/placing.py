@@ -11,7 +11,7 @@ score.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
@@ -277,24 +277,22 @@ class _Placer:
 
     def _rivals(
         self, poses: Mapping[int, Float64], camera: int, candidates: Sequence[tuple[float, Float64]]
-    ) -> list[float]:
-        """Return scores of alternative poses for a camera, descending.
+    ) -> Iterator[float]:
+        """Yield scores of alternative poses for a camera, descending.
 
         A pose that converges to the current one is not an alternative.
         """
         pose = poses[camera]
         distinct: list[Float64] = [pose]
-        scores: list[float] = []
         for gain, T in sorted(candidates, key=lambda pair: -pair[0]):
-            if len(scores) > _RIVALS or gain <= 0:
+            if gain <= 0:
                 break
             if not self._is_distinct(T, distinct):
                 continue
             distinct.append(T)
             refined = self._align({**poses, camera: T})
             if are_distinct_poses(pose, refined[camera], self._distinct_m):
-                scores.append(gain)
-        return scores
+                yield gain
 
     def _pose_probability(
         self, poses: Mapping[int, Float64], camera: int, rivals: Sequence[_Hypothesis]
@@ -320,20 +318,22 @@ class _Placer:
             for other in rivals
             if other.poses.keys() == poses.keys()
         ]
-        scores = self._rivals({**others, camera: pose}, camera, candidates)
-        rival = scores[0] if scores else 0.0
+        rival_scores = self._rivals({**others, camera: pose}, camera, candidates)
+        rival = next(rival_scores, 0.0)
         overlap = max(sum(s.overlap for s in agreements), 1e-9)
         evidence = Evidence(
             support=min(sum(s.support for s in agreements), 1.0),
             contradiction=sum(s.contradiction for s in agreements) / overlap,
             margin=score - rival,
         )
-        gaps = -np.diff(scores[: _RIVALS + 1]) * np.arange(2, len(scores[: _RIVALS + 1]) + 1)
+        if evidence.probability >= ACCEPTED:
+            return evidence.probability, ""
+        # Only now the other rivals: each costs a joint refinement.
+        scores = [rival, *itertools.islice(rival_scores, _RIVALS)]
+        gaps = -np.diff(scores) * np.arange(2, len(scores) + 1)
         mean_gap = float(gaps.mean()) if len(gaps) else rival
         chance = float(np.exp(-max(score - rival, 0.0) / mean_gap)) if mean_gap > 0 else 0.0
         probability = min(evidence.probability, 1 - chance)
-        if evidence.probability >= ACCEPTED:
-            return evidence.probability, ""
         if evidence.probability < PROBABLE:
             return probability, evidence.rejection_reason()
         if chance > _MAX_CHANCE:
