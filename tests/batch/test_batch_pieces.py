@@ -124,6 +124,7 @@ def test_cluster_loop_search_is_bit_identical(cluster: str, turn) -> None:  # no
         np.testing.assert_array_equal(a.information, b.information)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 def test_killed_worker_loses_no_results(cluster: str) -> None:
     there = DaskExecutor(cluster, lambda text: None)
@@ -140,6 +141,32 @@ def test_killed_worker_loses_no_results(cluster: str) -> None:
     there.close()
     assert killed
     assert [square for square, _ in found] == [k * k for k in range(40)]
+
+
+def test_requests_that_time_out_are_repeated(cluster: str, monkeypatch) -> None:
+    messages: list[str] = []
+    there = DaskExecutor(cluster, messages.append)
+    timed_out: list[str] = []
+
+    def once(name: str):
+        request = getattr(there._client, name)
+
+        def ask(*args, **kwargs):
+            if name not in timed_out:
+                timed_out.append(name)
+                raise TimeoutError
+            return request(*args, **kwargs)
+
+        return ask
+
+    for name in ("scheduler_info", "scatter"):
+        monkeypatch.setattr(there._client, name, once(name))
+    found = there.map(slowly_squared, 3, lambda k: (k,))
+    there.close()
+    assert timed_out == ["scheduler_info", "scatter"]
+    assert not messages
+    assert there.n_remote == 3
+    assert [square for square, _ in found] == [0, 1, 4]
 
 
 def test_worker_error_is_raised_as_in_local_run(cluster) -> None:
@@ -159,6 +186,7 @@ def test_lost_scheduler_falls_back_to_local_execution(batch_benchmark) -> None:
     with batch_benchmark.local_cluster(1) as (address, _):
         there = DaskExecutor(address, messages.append)
         some = there.map(slowly_squared, 3, lambda k: (k,))
+        assert not messages
         assert os.getpid() not in {pid for _, pid in some}
     rest = there.map(slowly_squared, 5, lambda k: (k,))
     assert {pid for _, pid in rest} == {os.getpid()}

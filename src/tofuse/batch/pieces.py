@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import platform
 from collections import deque
 from collections.abc import Callable
@@ -24,7 +25,7 @@ R = TypeVar("R")
 _POLL_S = 1.0  # interval at which the scheduler and its workers are checked
 _CHUNK = 4  # small pieces per task: each takes a fraction of a second
 _TASKS_PER_THREAD = 2  # so that the next one is present when one is done
-_MAX_ATTEMPTS = 3  # to submit a piece, before it is done locally
+_MAX_ATTEMPTS = 3  # to submit a piece, before it is done locally, and to reach a busy scheduler
 
 # Packages whose version influences results.
 _PACKAGES = ("numpy", "scipy", "numba")
@@ -60,7 +61,7 @@ class DaskExecutor(Executor):
         self._address, self._notify = address, notify
         self._client: Any = connect(address, "leave it out")
         self._abandoned = False
-        self._polled_at, self._threads = -_POLL_S, 0
+        self._polled_at, self._threads, self._unanswered = -_POLL_S, 0, 0
         self.n_remote = 0
         try:
             self._check_workers()
@@ -119,6 +120,9 @@ class DaskExecutor(Executor):
             except Empty:
                 continue
             except _DISCONNECTED:
+                if self._client.status == "running" and attempt < _MAX_ATTEMPTS:  # it is busy
+                    queue.appendleft((part, attempt + 1))
+                    continue
                 self._abandon()
                 break
             attempt, future = running.pop(part)
@@ -156,8 +160,10 @@ class DaskExecutor(Executor):
         if monotonic() - self._polled_at >= _POLL_S:
             try:
                 workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
-            except OSError:
-                return 0
+            except OSError:  # a busy scheduler may answer the next request
+                self._unanswered += 1
+                return self._threads if self._unanswered < _MAX_ATTEMPTS else 0
+            self._unanswered = 0
             self._polled_at, self._threads = monotonic(), sum(int(w["nthreads"]) for w in workers)
         return self._threads
 
@@ -171,6 +177,8 @@ class DaskExecutor(Executor):
 
     def _check_workers(self) -> None:
         """Refuse workers that would give different results."""
+        with contextlib.suppress(OSError):  # without any, the run is done on this machine
+            self._client.wait_for_workers(1, timeout=TIMEOUT_S)
         try:
             environments = self._client.run(_environment)
         except Exception as error:
@@ -185,6 +193,7 @@ class DaskExecutor(Executor):
                         where=str(worker),
                         remedy="results would differ: install the same versions there",
                     )
+        self._threads = len(environments)  # at least, until the scheduler is asked
 
 
 # Errors if a cluster disappears between two requests.
