@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help demo test quick lint docs gallery format lock audit sbom clean
+.PHONY: help demo test slow lint docs gallery format lock audit sbom clean
 
 help:                       ## this list
 	@awk -F ':.*## *' '/^[a-z]+:.*##/ { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -18,11 +18,12 @@ demo: .venv/.ready          ## simulate a recording, reconstruct it, leave a mod
 	$(BIN)/tofuse demo --out demo --overwrite
 
 # Compiled modules are kept, even where the environment says otherwise: many tests start processes.
-test: .venv/.ready          ## run the tests
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile
+PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile
+test: .venv/.ready          ## run the tests, some 4 minutes
+	$(PYTEST) -m "not slow"
 
-quick: .venv/.ready         ## run the tests that take no more than a second or two each
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not slow"
+slow: .venv/.ready          ## run the tests of whole runs, browsers, clusters and killed processes, some 10 minutes
+	$(PYTEST) -m slow
 
 lint: .venv/.ready          ## formatting, style, strict types, and who may import whom
 	$(BIN)/ruff format --check .

@@ -359,6 +359,7 @@ def test_missing_library_is_named(result, monkeypatch):
         result.mesh.to_open3d()
 
 
+@pytest.mark.slow
 def test_view_serves_page_until_stopped(result):
     pytest.importorskip("viser")
     from urllib.error import URLError

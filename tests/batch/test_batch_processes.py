@@ -163,6 +163,7 @@ def test_killed_jobs_and_batch_are_resumed(
     assert sum(int(r["starts"]) for r in records(out)) >= 4
 
 
+@pytest.mark.slow
 def test_interrupted_batch_reports_progress(
     batch_benchmark: ModuleType, listed: Path, tmp_path: Path
 ) -> None:
@@ -213,6 +214,7 @@ def test_batch_resumes_after_lost_scheduler(
     assert same(batch_benchmark, single_runs, out)
 
 
+@pytest.mark.slow
 def test_unreachable_scheduler_is_reported(
     listed: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:

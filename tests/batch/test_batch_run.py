@@ -416,6 +416,7 @@ def test_durations_are_formatted(seconds: float, text: str) -> None:
     assert duration(seconds) == text
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="reads /proc")
 def test_jobs_do_not_inherit_memory_limit_of_dask_workers(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "65536")

@@ -232,6 +232,7 @@ def test_real_sr4000_from_two_places_is_rejected(shared_data: Path) -> None:
         calibrate_depth(found, camera)
 
 
+@pytest.mark.slow
 def test_missing_amplitude_or_board_is_rejected(views: Recording) -> None:
     bare = [replace(frame, amplitude_image=None) for frame in views.select(0, 2)]
     recording = Recording.of(ArraySource(bare), "bare", "simulated")
@@ -241,6 +242,7 @@ def test_missing_amplitude_or_board_is_rejected(views: Recording) -> None:
         board_planes(views.select(0, 1), Board(9, 7, 0.1), "amplitude", wall=False)
 
 
+@pytest.mark.slow
 def test_camera_without_errors_is_not_corrected_in_room() -> None:
     """Pixels of other walls are near a wall in its corners, all in front of it."""
     camera = Pinhole(96, 72, 60.0, 60.0, 47.5, 35.5)

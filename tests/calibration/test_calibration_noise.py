@@ -245,6 +245,7 @@ def test_amplitude_gain_mismatch_is_corrected(gain: float) -> None:
     assert np.median(model.sigma(other[0])[seen] / right[seen]) == pytest.approx(1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_real_sr4000_noise_agrees_with_data_description(shared_data: Path) -> None:
     fit = estimate_noise(open_recording(shared_data / "sr4000_corridor"))
     assert (fit.law, fit.stretches, fit.frames) == ("amplitude", 2, 8)

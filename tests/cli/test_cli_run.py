@@ -401,6 +401,7 @@ def test_camera_option_replaces_intrinsics(recording, tmp_path) -> None:
     assert np.ptp(other[:, 0]) > 1.5 * np.ptp(own[:, 0])
 
 
+@pytest.mark.slow
 def test_loops_are_read_from_file(room_recording, tmp_path) -> None:
     loops = tmp_path / "loops.txt"
     T = read_tum(room_recording / "groundtruth.txt")[1][6]
@@ -680,6 +681,7 @@ def test_closed_output_pipe_is_silent(room_recording) -> None:
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.slow
 def test_simulated_recording_is_readable_by_run(tmp_path, capsys) -> None:
     words = ["simulate", "box", "--out", str(tmp_path / "rec"), "--frames", "2"]
     assert main([*words, "--without", "all", "--seed", "3", "--uniform"]) == 0

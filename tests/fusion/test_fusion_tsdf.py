@@ -366,6 +366,7 @@ def test_empty_views_make_empty_mesh() -> None:
     assert mesh.cloud().points.shape == (0, 3)
 
 
+@pytest.mark.slow
 def test_builder_keeps_views_within_memory_limit() -> None:
     frames, poses = around_a_ball(60, noise=np.random.default_rng(1))
     posed = dict(enumerate(poses))
@@ -630,6 +631,7 @@ def test_round_robin_views_make_nearly_same_surface(monkeypatch) -> None:
     assert turned.weight.sum() == pytest.approx(full.weight[common].sum(), rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stride", [1, 2])
 def test_near_cubes_match_slow_twin(stride) -> None:
     rng = np.random.default_rng(9)

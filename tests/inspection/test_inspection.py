@@ -69,6 +69,7 @@ def result(room_recording) -> tofuse.Result:
     return replace(found, recording={**found.recording, "warnings": []})
 
 
+@pytest.mark.slow
 def test_facts_of_simulated_recording(room_recording) -> None:
     found = inspect_recording(tofuse.open(room_recording))
     facts = found.facts

@@ -35,6 +35,7 @@ def _run(env: dict[str, str], code: str = _COMPILE) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="the home folder is used on POSIX systems only")
 @pytest.mark.parametrize("place", ["file", "missing"])
 def test_unwritable_home_uses_temporary_cache(tmp_path, place) -> None:
@@ -65,6 +66,7 @@ def test_writable_cache_is_kept_and_reused(tmp_path) -> None:
     assert {p: p.stat().st_mtime_ns for p in Path(folder).rglob("*.nb*")} == stamps  # reused
 
 
+@pytest.mark.slow
 def test_cache_key_changes_with_any_kernel(tmp_path) -> None:
     package = tmp_path / "kernels"
     shutil.copytree(Path(jit.__file__).parent, package, ignore=shutil.ignore_patterns("__pyc*"))

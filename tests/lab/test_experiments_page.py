@@ -65,6 +65,7 @@ def test_sweep_is_judged_by_its_errors():
     assert outcome("peaks-threshold", replace(sweep, position=position + 1)) == "partly"
 
 
+@pytest.mark.slow
 def test_peaks_case_gives_page_and_results(peaks_page):
     data = read(peaks_page)
     assert (data["kind"], data["parameters"]["seeds"]) == ("experiments", 1)
@@ -81,6 +82,7 @@ def test_peaks_case_gives_page_and_results(peaks_page):
     assert "“The yaw-angle is most improved.”" in text
 
 
+@pytest.mark.slow
 def test_scene_is_run_with_all_variants(rail_page):
     data = read(rail_page)
     runs = data["cases"]["rail"]["runs"]
@@ -101,6 +103,7 @@ def test_scene_is_run_with_all_variants(rail_page):
     assert not re.search(r"\bnan\b", re.sub(r"data:[^\"']+", "", text), re.IGNORECASE)
 
 
+@pytest.mark.slow
 def test_only_earlier_experiments_are_overwritten(peaks_page, tmp_path):
     with pytest.raises(OutputError, match="overwrite"):
         run_experiments(peaks_page.parent, cases=("peaks",), seeds=1)

@@ -68,6 +68,7 @@ def test_similar_rooms_differ_less() -> None:
     assert 0.02 < unlike["flat-alike"] < 0.5 * unlike["flat"]
 
 
+@pytest.mark.slow
 def test_flat_is_recorded_from_given_frame() -> None:
     from tofuse.lab.simulation.effects import Effects
     from tofuse.lab.simulation.record import plan, simulate_recording

@@ -377,6 +377,7 @@ def test_single_bounce_light_matches_form_factor_integral() -> None:
         assert light[2 + 4 * k, 22, 0] == pytest.approx((lit * form).sum() * area, rel=0.12)
 
 
+@pytest.mark.slow
 def test_corner_multipath_matches_integral_over_walls() -> None:
     """Falloff: half lamp, half lens; bounced light has that of the lamp at its source."""
     model = replace(MODEL, camera=Pinhole(176, 144, 152.0, 152.0, 87.5, 71.5))

@@ -187,6 +187,7 @@ def test_last_motion_is_extrapolated(room, monkeypatch):
     np.testing.assert_allclose(predicted, steady, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_odometry_fills_degenerate_directions():
     sequence = Sequence("wall", range(0, 15, 3))
     # In a frame of reference of its own, as in odometry files.
@@ -341,6 +342,7 @@ def test_jump_away_and_back_gives_three_components(corner, elsewhere, searches):
     assert any(i < 4 and j >= 7 for i, j in links) == searches
 
 
+@pytest.mark.slow
 def test_links_connect_different_components(corner, elsewhere):
     frames = in_order([*corner.frames[:4], *elsewhere, *corner.frames[2:5]])
     steps = run(frames)
@@ -448,6 +450,7 @@ def test_invalid_options_are_refused_by_name(path, value):
     assert "my.toml: odometry" in str(refused.value)
 
 
+@pytest.mark.slow
 def test_real_camera_after_large_move_is_correct_or_doubtful(shared_data):
     """Two positions 305 mm apart along a corridor, with nothing recorded in between."""
     recording = open_recording(shared_data / "sr4000_corridor")
@@ -470,6 +473,7 @@ def test_real_camera_after_large_move_is_correct_or_doubtful(shared_data):
         assert np.linalg.norm(relative[:3, 3]) < 0.01
 
 
+@pytest.mark.slow
 def test_real_camera_near_door_does_not_slide(shared_data):
     """At a distance of 0.25 m, moved by less than 1 cm: poses must not slide along the door."""
     recording = open_recording(shared_data / "iphone_record3d")

@@ -533,6 +533,7 @@ def test_propagate_and_predict_match_reference():
     np.testing.assert_array_equal(got, expected)
 
 
+@pytest.mark.slow
 def test_person_before_static_camera_is_segmented(shared_data):
     frames = list(open_recording(shared_data / "person_turning"))[:40:4]
     views = [prepare_view(frame, SurfaceOptions()) for frame in frames]

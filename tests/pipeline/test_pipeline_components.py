@@ -165,6 +165,7 @@ def test_finish_resumes_after_any_stage(there_and_back, joined) -> None:
         assert [c.frames for c in again.components] == [c.frames for c in result.components]
 
 
+@pytest.mark.slow
 def test_blank_frames_leave_one_model() -> None:
     places = [*range(6), 6, 7, 8, *range(9, 15)]
     frames = frames_of(places)

@@ -134,6 +134,7 @@ def test_frames_without_pose_stay_without(recording, truth) -> None:
     assert found.to_dict()["frames"] == 6
 
 
+@pytest.mark.slow
 def test_given_poses_are_kept_without_refinement(recording, truth) -> None:
     moved = bent(truth)
     config = replace(from_method("default"), odometry=GivenPoses(), refinement=NoRefinement())

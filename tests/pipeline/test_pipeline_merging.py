@@ -125,6 +125,7 @@ def test_run_json_states_session_of_each_frame(both, results) -> None:
     assert data["session_pairs"][0]["joined"]
 
 
+@pytest.mark.slow
 def test_flat_of_same_plan_is_not_joined(results) -> None:
     found = merged(results["here"], results["elsewhere"], searches=4)
     assert found.has_pose.tolist() == [True] * N + [False] * N

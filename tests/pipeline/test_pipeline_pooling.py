@@ -8,6 +8,7 @@ import pytest
 from tofuse.pipeline.pooling import pooled
 
 
+@pytest.mark.slow
 def test_variance_of_equal_estimates_follows_their_spread() -> None:
     rng = np.random.default_rng(0)
     off, stated = [], []

@@ -178,6 +178,7 @@ def test_device_poses_bound_slide_along_wall(covered) -> None:
     assert covered or displacement(right[seen], alone.trajectory[seen])[0] > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("prior", "sensors"), [("auto", ["gravity"]), ("none", []), ("device", None)]
 )

@@ -233,6 +233,7 @@ def test_wrong_intrinsics_are_corrected_or_part_of_bound(true, errors, corrected
         assert run_json(result)["self_calibration"][name] == getattr(d.calibrated, name)
 
 
+@pytest.mark.slow
 def test_correct_focal_length_is_unchanged(recording) -> None:
     result = reconstruct(recording, COARSE)
     assert result.diagnostics.calibrated is None

@@ -111,6 +111,7 @@ def plain(frame: Frame) -> Frame:
     return frame
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("there", [0.0, 0.5])
 def test_strength_is_fraction_of_error_in_data(straight: Recording, there: float) -> None:
     """The correction removes a bump of 2 %, of which the data contain this fraction."""

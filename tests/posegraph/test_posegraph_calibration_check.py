@@ -33,6 +33,7 @@ def kept(offset: float, views: int = 12) -> tuple[list[SampledView], Refined]:
     return views, refine(views, truth, OPTIONS)
 
 
+@pytest.mark.slow
 def test_range_offset_raises_alarm(monkeypatch):
     views, refined = kept(0.06)
     # With many pairs, a part of them and of their points is as conclusive.
@@ -106,6 +107,7 @@ def test_focal_length_error_scales_sideways_motion() -> None:
     assert 0.01 * found.motion["focal"][0] == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.slow
 def test_estimate_converges_in_errors_too() -> None:
     """Poses may rest while the error still changes."""
     views, refined = kept(0.06)
@@ -158,6 +160,7 @@ def test_unclosed_gap_contradicts_errors() -> None:
     assert not Gap(0, 9, (0.009, 0.008), (0.009, 0.008), 1.5, changed).contradicts  # no gap
 
 
+@pytest.mark.slow
 def test_error_that_only_closes_a_loop_is_rejected(monkeypatch):
     """Drift of odometry leaves a gap, too: views of a correct camera do not keep the error."""
     truth = path(24)[:8]

@@ -90,6 +90,7 @@ def test_nothing_to_solve():
     np.testing.assert_array_equal(found, graph.poses)
 
 
+@pytest.mark.slow
 def test_optimiser_finds_the_minimum_where_descent_from_odometry_does_not():
     graph, truth = drifting_laps(30, 12, 60.0)
     n = len(truth)

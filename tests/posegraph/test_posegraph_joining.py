@@ -431,6 +431,7 @@ def test_single_link_is_never_certain(three, min_probability) -> None:
     assert min_probability([probable(a[-1], b[0], 1.0)], at_least=0.999) is None
 
 
+@pytest.mark.slow
 def test_first_group_is_main_on_request(elsewhere, three) -> None:
     strange = stretch(0, range(4), **STRANGE)
     groups = replace(SPARSELY, main="first").join([strange, three[1], three[2]], [])

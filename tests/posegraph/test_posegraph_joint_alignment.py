@@ -75,6 +75,7 @@ def test_result_is_independent_of_threads(swing):
     np.testing.assert_array_equal(results[0], results[2])
 
 
+@pytest.mark.slow
 def test_camera_errors_are_estimated_where_observable():
     truth = path(12)
     views = [SampledView.of(s, 1500) for s in surfaces(truth, offset=0.05)]

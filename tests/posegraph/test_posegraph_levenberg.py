@@ -114,6 +114,7 @@ def test_one_step_solves_damped_system():
     assert lonely.solve(H, g, graph.measurements) is None
 
 
+@pytest.mark.slow
 def test_covariances_match_repeated_measurements():
     """Marginals of the dense inverse, and the spread over many graphs, agree."""
     graph, truth, _ = walk(16, 8)
@@ -315,6 +316,7 @@ def test_invalid_graphs_and_options_are_refused():
         replace(graph, gravity=Gravity(np.array([8]), np.array([[0.0, 1, 0]]), np.ones(1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least"), [("sphere", 63789.07892761), ("parking-garage", 0.63419240)]
 )

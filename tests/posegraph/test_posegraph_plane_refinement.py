@@ -181,6 +181,7 @@ def test_view_of_another_place_does_not_drag_others():
     assert error.mean() < 2 * peaks_bound(0.02)
 
 
+@pytest.mark.slow
 def test_two_sides_of_wall_stay_separate():
     """Two rooms with a thin wall between them, each seen from inside; the rest is seen by both."""
     rng = np.random.default_rng(0)

@@ -145,6 +145,7 @@ def test_nearest_views_are_overlapping_views(swing, monkeypatch) -> None:
     assert len(some) > 0.6 * len(every)
 
 
+@pytest.mark.slow
 def test_descriptor_index_finds_most_similar_views() -> None:
     rng = np.random.default_rng(4)
     places = rng.normal(0, 0.3, (200, 2, 15, 24)).astype(np.float32)

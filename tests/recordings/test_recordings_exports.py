@@ -174,6 +174,7 @@ def test_damaged_tiffs_are_refused(tmp_path: Path) -> None:
             read_tiff(path)
 
 
+@pytest.mark.slow
 def test_damage_raises_only_package_errors(tmp_path: Path) -> None:
     original = tmp_path / "a"
     made.make_tiff3d(original)

@@ -118,6 +118,7 @@ def test_pcl_pairwise(shared_data: Path) -> None:
             assert struct.unpack_from("<I", data, body + 4)[0] == 640 * 480 * 12
 
 
+@pytest.mark.slow
 def test_slam6d_scans(shared_data: Path) -> None:
     recording = open_recording(shared_data / "slam6d_scans")
     assert (recording.format, len(recording)) == ("slam6d", 3)

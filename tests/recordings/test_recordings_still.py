@@ -262,6 +262,7 @@ def test_run_averages_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert all(f["status"] == "tracked" for f in averaged["frames"])
 
 
+@pytest.mark.slow
 def test_sr4000_corridor(shared_data: Path) -> None:
     recording = open_recording(shared_data / "sr4000_corridor")
     assert stationary_intervals(recording) == [(0, 4), (4, 8)]

@@ -274,6 +274,7 @@ def test_scans_with_any_heading(scans, registered):
     assert found.contradiction < 0.01
 
 
+@pytest.mark.slow
 def test_clouds_without_viewpoint_under_any_rotation(frames):
     target, source, true = frames
     moved = se3.transform(ANYWHERE, source.points.astype(float))
@@ -283,6 +284,7 @@ def test_clouds_without_viewpoint_under_any_rotation(frames):
     assert angle < 4
 
 
+@pytest.mark.slow
 def test_clouds_of_different_density(scans):
     source, target, true = scans
     few = source[np.random.default_rng(2).permutation(len(source))[: len(source) // 10]]
@@ -314,6 +316,7 @@ def test_views_without_overlap_are_rejected(scans):
         assert reason in found.reason
 
 
+@pytest.mark.slow
 def test_views_of_different_extent_raise_error(scans, frames):
     ball = bumpy_ball(5000, 1)
     with pytest.raises(RegistrationError, match="does not fit; check the units"):
@@ -322,6 +325,7 @@ def test_views_of_different_extent_raise_error(scans, frames):
         tofuse.register(frames[0].points, ball * 4)
 
 
+@pytest.mark.slow
 def test_ambiguous_corridor_is_rejected():
     """Two parallel walls and a floor: the pose along them is unobservable."""
     found = tofuse.register(box_walls(6000, 1, 0.003, "xy"), box_walls(6000, 0, 0.003, "xy"))
@@ -444,6 +448,7 @@ def test_folder_of_scans_becomes_one_model(tmp_path):
         assert off(result.trajectory[k], true, points)[1] < 0.3
 
 
+@pytest.mark.slow
 def test_candidates_of_same_pose_are_not_rivals():
     """With large noise, iterations stop slightly apart; a pose elsewhere remains a rival."""
     views, truth = peaks_views(0.1, 101)

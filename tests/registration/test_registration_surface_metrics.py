@@ -116,6 +116,7 @@ def test_symmetric_metric_converges_faster_than_point_to_plane():
     assert iterations[Symmetric] < 0.8 * iterations[PointToPlane]
 
 
+@pytest.mark.slow
 def test_gicp_is_insensitive_to_maximum_distance():
     """Figures 3 to 5 of Segal et al.: the largest distance is easy to choose."""
     worst = {}

@@ -212,6 +212,7 @@ def test_uncertainty_is_bounded_by_prediction():
         np.testing.assert_allclose(axes[:, k] @ cut @ axes[:, k], axes[:, k] @ known @ axes[:, k])
 
 
+@pytest.mark.slow
 def test_tile_sums_match_numpy():
     """Geometric residuals only, summed pixel by pixel."""
     T = se3.exp([0.01, -0.01, 0.02, 0.004, 0.01, -0.006])

@@ -113,6 +113,7 @@ def test_camera_on_its_side_is_found(quarters):
     assert found.believed
 
 
+@pytest.mark.slow
 def test_views_of_different_rooms_are_rejected(pair):
     for k, boxes in enumerate((OTHER, BOXES)):
         half = (3.4, 1.6, 2.9)

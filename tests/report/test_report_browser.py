@@ -284,6 +284,7 @@ def test_slider_shows_frames_and_reason_of_loss(browser, report):
         seen.check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "scheme"), [(DESK, "light"), (PHONE, "dark")])
 def test_layout_follows_scheme_and_screen_size(browser, report, scheme, size):
     with opened(browser, report, viewport=size, color_scheme=scheme) as seen:
@@ -303,6 +304,7 @@ def test_layout_follows_scheme_and_screen_size(browser, report, scheme, size):
         seen.check()
 
 
+@pytest.mark.slow
 def test_page_without_scripts_shows_image_and_first_frame(browser, report):
     with opened(browser, report, viewport=PHONE, java_script_enabled=False) as seen:
         assert seen.page.locator("#viewer .stage > img").is_visible()

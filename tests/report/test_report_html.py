@@ -284,6 +284,7 @@ def in_parts(number=20):
     return replace(result, trajectory=poses, diagnostics=diagnostics, components=components)
 
 
+@pytest.mark.slow
 def test_components_are_listed_with_their_own_models(tmp_path):
     got = page(tmp_path, in_parts(), ReportExtras("x"))
     assert got.row("0 (main)")[1:] == ["0–9", "this one", "–", "10"]
@@ -465,6 +466,7 @@ def test_viewer_thins_large_model(tmp_path):
     assert "150,000 of 200,000 points are shown" in got.sections["model"]
 
 
+@pytest.mark.slow
 def test_external_text_is_escaped(tmp_path):
     bad = "</script><script>alert('1')</script><b>&"
     result, extras = room()
@@ -514,6 +516,7 @@ def many(number):
     )
 
 
+@pytest.mark.slow
 def test_long_recording_stays_readable(tmp_path):
     got = page(tmp_path, many(2000), ReportExtras("long"))
     titles = [t for t in got.titles if t.startswith("Frame ")]
@@ -523,6 +526,7 @@ def test_long_recording_stays_readable(tmp_path):
     assert "150 more are not shown" in got.sections["loops"]
 
 
+@pytest.mark.slow
 def test_page_of_ten_thousand_frames_stays_small(tmp_path):
     got = page(tmp_path, many(10_000), ReportExtras("very long"))
     assert (tmp_path / "report.html").stat().st_size < 4e6
@@ -611,6 +615,7 @@ POOR = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", POOR)
 def test_poor_results_give_complete_report(name, tmp_path):
     result, extras = POOR[name]
@@ -637,6 +642,7 @@ def test_poor_results_state_what_is_missing(tmp_path):
     assert "There is nothing to show" in got.sections["model"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("title", [os.fsdecode(b"caf\xe9 'q' \"") + '\u202e\u062e\u0631<b>"x"', ""])
 def test_any_file_name_is_shown(title, tmp_path):
     result, extras = room()

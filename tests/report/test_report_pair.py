@@ -109,6 +109,7 @@ def test_distant_start_has_its_own_frame() -> None:
     assert after[0] < 2
 
 
+@pytest.mark.slow
 def test_large_views_are_thinned() -> None:
     many = relief(MAX_POINTS + 5000, 1)
     scene = pair_scene(pair(many, many[:1000], pose=np.eye(4)))

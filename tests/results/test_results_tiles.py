@@ -262,6 +262,7 @@ def small_limits(monkeypatch) -> None:
     monkeypatch.setattr(detail, "_TRIANGLES_PER_EDGE", 32)
 
 
+@pytest.mark.slow
 def test_large_result_has_tiles_and_overview(tmp_path, small_limits) -> None:
     result, _ = make_room()
     mesh = waves()

@@ -77,6 +77,7 @@ def test_camera_without_overlap_is_named() -> None:
     assert found.rig.unplaced["cam2"]
 
 
+@pytest.mark.slow
 def test_images_of_static_scene_are_averaged() -> None:
     cameras = [camera(k, images(k, 6)) for k in range(2)]
     assert not moves(cameras, "auto")

@@ -50,6 +50,7 @@ def periods_of(frame: RangeFrame, radial: np.ndarray) -> tuple[np.ndarray, np.nd
     return lacks, frame.valid & (radial > 0) & (off < 0.5) & confident
 
 
+@pytest.mark.slow
 def test_hall_beyond_period_is_unwrapped() -> None:
     """8 x 8 m before a camera with a period of 5 m: most of it is wrapped."""
     frames = taken("hall", 90)
@@ -263,6 +264,7 @@ def test_native_recordings_with_several_frequencies(
     assert np.quantile(np.abs(a.depth - b.depth)[both], 0.999) < 0.003
 
 
+@pytest.mark.slow
 def test_several_frequencies_give_same_trajectory_as_depth(
     room_recording: Path, two_frequencies: Path
 ) -> None:
