@@ -289,6 +289,15 @@ def test_unorganised_pcd_stays_cloud(tmp_path: Path) -> None:
     assert frame.origin.tolist() == [1, 2, 3]
 
 
+def test_pcd_with_width_and_height_exchanged_is_refused(tmp_path: Path) -> None:
+    right = pcd_bytes(pcd_points(CAMERA, 1))
+    wrong = right.replace(b"WIDTH 40", b"WIDTH 30").replace(b"HEIGHT 30", b"HEIGHT 40")
+    (tmp_path / "a.pcd").write_bytes(wrong)
+    with pytest.raises(InputError, match="has WIDTH 30 and HEIGHT 40, but rows of 40 points") as e:
+        open_recording(tmp_path)
+    assert e.value.remedy == "swap WIDTH and HEIGHT"
+
+
 def test_pcd_of_another_camera_is_unreadable(tmp_path: Path) -> None:
     for k in range(12):
         (tmp_path / f"{k}.pcd").write_bytes(pcd_bytes(pcd_points(CAMERA, k)))
