@@ -32,6 +32,8 @@ WALL = Material("wall", 0.65, 0.1, "noise", (0.5, 0.5, 0.5))
 GROUND = Material("ground", 0.4, 0.2, "speckle", (0.1, 0.1, 0.1))
 WHITE = Material("ceiling", 0.78, 0.05, "tiles", (0.6, 0.6, 0.6))
 WOOD = Material("wood", 0.45, 0.2, "wood", (0.9, 0.9, 0.05))
+PLASTER = Material("plaster", 0.7)
+TILES = Material("tiles", 0.8, 0.05, "tiles", (0.15, 0.15, 0.15))
 THINGS = tuple(Material(f"thing {k}", 0.25 + 0.1 * k, 0.1, "print", (0.1,) * 3) for k in range(5))
 
 
@@ -269,6 +271,83 @@ def _tunnel(assembly: Assembly, _rng: np.random.Generator) -> None:
     assembly.add(WALL, meshes.inside_out(meshes.lathe(profile, 48)).transformed(T))
 
 
+def _attic(assembly: Assembly, rng: np.random.Generator) -> None:
+    """Add a room under a roof, with five boxes: between the gables, views are degenerate."""
+    low, ridge, half, length = 0.3, 2.5, 2.0, 3.0
+    assembly.add(GROUND, meshes.quad((-length, -half, 0), (2 * length, 0, 0), (0, 2 * half, 0)))
+    for side in (-1, 1):
+        along, up = (2 * length, 0, 0), (0, -side * half, ridge - low)
+        edges = (along, up) if side > 0 else (up, along)
+        assembly.add(WOOD, meshes.quad((-length, side * half, low), *edges))
+        assembly.add(WALL, meshes.quad((-length, side * half, 0), (0, 0, low), along))
+        edges = ((0, 2 * half, 0), (0, 0, ridge))
+        assembly.add(
+            WALL, meshes.quad((side * length, -half, 0), *(edges if side < 0 else edges[::-1]))
+        )
+    for material in THINGS:
+        size, (x, y) = rng.uniform(0.2, 0.6, 3), rng.uniform((-2, -1.2), (2, 1.2))
+        at = (x + 1.2 if abs(x) + abs(y) < 0.8 else x, y)
+        thing = meshes.box(size, (0, 0, size[2] / 2))
+        assembly.add(material, thing.transformed(placed(at, rng.uniform(0, 3))))
+
+
+def _in_the_attic(t: float) -> Float64:
+    """Look around within 10 s, while walking in a circle."""
+    a, b = 2 * np.pi * t / 10, 0.7 * t
+    return paths.look_at(
+        (0.4 * np.sin(b), 0.3 * np.cos(b), 1.3), (2 * np.cos(a), 2 * np.sin(a), 0.9)
+    )
+
+
+def _bathroom(assembly: Assembly, _rng: np.random.Generator) -> None:
+    """Add a tiled room of 2.0 x 1.8 m with a bath, a basin, a toilet and a cupboard."""
+    shell(assembly, (-1.0, -0.9, 0), (1.0, 0.9, 2.4), [TILES] * 4, TILES, PLASTER)
+    assembly.add(PLASTER, meshes.box_between((-1.0, 0.2, 0), (0.9, 0.9, 0.55)))
+    raised = np.eye(4)
+    raised[:3, 3] = 0.7, -0.5, 0.8
+    assembly.add(PLASTER, meshes.superellipsoid((0.5, 0.4, 0.2), (0.6, 0.8)).transformed(raised))
+    toilet = meshes.superellipsoid((0.4, 0.6, 0.7), (0.8, 0.9))
+    assembly.add(PLASTER, toilet.transformed(placed((-0.4, -0.6), 0.0)))
+    assembly.add(THINGS[1], meshes.box_between((-0.98, -0.3, 1.2), (-0.9, 0.2, 1.5)))
+
+
+def _in_the_bathroom(t: float) -> Float64:
+    """Stand in the middle, and look around within 10 s."""
+    a = 0.6 * t
+    return paths.look_at((0.1, -0.1, 1.5), (0.1 + np.cos(a), np.sin(a) - 0.1, 0.8))
+
+
+def _bookshelf(assembly: Assembly, rng: np.random.Generator) -> None:
+    """Add a wall of 5 m with six shelves full of books."""
+    assembly.add(WALL, meshes.quad((-4, 0.3, 0), (8, 0, 0), (0, 0, 3)))
+    assembly.add(GROUND, meshes.quad((-4, -3, 0), (8, 0, 0), (0, 3.3, 0)))
+    for level in range(6):
+        z, x = 0.3 + 0.35 * level, -2.5
+        assembly.add(WOOD, meshes.box_between((-2.5, 0, z - 0.02), (2.5, 0.3, z)))
+        while x < 2.4:
+            width, height, depth = rng.uniform((0.015, 0.18, 0.12), (0.06, 0.3, 0.25))
+            book = meshes.box_between((x, 0.3 - depth, z), (x + width, 0.3, z + height))
+            assembly.add(THINGS[rng.integers(5)], book)
+            x += width + (0.1 if rng.random() < 0.05 else 0.002)
+
+
+def _car(assembly: Assembly, _rng: np.random.Generator) -> None:
+    """Add a car on open ground."""
+    assembly.add(GROUND, meshes.quad((-8, -8, 0), (16, 0, 0), (0, 16, 0)))
+    for material, size, roundness, z in (
+        (THINGS[2], (3.8, 1.6, 0.7), (0.3, 0.4), 0.6),
+        (THINGS[3], (2.2, 1.4, 0.8), (0.6, 0.5), 1.0),
+    ):
+        raised = np.eye(4)
+        raised[2, 3] = z
+        body = meshes.superellipsoid(size, roundness, (16, 32))
+        assembly.add(material, body.transformed(raised))
+    for x in (-1.2, 1.2):
+        for y in (-0.75, 0.75):
+            wheel = meshes.rod((x, y - 0.1, 0.3), (x, y + 0.1, 0.3), 0.3, segments=16)
+            assembly.add(THINGS[0], wheel)
+
+
 def _pausing(seed: int) -> Path:
     """Stand still for 4 s, then walk."""
     rng = np.random.default_rng([seed, 14])
@@ -356,6 +435,34 @@ UNUSUAL: dict[str, Unusual] = {
     ),
     "plants": Unusual(built("plants", _plants), _in_room(calm), IFM, 120),
     "tunnel": Unusual(built("tunnel", _tunnel), _fixed(through_the_tunnel), IFM),
+    "attic": Unusual(
+        built("attic", _attic),
+        _fixed(_in_the_attic, 0.02, 2.0),
+        camera_model("pico-flexx"),
+        120,
+        10.0,
+    ),
+    "bathroom": Unusual(
+        built("bathroom", _bathroom),
+        _fixed(_in_the_bathroom, 0.04, 3.0),
+        pinhole("azure-nfov", 320, 288, 75),
+        120,
+        10.0,
+    ),
+    "bookshelf": Unusual(
+        built("bookshelf", _bookshelf),
+        _fixed(straight(paths.look_at((-1.8, -0.75, 1.2), (-1.8, 0.3, 1.15)), (0.35, 0, 0))),
+        camera_model("pico-flexx"),
+        100,
+        10.0,
+    ),
+    "car": Unusual(
+        built("car", _car),
+        _fixed(around(3.3, 1.5, (0, 0, 0.6), 16.0)),
+        pinhole("azure-nfov", 320, 288, 75),
+        160,
+        10.0,
+    ),
     "range of 1.5 m": Unusual(known("room"), _in_room(calm), IFM, range_m=1.5),
     "1 Hz": Unusual(known("room"), _in_room(calm), IFM, 13, 1.0),
     "field of view of 120 degrees": Unusual(

@@ -201,6 +201,17 @@ def test_pairs_across_degenerate_frame_are_aligned_again(view, degenerate) -> No
     assert not len(after)
 
 
+@pytest.mark.parametrize(("corners", "constrained"), [(1, False), (5, True)])
+def test_single_constrained_pair_of_degenerate_view_is_chance(corners, constrained) -> None:
+    """One constrained pair of 20 would bound the pose; five of 20 are more than by chance."""
+    steps = [Measured(k, 20, np.eye(4), np.eye(6) * 1e6) for k in range(20)]
+    graph = build_graph(range(21), np.tile(np.eye(4), (21, 1, 1)), steps)
+    wall, corner = (PosedView(surface, np.eye(4)) for surface in (flat_wall(), surface_of_corner()))
+    views = dict.fromkeys(range(20), wall) | dict.fromkeys([*range(corners), 20], corner)
+    found = degenerate_directions(graph, {20: X}, (), views)
+    assert [len(d) == 0 for d in found] == [constrained and k < corners for k in range(20)]
+
+
 def flat_wall():
     z = np.full((60, 80), 2.0, np.float32)
     return prepare_view(as_frame(z, 0), SurfaceOptions())

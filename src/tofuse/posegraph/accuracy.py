@@ -15,7 +15,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import gammaincinv
+from scipy.special import bdtrc, gammaincinv
 
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
@@ -43,6 +43,9 @@ _NO_DIRECTIONS = np.zeros((0, 6))
 # Number of pairs over degenerate frames that are aligned again, the shortest first: at the end of a
 # long one the camera came back, which a loop closure verifies.
 _MAX_SPANNING = 2000
+# A pair without information along a degenerate direction seems to have some with this probability,
+# by chance; and the significance of the number of such pairs of one view.
+_PASSES_BY_CHANCE, _SIGNIFICANCE = 0.05, 0.05
 # Near the final pose. A direction with no smaller sigma than the prior is not measured.
 _ALIGNMENT = ProjectiveOptions()
 # Standard deviation, in `UNITS`, that an error along a degenerate direction causes in the others.
@@ -185,7 +188,9 @@ def degenerate_directions(
 
     Those of the tracker's registrations are known. A pair of the refinement is aligned again if
     tracking was degenerate in one of its views or between them: after an unnoticed slide along a
-    wall, later views overlap with earlier ones at wrong poses.
+    wall, later views overlap with earlier ones at wrong poses. Among many pairs of a degenerate
+    view, some seem constrained by chance, and a single one would bound all later poses. So pairs of
+    such a view count as constrained only if there are more of them than by chance.
 
     Parameters
     ----------
@@ -232,8 +237,37 @@ def degenerate_directions(
             # degenerate pair is taken to be degenerate in all directions of its views.
             result[k] = np.concatenate([realigned, result[k]]) if len(realigned) else _NO_DIRECTIONS
 
+    of_views = list(result)
     run_chunks(work, len(to_align), -(-len(to_align) // 16))
+    by_chance = _constrained_by_chance(
+        np.array([graph.ids[list(graph.edges[k])] for k in to_align], np.intp).reshape(-1, 2),
+        np.array([len(result[k]) == 0 for k in to_align], np.bool_),
+        degenerate,
+    )
+    for k in np.asarray(to_align, np.intp)[by_chance]:
+        result[k] = of_views[k]
     return result
+
+
+def _constrained_by_chance(pairs: Intp, constrained: Bool, degenerate: Intp) -> Bool:
+    """Whether pairs (n, 2) seem constrained (n,), but one of their frames has few such pairs.
+
+    Parameters
+    ----------
+    degenerate
+        Indices of the degenerate frames, sorted.
+    """
+    is_degenerate = np.isin(pairs, degenerate)
+    row = np.searchsorted(degenerate, pairs)
+    total, passed = (
+        np.bincount(row[is_degenerate & counted[:, None]], minlength=len(degenerate) + 1)
+        for counted in (np.ones(len(pairs), np.bool_), constrained)
+    )
+    # P(X >= passed) of the binomial distribution.
+    chance = np.where(passed > 0, bdtrc(passed - 1, total, _PASSES_BY_CHANCE), 1.0)
+    is_few = chance > _SIGNIFICANCE + 1e-9
+    found: Bool = constrained & (is_degenerate & is_few[row]).any(1)
+    return found
 
 
 def without_degenerate(
@@ -246,7 +280,8 @@ def without_degenerate(
     Information there comes from noise (`uncertainty`) or from the prediction. These directions get
     practically unbounded variances. They are known to a few degrees only, and differ that much
     between edges, which together would seem to constrain them. So the error along them, up to the
-    smallest that counts as unbounded, is also part of the error in the other directions.
+    smallest that counts as unbounded, is also part of the error in the other directions. All
+    degenerate pairs of a view share it: their number does not reduce it.
 
     Parameters
     ----------
@@ -259,6 +294,8 @@ def without_degenerate(
     """
     information = graph.information.copy()
     unmeasured_variance = np.diag((_UNMEASURED_SIGMA / UNITS) ** 2)
+    is_degenerate = np.array([len(d) > 0 for d in directions], np.bool_)
+    n_degenerate = np.bincount(graph.edges[is_degenerate].ravel(), minlength=len(graph.ids))
     for k, ((a, b), degenerate) in enumerate(zip(graph.edges, directions, strict=True)):
         i, j = int(graph.ids[a]), int(graph.ids[b])
         if (i, j) in unmeasured or (j, i) in unmeasured:
@@ -271,7 +308,8 @@ def without_degenerate(
         scaled = H - H @ basis @ np.linalg.pinv(basis.T @ H @ basis, hermitian=True) @ basis.T @ H
         unbounded = basis @ np.linalg.inv(basis.T @ unmeasured_variance @ basis) @ basis.T
         measured = scaled + unbounded
-        measured = np.linalg.solve(np.eye(6) + _LEAK**2 * measured, measured)
+        leak_variance = _LEAK**2 * max(n_degenerate[a], n_degenerate[b])
+        measured = np.linalg.solve(np.eye(6) + leak_variance * measured, measured)
         information[k] = 0.5 * (measured + measured.T) / np.outer(UNITS, UNITS)
     return replace(graph, information=information)
 
