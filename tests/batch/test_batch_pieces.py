@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -167,6 +168,23 @@ def test_requests_that_time_out_are_repeated(cluster: str, monkeypatch) -> None:
     assert not messages
     assert there.n_remote == 3
     assert [square for square, _ in found] == [0, 1, 4]
+
+
+@pytest.mark.slow
+def test_first_worker_may_connect_after_run(batch_benchmark) -> None:
+    messages: list[str] = []
+    with batch_benchmark.local_cluster(0) as (address, _):
+        command = [sys.executable, "-m", "dask", "worker", address, "--no-nanny", "--no-dashboard"]
+        worker = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        try:
+            there = DaskExecutor(address, messages.append)
+            there.map(slowly_squared, 3, lambda k: (k,))
+            there.close()
+        finally:
+            worker.kill()
+            worker.wait()
+    assert not messages
+    assert there.n_remote == 3
 
 
 def test_worker_error_is_raised_as_in_local_run(cluster) -> None:

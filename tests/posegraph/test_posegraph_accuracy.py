@@ -146,10 +146,11 @@ def test_unmeasured_direction_is_unbounded(direction) -> None:
     )
 
 
-def test_slightly_different_directions_do_not_bound_each_other() -> None:
-    """A slide along x, whose direction every pair of views knows to a degree only."""
+@pytest.mark.parametrize(("degrees", "neighbours"), [(1, 4), (3, 12)])
+def test_slightly_different_directions_do_not_bound_each_other(degrees, neighbours) -> None:
+    """A slide along x, whose direction every pair of views knows to some degrees only."""
     rng = np.random.default_rng(3)
-    pairs = [(i, j) for i in range(N) for j in range(i + 1, min(i + 5, N))]
+    pairs = [(i, j) for i in range(N) for j in range(i + 1, min(i + 1 + neighbours, N))]
     steps = [
         Measured(i, j, se3.inverse(TRUE[i]) @ TRUE[j], np.diag([1e7] * 3 + [1e8] * 3))
         for i, j in pairs
@@ -158,7 +159,7 @@ def test_slightly_different_directions_do_not_bound_each_other() -> None:
     directions = []
     for i, j in pairs:
         slides = {i, j} & set(range(5, 10))
-        x = TRUE[j, :3, :3].T @ [1.0, *np.radians(rng.normal(0, 1, 2))]
+        x = TRUE[j, :3, :3].T @ [1.0, *np.radians(rng.normal(0, degrees, 2))]
         directions.append(np.array([[*x, 0, 0, 0]]) if slides else np.zeros((0, 6)))
     a = accuracy_of(GraphCovariances(without_degenerate(graph, directions)), ObservedErrors(), 1.0)
     assert set(range(5, 10)) <= set(a.unbounded)

@@ -43,9 +43,10 @@ _NO_DIRECTIONS = np.zeros((0, 6))
 # Number of pairs over degenerate frames that are aligned again, the shortest first: at the end of a
 # long one the camera came back, which a loop closure verifies.
 _MAX_SPANNING = 2000
-# A pair without information along a degenerate direction seems to have some with this probability,
-# by chance; and the significance of the number of such pairs of one view.
-_PASSES_BY_CHANCE, _SIGNIFICANCE = 0.05, 0.05
+# Probability that a pair without information along a degenerate direction seems to have some.
+_CHANCE_OF_PAIR = 0.05
+# Significance level of the number of such pairs of a view. It admits the only pair of a view.
+_SIGNIFICANCE = 0.05 + 1e-9
 # Near the final pose. A direction with no smaller sigma than the prior is not measured.
 _ALIGNMENT = ProjectiveOptions()
 # Standard deviation, in `UNITS`, that an error along a degenerate direction causes in the others.
@@ -189,8 +190,8 @@ def degenerate_directions(
     Those of the tracker's registrations are known. A pair of the refinement is aligned again if
     tracking was degenerate in one of its views or between them: after an unnoticed slide along a
     wall, later views overlap with earlier ones at wrong poses. Among many pairs of a degenerate
-    view, some seem constrained by chance, and a single one would bound all later poses. So pairs of
-    such a view count as constrained only if there are more of them than by chance.
+    view, some seem constrained by chance, and a single one would bound all later poses. So the
+    pairs of such a view count as constrained only if they are more than chance explains.
 
     Parameters
     ----------
@@ -239,34 +240,34 @@ def degenerate_directions(
 
     of_views = list(result)
     run_chunks(work, len(to_align), -(-len(to_align) // 16))
-    by_chance = _constrained_by_chance(
-        np.array([graph.ids[list(graph.edges[k])] for k in to_align], np.intp).reshape(-1, 2),
-        np.array([len(result[k]) == 0 for k in to_align], np.bool_),
-        degenerate,
-    )
-    for k in np.asarray(to_align, np.intp)[by_chance]:
+    aligned = np.array(to_align, np.intp)
+    constrained = np.array([len(result[k]) == 0 for k in to_align], np.bool_)
+    pairs = np.asarray(graph.ids, np.intp)[graph.edges[aligned]]
+    for k in aligned[_constrained_by_chance(pairs, constrained, degenerate)]:
         result[k] = of_views[k]
     return result
 
 
 def _constrained_by_chance(pairs: Intp, constrained: Bool, degenerate: Intp) -> Bool:
-    """Whether pairs (n, 2) seem constrained (n,), but one of their frames has few such pairs.
+    """(n,) whether a pair seems constrained, but a degenerate frame of it has few such pairs.
 
     Parameters
     ----------
+    pairs
+        (n, 2) frames.
+    constrained
+        (n,) whether the alignment of a pair has no degenerate direction.
     degenerate
-        Indices of the degenerate frames, sorted.
+        Frames whose tracking is degenerate, ascending.
     """
     is_degenerate = np.isin(pairs, degenerate)
     row = np.searchsorted(degenerate, pairs)
-    total, passed = (
-        np.bincount(row[is_degenerate & counted[:, None]], minlength=len(degenerate) + 1)
-        for counted in (np.ones(len(pairs), np.bool_), constrained)
-    )
-    # P(X >= passed) of the binomial distribution.
-    chance = np.where(passed > 0, bdtrc(passed - 1, total, _PASSES_BY_CHANCE), 1.0)
-    is_few = chance > _SIGNIFICANCE + 1e-9
-    found: Bool = constrained & (is_degenerate & is_few[row]).any(1)
+    count = len(degenerate) + 1
+    n_pairs = np.bincount(row[is_degenerate], minlength=count)
+    n_constrained = np.bincount(row[is_degenerate & constrained[:, None]], minlength=count)
+    # P(X >= n_constrained) of the binomial distribution.
+    chance = np.where(n_constrained > 0, bdtrc(n_constrained - 1, n_pairs, _CHANCE_OF_PAIR), 1.0)
+    found: Bool = constrained & (is_degenerate & (chance > _SIGNIFICANCE)[row]).any(1)
     return found
 
 
