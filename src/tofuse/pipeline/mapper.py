@@ -74,7 +74,7 @@ class Mapper:
         self._intake = Intake()
         self._log = FrameLog()
         self._queue = BackgroundQueue()
-        self._ended = self._finished = False
+        self._finished = False
         self._start_method(tracker)
 
     def _start_method(self, tracker: Tracker | None = None) -> None:
@@ -242,14 +242,6 @@ class Mapper:
         """Prepared views of frames with a pose, spaced by motion, in the order of their frames."""
         return self._observations.views.views
 
-    def end(self) -> None:
-        """End tracking, and release the state that only further frames would need."""
-        if not self._ended:
-            self._intake.end()
-            self._ended = True
-            del self._tracker  # its keyframes
-            trim_memory()
-
     def finish(self) -> Reconstruction:
         """Join components, close loops, optimise, refine, fuse and judge.
 
@@ -258,14 +250,15 @@ class Mapper:
         InputError
             If no frame has a pose.
         """
-        if self._finished:
-            raise InputError("is finished", where="mapper", remedy="make a new Mapper")
+        self._check_open()
         self._finished = True
         self._log.check_posed()
         self._live_poses.finish()
         with self.watch.timing("fusion"):
             self._queue.finish()
-        self.end()
+        self._intake.end()
+        del self._tracker  # its keyframes
+        trim_memory()
         result = self._assembly().run(self._log)
         diagnostics = replace(
             result.diagnostics,
@@ -304,5 +297,5 @@ class Mapper:
         self._intake.accept(frame.index, kind)
 
     def _check_open(self) -> None:
-        if self._finished or self._ended:
+        if self._finished:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
