@@ -45,7 +45,7 @@ class Record:
     frames, posed
         Number of readable frames, and of those with a pose.
     seconds
-        Time of the run, including that before it was resumed.
+        Time of the run since its last start.
     peak_bytes
         Peak memory of its process.
     """
