@@ -304,7 +304,7 @@ def _split(arrays: Arrays, name: str) -> list[NDArray[Any]]:
 def _unpacked_mask(bits: NDArray[Any], shape: tuple[int, ...]) -> Bool:
     """Return a mask (H, W) from its compressed bits."""
     rows, columns = shape
-    packed = np.frombuffer(zlib.decompress(bits), np.uint8)
+    packed = np.frombuffer(zlib.decompress(bits.tobytes()), np.uint8)
     return np.unpackbits(packed, count=rows * columns).astype(np.bool_).reshape(rows, columns)
 
 
