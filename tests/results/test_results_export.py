@@ -27,7 +27,7 @@ from tofuse.files.tileset import read_tileset
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry import se3
 from tofuse.results.export import FORMATS, export
-from tofuse.results.folder import LOCK, OutputFolder
+from tofuse.results.folder import OutputFolder
 
 TIMES, POSES = np.array([0.1, 0.2, 0.5]), se3.exp(np.random.default_rng(1).normal(size=(3, 6)))
 POSES[0] = np.eye(4)
@@ -443,7 +443,7 @@ def test_only_one_process_writes_to_a_result(result: Path, tmp_path: Path) -> No
         patch.setitem(FORMATS, "log", ("trajectory.log", during))
         export(result, ["log"])
     assert len(seen) == 1
-    assert not (result / LOCK).exists()
+    assert not list(result.parent.glob(".tofuse-*"))
 
 
 def test_component_uses_lock_of_its_result(result: Path) -> None:
