@@ -202,7 +202,6 @@ FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
     "glb": ("mesh.glb", _mesh),
     "gltf": ("mesh.gltf", _mesh),
     "obj": ("mesh.obj", _mesh),
-    "usdz": ("mesh.usdz", _mesh),
     "stl": ("mesh.stl", _stl),
     "3dtiles": (f"{TILES}/{TILESET}", _tiles),
     "kitti": ("trajectory.kitti.txt", _kitti),

@@ -34,7 +34,6 @@ FILES = (
     "mesh.mtl",
     "mesh.png",
     "mesh.jpg",
-    "mesh.usdz",
     "mesh.stl",
     "report.html",
     "view.npz",
