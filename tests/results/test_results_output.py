@@ -233,7 +233,7 @@ def test_component_with_its_own_model_has_a_folder(tmp_path) -> None:
 def test_all_files_of_earlier_result_are_replaced(tmp_path) -> None:
     write_result(torn(seed=1), OutputFolder(tmp_path))
     (tmp_path / "component-7").mkdir()
-    for name in ("component-7/cloud.pcd", "mesh.stl", ".DS_Store"):
+    for name in ("component-7/cloud.pcd", "mesh.stl", ".DS_Store", ".tofuse-tracked.npz"):
         (tmp_path / name).write_text("exported")
     for name in ("nerfstudio/transforms.json", "nerfstudio/images/a.png", "colmap/sparse/0/a.txt"):
         (tmp_path / name).parent.mkdir(parents=True)

@@ -90,7 +90,7 @@ class Contract:
                 folders[:] = [f for f in folders if f != RECORDING or prefix]
             folders[:] = sorted(f for f in folders if not f.startswith(UNFINISHED))
             links = [f for f in folders if (Path(parent) / f).is_symlink()]
-            for name in (*links, *sorted(names)):
+            for name in (*links, *sorted(n for n in names if not n.startswith(UNFINISHED))):
                 path = (relative / name).as_posix()
                 known = self.files.fullmatch(prefix + path) or _OF_SYSTEMS.fullmatch(path)
                 if not known or (Path(parent) / name).is_symlink():
