@@ -18,7 +18,7 @@ from tofuse.batch.folder import BatchFolder, Record
 from tofuse.batch.jobs import Job
 from tofuse.batch.table import write_table
 from tofuse.files.atomic import write_text
-from tofuse.files.staging import is_interrupted, new_folder
+from tofuse.files.staging import finish_replacing, is_interrupted, new_folder
 from tofuse.pipeline.checkpoint import Checkpoints
 from tofuse.recordings.rig import Rig, RigCamera, write_rig
 from tofuse.results.folder import OutputFolder, finish_interrupted, is_result
@@ -158,6 +158,7 @@ def _text(folder: Path, number: int) -> None:
 
 def _folder(folder: Path, number: int) -> None:
     made = folder / "made"
+    finish_replacing(made)
     if number and not (made.exists() and any(made.iterdir())):
         with new_folder(made) as made:
             (made / "depth").mkdir()
