@@ -128,9 +128,10 @@ def cuts(first: int, count: int, seed: int) -> tuple[int, list[str]]:
             results[number] = shown(Path(base) / f"whole-{number}")
         for k in range(first, first + count):
             rng = np.random.default_rng([seed, k])
-            folder = Path(base) / f"cut-{k:06}"
+            folder = Path(base) / f"cut-{k:06}" / "out"
             write(folder, 1)
-            (folder / "mine.txt").write_bytes(b"mine")
+            (folder / "recording").mkdir()
+            (folder / "recording" / "mine.txt").write_bytes(b"mine")
             for job in itertools.chain(
                 [lambda f: write(f, 2)], [finish_interrupted] * int(rng.integers(4))
             ):
@@ -138,12 +139,12 @@ def cuts(first: int, count: int, seed: int) -> tuple[int, list[str]]:
                 with power.connected(), suppress(PowerCut):
                     job(folder)
                 if power.off:
-                    power.lose(folder)
+                    power.lose(folder.parent)
             try:
                 finish_interrupted(folder)
                 OutputFolder(folder, overwrite=True).discard()
                 found = made_results.contents(folder)
-                mine = found.pop("mine.txt", None)
+                mine = found.pop("recording/mine.txt", None)
                 if mine != b"mine" or found not in results.values() or not is_result(folder):
                     faults.append(f"cut {k}: neither the old result nor the new one")
             except Exception as error:

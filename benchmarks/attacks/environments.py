@@ -102,8 +102,8 @@ STAGES = (
     ("tracking", "tofuse.pipeline.reconstruct:push_frames"),
     ("a model", "tofuse.pipeline.backend:BackEnd.run"),
     ("writing", "tofuse.results.output:_write_files"),
-    ("moving", "tofuse.results.folder:move_all"),
-    ("moves", "tofuse.files.staging:_Plan.carry_out"),
+    ("moving", "tofuse.files.staging:replace_folder"),
+    ("moves", "tofuse.files.staging:_move_into_place"),
     ("the end", "tofuse.pipeline.tracked_file:TrackedFile.remove"),
 )
 _SIGNALS = ("SIGINT", "SIGTERM")

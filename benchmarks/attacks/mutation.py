@@ -343,7 +343,6 @@ def _results() -> dict[str, Subject]:
     return {
         "a result": _file("out", _result, _load),
         "a result with images": _file("all", _with_images, _export),
-        "a plan": _file("out", _stopped, _settle),
         "tiles": _file("tiles", _tiles, _load_tiles),
         "a session": _file("out", _session, _load_session),
     }
@@ -408,38 +407,6 @@ def _load_session(out: Path) -> None:
     except InputError as error:  # if there is nothing else to complain about
         if "is a single session" not in str(error):
             raise
-
-
-def _stopped(out: Path) -> None:
-    """A result, and an interrupted replacement by another one."""
-    import made_results
-    from attacks.power import Power, PowerCut
-    from tofuse.files import staging
-    from tofuse.results.folder import OutputFolder
-    from tofuse.results.output import write_result
-
-    _result(out)
-    (out / "precious.txt").write_text("mine")
-    for calls in range(10, 80):
-        power = Power(calls)
-        with power.connected(), suppress(PowerCut):
-            write_result(made_results.torn(seed=2), OutputFolder(out, overwrite=True))
-        if staging.is_interrupted(out / ".tofuse-unfinished"):
-            break
-    assert staging.is_interrupted(out / ".tofuse-unfinished")
-
-
-def _settle(out: Path) -> None:
-    from tofuse.results.folder import OutputFolder, finish_interrupted
-
-    mine = out / "precious.txt"
-    before = mine.read_bytes() if mine.is_file() else None
-    try:
-        finish_interrupted(out)
-        OutputFolder(out, overwrite=True).discard()
-    finally:
-        if before is not None and mine.read_bytes() != before:
-            raise AssertionError("a file of the user has changed")
 
 
 def damage(folder: Path, rng: np.random.Generator) -> None:

@@ -129,6 +129,6 @@ def cut_everywhere(
         with power.connected(), suppress(PowerCut):
             job(folder)
         if power.off:
-            power.lose(folder)
+            power.lose(folder.parent)
         check(folder, calls)
     return whole.calls

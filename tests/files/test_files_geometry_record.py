@@ -13,8 +13,6 @@ from tofuse.files.las import write_las, write_laz
 from tofuse.files.obj import write_obj
 from tofuse.files.pcd import write_pcd
 from tofuse.files.ply import write_ply
-from tofuse.files.stl import write_stl
-from tofuse.files.usdz import write_usdz
 
 POINTS = np.zeros((3, 3), np.float32)
 FACE = np.array([[0, 1, 2]], np.int32)
@@ -31,8 +29,6 @@ FACE = np.array([[0, 1, 2]], np.int32)
         write_obj,
         write_pcd,
         write_ply,
-        write_stl,
-        write_usdz,
     ],
 )
 def test_every_writer_checks_shapes(tmp_path, write) -> None:

@@ -33,12 +33,30 @@ def test_lock_is_exclusive(tmp_path: Path) -> None:
     assert (inside, most) == (0, 1)
 
 
+HOLD = """
+import subprocess, sys
+from tofuse.files.locking import locked
+with locked(sys.argv[1]) as handle:
+    command = [sys.executable, "-c", "input()"]
+    subprocess.Popen(command, pass_fds=(handle,), stdout=subprocess.DEVNULL)
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX locks")
-def test_inherited_lock_is_held(tmp_path: Path) -> None:
-    with locked(tmp_path / "lock") as handle:
-        child = subprocess.Popen(
-            [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=(handle,)
-        )
+def test_child_of_killed_process_holds_lock(tmp_path: Path) -> None:
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path / "lock")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert holder.stdin is not None
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == b"held\n"
+    holder.kill()
+    holder.wait()
+    holder.stdout.close()
     taken = threading.Event()
 
     def take() -> None:
@@ -48,13 +66,14 @@ def test_inherited_lock_is_held(tmp_path: Path) -> None:
     thread = threading.Thread(target=take)
     thread.start()
     assert not taken.wait(0.3)
-    child.communicate(b"\n")
+    holder.stdin.close()  # which ends the child
     assert taken.wait(30)
     thread.join()
 
 
 def test_uncreatable_lock_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="create its folder first"), locked(tmp_path / "a" / "b"):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="can't be written"), locked(tmp_path / "file" / "lock"):
         pass
 
 

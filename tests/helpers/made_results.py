@@ -9,7 +9,6 @@ import numpy as np
 
 from tofuse.fusion.cloud import empty_cloud
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.results.folder import LOCK
 from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 
 
@@ -85,5 +84,5 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {
         str(p.relative_to(folder)): p.read_bytes()
         for p in folder.rglob("*")
-        if p.is_file() and p.name != LOCK
+        if p.is_file() and not p.name.startswith(".tofuse-lock")
     }

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
-import struct
-import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -27,7 +23,7 @@ from tofuse.files.tileset import read_tileset
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry import se3
 from tofuse.results.export import FORMATS, export
-from tofuse.results.folder import LOCK, OutputFolder
+from tofuse.results.folder import OutputFolder
 
 TIMES, POSES = np.array([0.1, 0.2, 0.5]), se3.exp(np.random.default_rng(1).normal(size=(3, 6)))
 POSES[0] = np.eye(4)
@@ -217,64 +213,10 @@ def sampled(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return image[v, u, :3]
 
 
-def test_usdz_matches_specification(result: Path, upright) -> None:
-    """The archive is checked by the specification, the scene by its text."""
-    (path,) = export(result, ["usdz"])
-    data = path.read_bytes()
-    with zipfile.ZipFile(path) as archive:
-        assert archive.testzip() is None
-        files = archive.infolist()
-        scene = archive.read(files[0]).decode()
-        image = cv2.imdecode(np.frombuffer(archive.read("texture.jpg"), np.uint8), 1)[..., ::-1]
-    assert [each.filename for each in files] == ["model.usda", "texture.jpg"]
-    for each in files:
-        assert (each.compress_type, each.flag_bits & 1) == (zipfile.ZIP_STORED, 0)
-        name, extra = struct.unpack_from("<HH", data, each.header_offset + 26)
-        assert (each.header_offset + 30 + name + extra) % 64 == 0
-    assert scene.startswith("#usda 1.0")
-    assert 'upAxis = "Y"' in scene
-    assert "metersPerUnit = 1\n" in scene
-
-    def numbers(what: str) -> np.ndarray:
-        (found,) = re.findall(re.escape(what) + r" = \[(.*)\]", scene)
-        return np.array(re.findall(r"-?[0-9.]+", found), float)
-
-    faces = numbers("faceVertexIndices").astype(int).reshape(-1, 3)
-    assert (numbers("faceVertexCounts") == 3).all()
-    uv = numbers("primvars:st").reshape(-1, 2) * [1, -1] + [0, 1]
-    points = numbers("point3f[] points").reshape(-1, 3)
-    normals = numbers("normal3f[] normals").reshape(-1, 3)
-    check_surface(upright, points, faces, normals, sampled(image, uv))
-    low, high = numbers("float3[] extent").reshape(2, 3)
-    np.testing.assert_allclose([low, high], [points.min(0), points.max(0)], atol=1e-5)
-
-
-def test_usdz_read_by_openusd(result: Path, upright) -> None:
-    usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed")
-    from pxr import UsdGeom, UsdShade
-
-    (path,) = export(result, ["usdz"])
-    stage = usd.Stage.Open(str(path))
-    assert UsdGeom.GetStageUpAxis(stage) == "Y"
-    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
-    mesh = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("surface"))
-    points, faces = mesh.GetPointsAttr().Get(), mesh.GetFaceVertexIndicesAttr().Get()
-    faces = np.array(faces).reshape(-1, 3)
-    check_surface(upright, np.array(points), faces, np.array(mesh.GetNormalsAttr().Get()), None)
-    assert mesh.GetNormalsInterpolation() == "vertex"
-    assert len(mesh.GetPrim().GetAttribute("primvars:st").Get()) == len(points)
-    material, _ = UsdShade.MaterialBindingAPI(mesh.GetPrim()).ComputeBoundMaterial()
-    shader = material.ComputeSurfaceSource()[0]
-    source = shader.GetInput("diffuseColor").GetConnectedSources()[0][0].source
-    file = UsdShade.Shader(source.GetPrim()).GetInput("file").Get()
-    assert file.path == "texture.jpg"
-    assert file.resolvedPath.endswith("mesh.usdz[texture.jpg]")
-
-
 def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) -> None:
     trimesh = pytest.importorskip("trimesh")
     monkeypatch.setattr("tofuse.results.export._MAX_TEXTURED_FACES", 10)
-    glb, obj, usdz = export(result, ["glb", "obj", "usdz"])
+    glb, obj = export(result, ["glb", "obj"])
     (mesh,) = trimesh.load_scene(obj, process=False, maintain_order=True).geometry.values()
     color = mesh.visual.vertex_colors[:, :3]
     check_surface(upright, mesh.vertices, mesh.faces, mesh.vertex_normals, color)
@@ -285,11 +227,6 @@ def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) ->
     s = upright.color / 255
     light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(found, light, atol=1e-4)
-    with zipfile.ZipFile(usdz) as archive:
-        scene = archive.read("model.usda").decode()
-    found = re.findall(r"displayColor = \[(.*)\]", scene)[0]
-    numbers = np.array(re.findall(r"[0-9.]+", found), float).reshape(-1, 3)
-    np.testing.assert_allclose(numbers, light, atol=1e-4)
 
 
 def test_simplified_surfaces_keep_colours(result: Path) -> None:
@@ -443,7 +380,7 @@ def test_only_one_process_writes_to_a_result(result: Path, tmp_path: Path) -> No
         patch.setitem(FORMATS, "log", ("trajectory.log", during))
         export(result, ["log"])
     assert len(seen) == 1
-    assert not (result / LOCK).exists()
+    assert not list(result.parent.glob(".tofuse-*"))
 
 
 def test_component_uses_lock_of_its_result(result: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from made_results import contents
 from parsed_glb import parse
 from report_results import make_room
 from tofuse.errors import InputError, OutputError
@@ -24,7 +22,7 @@ from tofuse.fusion.levels import levels
 from tofuse.fusion.upright import upright
 from tofuse.geometry import se3
 from tofuse.results import tiles
-from tofuse.results.folder import STAGING, OutputFolder, finish_interrupted
+from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
 from tofuse.results.tiles import TilingSummary, is_tiles, write_tiles
 from tofuse.results.types import Component
@@ -338,41 +336,6 @@ def test_component_may_be_tiled_too(tmp_path, small_limits) -> None:
     (out / "component-1" / "tiles" / "more.glb").write_text("")
     with pytest.raises(OutputError, match="component-1"):
         OutputFolder(out, overwrite=True)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stopped_at", [0, 1, 3, 6, 12])
-def test_interrupted_moves_are_finished_with_all_tiles(
-    tmp_path, small_limits, monkeypatch, stopped_at
-) -> None:
-    """Results are never mixed, including tiles of a component."""
-    first, _ = make_room()
-    apart = Component(((0, 9),), None, None, replace(first, mesh=waves(90)))
-    main = Component(((10, 23),), np.eye(4), None, None)
-    second = replace(first, mesh=waves(), components=(main, apart), seed=3)
-    out = tmp_path / "out"
-    write_result(replace(first, mesh=waves(100)), OutputFolder(out))
-    before = sorted(contents(out).items())
-    moves = 0
-    move = os.replace
-
-    def cut_off(a, b):
-        nonlocal moves
-        if Path(b).parent in (out, out / STAGING / "replaced"):
-            if moves >= stopped_at:
-                raise OSError("power")
-            moves += 1
-        move(a, b)
-
-    monkeypatch.setattr(os, "replace", cut_off)
-    with pytest.raises(OutputError):
-        write_result(second, OutputFolder(out, overwrite=True))
-    monkeypatch.setattr(os, "replace", move)
-    finish_interrupted(out)
-    assert sorted(contents(out).items()) == before
-    write_result(second, OutputFolder(out, overwrite=True))
-    assert is_tiles(out / "component-1" / "tiles")
-    assert is_tiles(out / "tiles")
 
 
 def test_overview_is_as_fine_as_size_limit_allows(tmp_path, small_limits) -> None:

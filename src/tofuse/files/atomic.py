@@ -10,7 +10,6 @@ import errno
 import itertools
 import os
 import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -149,32 +148,3 @@ def make_folder(path: str | Path) -> Path:
     except OSError as error:
         raise output_error(error, path) from error
     return path
-
-
-@contextmanager
-def new_folder(path: str | Path) -> Iterator[Path]:
-    """Yield an empty temporary folder, renamed to `path` if the block succeeds, else removed.
-
-    The block should only write: its OSErrors become OutputErrors about `path`.
-
-    Raises
-    ------
-    OutputError
-        If `path` exists and is not an empty folder, or can't be written.
-    """
-    path = Path(path)
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise OutputError("isn't empty", where=path, remedy="choose a new folder")
-    parent = make_folder(path.absolute().parent)
-    try:
-        # The folder of `tempfile` is private; the one inside has the usual permissions.
-        with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=parent) as private:
-            temporary = make_folder(Path(private) / "made")
-            yield temporary
-            sync_tree(temporary)
-            if path.exists():
-                path.rmdir()
-            os.replace(temporary, path)
-            sync(parent)
-    except OSError as error:
-        raise output_error(error, path) from error

@@ -4,7 +4,8 @@ The layout is that of "OpenEXR File Layout" of the Academy Software Foundation: 
 attributes, a table of offsets, and blocks of scan lines, channel after channel in each line. ZIP
 deflates the differences of neighbouring bytes, the even bytes of a block before the odd ones.
 
-Implemented here, as OpenCV's decoder is disabled by default.
+Implemented here, as OpenCV's decoder is disabled by default, and the package OpenEXR (3.5) crashes
+on damaged headers, or prints to the standard output.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
+from tofuse.files.atomic import write_bytes
 from tofuse.files.e57 import write_e57
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import write_glb, write_gltf
@@ -19,8 +20,6 @@ from tofuse.files.obj import write_obj
 from tofuse.files.pcd import write_pcd
 from tofuse.files.ply import write_ply
 from tofuse.files.reading import path_of, required_package
-from tofuse.files.stl import write_stl
-from tofuse.files.usdz import write_usdz
 from tofuse.fusion.colors import display_colors
 
 # From x right, y down, z forward into glTF's x right, y up, z towards the viewer.
@@ -43,7 +42,7 @@ def save(record: GeometryRecord, path: str | Path, R_up_world: Float64 = _R_GLTF
     path
         The file.
     R_up_world
-        (3, 3) rotation from the world to axes with y up, used for glTF, OBJ, STL and USDZ; by
+        (3, 3) rotation from the world to axes with y up, used for glTF, OBJ and STL; by
         default the axes of the first camera.
 
     Raises
@@ -125,14 +124,17 @@ def _las(record: GeometryRecord, path: str | Path, _: Float64) -> None:
     )
 
 
+def _stl(mesh: GeometryRecord, path: str | Path, R: Float64) -> None:
+    write_bytes(path, to_trimesh(_for_display(mesh, R)).export(file_type="stl"))
+
+
 _Write = Callable[[GeometryRecord, str | Path, Float64], None]
 _MESHES: dict[str, _Write] = {
     ".glb": lambda mesh, path, R: write_glb(path, _for_display(mesh, R), generator=_GENERATOR),
     ".gltf": lambda mesh, path, R: write_gltf(path, _for_display(mesh, R), generator=_GENERATOR),
     ".ply": _ply,
     ".obj": lambda mesh, path, R: write_obj(path, _for_display(mesh, R)),
-    ".usdz": lambda mesh, path, R: write_usdz(path, _for_display(mesh, R), generator=_GENERATOR),
-    ".stl": lambda mesh, path, R: write_stl(path, _for_display(mesh, R)),
+    ".stl": _stl,
 }
 _CLOUDS: dict[str, _Write] = {
     ".ply": _ply,

@@ -84,7 +84,7 @@ class Mesh:
         return GeometryRecord(self.vertices, self.faces, self.normals, self.color, scalars=scalars)
 
     def save(self, path: str | Path) -> None:
-        """Write the mesh to a path ending in .glb, .gltf, .ply, .obj, .stl or .usdz."""
+        """Write the mesh to a path ending in .glb, .gltf, .ply, .obj or .stl."""
         exchange.save(self.record(), path)
 
     def to_trimesh(self) -> Any:

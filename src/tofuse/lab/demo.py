@@ -5,21 +5,20 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from tofuse.errors import OutputError
-from tofuse.files.atomic import UNFINISHED, sync_tree, write_text
+from tofuse.files.atomic import write_text
+from tofuse.files.staging import replacing_folder
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.passing import Passing
 from tofuse.lab.simulation.record import simulate
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.run import run
 from tofuse.pipeline.run_options import Options, resolve
-from tofuse.results.folder import RECORDING, OutputFolder
+from tofuse.results.folder import RECORDING, OutputFolder, is_result
 from tofuse.results.types import Reconstruction
 
 # Settings of the thesis per scene (section 4.1): points beyond the object are removed.
@@ -60,60 +59,41 @@ def demo(
     )
     # Validate options and folder before the simulation.
     resolve(options)
-    with (
-        OutputFolder(out, overwrite=overwrite) as folder,
-        _replacing_recording(out / RECORDING) as fresh,
-    ):
+    recording = out / RECORDING
+    with OutputFolder(out, overwrite=overwrite) as folder:
         expect_failure = scene == FAILURE
-        simulate_to(
-            scene,
-            fresh,
-            seed=seed,
-            texture=not expect_failure,
-            without=("wrap",) if expect_failure else (),
-            progress=progress,
-        )
-        if scene == "peaks":
-            thesis = options.method == "thesis"
-            write_text(fresh / "peaks.toml", PEAKS_CONFIG + (PEAKS_ICP if thesis else ""))
-            options = replace(options, config=out / RECORDING / "peaks.toml")
-        sync_tree(fresh)
-        os.replace(fresh, out / RECORDING)
-        return run([out / RECORDING], options, progress, folder)
-
-
-@contextmanager
-def _replacing_recording(path: Path) -> Iterator[Path]:
-    """Yield a temporary path, moved to `path` on success; a failure restores the old recording.
-
-    Only a simulated recording is ever replaced.
-    """
-    fresh, old = path.parent / f"{UNFINISHED}simulating", path.parent / f"{UNFINISHED}replaced"
-    for folder in (path, fresh, old):
-        if os.path.lexists(folder) and not _is_simulated(folder):
-            raise OutputError(
-                "is no simulated recording, or holds something else as well",
-                where=folder,
-                remedy="move it away, or choose another --out",
+        with replacing_folder(recording, lambda _: _check_simulated(recording)) as fresh:
+            simulate_to(
+                scene,
+                fresh,
+                seed=seed,
+                texture=not expect_failure,
+                without=("wrap",) if expect_failure else (),
+                progress=progress,
             )
-    shutil.rmtree(fresh, ignore_errors=True)
-    if not path.exists() and old.exists():  # interrupted in between
-        os.replace(old, path)
-    shutil.rmtree(old, ignore_errors=True)
-    if path.exists():
-        os.replace(path, old)
-    try:
-        yield fresh
-    except BaseException:
-        for leftover in (fresh, path):
-            shutil.rmtree(leftover, ignore_errors=True)
-        if old.exists():
-            os.replace(old, path)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
+            if scene == "peaks":
+                thesis = options.method == "thesis"
+                write_text(fresh / "peaks.toml", PEAKS_CONFIG + (PEAKS_ICP if thesis else ""))
+                options = replace(options, config=recording / "peaks.toml")
+        try:
+            return run([recording], options, progress, folder)
+        except BaseException:
+            if not is_result(out):
+                shutil.rmtree(recording, ignore_errors=True)
+            raise
 
 
-# All files of a simulated recording, complete or being written.
+def _check_simulated(folder: Path) -> None:
+    """Check that nothing but a simulated recording is replaced."""
+    if os.path.lexists(folder) and not _is_simulated(folder):
+        raise OutputError(
+            "is no simulated recording, or holds something else as well",
+            where=folder,
+            remedy="move it away, or choose another --out",
+        )
+
+
+# All files of a simulated recording.
 _SIMULATED = re.compile(
     r"(truth/)?[a-z_]+/\.?\d{6}\.[\w.-]+|truth/[\w.-]+\.ply"
     r"|\.?(camera|correction|rays|timestamps|groundtruth|odometry|frames|imu|peaks)\.[\w.-]+"
@@ -121,7 +101,7 @@ _SIMULATED = re.compile(
 
 
 def _is_simulated(folder: Path) -> bool:
-    """Whether a folder contains a simulated recording, or a part of it, and nothing else."""
+    """Whether a folder contains a simulated recording and nothing else, or is empty."""
     if folder.is_symlink() or not folder.is_dir():
         return False
     for parent, folders, names in os.walk(folder):
@@ -130,7 +110,7 @@ def _is_simulated(folder: Path) -> bool:
         relative = Path(parent).relative_to(folder)
         if not all(_SIMULATED.fullmatch((relative / name).as_posix()) for name in names):
             return False
-    return folder.name.startswith(UNFINISHED) or (folder / "truth").is_dir()
+    return (folder / "truth").is_dir() or not any(folder.iterdir())
 
 
 # Section 4.1.6: all points, no filters; and a resolution of 1 m. Loops would be 3 m apart.

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 
 from tofuse.errors import InputError
-from tofuse.files.atomic import new_folder
+from tofuse.files.staging import new_folder
 from tofuse.live.device import DeviceError, Stream
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter

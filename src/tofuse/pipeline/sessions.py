@@ -124,9 +124,9 @@ def _read_parts(
     Also the loop closures between them, see `Session`. Its components are numbered from
     `components`.
     """
+    finish_interrupted(folder)
     if not folder.exists():
         raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
-    finish_interrupted(folder)
     if not folder.is_dir() or not is_result(folder):
         raise InputError("contains no result (no run.json)", where=folder, remedy=_REMEDY)
     run = read_run_json(folder / "run.json")

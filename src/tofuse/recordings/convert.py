@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.files.atomic import new_folder
+from tofuse.files.staging import new_folder
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable
 from tofuse.recordings.depth_counts import MAX_COUNTS
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame

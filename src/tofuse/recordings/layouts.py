@@ -10,8 +10,9 @@ import numpy as np
 
 from tofuse.arrays import UInt8
 from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.files.atomic import make_folder, new_folder, write_text
+from tofuse.files.atomic import make_folder, write_text
 from tofuse.files.images import write_png
+from tofuse.files.staging import new_folder
 from tofuse.files.trajectory import write_log, write_tum
 from tofuse.geometry.cameras import Pinhole
 from tofuse.recordings.camera_file import SCHEMA, camera_fields

@@ -14,10 +14,11 @@ import numpy as np
 
 from tofuse.arrays import Float64, Intp, UInt8
 from tofuse.errors import InputError, OutputError
-from tofuse.files.atomic import make_folder, new_folder, output_error
+from tofuse.files.atomic import make_folder
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.images import jpeg_bytes
 from tofuse.files.ply import read_ply
+from tofuse.files.staging import new_folder, replacing_folder
 from tofuse.files.stamps import stamp
 from tofuse.files.trajectory import associate, read_tum, write_kitti, write_log
 from tofuse.fusion import exchange
@@ -31,7 +32,7 @@ from tofuse.results.folder import (
     claimed,
     finish_interrupted,
     is_result,
-    lock_folder,
+    result_folder,
 )
 from tofuse.results.loading import read_mesh
 from tofuse.results.nerfstudio import write_nerfstudio
@@ -152,38 +153,20 @@ def _colmap(result: _Result, path: Path) -> None:
         write_colmap(result.folder, folder, result.every, result.pinhole)
 
 
-# Exports that are folders of images with poses, and their content.
-_IMAGE_FOLDERS = frozenset({"images", "depth", "sigma", "masks"})
-FOLDERS = {
-    "nerfstudio": _IMAGE_FOLDERS | {"transforms.json", "points.ply"},
-    "colmap": _IMAGE_FOLDERS | {"sparse"},
-}
-
-
-def foreign(folder: Path) -> tuple[str, ...]:
-    """Return names in an export folder that no export wrote; the folder's name if it is none."""
-    if folder.is_symlink() or not folder.is_dir():
-        return (folder.name,)
-    return tuple(sorted({p.name for p in folder.iterdir()} - FOLDERS[folder.name]))
-
-
 @contextmanager
 def _folder(path: Path) -> Iterator[Path]:
     """Yield a new folder that then replaces an earlier export in its place."""
-    if os.path.lexists(path) and (unexpected := foreign(path)):
-        raise OutputError(
-            f"contains {unexpected[0]}, which is not part of an export",
-            where=path,
-            remedy="move it away, or pass another --out",
-        )
-    staged = path.with_name(f".{path.name}-{os.getpid()}")
-    with new_folder(staged) as folder:
+
+    def check(folder: Path) -> None:
+        if unexpected := RESULT.foreign(folder, f"{path.name}/"):
+            raise OutputError(
+                f"contains {unexpected}, which is not part of an export",
+                where=path,
+                remedy="move it away, or pass another --out",
+            )
+
+    with replacing_folder(path, check) as folder:
         yield folder
-    try:
-        shutil.rmtree(path, ignore_errors=True)
-        os.replace(staged, path)
-    except OSError as error:
-        raise output_error(error, path) from error
 
 
 def _tiles(result: _Result, path: Path) -> None:
@@ -219,7 +202,6 @@ FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
     "glb": ("mesh.glb", _mesh),
     "gltf": ("mesh.gltf", _mesh),
     "obj": ("mesh.obj", _mesh),
-    "usdz": ("mesh.usdz", _mesh),
     "stl": ("mesh.stl", _stl),
     "3dtiles": (f"{TILES}/{TILESET}", _tiles),
     "kitti": ("trajectory.kitti.txt", _kitti),
@@ -241,7 +223,7 @@ def export(
 ) -> list[Path]:
     """Write a result in other formats, and return the paths of the files.
 
-    The target folder is locked against other processes.
+    A target folder that is a result is locked against other processes.
 
     Parameters
     ----------
@@ -269,7 +251,7 @@ def export(
         If a file exists already, or can't be written, or another process writes into the folder.
     """
     folder = Path(folder)
-    finish_interrupted(lock_folder(folder))
+    finish_interrupted(result_folder(folder))
     if not is_result(folder):
         raise InputError("is not a result", where=folder, remedy="pass the --out of `tofuse run`")
     unknown = [name for name in formats if name not in FORMATS]
@@ -289,7 +271,7 @@ def export(
                 )
         result = _Result(folder, faces, every, pinhole)
         # Images first: only they can be missing after a complete run.
-        for name in sorted(files, key=lambda name: name not in FOLDERS):
+        for name in sorted(files, key=lambda name: name not in ("nerfstudio", "colmap")):
             FORMATS[name][1](result, files[name])
     return list(files.values())
 

@@ -1,13 +1,10 @@
-"""The output folder of a run: locked first, staged inside, moved into place at the end.
+"""The output folder of a run: locked first, written beside it, moved into place at the end.
 
-A folder is not modified before it is known to contain an earlier result. One process at a
-time may write into it. A process that is stopped while it moves a result into place leaves a plan
-by which the next one, reading or writing, finishes the moves (`files.moving`).
+A folder is not modified before it is known to contain an earlier result and nothing else.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
@@ -15,28 +12,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from tofuse.errors import InputError, OutputError
-from tofuse.files.atomic import UNFINISHED
+from tofuse.files.atomic import UNFINISHED, output_error
 from tofuse.files.locking import Claim
 from tofuse.files.reading import path_of, read_text
-from tofuse.files.staging import (
-    Names,
-    check_interrupted,
-    clear,
-    is_interrupted,
-    move_all,
-    not_a_result_error,
-    recover,
-    result_locations,
-)
+from tofuse.files.staging import StagedFolder, beside, finish_replacing, is_interrupted
 
-STAGING = f"{UNFINISHED}unfinished"
-LOCK = f"{UNFINISHED}lock"
 TRACKED = f"{UNFINISHED}tracked.npz"  # tracked frames of an interrupted run
-RECORDING = "recording"  # written by `tofuse demo` next to its result
+RECORDING = "recording"  # written by `tofuse demo` next to its result, and kept with it
 
 # Files of a result, by `tofuse run` and `tofuse export`; all of them are removed with it.
 FILES = (
@@ -50,7 +34,6 @@ FILES = (
     "mesh.mtl",
     "mesh.png",
     "mesh.jpg",
-    "mesh.usdz",
     "mesh.stl",
     "report.html",
     "view.npz",
@@ -67,41 +50,60 @@ FILES = (
 )
 # Large surfaces are in tiles, in their own folder (`results.tiles`).
 TILES, TILESET = "tiles", "tileset.json"
-_TILES = Names(
-    frozenset({TILESET}), file_pattern=re.compile(r"\d{1,4}(-\d{1,9}){3}\.glb", re.ASCII)
-)
-_WITH_TILES = (re.compile(re.escape(TILES)), _TILES)
 # The model of a separate component is in its own folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
+_IMAGES = r"(images|depth|sigma|masks|sparse)/.+"  # exported, with their poses
+_OF_SYSTEMS = re.compile(r"(.*/)?(\.DS_Store|Thumbs\.db|desktop\.ini)")
 
 
 @dataclass(frozen=True)
 class Contract:
-    """The files of one kind of result.
+    """What one kind of result consists of.
 
     Attributes
     ----------
-    names
-        Names of the files and folders that it may contain.
+    files
+        Pattern of the paths of its files, relative to its folder.
     marker
-        The file that is moved into place last: if it exists, the result is complete.
+        The file by which it is recognised.
     is_ours
-        Whether a folder contains a result of this kind, by its marker.
+        Whether a folder contains a result of this kind.
     """
 
-    names: Names
+    files: re.Pattern[str]
     marker: str
     is_ours: Callable[[Path], bool]
 
+    def foreign(self, folder: Path, prefix: str = "") -> str | None:
+        """Return the path of a file or link in a folder that no such result has, relative to it.
 
-class OutputFolder:
+        Parameters
+        ----------
+        folder
+            The folder; its recording and files of an interrupted run are ignored.
+        prefix
+            Its path in the result, with a slash at the end.
+        """
+        for parent, folders, names in os.walk(folder):
+            relative = Path(parent).relative_to(folder)
+            if parent == str(folder):
+                folders[:] = [f for f in folders if f != RECORDING or prefix]
+            folders[:] = sorted(f for f in folders if not f.startswith(UNFINISHED))
+            links = [f for f in folders if (Path(parent) / f).is_symlink()]
+            for name in (*links, *sorted(n for n in names if not n.startswith(UNFINISHED))):
+                path = (relative / name).as_posix()
+                known = self.files.fullmatch(prefix + path) or _OF_SYSTEMS.fullmatch(path)
+                if not known or (Path(parent) / name).is_symlink():
+                    return path
+        return None
+
+
+class OutputFolder(StagedFolder):
     """A folder that a run may write into, locked against other processes.
 
     The constructor checks everything that can be checked before hours of work: that the folder is
-    empty or has an earlier result, that no other process writes into it, and that it is writable.
-
-    Files and folders (`tiles`, `component-1` and so on) are moved into place as a whole. Links are
-    moved as links, and never followed.
+    empty or has an earlier result, that no other process writes into it, and that it can be
+    replaced.
 
     The lock is released when the result is written; in a `with` statement, at its end.
     """
@@ -127,85 +129,45 @@ class OutputFolder:
             or another process writes into it, or it can't be written.
         """
         self.path = path_of(path, "folder", "pass the path of a folder")
-        self._contract = contract or RESULT
-        self._names = self._contract.names
-        self._staging = self.path / STAGING
-        self._created: list[Path] = []
-        self._claim: Claim | None = None
-        self._entered = False
-        try:
-            # Before any change, and again under the lock.
-            _check_content(self.path, self._contract, overwrite)
-            self._created = [p for p in (self.path, *self.path.parents) if not p.exists()]
-            self.path.mkdir(parents=True, exist_ok=True)
-            self._claim = Claim(self.path / LOCK, target=self.path)
-            _recover(self.path, self._contract)
-            _check_content(self.path, self._contract, overwrite)
-            if not clear(self._staging, self._names):
-                raise not_a_result_error(self._staging)
-            self._staging.mkdir()
-        except OSError as error:
-            self.discard()
-            raise _output_error(self.path, error) from error
-        except BaseException:
-            self.discard()
-            raise
+        self._contract, self._overwrite = contract or RESULT, overwrite
+        super().__init__(self.path, self._check_content, kept=RECORDING)
+        self._overwrite = True  # of a recording that is simulated meanwhile
 
-    def __enter__(self) -> Self:
-        self._entered = True
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
-    ) -> None:
-        self._entered = False
-        self.discard()
-
-    @contextmanager
-    def staging(self) -> Iterator[Path]:
-        """Yield a folder to write into; on success all of it is moved into place, else nothing.
-
-        Files of an earlier result that were not written again are removed.
-        """
-        try:
-            yield self._staging
-            move_all(self._staging, self.path, self._names, self._contract.marker)
-        except OutputError as error:
-            # The path in its final place, not in the staging folder.
-            where = self._final(error.where or "")
-            raise OutputError(error.problem, where=where, remedy=error.remedy) from error
-        except OSError as error:
-            raise _output_error(self.path, error) from error
-        finally:
-            if self._entered:
-                self._clear()
-            else:
-                self.discard()
-
-    def _final(self, staged: str) -> Path:
-        path = Path(staged)
-        if path.is_relative_to(self._staging):
-            return self.path / path.relative_to(self._staging)
-        return path if path.is_relative_to(self.path) else self.path / path.name
-
-    def _clear(self) -> None:
-        if self._claim is not None and not is_interrupted(self._staging):
-            clear(self._staging, self._names)
-
-    def discard(self) -> None:
-        """Remove unfinished files, and folders that were created for them if they are empty."""
-        try:
-            self._clear()
-        finally:
-            if self._claim is not None:
-                self._claim.release()
-                self._claim = None
-        with contextlib.suppress(OSError):
-            for folder in self._created:
-                folder.rmdir()
+    def _check_content(self, folder: Path) -> None:
+        """Reject a folder with anything but a result that may be replaced."""
+        if not folder.exists():
+            if self.path.is_symlink():
+                raise OutputError(
+                    f"is a link to {os.readlink(self.path)}, which doesn't exist",
+                    where=self.path,
+                    remedy="create its target, or pass another --out",
+                )
+            return
+        entries = {p.name for p in folder.iterdir() if not p.name.startswith(UNFINISHED)}
+        if not entries:
+            return
+        if not self._contract.is_ours(folder) and entries - {RECORDING}:
+            raise OutputError(
+                f"contains {min(entries)}, but no earlier result of this command",
+                where=self.path,
+                remedy="pass a new or empty folder as --out",
+            )
+        if not self._overwrite:
+            recording = entries == {RECORDING}
+            raise OutputError(
+                "contains a recording" if recording else "contains an earlier result",
+                where=self.path,
+                remedy="pass --overwrite to replace it, or another --out",
+            )
+        if foreign := self._contract.foreign(folder):
+            raise OutputError(
+                "is not a file of an earlier result",
+                where=self.path / foreign,
+                remedy="move it away, or choose another --out",
+            )
 
 
-def check_output(path: str | Path, *, overwrite: bool) -> None:
+def check_output(path: Path, *, overwrite: bool) -> None:
     """Check early whether `OutputFolder` will accept a folder, before long work.
 
     Parameters
@@ -218,126 +180,59 @@ def check_output(path: str | Path, *, overwrite: bool) -> None:
     OutputError
         If the folder can't be written into, or another process writes into it.
     """
-    path = Path(path)
-    lock = path / LOCK
-    if os.path.lexists(lock):
-        Claim(lock, target=path).release()
-    try:
-        _check_content(path, RESULT, overwrite)
-    except OSError as error:
-        raise _output_error(path, error) from error
-
-
-def _check_content(path: Path, contract: Contract, overwrite: bool) -> None:
-    """Reject a folder with anything but a result that may be replaced."""
-    staging = path / STAGING
-    if path.exists() and not path.is_dir():
-        raise OutputError("is a file", where=path, remedy="pass a folder as --out")
-    if is_interrupted(staging):
-        check_interrupted(staging, contract.names, contract.marker)
-        if any(contract.is_ours(place) for place in result_locations(staging, path)):
-            return
-    entries = {p.name for p in path.iterdir()} if path.exists() else set()
-    entries -= {name for name in entries if name.startswith(UNFINISHED)}
-    if not entries:
-        return
-    if not contract.is_ours(path) and entries - {RECORDING}:
-        raise OutputError(
-            "is not empty and contains no earlier result of this command",
-            where=path,
-            remedy="pass a new or empty folder as --out",
-        )
-    if not overwrite:
-        raise OutputError(
-            "contains an earlier result" if contract.marker in entries else "contains a recording",
-            where=path,
-            remedy="pass --overwrite to replace it, or another --out",
-        )
-    for name in sorted(entries):
-        if contract.names.folder(name) and not contract.names.is_result_folder(path / name):
-            raise not_a_result_error(path / name)
-
-
-def lock_folder(folder: Path) -> Path:
-    """Return the folder whose lock protects a folder: for a component's folder, its result's."""
-    parent = folder.resolve().parent
-    if component_number(folder.resolve()) is not None and is_result(parent):
-        return parent
-    return folder
+    OutputFolder(path, overwrite=overwrite).discard()
 
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder in the block, so that no run replaces its content.
+    """Hold the lock of a result, or that of a component, in the block: no run replaces it then.
+
+    Other folders are not locked.
 
     Raises
     ------
     OutputError
         If another process writes into it, or it can't be written.
     """
-    locked = lock_folder(folder)
-    claim = Claim(locked / LOCK, target=locked)
+    result = result_folder(folder)
+    claim = Claim(beside(result, "lock"), target=result) if is_result(result) else None
     try:
         yield
     finally:
-        claim.release()
+        if claim is not None:
+            claim.release()
 
 
-def _recover(folder: Path, contract: Contract) -> None:
-    """Finish the moves of an interrupted process."""
-    staging = folder / STAGING
-    if not is_interrupted(staging):
-        return
-    check_interrupted(staging, contract.names, contract.marker)
-    if not any(contract.is_ours(place) for place in result_locations(staging, folder)):
-        raise not_a_result_error(folder)
-    recover(staging, folder, contract.names, contract.marker)
-
-
-def _output_error(path: Path, error: OSError) -> OutputError:
-    if path.is_symlink() and not path.exists():
-        return OutputError(
-            f"is a link to {os.readlink(path)}, which doesn't exist",
-            where=path,
-            remedy="create its target, or pass another --out",
-        )
-    return OutputError(
-        f"can't be written ({error.strerror or error})",
-        where=path,
-        remedy="check the permissions and the free space, or pass another --out",
-    )
+def result_folder(folder: Path) -> Path:
+    """Return the result that the folder of a component belongs to; any other folder itself."""
+    folder = Path(os.path.realpath(folder))
+    is_component = component_number(folder) is not None and is_result(folder.parent)
+    return folder.parent if is_component else folder
 
 
 def finish_interrupted(folder: Path) -> None:
-    """Finish moves that were interrupted, so that a result can be read.
+    """Finish the replacement of a result that was interrupted, so that it can be read.
 
     Raises
     ------
     InputError
-        If another process is moving a result into place, or interrupted moves can't be finished.
+        If another process is replacing it, or that can't be finished.
     """
-    staging = folder / STAGING
-    if not is_interrupted(staging):
+    place = Path(os.path.realpath(folder))
+    if not is_interrupted(place):
         return
     try:
-        claim = Claim(folder / LOCK, target=folder)
+        claim = Claim(beside(place, "lock"), target=folder)
         try:
-            _recover(folder, RESULT)
-            clear(staging, RESULT.names)
+            finish_replacing(place, RECORDING)
         finally:
             claim.release()
-    except OutputError as error:
+    except (OutputError, OSError) as error:
+        reason = error if isinstance(error, OutputError) else output_error(error, folder)
         raise InputError(
-            f"a result is being moved into place: {error.problem}",
-            where=error.where,
-            remedy=error.remedy,
-        ) from error
-    except OSError as error:
-        raise InputError(
-            f"moving a result into place was interrupted, and can't be finished "
-            f"({error.strerror or error})",
+            f"is being replaced, or that was interrupted: {reason.problem}",
             where=folder,
-            remedy="copy the folder, with hidden files, to a writable place, and try again",
+            remedy="wait until it is done, or make the folder that it is in writable",
         ) from error
 
 
@@ -366,7 +261,11 @@ def component_number(folder: Path) -> int | None:
     return int(folder.name.split("-")[1]) if _COMPONENT.fullmatch(folder.name) else None
 
 
-_MODEL = Names(frozenset(FILES), (_WITH_TILES,))
+_FILE = "|".join(map(re.escape, FILES))
+_TILE = rf"{TILES}/({re.escape(TILESET)}|\d{{1,4}}(-\d{{1,9}}){{3}}\.glb)"
+_EXPORTED = rf"nerfstudio/(transforms\.json|points\.ply|{_IMAGES})|colmap/{_IMAGES}"
 RESULT = Contract(
-    Names(frozenset(FILES), (_WITH_TILES, (_COMPONENT, _MODEL))), "run.json", is_result
+    re.compile(rf"({_COMPONENT.pattern}/)?({_FILE}|{_TILE})|{_EXPORTED}", re.ASCII),
+    "run.json",
+    is_result,
 )

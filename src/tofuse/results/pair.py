@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +18,6 @@ from tofuse.files.atomic import write_text
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import write_ply
 from tofuse.files.pose import pose_text
-from tofuse.files.staging import Names
 from tofuse.geometry import se3
 from tofuse.recordings.cloud_files import MAP_COORDINATES_M
 from tofuse.recordings.frames import Frame
@@ -249,7 +249,7 @@ def is_registration(folder: Path) -> bool:
     return data is not None and {"schema", "version", "T_target_source"} <= set(data)
 
 
-CONTRACT = Contract(Names(frozenset(FILES)), MARKER, is_registration)
+CONTRACT = Contract(re.compile("|".join(map(re.escape, FILES))), MARKER, is_registration)
 
 
 def pair_folder(path: Path, *, overwrite: bool = False) -> OutputFolder:

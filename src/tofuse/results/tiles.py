@@ -16,7 +16,7 @@ from tofuse.files.tileset import Tile, write_tileset
 from tofuse.fusion.colors import display_colors
 from tofuse.fusion.levels import Level, TileIndex, levels
 from tofuse.fusion.mesh import Mesh
-from tofuse.results.folder import RESULT, TILESET
+from tofuse.results.folder import RESULT, TILES, TILESET
 
 # A surface with more triangles is tiled. These take 110 MB of glTF, all of which must be loaded
 # before anything is shown.
@@ -91,7 +91,7 @@ def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> TilingSummary:
 
 def is_tiles(folder: Path) -> bool:
     """Whether it is a folder `tiles` that contains only files of `write_tiles`."""
-    return RESULT.names.is_result_folder(folder)
+    return folder.is_dir() and not RESULT.foreign(folder, f"{TILES}/")
 
 
 def overview(mesh: Mesh) -> Mesh:

@@ -163,9 +163,9 @@ def read_content(folder: Path) -> ViewContent:
     InputError
         If it is not an output folder, or its files are damaged or of different runs.
     """
+    finish_interrupted(folder)
     if not folder.exists():
         raise InputError("doesn't exist", where=folder, remedy="pass the --out of `tofuse run`")
-    finish_interrupted(folder)
     if not folder.is_dir() or not is_result(folder):
         raise InputError(
             "is not a result (no run.json)", where=folder, remedy="pass the --out of `tofuse run`"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Mapping
 from functools import cache
@@ -16,7 +17,6 @@ from threadpoolctl import threadpool_limits
 
 from tofuse._version import __version__
 from tofuse.errors import InputError
-from tofuse.files.staging import Names
 from tofuse.lab.experiments import sections
 from tofuse.lab.experiments.cases import CASES, DRAWS, METHODS, CaseResult, Run, run_case
 from tofuse.lab.experiments.peaks import AXES, SIGMAS_M, PeaksSweep, sweep_peaks
@@ -104,7 +104,7 @@ def is_experiments(folder: Path) -> bool:
     return data is not None and data.get("kind") == KIND
 
 
-_CONTRACT = Contract(Names(frozenset({"index.html", _MARKER})), _MARKER, is_experiments)
+_CONTRACT = Contract(re.compile(rf"index\.html|{re.escape(_MARKER)}"), _MARKER, is_experiments)
 
 
 def _run_all(

@@ -17,7 +17,14 @@ from tofuse.errors import InputError
 from tofuse.files.exr import parse_exr
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.lzfse import lzfse_decompress
-from tofuse.files.reading import input_error, is_file, is_folder, list_folder, read_bytes
+from tofuse.files.reading import (
+    input_error,
+    is_file,
+    is_folder,
+    list_folder,
+    read_bytes,
+    required_package,
+)
 from tofuse.geometry import quaternion
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
@@ -162,6 +169,7 @@ class _Archive:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.where = Path(f"{path}: metadata")
+        required_package("lzfse", "phones", path)
         try:
             self.archive = zipfile.ZipFile(path)
             self.names = set(self.archive.namelist())
