@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,36 +19,24 @@ NO_MEASUREMENT = (128, 128, 132)
 REMOVED = (225, 40, 135)  # removed by the filter shown; not in the colour map
 BACKGROUND = (22, 25, 30)  # of the 3D view
 
-# Viridis at nine places (matplotlib's, CC0): near is dark, far is bright, in grey print as well.
-_VIRIDIS = np.array(
-    [
-        [68, 1, 84],
-        [71, 44, 122],
-        [59, 81, 139],
-        [44, 113, 142],
-        [33, 144, 141],
-        [39, 173, 129],
-        [92, 200, 99],
-        [170, 220, 50],
-        [253, 231, 37],
-    ],
-    float,
-)
-
 
 def viridis(value: Float64) -> UInt8:
-    """Return viridis colours (..., 3) of values from 0 to 1."""
-    position = np.clip(np.nan_to_num(value), 0, 1) * (len(_TABLE) - 1)
-    return _TABLE[np.round(position).astype(np.intp)]
+    """Return viridis colours (..., 3) of values from 0 to 1: near is dark, far is bright."""
+    return _ramp()[np.round(255 * np.clip(np.nan_to_num(value), 0, 1)).astype(np.intp)]
 
 
-def _interpolate(position: Float64) -> UInt8:
-    low = np.minimum(position.astype(int), len(_VIRIDIS) - 2)
-    t = (position - low)[..., None]
-    return np.round(_VIRIDIS[low] * (1 - t) + _VIRIDIS[low + 1] * t).astype(np.uint8)
+@cache
+def _ramp() -> UInt8:
+    """The 256 colours of the map, (256, 3) RGB."""
+    import cv2
+
+    levels = np.arange(256, dtype=np.uint8)[:, None]
+    return np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8)
 
 
-_TABLE = _interpolate(np.linspace(0, len(_VIRIDIS) - 1, 1025))
+def css(color: Sequence[int]) -> str:
+    """Return an RGB colour as in a style sheet."""
+    return f"rgb{tuple(color)}"
 
 
 def encode(image: UInt8, *, jpeg: bool = False) -> bytes:
