@@ -209,7 +209,7 @@ def _step_images(
     limits: tuple[float, float],
     framing: thumbnails.Framing,
 ) -> list[str]:
-    """The depth image of a frame, with the pixels removed since the previous one, and its points."""
+    """The depth image of a frame, with the pixels removed since the previous one; its points."""
     images = []
     if isinstance(frame, RangeFrame):
         removed = previous.valid & ~frame.valid if isinstance(previous, RangeFrame) else None

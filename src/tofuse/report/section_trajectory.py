@@ -101,11 +101,19 @@ def _rows(name: str, offsets: Float64, compared: bool) -> list[list[str]]:
     if len(valid) == 0:
         return []
     values = np.insert(valid, 3, np.linalg.norm(valid[:, :3], axis=1), axis=1)
-    kinds = {"last frame": values[-1], "rms": np.sqrt((values**2).mean(0)), "largest": values.max(0)}
+    kinds = {
+        "last frame": values[-1],
+        "rms": np.sqrt((values**2).mean(0)),
+        "largest": values.max(0),
+    }
     if not compared:
         del kinds["rms"]
     return [
-        [f"{name}, {kind}", *(words.length(float(v)) for v in row[:4]), f"{np.degrees(row[4]):.2f}°"]
+        [
+            f"{name}, {kind}",
+            *(words.length(float(v)) for v in row[:4]),
+            f"{np.degrees(row[4]):.2f}°",
+        ]
         for kind, row in kinds.items()
     ]
 

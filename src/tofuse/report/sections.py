@@ -28,7 +28,11 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         ("components", "Components", section_parts.components),
         ("frames", "Frames", section_frames.frames),
         ("views", "Dimensions", section_model.views),
-        ("error", "Displacement" if subject.reference is None else "Error", section_trajectory.error),
+        (
+            "error",
+            "Displacement" if subject.reference is None else "Error",
+            section_trajectory.error,
+        ),
         ("objective", "Objective", section_trajectory.optimisation),
         ("filters", "Filters", section_frames.filters),
         ("loops", "Loop closures", section_frames.loops),
