@@ -429,7 +429,6 @@ import os, pathlib, signal, sys
 from tofuse.cli import main
 from tofuse.cli.progress import QuietProgress
 from tofuse.pipeline import checkpoint, run
-run.write_report_files = lambda *a: (a[-1] / "report.html").write_text("report")
 checkpoint._INTERVAL_S, checkpoint._TIME_FRACTION = 0.0, 1e9
 out, last_event, last_move = pathlib.Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 events = moves = 0
@@ -462,13 +461,10 @@ def killed(out: Path, *words: object, event: int = -1, move: int = -1) -> tuple[
 def test_repeatedly_killed_run_gives_same_bytes(
     room_recording: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(
-        run, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
-    )
     whole, out = tmp_path / "whole", tmp_path / "out"
-    words = (room_recording, "--every", 2, "--seed", 2, "--voxel", "5cm")
+    words = (room_recording, "--every", 2, "--seed", 2, "--voxel", "5cm", "--no-report")
     assert main(["run", "--out", str(whole), *map(str, words)]) == 0
-    assert {p.name for p in whole.iterdir()} == {*SAME, "report.html", "run.json"}
+    assert {p.name for p in whole.iterdir()} == {*SAME, "run.json"}
     rng = np.random.default_rng(5)
     # In tracking or after it, and at the moves of files.
     for how in ({"event": int(rng.integers(3, 20))}, {"move": int(rng.integers(1, 8))}):
@@ -493,18 +489,24 @@ def test_full_disk_preserves_earlier_result(
 ) -> None:
     import resource
 
-    monkeypatch.setattr(
-        run, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
-    )
     out = tmp_path / "out"
     out.mkdir()
     (out / "run.json").write_text('{"schema": 1, "version": "0", "verdict": "good"}')
-    words = ["run", str(room_recording), "--out", str(out), "--every", "4", "--overwrite"]
+    words = [
+        "run",
+        str(room_recording),
+        "--out",
+        str(out),
+        "--every",
+        "4",
+        "--overwrite",
+        "--no-report",
+    ]
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     # Files may not grow beyond some kilobytes: simulates a full disk.
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
     try:
-        assert main(words) == 2
+        assert main([*words, "--overwrite"]) == 2
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     message = capsys.readouterr().err

@@ -123,7 +123,6 @@ ORDER = [
     "verdict",
     "frames",
     "views",
-    "cameras",
     "error",
     "objective",
     "filters",
@@ -186,7 +185,7 @@ def test_errors_are_relative_to_reference(shown):
             result.trajectory[:, :3, 3] - result.diagnostics.sequential[:, :3, 3], axis=1
         )
     )
-    assert f"most at frame {worst}." in shown.sections["cameras"]
+    assert f"most at frame {worst}." in shown.sections["error"]
 
 
 @pytest.fixture(scope="module")

@@ -134,12 +134,13 @@ def _row(job: Job, record: Record, folder: BatchFolder) -> Row:
         accuracy += "" if record.relative is None else f" ({100 * record.relative:.2g} %)"
     elif done:
         accuracy = "not bounded"
+    has_report = (folder.result(job) / "report.html").is_file()
     picture = folder.picture(job)
     return Row(
         job.name,
         job.recording,
         " ".join(job.arguments),
-        f"{quote(job.name)}/report.html" if done else "",
+        f"{quote(job.name)}/report.html" if done and has_report else "",
         quote(f"{picture.parent.name}/{picture.name}") if done and picture.is_file() else "",
         record.verdict if done else "no result",
         record.verdict if done else "failed",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -90,12 +91,8 @@ def run(
             give_back()
             # BLAS results depend on its number of threads, and idle threads busy-wait.
             with threadpool_limits(1):
-                write_result(
-                    result,
-                    out,
-                    lambda r, f: write_report_files(job.recording, job.config, r, f),
-                    texture,
-                )
+                report = partial(write_report_files, job.recording, job.config)
+                write_result(result, out, None if options.no_report else report, texture)
             checkpoints.finish()
         except _STATE_ERRORS as error:
             checkpoints.give_up(error)
