@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.inspection.finding import Finding
+from tofuse.inspection.finding import Finding, is_significant
 from tofuse.inspection.geometry import check_kind, wrong_focal
 from tofuse.inspection.pair_motion import Pair, aligned, aligned_pair, field_of_view
 from tofuse.inspection.sample import VIEW_COLUMNS, Sample, part_starts
@@ -45,14 +45,20 @@ def check_focal(sample: Sample) -> Iterator[Finding]:
     if any(check_kind(sample)):
         return
     centre = _coarse_estimate(sample)
-    scores = _consistent([_scores(pair) for pair in _rotated_pairs(sample, centre)])
+    scores = _consistent(
+        [
+            [_rescaled(pair, log_scale).alignment.score for log_scale in _FINE]
+            for pair in _rotated_pairs(sample, centre)
+        ]
+    )
     if len(scores) < _MIN_PAIRS:
         return
     best = int(scores.mean(0).argmax())
     # At either end it may not be a maximum; with low scores it is not significant.
     if best in (0, len(_FINE) - 1) or scores[:, best].mean() < _MIN_MEAN_SCORE:
         return
-    if not centre and not _leads(scores, best, _NOMINAL, _MIN_LEAD):
+    lead = scores[:, best] - scores[:, _NOMINAL]
+    if not centre and not is_significant(lead, _MIN_LEAD, _MIN_LEAD_SIGMAS):
         return
     # Jackknife over the pairs (Efron 1982), at the same maximum.
     peaks = np.array(
@@ -73,13 +79,6 @@ def _parabola_peak(score: Float64, best: int) -> float:
     return float(_FINE[best] + np.clip(shift, -1.0, 1.0) * (_FINE[1] - _FINE[0]))
 
 
-def _leads(scores: Float64, best: int, other: int, min_lead: float) -> bool:
-    """Whether one focal length has significantly better scores (N, M) than another."""
-    lead = scores[:, best] - scores[:, other]
-    error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
-    return float(lead.mean()) > max(min_lead, _MIN_LEAD_SIGMAS * error)
-
-
 def _consistent(scores: Sequence[Sequence[float]]) -> Float64:
     """Scores (N, M) of the pairs that are consistent under any of M focal lengths.
 
@@ -93,10 +92,12 @@ def _coarse_estimate(sample: Sample) -> float:
     scores = _consistent([_coarse_scores(pair) for pair in _shifted_pairs(sample)])
     if len(scores) < _MIN_PAIRS:
         return 0.0
-    best = int(scores.mean(0).argmax())
     mean = scores.mean(0)
-    is_better = _leads(scores, best, _COARSE_STEPS, _MIN_COARSE_LEAD) and (
-        mean[best] - max(mean[0], mean[-1]) > _MIN_COARSE_LEAD
+    best = int(mean.argmax())
+    lead = scores[:, best] - scores[:, _COARSE_STEPS]
+    is_better = (
+        is_significant(lead, _MIN_COARSE_LEAD, _MIN_LEAD_SIGMAS)
+        and mean[best] - max(mean[0], mean[-1]) > _MIN_COARSE_LEAD
     )
     return (best - _COARSE_STEPS) * _COARSE_STEP if is_better else 0.0
 
@@ -141,11 +142,9 @@ def _wider(
     gap = int(np.clip(np.round(desired / max(motion, 1e-4)), 1, _MAX_GAP))
     if not step.fits or gap * motion < minimum:
         return None
-    return step if gap == 1 else _pair_at_gap(sample, step, gap, log_scale)
-
-
-def _pair_at_gap(sample: Sample, step: Pair, gap: int, log_scale: float) -> Pair | None:
-    """The pair of the same first frame and one `gap` frames later, or earlier near the end."""
+    if gap == 1:
+        return step
+    # The same first frame, and one that is later, or earlier near the end.
     recording = sample.recording
     position = int(np.searchsorted(recording.indices, sample.frames[step.i].index))
     starts = [0, *part_starts(recording), len(recording)]
@@ -158,11 +157,6 @@ def _pair_at_gap(sample: Sample, step: Pair, gap: int, log_scale: float) -> Pair
             second = prepare_view(frame, SurfaceOptions(columns=VIEW_COLUMNS))
             return aligned_pair(step.first, _scaled(second, log_scale), step.i, k)
     return None
-
-
-def _scores(pair: Pair) -> list[float]:
-    """Alignment score of the views under each of the fine scales."""
-    return [_rescaled(pair, log_scale).alignment.score for log_scale in _FINE]
 
 
 def _rescaled(pair: Pair, log_scale: float) -> Pair:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tofuse.geometry.cameras import Camera, Pinhole, RayTable
+from tofuse.geometry.cameras import Pinhole, RayTable
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.planar import Distortion, fit_distortion
 from tofuse.inspection.sample import Sample
@@ -38,31 +38,23 @@ def check_kind(sample: Sample) -> Iterator[Finding]:
     wrong_exponent = 1.0 if kind == "z" else -1.0
     if sigma > _MAX_KIND_SIGMA or abs(alpha - wrong_exponent) > _KIND_TOLERANCE:
         return
-    evidence = {
-        "exponent": alpha,
-        "sigma": sigma,
-        "rms_fraction": distortion.rms_before,
-        "rms_share_if_corrected": distortion.rms_after,
-    }
-    surfaces = f"{distortion.surfaces} surfaces"
-    if kind == "z":
-        yield Finding(
-            "range_taken_for_z",
-            f"Walls bulge as if radial range were taken for z: planes fit {surfaces} to "
-            f"{distortion.rms_after:.2%} of the depth as range, and to "
-            f"{distortion.rms_before:.2%} as z.",
-            'Set depth_kind to "range".',
-            evidence,
-        )
-    else:
-        yield Finding(
-            "z_taken_for_range",
-            f"Walls are concave as if z were taken for radial range: planes fit {surfaces} to "
-            f"{distortion.rms_after:.2%} of the depth as z, and to "
-            f"{distortion.rms_before:.2%} as range.",
-            'Set depth_kind to "z".',
-            evidence,
-        )
+    code, shape, declared, actual = (
+        ("range_taken_for_z", "bulge as if radial range were taken for z", "z", "range")
+        if kind == "z"
+        else ("z_taken_for_range", "are concave as if z were taken for radial range", "range", "z")
+    )
+    yield Finding(
+        code,
+        f"Walls {shape}: planes fit {distortion.surfaces} surfaces to {distortion.rms_after:.2%} "
+        f"of the depth as {actual}, and to {distortion.rms_before:.2%} as {declared}.",
+        f'Set depth_kind to "{actual}".',
+        {
+            "exponent": alpha,
+            "sigma": sigma,
+            "rms_fraction": distortion.rms_before,
+            "rms_share_if_corrected": distortion.rms_after,
+        },
+    )
 
 
 def check_lens(sample: Sample) -> Iterator[Finding]:
@@ -122,8 +114,8 @@ def check_intrinsics(sample: Sample) -> Iterator[Finding]:
     if not sample.images:
         return
     camera = sample.images[0].camera
-    lens = _pinhole(camera)
-    if lens is None:
+    lens = camera.fit if isinstance(camera, RayTable) else camera
+    if not isinstance(lens, Pinhole):
         return
     offset_x = (lens.cx - (lens.width - 1) / 2) / lens.width
     offset_y = (lens.cy - (lens.height - 1) / 2) / lens.height
@@ -133,25 +125,21 @@ def check_intrinsics(sample: Sample) -> Iterator[Finding]:
         "fx_fraction": lens.fx / lens.width,
         "fx_over_fy": lens.fx / lens.fy,
     }
-    remedy = "Use the intrinsics of the depth camera at this resolution."
     if max(abs(offset_x), abs(offset_y)) > _MAX_CENTRE_OFFSET:
-        text = (
+        fault = (
             f"The principal point ({lens.cx:.0f}, {lens.cy:.0f}) is far from the centre of "
-            f"images of {lens.width} x {lens.height}: these are intrinsics of another resolution "
-            "or another camera."
+            f"images of {lens.width} x {lens.height}"
         )
     elif not _MIN_FOCAL < lens.fx / lens.width < _MAX_FOCAL:
-        text = (
+        fault = (
             f"A focal length of {lens.fx:.4g} pixels gives images of {lens.width} columns a field "
-            f"of view of {2 * np.degrees(np.arctan(lens.width / 2 / lens.fx)):.0f} degrees: these "
-            "are intrinsics of another resolution or another camera."
+            f"of view of {2 * np.degrees(np.arctan(lens.width / 2 / lens.fx)):.0f} degrees"
         )
     else:
         return
-    yield Finding("other_intrinsics", text, remedy, evidence)
-
-
-def _pinhole(camera: Camera) -> Pinhole | None:
-    if isinstance(camera, RayTable):
-        return camera.fit
-    return camera if isinstance(camera, Pinhole) else None
+    yield Finding(
+        "other_intrinsics",
+        f"{fault}: these are intrinsics of another resolution or another camera.",
+        "Use the intrinsics of the depth camera at this resolution.",
+        evidence,
+    )
