@@ -607,7 +607,7 @@ def test_two_trajectory_lines_are_not_read_as_matrix(tmp_path) -> None:
         read_pose(tmp_path / "t.txt")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_report_in_browser(room_recording, tmp_path) -> None:
     """The three states differ, views can be hidden, and the page makes no external requests."""
     out = tmp_path / "out"

@@ -16,8 +16,15 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.inspection.finding import Finding, is_significant
 from tofuse.inspection.geometry import check_kind, wrong_focal
-from tofuse.inspection.pair_motion import Pair, aligned, aligned_pair, field_of_view
-from tofuse.inspection.sample import VIEW_COLUMNS, Sample, part_starts
+from tofuse.inspection.sample import (
+    VIEW_COLUMNS,
+    Pair,
+    Sample,
+    aligned,
+    aligned_pair,
+    field_of_view,
+    part_starts,
+)
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
 

@@ -9,8 +9,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.inspection import channels
 from tofuse.inspection.finding import Finding
-from tofuse.inspection.pair_motion import Pair
-from tofuse.inspection.sample import Sample
+from tofuse.inspection.sample import Pair, Sample
 
 # Smaller motions count as standing still.
 _STILL_M, _STILL_RAD = 0.01, np.radians(0.5)
