@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help demo test slow lint docs gallery format lock audit sbom clean
+.PHONY: help demo test slow nightly lint docs gallery format lock audit sbom clean
 
 help:                       ## this list
 	@awk -F ':.*## *' '/^[a-z]+:.*##/ { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))

@@ -6,16 +6,13 @@ import re
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tofuse._version import __version__
 from tofuse.files.atomic import write_text
 from tofuse.report.extras import ReportExtras
 from tofuse.report.policy import secured
 from tofuse.results.types import Reconstruction
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 # Files of the pages' script; each uses functions of the previous ones.
 SCRIPTS = (
@@ -59,11 +56,8 @@ def write_page(path: Path, template: str, **values: Any) -> None:
 
 def page(template: str, **values: Any) -> str:
     """Return a page as HTML, with a mark for each byte of a file's name that is not UTF-8."""
-    text = (
-        _environment()
-        .get_template(template)
-        .render(version=__version__, style=asset("style.css"), **values)
-    )
+    made = _environment().get_template(template)
+    text = made.render(version=__version__, style=asset("style.css"), **values)
     return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text)
 
 
@@ -80,15 +74,10 @@ def asset(name: str) -> str:
 
 
 @cache
-def _environment() -> Environment:
+def _environment() -> Any:
     from jinja2 import Environment, FunctionLoader, StrictUndefined
 
-    environment = Environment(
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        loader=FunctionLoader(asset),
-    )
+    loader, trim = FunctionLoader(asset), {"trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(autoescape=True, undefined=StrictUndefined, loader=loader, **trim)
     environment.policies["json.dumps_kwargs"] = {}  # keys in their order
     return environment
