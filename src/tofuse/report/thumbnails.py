@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import Bool, Float32, Float64, Int32, UInt8
+from tofuse.arrays import Bool, Float32, Float64, UInt8
 from tofuse.kernels.splat import nearest_points
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 
@@ -157,33 +157,15 @@ def splat(
     -------
     (H, W, 4) RGBA, transparent where there is no point.
     """
-    indices = nearest(points, T_view_world, size, scale=scale, distance=distance, radius=radius)
-    return _to_image(indices, colors[indices[indices >= 0]])
-
-
-def nearest(
-    points: Float64,
-    T_view_world: Float64,
-    size: tuple[int, int],
-    *,
-    scale: float,
-    distance: float | None = None,
-    radius: int = 1,
-) -> Int32:
-    """Return the index of the visible point at each pixel (H, W), as `splat` draws them; or -1."""
     indices = np.full(size[::-1], -1, np.int32)
     depth = np.full(indices.shape, np.inf)
     nearest_points(
         np.ascontiguousarray(points), T_view_world, scale, distance or 0.0, radius, depth, indices
     )
-    return indices
-
-
-def _to_image(indices: Int32, colors: UInt8) -> UInt8:
-    """RGBA image (H, W, 4) of point indices (H, W), with colours (K, 3) of pixels with a point."""
+    covered = indices >= 0
     image = np.zeros((*indices.shape, 4), np.uint8)
-    image[indices >= 0, :3] = colors
-    image[indices >= 0, 3] = 255
+    image[covered, :3] = colors[indices[covered]]
+    image[covered, 3] = 255
     return image
 
 
@@ -233,14 +215,14 @@ class Framing:
 def cloud_image(frame: Frame, limits: tuple[float, float], framing: Framing) -> UInt8:
     """Render a view's points in the colours of `depth_image`, (H, W, 4) RGBA."""
     points = frame.points.astype(float)
-    radius = 1 if len(points) > 60_000 else 2
-    indices = nearest(
-        points, framing.T_view_world, framing.size, scale=framing.scale, radius=radius
-    )
-    visible = points[indices[indices >= 0]]
-    if isinstance(frame, RangeFrame):
-        depth = visible[:, 2]
-    else:
-        depth = np.linalg.norm(visible - frame.origin, axis=1)
+    is_range = isinstance(frame, RangeFrame)
+    depth = points[:, 2] if is_range else np.linalg.norm(points - frame.origin, axis=1)
     low, high = limits
-    return _to_image(indices, viridis((depth - low) / (high - low)))
+    return splat(
+        points,
+        viridis((depth - low) / (high - low)),
+        framing.T_view_world,
+        framing.size,
+        scale=framing.scale,
+        radius=1 if len(points) > 60_000 else 2,
+    )
