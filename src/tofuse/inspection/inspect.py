@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Pinhole, RayTable
-from tofuse.inspection import channels, focal, geometry, motion_checks, times, values
+from tofuse.inspection import channels, geometry, motion_checks, times, values
 from tofuse.inspection.finding import SEVERITIES, Finding
 from tofuse.inspection.sample import Sample
 from tofuse.inspection.values import depths_of
@@ -48,7 +48,7 @@ QUICK: tuple[Check, ...] = (
     motion_checks.check_still,
     motion_checks.check_walls,
 )
-CHECKS: tuple[Check, ...] = (*QUICK, focal.check_focal)
+CHECKS: tuple[Check, ...] = (*QUICK, geometry.check_focal)
 
 
 @dataclass(frozen=True, eq=False)
