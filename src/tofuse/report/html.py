@@ -77,7 +77,13 @@ def asset(name: str) -> str:
 def _environment() -> Any:
     from jinja2 import Environment, FunctionLoader, StrictUndefined
 
-    loader, trim = FunctionLoader(asset), {"trim_blocks": True, "lstrip_blocks": True}
-    environment = Environment(autoescape=True, undefined=StrictUndefined, loader=loader, **trim)
+    loader = FunctionLoader(asset)
+    environment = Environment(
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        loader=loader,
+    )
     environment.policies["json.dumps_kwargs"] = {}  # keys in their order
     return environment

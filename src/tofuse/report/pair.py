@@ -257,7 +257,8 @@ def distance_colors(distance: Float64, cap_m: float) -> UInt8:
 
 def packed(scene: PairScene) -> dict[str, Any]:
     """Return the scene for the viewer: plain data, arrays as `pack` packs them."""
-    arrays, placed = {}, {}
+    arrays: dict[str, str] = {}
+    placed: dict[str, dict[str, Any]] = {}
     for key, points in scene.points.items():
         low, extent = points.min(0), np.maximum(np.ptp(points, axis=0), 1e-6)
         normals = scene.normals[key]

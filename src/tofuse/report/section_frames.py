@@ -165,7 +165,8 @@ def filters(s: Subject) -> Values:
     """Return one frame after each filter (figure 3.2), and the fractions removed."""
     removed, steps = s.result.diagnostics.removed, s.extras.filter_steps
     counts: dict[str, tuple[int, int]] = {}  # points removed, of all; a filter may be used twice
-    shown, note = [], ""
+    shown: list[tuple[str, str, list[str]]] = []
+    note = ""
     if steps:
         (first, raw), *later = steps
         limits = thumbnails.depth_limits(raw)

@@ -52,19 +52,20 @@ def model(s: Subject) -> Values:
     }
 
 
-def _toggles(scene: Scene) -> list[list[str | bool]]:
+def _toggles(scene: Scene) -> list[tuple[str, str, str, bool]]:
     """Name, label, colour and initial state of the switches below the view."""
     has_mesh = scene.mesh is not None
+    has_normals = has_mesh or scene.normals is not None
     switches = (
-        (has_mesh, "mesh", "Surface", "", True),
-        (True, "points", "Points", "", not has_mesh),
-        (has_mesh or scene.normals is not None, "peel", "Hide walls seen from behind", "", True),
-        (len(scene.after), "after", "Cameras", "#5ab0f5", True),
-        (len(scene.before), "before", "Cameras before optimisation", "#f0a03c", False),
-        (len(scene.reference), "reference", "Reference trajectory", "#d8dade", False),
-        (len(scene.loops), "loops", "Loop closures", "#5fd08a", True),
+        (has_mesh, ("mesh", "Surface", "", True)),
+        (True, ("points", "Points", "", not has_mesh)),
+        (has_normals, ("peel", "Hide walls seen from behind", "", True)),
+        (len(scene.after), ("after", "Cameras", "#5ab0f5", True)),
+        (len(scene.before), ("before", "Cameras before optimisation", "#f0a03c", False)),
+        (len(scene.reference), ("reference", "Reference trajectory", "#d8dade", False)),
+        (len(scene.loops), ("loops", "Loop closures", "#5fd08a", True)),
     )
-    return [switch for available, *switch in switches if available]
+    return [switch for is_available, switch in switches if is_available]
 
 
 def _color_source(s: Subject) -> str:

@@ -159,7 +159,8 @@ def optimisation(s: Subject) -> Values:
         texts += [_refined(d.refinement), _camera_check(d.refinement)]
     values = np.array(d.objective, float)
     finite = values[np.isfinite(values)]
-    figures, text = [], ""
+    figures: list[tuple[str, str]] = []
+    text = ""
     if len(finite):
         text = f"From {finite[0]:.4g} to {finite[-1]:.4g}"
         text += f" in {words.count(len(values) - 1, 'iteration')}."
