@@ -480,7 +480,8 @@ def two_components(recording, config, **_options) -> Reconstruction:
 def test_unconnected_component_has_own_result(room_recording, tmp_path, monkeypatch, capfd) -> None:
     monkeypatch.setattr(run_module, "reconstruct", two_components)
     out = tmp_path / "out"
-    run(room_recording, "--out", out, "--every", 2, "--method", "thesis", status=3)
+    words = (room_recording, "--out", out, "--every", 2, "--method", "thesis")
+    run(*words, status=3, report=True)
     output = capfd.readouterr().out.splitlines()
     assert "  degraded: The recording consists of 2 parts." in output
     at = output.index("  degraded: The recording consists of 2 parts.")
