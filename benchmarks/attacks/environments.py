@@ -223,7 +223,7 @@ def attempt(environment: Environment, recording: Path, where: Path, *arguments: 
 def _judged(
     environment: Environment, status: int, stderr: str, out: Path, mine: dict[str, bytes] | None
 ) -> Outcome:
-    whole = {"run.json", "trajectory.txt", "cloud.ply", "pose_graph.g2o", "report.html"}
+    whole = {"run.json", "trajectory.txt", "cloud.ply", "pose_graph.g2o"}
     there = {p.name for p in out.iterdir()} if out.is_dir() else set()
     result = whole <= there
     old = mine is not None and (out / "run.json").read_bytes() == mine["run.json"]

@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 
 from aligned_surfaces import drifted, path, surfaces
-from light_report import write_light_report
 from paths import BENCHMARKS, HELPERS
 from refined_submaps import refined
 from revisited_path import ALL, pushed, turn  # noqa: F401 - a fixture
 from tofuse.batch import client
 from tofuse.cli import main
 from tofuse.kernels.executors import LocalExecutor, executor, using_executor
-from tofuse.pipeline import run as run_module
 from tofuse.posegraph.refinement import Joint
 from tofuse.posegraph.revisits import Revisits
 
@@ -74,14 +72,13 @@ def test_cluster_run_gives_same_bytes(
     recording = simulate("room", tmp_path / "room", frames=11, effects=Effects.none())
     config = tmp_path / "small.toml"
     config.write_text('corrections = []\n[refinement]\npart = "joint"\nsubmap = 10\n')
-    # It is drawn by this process either way.
-    monkeypatch.setattr(run_module, "write_report_files", write_light_report)
     there: list[int] = []
     leave = DaskExecutor.close
     monkeypatch.setattr(
         DaskExecutor, "close", lambda self: (there.append(self.n_remote), leave(self))
     )
-    words = ["run", str(recording), "--config", str(config), "--voxel", "50mm", "--threads", "2"]
+    words = ["run", str(recording), "--config", str(config), "--voxel", "50mm", "--no-report"]
+    words += ["--threads", "2"]
     assert main([*words, "--out", str(tmp_path / "here")]) == 0
     assert main([*words, "--out", str(tmp_path / "there"), "--scheduler", cluster]) == 0
     assert there == [2]  # submaps

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shlex
 import signal
 import subprocess
@@ -16,15 +15,13 @@ from types import ModuleType
 
 import pytest
 
-from light_report import STUB, write_light_report
 from paths import BENCHMARKS
 from tofuse.batch import client
 from tofuse.cli import main
-from tofuse.pipeline import run as run_module
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 JOBS = [f"seed-{k}" for k in range(2)]
-WORDS = ("--every", "4", "--method", "thesis", "--threads", "1")
+WORDS = ("--every", "4", "--method", "thesis", "--no-report", "--threads", "1")
 
 
 @pytest.fixture
@@ -43,8 +40,8 @@ def batch_benchmark(monkeypatch) -> ModuleType:
 def listed(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A table of the jobs."""
     path = tmp_path_factory.mktemp("listed") / "list.csv"
-    rows = [f"{room_recording},{name},{k},4,thesis" for k, name in enumerate(JOBS)]
-    path.write_text("\n".join(["recording,name,seed,every,method", *rows]) + "\n")
+    rows = [f"{room_recording},{name},{k},4,thesis,true" for k, name in enumerate(JOBS)]
+    path.write_text("\n".join(["recording,name,seed,every,method,no-report", *rows]) + "\n")
     return path
 
 
@@ -52,21 +49,10 @@ def listed(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def single_runs(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The results of `tofuse run` for each of them."""
     out = tmp_path_factory.mktemp("single_runs")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_module, "write_report_files", write_light_report)
-        for k, name in enumerate(JOBS):
-            words = ("--out", out / name, "--seed", k, *WORDS)
-            assert main(["run", str(room_recording), *map(str, words)]) == 0
+    for k, name in enumerate(JOBS):
+        words = ("--out", out / name, "--seed", k, *WORDS)
+        assert main(["run", str(room_recording), *map(str, words)]) == 0
     return out
-
-
-@pytest.fixture
-def light_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Jobs, on this machine or of Dask workers, write the same light report."""
-    (tmp_path / "light").mkdir()
-    (tmp_path / "light" / "sitecustomize.py").write_text(STUB)
-    known = os.environ.get("PYTHONPATH", "")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "light"), known]))
 
 
 def states(out: Path) -> dict[str, str]:
@@ -143,7 +129,6 @@ def test_bad_recording_does_not_stop_batch(room_recording: Path, tmp_path: Path,
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("light_jobs")
 def test_killed_jobs_and_batch_are_resumed(
     batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
 ) -> None:
@@ -180,7 +165,6 @@ def test_interrupted_batch_reports_progress(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("light_jobs")
 def test_killed_dask_worker_loses_no_results(
     batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
 ) -> None:
@@ -195,7 +179,6 @@ def test_killed_dask_worker_loses_no_results(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("light_jobs")
 def test_batch_resumes_after_lost_scheduler(
     batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
 ) -> None:

@@ -32,7 +32,9 @@ T_SMALL = turn([0.1, 1, 0.2], 4) @ se3.exp([0.02, -0.01, 0.03, 0, 0, 0])
 @pytest.fixture
 def light_page(monkeypatch) -> None:
     """Skip the page if the test does not use it."""
-    monkeypatch.setattr("tofuse.report.pair.render_pair", lambda result: "<html>")
+    monkeypatch.setattr(
+        "tofuse.report.pair.write_pair_report", lambda _, path: path.write_text("<html>")
+    )
 
 
 @pytest.fixture
@@ -457,7 +459,7 @@ def test_write_failure_keeps_earlier_result(
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("tofuse.report.pair.render_pair", full)
+    monkeypatch.setattr("tofuse.report.pair.write_pair_report", full)
     refuses(
         capfd, "register", clouds[1], clouds[1], "--out", out, "--overwrite",
         says=(str(out), "No space left"),
@@ -605,7 +607,7 @@ def test_two_trajectory_lines_are_not_read_as_matrix(tmp_path) -> None:
         read_pose(tmp_path / "t.txt")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_report_in_browser(room_recording, tmp_path) -> None:
     """The three states differ, views can be hidden, and the page makes no external requests."""
     out = tmp_path / "out"

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from light_report import write_light_report
 from tofuse.cli import main
 from tofuse.cli.parser import DEMO_SCENES, make_parser
 from tofuse.errors import TofuseError
@@ -41,24 +40,9 @@ from wrapped_depth import wrapping
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
 FILES = {*SAME, "report.html", "view.npz", "run.json"}
+LIGHT = {*SAME, "run.json"}  # with --no-report
 # Options of a quick run.
-QUICK = ("--every", "4", "--method", "thesis")
-
-
-@pytest.fixture(autouse=True)
-def light_report(request, monkeypatch):
-    """Skip the report, half of the time of a run, if the test does not use it."""
-    if "full_report" not in request.fixturenames:
-        skip_report(monkeypatch)
-
-
-def skip_report(monkeypatch) -> None:
-    monkeypatch.setattr(run_module, "write_report_files", write_light_report)
-
-
-@pytest.fixture
-def full_report() -> None:
-    """Ask for the real report."""
+QUICK = ("--every", "4", "--method", "thesis", "--no-report")
 
 
 @pytest.fixture
@@ -66,8 +50,10 @@ def recording(room_recording, tmp_path) -> Path:
     return shutil.copytree(room_recording, tmp_path / "rec")
 
 
-def run(*words: object, status: int = 0) -> None:
-    assert main(["run", *(str(w) for w in words)]) == status
+def run(*words: object, status: int = 0, report: bool = False) -> None:
+    """Run, without the report where the test does not use it: it takes half of the time."""
+    more = [] if report else ["--no-report"]
+    assert main(["run", *(str(w) for w in words), *more]) == status
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -96,9 +82,7 @@ def plain_run(room_recording, tmp_path_factory) -> Path:
 def quick_run(room_recording, tmp_path_factory) -> Path:
     """The result of a quick run, without its report."""
     out = tmp_path_factory.mktemp("quick") / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        skip_report(patch)
-        run(room_recording, "--out", out, *QUICK)
+    run(room_recording, "--out", out, *QUICK)
     return out
 
 
@@ -287,7 +271,7 @@ def test_ranges_beyond_period_are_unwrapped(room_recording, tmp_path) -> None:
     farthest = {}
     for name, options in (("near", []), ("far", ["--unwrap"])):
         # Without unwrapping the run is rejected or wrong; the test does not distinguish these.
-        options = [*options, "--method", "thesis"]
+        options = [*options, "--method", "thesis", "--no-report"]
         words = ["run", str(tmp_path / "rec"), "--out", str(tmp_path / name), *options]
         assert main(words) == 0 or name == "near"
         made = run_json(tmp_path / name)
@@ -315,12 +299,11 @@ def test_object_option_rejects_moving_camera(room_recording, tmp_path, capsys) -
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("full_report")
 def test_unreadable_frame_is_skipped_and_blank_one_lost(recording, tmp_path, capsys) -> None:
     unreadable, blank = (recording / f"depth/00000{k}.png" for k in (1, 3))
     unreadable.write_bytes(unreadable.read_bytes()[:200])
     write_png(blank, np.zeros_like(read_image(blank)))
-    run(recording, "--out", tmp_path / "out", "--end", 6, status=3)
+    run(recording, "--out", tmp_path / "out", "--end", 6, status=3, report=True)
     assert "4 of 6 frames tracked, 1 lost, 1 unreadable" in capsys.readouterr().out
     data = run_json(tmp_path / "out")
     status = ["tracked", "skipped", "tracked", "lost", "tracked", "tracked"]
@@ -337,9 +320,8 @@ def test_unreadable_frame_is_skipped_and_blank_one_lost(recording, tmp_path, cap
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("full_report")
 def test_single_frame_run_succeeds(room_recording, tmp_path) -> None:
-    run(room_recording, "--out", tmp_path / "out", "--end", 1)
+    run(room_recording, "--out", tmp_path / "out", "--end", 1, report=True)
     data = run_json(tmp_path / "out")
     assert [r["code"] for r in data["reasons"]] == ["single_frame", "correction_left_out"]
     # Nothing was registered, so the accuracy is unknown.
@@ -494,11 +476,11 @@ def two_components(recording, config, **_options) -> Reconstruction:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("full_report")
 def test_unconnected_component_has_own_result(room_recording, tmp_path, monkeypatch, capfd) -> None:
     monkeypatch.setattr(run_module, "reconstruct", two_components)
     out = tmp_path / "out"
-    run(room_recording, "--out", out, "--every", 2, "--method", "thesis", status=3)
+    words = (room_recording, "--out", out, "--every", 2, "--method", "thesis")
+    run(*words, status=3, report=True)
     output = capfd.readouterr().out.splitlines()
     assert "  degraded: The recording consists of 2 parts." in output
     at = output.index("  degraded: The recording consists of 2 parts.")
@@ -515,7 +497,6 @@ def test_unconnected_component_has_own_result(room_recording, tmp_path, monkeypa
     report = (out / "component-1/report.html").read_text()
     assert ", component 1 –" in report
     assert "component-1/report.html" in (out / "report.html").read_text()
-    skip_report(monkeypatch)
     run(room_recording, "--out", out, *QUICK, "--overwrite", "--json", status=3)
     last = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert last["reasons"] == run_json(out)["reasons"]
@@ -590,7 +571,16 @@ def test_killed_run_changes_nothing(room_recording, quick_run, tmp_path) -> None
     """By SIGKILL; test_cli_boundary.py sends signals that the program handles."""
     out = shutil.copytree(quick_run, tmp_path / "out")
     before = contents(out)
-    words = ["run", str(room_recording), "--out", str(out), "--overwrite", "--seed", "1"]
+    words = [
+        "run",
+        str(room_recording),
+        "--out",
+        str(out),
+        "--overwrite",
+        "--seed",
+        "1",
+        "--no-report",
+    ]
     job = subprocess.Popen(
         [sys.executable, "-c", _SLOW, *words, "--end", "4", "--method", "thesis"],
         stdout=subprocess.PIPE,
@@ -606,7 +596,7 @@ def test_killed_run_changes_nothing(room_recording, quick_run, tmp_path) -> None
     assert left == {"out", ".tofuse-new-out", ".tofuse-lock-out"}
     run(room_recording, "--out", out, *QUICK, status=2)
     run(room_recording, "--out", out, *QUICK, "--overwrite")
-    assert {p.name for p in out.iterdir()} == FILES
+    assert {p.name for p in out.iterdir()} == LIGHT
 
 
 OPTIONS = {

@@ -24,7 +24,6 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.atlas import NO_TRIANGLE, draw_triangles
 from tofuse.pipeline import paint
-from tofuse.pipeline import run as run_module
 from tofuse.pipeline import run_options as options_module
 from tofuse.recordings.frames import RangeFrame
 
@@ -315,12 +314,9 @@ def test_plain_atlas_cells_shrink_with_more_triangles() -> None:
 @pytest.mark.slow
 def test_run_with_texture(room_recording: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     trimesh = pytest.importorskip("trimesh")
-    monkeypatch.setattr(
-        run_module, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
-    )
     monkeypatch.setattr(options_module, "TEXTURE", 256)
     monkeypatch.setattr(paint, "_FACES", 3000)
-    words = ["run", str(room_recording), "--every", "7", "--voxel", "3cm", "--out"]
+    words = ["run", str(room_recording), "--every", "7", "--voxel", "3cm", "--no-report", "--out"]
     for threads, name in (("1", "a"), ("2", "b")):
         out = str(tmp_path / name)
         assert main([*words, out, "--texture", "--threads", threads]) == 0

@@ -14,7 +14,6 @@ from tofuse.errors import UnreadableFrameError
 from tofuse.files.images import read_image
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.simulation.record import simulate_recording
-from tofuse.pipeline import run as run_module
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.noise import noise_model_for
@@ -244,14 +243,11 @@ def test_simulated_rotation_is_not_stationary() -> None:
 
 @pytest.mark.slow
 def test_run_averages_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        run_module, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
-    )
     writer = RecordingWriter(tmp_path / "rec", CAMERA, depth_unit_m=0.0001)
     for k, shift in enumerate([0, 0, 0, 0.03, 0.03, 0.03]):
         writer.add(shot(k, scene(shift), 0.003))
     writer.finish()
-    options = ["run", str(tmp_path / "rec"), "--method", "thesis", "--threads", "1"]
+    options = ["run", str(tmp_path / "rec"), "--method", "thesis", "--threads", "1", "--no-report"]
     main([*options, "--out", str(tmp_path / "plain")])
     main([*options, "--out", str(tmp_path / "averaged"), "--average-still"])
     plain, averaged = (

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -13,9 +11,9 @@ import pytest
 from browser import changed, chromium, watched
 from report_results import make_room
 from tofuse.report.html import write_report
-from tofuse.report.pictures import draw
 from tofuse.report.thumbnails import viridis
-from tofuse.results.samples import FrameSample, FrameSamples
+
+pytestmark = pytest.mark.nightly
 
 DESK, PHONE = {"width": 1200, "height": 900}, {"width": 390, "height": 800}
 
@@ -57,7 +55,6 @@ def middle(page):
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
-@pytest.mark.slow
 def test_model_rotates_and_toggles_switch(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -90,7 +87,6 @@ def test_model_rotates_and_toggles_switch(browser, report):
         seen.check()
 
 
-@pytest.mark.slow
 def test_colours_of_values_match_colour_bar(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -117,7 +113,6 @@ def test_colours_of_values_match_colour_bar(browser, report):
         seen.check()
 
 
-@pytest.mark.slow
 def test_two_taps_measure_distance_with_error(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -149,7 +144,6 @@ def test_two_taps_measure_distance_with_error(browser, report):
         seen.check()
 
 
-@pytest.mark.slow
 def test_section_cuts_and_is_reset(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -167,7 +161,6 @@ def test_section_cuts_and_is_reset(browser, report):
         seen.check()
 
 
-@pytest.mark.slow
 def test_screenshot_and_full_screen(browser, report, tmp_path):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -191,7 +184,6 @@ def test_screenshot_and_full_screen(browser, report, tmp_path):
         seen.check()
 
 
-@pytest.mark.slow
 def test_reason_links_to_its_frames(browser, report):
     with opened(browser, report, viewport=PHONE) as seen:  # where the model is out of sight
         page = seen.page
@@ -215,7 +207,6 @@ def test_reason_links_to_its_frames(browser, report):
         seen.check()
 
 
-@pytest.mark.slow
 def test_cameras_and_timeline_select_frames(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -237,7 +228,6 @@ def test_cameras_and_timeline_select_frames(browser, report):
         seen.check()
 
 
-@pytest.mark.slow
 def test_phone_scrolls_past_model(browser, report):
     with opened(browser, report, viewport=PHONE, has_touch=True, is_mobile=True) as seen:
         page = seen.page
@@ -262,7 +252,6 @@ def test_phone_scrolls_past_model(browser, report):
         seen.check()
 
 
-@pytest.mark.slow
 def test_slider_shows_frames_and_reason_of_loss(browser, report):
     with opened(browser, report, viewport=DESK) as seen:
         page = seen.page
@@ -284,7 +273,6 @@ def test_slider_shows_frames_and_reason_of_loss(browser, report):
         seen.check()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("size", "scheme"), [(DESK, "light"), (PHONE, "dark")])
 def test_layout_follows_scheme_and_screen_size(browser, report, scheme, size):
     with opened(browser, report, viewport=size, color_scheme=scheme) as seen:
@@ -304,29 +292,9 @@ def test_layout_follows_scheme_and_screen_size(browser, report, scheme, size):
         seen.check()
 
 
-@pytest.mark.slow
 def test_page_without_scripts_shows_image_and_first_frame(browser, report):
     with opened(browser, report, viewport=PHONE, java_script_enabled=False) as seen:
         assert seen.page.locator("#viewer .stage > img").is_visible()
         assert seen.page.locator("#player img").first.is_visible()
         assert not seen.page.locator("#frame").is_visible()
         seen.check()
-
-
-@pytest.mark.slow
-def test_long_recording_of_large_images_stays_below_size_limit(tmp_path):
-    result, extras = make_room()
-    rng = np.random.default_rng(0)
-    collector = FrameSamples()
-    color = rng.integers(0, 255, (131, 176, 3)).astype(np.uint8)
-    depth = rng.uniform(1, 5, (131, 176)).astype(np.float16)
-    taken = FrameSample(0, depth, (depth > 2).astype(np.uint8), depth.astype(np.float32), color)
-    for k in range(3000):
-        collector.take(lost=k % 7 == 0, make=partial(replace, taken, index=k))
-    kept = collector.all
-    assert 80 <= len(kept) <= 200
-    assert sum(s.index % 7 == 0 for s in kept) >= 20
-    # All of them pure noise, the worst case for image compression.
-    detailed = replace(result, diagnostics=replace(result.diagnostics, samples=kept))
-    write_report(detailed, tmp_path / "r.html", replace(extras, pictures=draw(kept)))
-    assert (tmp_path / "r.html").stat().st_size < 20e6

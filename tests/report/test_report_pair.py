@@ -10,13 +10,13 @@ from tofuse.geometry import se3
 from tofuse.recordings.single import SingleView
 from tofuse.registration.base import Registration
 from tofuse.report import thumbnails
-from tofuse.report.pair_scene import (
+from tofuse.report.pair import (
     MAX_POINTS,
+    PairScene,
     distance_colors,
     distances,
     packed,
-    pair_scene,
-    render_modes,
+    still,
 )
 from tofuse.results.pair import LocalView, PairResult
 from unpacked import unpack
@@ -70,7 +70,7 @@ def decoded(data: dict, mode: str, which: str) -> np.ndarray:
 def test_layers_are_placed_by_poses() -> None:
     others, points = relief(900, 1), se3.transform(se3.inverse(T), relief(800, 2))
     start = se3.exp([0.3, 0, 0, 0, 0, 0.2])
-    scene = pair_scene(pair(points, others, start=start))
+    scene = PairScene.of(pair(points, others, start=start))
     data = packed(scene)
     for mode, which, truth in (
         ("before", "source", se3.transform(start, points)),
@@ -80,8 +80,8 @@ def test_layers_are_placed_by_poses() -> None:
         ("after", "target", others),
     ):
         np.testing.assert_allclose(decoded(data, mode, which), truth, atol=1e-4)
-    assert scene.fraction > 0.8
-    assert scene.median_m < 0.01
+    assert len(scene.matched) / len(scene.all_distances) > 0.8
+    assert np.median(scene.matched) < 0.01
     assert scene.cap_m * 1000 in (1, 2, 5, 10, 20)
     # All are framed by the visible content, identically, so that nothing jumps.
     assert data["outlines"]["before"] == data["outlines"]["after"]
@@ -89,21 +89,18 @@ def test_layers_are_placed_by_poses() -> None:
 
 def test_wrong_pose_is_visible() -> None:
     others, points = relief(3000, 1), se3.transform(se3.inverse(T), relief(3000, 2))
-    right = pair_scene(pair(points, others))
-    wrong = pair_scene(pair(points, others, pose=se3.exp([0, 0, 0.03, 0, 0, 0]) @ T))
-    assert wrong.median_m > 4 * right.median_m
-    drawn = render_modes(right)
-    assert set(drawn) == {"before", "after", "distance"}
-    for image in drawn.values():
-        filled = (image != thumbnails.BACKGROUND).any(-1)
-        assert 0.1 < filled.mean() < 0.95
-        assert not filled[[0, -1]].all(1).any()
+    right = PairScene.of(pair(points, others))
+    wrong = PairScene.of(pair(points, others, pose=se3.exp([0, 0, 0.03, 0, 0, 0]) @ T))
+    assert np.median(wrong.matched) > 4 * np.median(right.matched)
+    filled = (still(right) != thumbnails.BACKGROUND).any(-1)
+    assert 0.1 < filled.mean() < 0.95
+    assert not filled[[0, -1]].all(1).any()
 
 
 def test_distant_start_has_its_own_frame() -> None:
     points = relief(500, 1)
     far = se3.exp([50.0, 0, 0, 0, 0, 0])
-    data = packed(pair_scene(pair(points, points, pose=np.eye(4), start=far)))
+    data = packed(PairScene.of(pair(points, points, pose=np.eye(4), start=far)))
     before, after = (np.ptp(data["outlines"][mode], axis=0) for mode in ("before", "after"))
     assert before[0] > 40
     assert after[0] < 2
@@ -112,8 +109,9 @@ def test_distant_start_has_its_own_frame() -> None:
 @pytest.mark.slow
 def test_large_views_are_thinned() -> None:
     many = relief(MAX_POINTS + 5000, 1)
-    scene = pair_scene(pair(many, many[:1000], pose=np.eye(4)))
-    assert (scene.shown, scene.total) == (MAX_POINTS + 1000, MAX_POINTS + 6000)
+    scene = PairScene.of(pair(many, many[:1000], pose=np.eye(4)))
+    shown = len(scene.points["source"]) + len(scene.points["target"])
+    assert (shown, scene.total) == (MAX_POINTS + 1000, MAX_POINTS + 6000)
     assert sum(len(text) for text in packed(scene)["arrays"].values()) < 2.5e6
 
 
@@ -124,7 +122,7 @@ def test_large_views_are_thinned() -> None:
 def test_maps_and_scans_are_upright(format, center, up) -> None:  # noqa: A002
     """Down is y for the viewer; in a map up is z."""
     points = relief(500, 1)
-    scene = pair_scene(pair(points, points, pose=np.eye(4), format=format, center=center))
-    shown = scene.layers["after"][1].points
+    scene = PairScene.of(pair(points, points, pose=np.eye(4), format=format, center=center))
+    shown = scene.points["target"]
     turned = np.column_stack([points[:, 0], -points[:, 2], points[:, 1]])
     np.testing.assert_allclose(shown, turned if up else points, atol=1e-5)

@@ -22,7 +22,7 @@ from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.recordings.rig import Rig, RigCamera, read_rig, write_rig
 from tofuse.report.scene import CAMERA_COLORS
-from tofuse.report.section_rig import upright
+from tofuse.report.section_parts import upright
 from tofuse.rigs.calibrate import Calibration, calibrate_cameras, moves
 from tofuse.rigs.inputs import Camera, unique_names
 from tofuse.viewer.content import read_content

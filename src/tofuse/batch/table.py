@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from urllib.parse import quote
 
-from tofuse._version import __version__
 from tofuse.batch.folder import BatchFolder, Record
 from tofuse.batch.jobs import Job
 from tofuse.files.atomic import write_text
@@ -99,8 +98,7 @@ def _csv(ended: Sequence[tuple[Job, Record]]) -> str:
 def _html(
     ended: Sequence[tuple[Job, Record]], total: int, running: int, folder: BatchFolder
 ) -> str:
-    from tofuse.report.html import asset, template
-    from tofuse.report.policy import secured
+    from tofuse.report.html import page
 
     rows = [_row(job, record, folder) for job, record in ended]
     counts = Counter(row.tone for row in rows)
@@ -116,16 +114,14 @@ def _html(
         facts.append(("pending", f"{total - len(ended)}"))
     seconds = sum(record.seconds or 0 for _, record in ended)
     facts.append(("total time", duration(seconds)))
-    page = template("batch.html.j2").render(
+    return page(
+        "batch.html.j2",
         title=folder.path.name,
-        version=__version__,
-        style=asset("style.css"),
         facts=facts,
         rows=rows,
         running=running,
         refresh=_REFRESH_S if len(ended) < total else None,
     )
-    return secured(page)
 
 
 def _row(job: Job, record: Record, folder: BatchFolder) -> Row:
@@ -138,12 +134,13 @@ def _row(job: Job, record: Record, folder: BatchFolder) -> Row:
         accuracy += "" if record.relative is None else f" ({100 * record.relative:.2g} %)"
     elif done:
         accuracy = "not bounded"
+    has_report = (folder.result(job) / "report.html").is_file()
     picture = folder.picture(job)
     return Row(
         job.name,
         job.recording,
         " ".join(job.arguments),
-        f"{quote(job.name)}/report.html" if done else "",
+        f"{quote(job.name)}/report.html" if done and has_report else "",
         quote(f"{picture.parent.name}/{picture.name}") if done and picture.is_file() else "",
         record.verdict if done else "no result",
         record.verdict if done else "failed",

@@ -155,7 +155,17 @@ def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
     from tofuse.pipeline.run import exit_status
     from tofuse.rigs.run import run_rig
 
-    for name in ("view", "into", "loops", "guess", "object", "average_still", "camera", "topic"):
+    for name in (
+        "view",
+        "into",
+        "loops",
+        "guess",
+        "object",
+        "average_still",
+        "camera",
+        "topic",
+        "no_report",
+    ):
         if getattr(arguments, name):
             option = f"--{name.replace('_', '-')}"
             raise InputError("can't be used with a rig", where=option, remedy="leave it out")
@@ -422,11 +432,17 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     parts.append(f"{closures} loop{'' if closures == 1 else 's'} closed")
     parts.append(f"{len(result.cloud):,} points")
     console.print(", ".join(parts), markup=False)
-    console.print(f"see {out / 'report.html'}", markup=False)
+    console.print(f"see {_page_of(out)}", markup=False)
     for number, component in enumerate(result.components):
         if component.result is not None and not component.connected:
-            path = out / component_name(number) / "report.html"
+            path = _page_of(out / component_name(number))
             console.print(f"and {path}, for {in_words(component.frames)}", markup=False)
+
+
+def _page_of(folder: Path) -> Path:
+    """Return the report of a result; its folder with --no-report."""
+    page = folder / "report.html"
+    return page if page.is_file() else folder
 
 
 def _print_warnings(console: Console, warnings: Iterable[str]) -> None:

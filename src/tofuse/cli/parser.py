@@ -231,6 +231,7 @@ def _run(commands: Any) -> None:
         Path,
         "merge the recording into the map of an existing result, if they overlap",
     )
+    _flag(p, "--no-report", "don't draw report.html, which takes up to half of a short run")
     _flag(p, "--texture", "texture the surface, in mesh.glb and mesh.obj")
     _faces(p, "default: all")
     _voxel(p, "from the camera's resolution")

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from tofuse.arrays import Float32, Float64
-from tofuse.inspection.finding import Finding
+from tofuse.inspection.finding import Finding, is_significant
 from tofuse.inspection.sample import Sample
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 
@@ -32,8 +32,8 @@ _MIN_FRAMES = 3
 # direction correlate at many shifts.
 _MIN_COLOR_CORRELATION, _MIN_COLOR_LEAD, _MAX_COLOR_UNSHIFTED = 0.42, 0.16, 0.68
 _MAX_ELSEWHERE, _PEAK_RADIUS_PX = 0.95, 4
-# Gain in correlation by a shift that shows camera motion.
-_MIN_MOTION_GAIN = 0.03
+# Gain in correlation by a shift of up to some pixels that shows camera motion.
+_MIN_MOTION_GAIN, _MAX_MOTION_PX = 0.03, 6
 
 
 def check_mirrored(sample: Sample) -> Iterator[Finding]:
@@ -49,12 +49,10 @@ def check_mirrored(sample: Sample) -> Iterator[Finding]:
         }
         identity = scores.pop("as it is")
         orientation, best = max(scores.items(), key=lambda item: float(item[1].mean()))
-        lead = best - identity
-        error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
         reoriented = [(d, np.ascontiguousarray(_ORIENTATIONS[orientation](a))) for d, a in edges]
         if (
             best.mean() > _MIN_CORRELATION
-            and lead.mean() > max(_MIN_LEAD, _MIN_LEAD_SIGMAS * error)
+            and is_significant(best - identity, _MIN_LEAD, _MIN_LEAD_SIGMAS)
             and _peaks_at_zero_shift(reoriented)
         ):
             yield Finding(
@@ -86,7 +84,6 @@ def check_color(sample: Sample) -> Iterator[Finding]:
     mean = correlations.mean(0)
     i, j = np.unravel_index(int(mean.argmax()), mean.shape)
     lead = correlations[:, i, j] - correlations[:, max_shift, max_shift]
-    error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
     shift = float(np.hypot(i - max_shift, j - max_shift)) / columns
     down, right = np.mgrid[: mean.shape[0], : mean.shape[1]]
     elsewhere = mean[np.hypot(down - i, right - j) > _PEAK_RADIUS_PX].max()
@@ -96,7 +93,7 @@ def check_color(sample: Sample) -> Iterator[Finding]:
         or elsewhere > _MAX_ELSEWHERE * mean[i, j]
     ):
         return
-    if shift > _MIN_SHIFT and lead.mean() > max(_MIN_COLOR_LEAD, _MIN_LEAD_SIGMAS * error):
+    if shift > _MIN_SHIFT and is_significant(lead, _MIN_COLOR_LEAD, _MIN_LEAD_SIGMAS):
         pixels = shift * pairs[0][0].camera.width
         yield Finding(
             "color_unregistered",
@@ -109,15 +106,14 @@ def check_color(sample: Sample) -> Iterator[Finding]:
 
 def shifted(first: RangeFrame, second: RangeFrame) -> bool:
     """Whether the edges of one image are shifted relative to those of the other."""
-    max_shift = 6
-    is_shifted: list[bool] = []
     for channel_of in (_amplitude, _log_depth):
         a, b = channel_of(first), channel_of(second)
         if a is None or b is None:
             continue
-        scores = _shift_correlations(_edges(a), _edges(b), max_shift)
-        is_shifted.append(bool(scores.max() - scores[max_shift, max_shift] > _MIN_MOTION_GAIN))
-    return any(is_shifted)
+        scores = _shift_correlations(_edges(a), _edges(b), _MAX_MOTION_PX)
+        if scores.max() - scores[_MAX_MOTION_PX, _MAX_MOTION_PX] > _MIN_MOTION_GAIN:
+            return True
+    return False
 
 
 def _amplitude(frame: RangeFrame) -> Float32 | None:

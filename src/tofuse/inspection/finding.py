@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+
+from tofuse.arrays import Float64
+
 Severity = Literal["severe", "warning", "note"]
 
 SEVERITIES: tuple[Severity, ...] = ("severe", "warning", "note")
@@ -78,3 +82,9 @@ class Finding:
             "remedy": self.remedy,
             "evidence": self.evidence,
         }
+
+
+def is_significant(lead: Float64, minimum: float, sigmas: float) -> bool:
+    """Whether the mean of leads (N,) exceeds a minimum, and a number of its standard errors."""
+    error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
+    return float(lead.mean()) > max(minimum, sigmas * error)

@@ -9,8 +9,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.inspection import channels
 from tofuse.inspection.finding import Finding
-from tofuse.inspection.pair_motion import Pair
-from tofuse.inspection.sample import Sample
+from tofuse.inspection.sample import Pair, Sample
 
 # Smaller motions count as standing still.
 _STILL_M, _STILL_RAD = 0.01, np.radians(0.5)
@@ -30,7 +29,13 @@ def check_still(sample: Sample) -> Iterator[Finding]:
     """Check whether the camera moves at all."""
     if sample.turning or len(sample.views) < _MIN_FRAMES or not sample.pairs:
         return
-    if _is_static(sample):
+    # In degenerate directions an alignment keeps its initial pose, so edges are compared too.
+    first, *others = sample.images
+    if (
+        all(_still(p) for p in sample.pairs)
+        and all(_still(p) for p in sample.distant_pairs)
+        and not any(channels.shifted(first, image) for image in others)
+    ):
         yield Finding(
             "static",
             f"The camera does not move in the {len(sample.views)} sampled frames: the model will "
@@ -39,17 +44,6 @@ def check_still(sample: Sample) -> Iterator[Finding]:
             "in front of it, use --object.",
             {"frames": len(sample.views)},
         )
-
-
-def _is_static(sample: Sample) -> bool:
-    """Whether neither neighbouring nor distant frames show motion."""
-    if not sample.pairs or not all(_still(p) for p in sample.pairs):
-        return False
-    if not all(_still(p) for p in sample.distant_pairs):
-        return False
-    # In degenerate directions an alignment keeps its initial pose, so edges are compared too.
-    images = sample.images
-    return not any(channels.shifted(images[0], image) for image in images[1:])
 
 
 def _still(pair: Pair) -> bool:
@@ -131,12 +125,12 @@ def check_walls(sample: Sample) -> Iterator[Finding]:
     """Check for views of a single plane."""
     if not sample.views:
         return
-    largest = dict.fromkeys(sample.views, 0.0)
-    for region in sample.regions:
-        if region.misfit > _MAX_MISFIT:
-            continue
-        largest[region.frame] = max(largest[region.frame], region.fraction)
-    single_plane = [fraction > _MIN_WALL_FRACTION for fraction in largest.values()]
+    planar = {
+        region.frame
+        for region in sample.regions
+        if region.fraction > _MIN_WALL_FRACTION and region.misfit <= _MAX_MISFIT
+    }
+    single_plane = [frame in planar for frame in sample.views]
     if np.mean(single_plane) >= _MIN_FREQUENCY:
         yield Finding(
             "wall_only",

@@ -45,13 +45,11 @@ def write_sheet(inspection: Inspection, path: Path) -> Path:
     lines = _lines(inspection)
     columns = max(len(frames), 2)
     text_height = 0.135 * len(lines) + 0.45
-    images_height = 3 * 1.75
-    figure = Figure(figsize=(2.35 * columns, images_height + text_height), facecolor="white")
+    height = 3 * 1.75 + text_height
+    figure = Figure(figsize=(2.35 * columns, height), facecolor="white")
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(
-        3, columns, left=0.01, right=0.90, top=1 - 0.3 / (images_height + text_height),
-        bottom=text_height / (images_height + text_height), wspace=0.04, hspace=0.16,
-    )  # fmt: skip
+    place = {"left": 0.01, "right": 0.9, "bottom": text_height / height, "top": 1 - 0.3 / height}
+    grid = figure.add_gridspec(3, columns, **place, wspace=0.04, hspace=0.16)
     limits = _limits(frames)
     for column, frame in enumerate(frames):
         axes = [figure.add_subplot(grid[row, column]) for row in range(3)]
@@ -64,11 +62,9 @@ def write_sheet(inspection: Inspection, path: Path) -> Path:
             bar.tick_params(labelsize=7)
             bar.set_title("m", fontsize=8)
     for row, (name, colour) in enumerate(_MASK):
-        figure.text(
-            0.912, (text_height + 0.25 * row) / (images_height + text_height), f"■ {name}",
-            fontsize=6, color=np.array(colour) / 255 * 0.75,
-        )  # fmt: skip
-    top = (text_height - 0.2) / (images_height + text_height)
+        y, darker = (text_height + 0.25 * row) / height, np.array(colour) / 255 * 0.75
+        figure.text(0.912, y, f"■ {name}", fontsize=6, color=darker)
+    top = (text_height - 0.2) / height
     figure.text(0.012, top, "\n".join(lines), fontsize=7.5, va="top", family="monospace")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -83,9 +79,7 @@ def write_sheet(inspection: Inspection, path: Path) -> Path:
 
 
 def _lines(inspection: Inspection) -> list[str]:
-    facts = inspection.facts
-    shown = ("recording", "format", "frames", "time", "images", "depth is", "depth", "with")
-    out = [f"{name:<10} {facts[name]}"[:_LINE_WIDTH] for name in shown if name in facts]
+    out = [f"{name:<16} {fact}"[:_LINE_WIDTH] for name, fact in inspection.facts.items()]
     out.append("")
     for finding in inspection.findings:
         text = f"{finding.severity}: {finding.code}: {finding.text}"

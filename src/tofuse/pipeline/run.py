@@ -7,6 +7,7 @@ import json
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -87,12 +88,8 @@ def run(
             trim_memory()
             # BLAS results depend on its number of threads, and idle threads busy-wait.
             with threadpool_limits(1):
-                write_result(
-                    result,
-                    out,
-                    lambda r, f: write_report_files(job.recording, job.config, r, f),
-                    texture,
-                )
+                report = partial(write_report_files, job.recording, job.config)
+                write_result(result, out, None if options.no_report else report, texture)
         except BaseException as error:
             if tracked_file is not None:
                 tracked_file.keep_after(error)

@@ -79,6 +79,7 @@ class Options(OpeningOptions, ModelOptions):
     unwrap: bool = False
     memory: int | None = None
     overwrite: bool = False
+    no_report: bool = False
 
 
 def resolve(options: Options, kind: ViewKind = "range") -> Config:

@@ -16,34 +16,44 @@ _SMALL_RAD = 1e-6
 def decision(result: PairResult) -> tuple[str, str]:
     """Return whether the pose is accepted, and the remainder of the sentence."""
     registration = result.registration
-    probability = (
-        ""
-        if registration.probability is None
-        else f"probability {_probability(registration.probability)}"
-    )
+    parts = []
+    if registration.probability is not None:
+        parts.append(f"probability {_probability(registration.probability)}")
     if registration.believed:
-        return "Accepted", probability
+        return "Accepted", "; ".join(parts)
+    reason = registration.reason
     if registration.believed is None:
-        return "Not verified", "; ".join(
-            text
-            for text in (probability, registration.reason or "the method can't verify its result")
-            if text
-        )
-    return "Rejected", "; ".join(text for text in (probability, registration.reason) if text)
+        reason = reason or "the method can't verify its result"
+    if reason:
+        parts.append(reason)
+    return "Not verified" if registration.believed is None else "Rejected", "; ".join(parts)
 
 
-def translation(result: PairResult) -> str:
-    """Return the translation as text."""
+def lines(result: PairResult) -> list[tuple[str, str]]:
+    """Return name and value of each property of the pose; values may have several lines."""
     t = result.T_target_source[:3, 3]
-    return f"{vector(t, 4)} m, length {np.linalg.norm(t):.4f} m"
-
-
-def moved_center(result: PairResult) -> str:
-    """Return the displacement of a source's centre as text; empty if that is the origin."""
+    translation = f"{vector(t, 4)} m, length {np.linalg.norm(t):.4f} m"
     center = result.source.center
-    if not center.any():
-        return ""
-    return f"displacement {vector(result.moved_m, 4)} m at {vector(center, 0)}, the source's centre"
+    if center.any():
+        displacement = f"displacement {vector(result.moved_m, 4)} m"
+        translation += f"\n{displacement} at {vector(center, 0)}, the source's centre"
+    rms_m = result.registration.rms_m
+    found = [
+        ("translation", translation),
+        ("rotation", rotation(result)),
+        ("T_target_source", matrix(result)),
+        ("overlap", overlap(result)),
+        ("rms distance", f"{1000 * rms_m:.2f} mm" if np.isfinite(rms_m) else "unknown"),
+    ]
+    note = "1\N{GREEK SMALL LETTER SIGMA}, worst observable direction"
+    if result.registration.believed is None:
+        note += "; from point noise only, usually too small"
+    found.append(("sigma", f"{sigma(result)} ({note})"))
+    if free := unobservable(result):
+        found.append(("unobservable", f"{free} (axes of the source)"))
+    if rival := runner_up(result):
+        found.append(("runner-up", rival))
+    return found
 
 
 def rotation(result: PairResult) -> str:
@@ -55,11 +65,13 @@ def rotation(result: PairResult) -> str:
     return f"{np.degrees(angle):.3f}\N{DEGREE SIGN} about {vector(w / angle, 3)}"
 
 
-def matrix(result: PairResult) -> list[str]:
-    """Return the rows of T_target_source as text."""
+def matrix(result: PairResult) -> str:
+    """Return T_target_source as text, a line a row."""
     T = result.T_target_source
     width = max(len(f"{value:.6f}") for value in T[:3, 3])
-    return [" ".join(f"{v:12.9f}" for v in row[:3]) + f"  {row[3]:{width}.6f}" for row in T]
+    return "\n".join(
+        " ".join(f"{v:12.9f}" for v in row[:3]) + f"  {row[3]:{width}.6f}" for row in T
+    )
 
 
 def overlap(result: PairResult) -> str:
@@ -77,12 +89,6 @@ def overlap(result: PairResult) -> str:
     return ", ".join(parts)
 
 
-def rms(result: PairResult) -> str:
-    """Return the rms distance of corresponding points as text."""
-    value = result.registration.rms_m
-    return f"{1000 * value:.2f} mm" if np.isfinite(value) else "unknown"
-
-
 def sigma(result: PairResult) -> str:
     """Return one standard deviation in the worst observable direction as text."""
     metres, radians = result.sigma
@@ -92,14 +98,6 @@ def sigma(result: PairResult) -> str:
     if radians is not None:
         parts.append(f"{np.degrees(radians):.3f}\N{DEGREE SIGN}")
     return ", ".join(parts) or "unknown"
-
-
-def sigma_note(result: PairResult) -> str:
-    """Return an explanation of `sigma`."""
-    note = "1\N{GREEK SMALL LETTER SIGMA}, worst observable direction"
-    if result.registration.believed is None:
-        note += "; from point noise only, usually too small"
-    return note
 
 
 def unobservable(result: PairResult) -> str:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -19,24 +20,20 @@ if TYPE_CHECKING:
 
 
 # Placeholders that `svg` replaces by the page's variables of the same names.
-INK, MUTED, GRID = "#010101", "#020202", "#030303"
-PAGE = "#090909"
-BEFORE, AFTER, REFERENCE, LOOP, BAD = "#040404", "#050505", "#060606", "#070707", "#080808"
-_VARIABLES = {
-    INK: "ink",
-    MUTED: "muted",
-    GRID: "grid",
-    BEFORE: "before",
-    AFTER: "after",
-    REFERENCE: "reference",
-    LOOP: "loop",
-    BAD: "bad",
-    PAGE: "page",
-}
+INK, MUTED, GRID, PAGE = "#010101", "#020202", "#030303", "#090909"
+BEFORE, AFTER, REFERENCE, BAD = "#040404", "#050505", "#060606", "#080808"
+_VARIABLES = dict(
+    zip(
+        (INK, MUTED, GRID, PAGE, BEFORE, AFTER, REFERENCE, BAD),
+        ("ink", "muted", "grid", "page", "before", "after", "reference", "bad"),
+        strict=True,
+    )
+)
 _MODEL_COLOR = (112, 138, 176)  # of the model's points: visible on white and on near-black
 _MAX_QUANTILE = 50_000  # maximum number of points of which quantiles are computed
 _MAX_MM_EXTENT_M = 0.6  # plans of smaller extent have ticks in mm
 _WIDTH = 440  # of a plan, in pixels
+_LABEL: Any = {"color": MUTED, "fontsize": 10.5, "labelpad": 2}  # style of an axis label
 _STYLE: Any = {
     "svg.fonttype": "none",
     "image.composite_image": False,
@@ -44,18 +41,6 @@ _STYLE: Any = {
     "axes.unicode_minus": True,
     "path.simplify": True,
 }
-
-
-def _figure_class() -> type[Figure]:
-    """Import matplotlib without its log messages about the font cache."""
-    log = logging.getLogger("matplotlib")
-    level = log.level
-    log.setLevel(logging.ERROR)
-    try:
-        from matplotlib.figure import Figure
-    finally:
-        log.setLevel(level)
-    return Figure
 
 
 def make_figure(
@@ -70,26 +55,32 @@ def make_figure(
     margins
         Left, bottom, right and top, pixels.
     """
-    figure = _figure_class()(figsize=(width / 72, height / 72), dpi=72)
+    with _quiet("matplotlib"):  # about the font cache
+        from matplotlib.figure import Figure
+    figure = Figure(figsize=(width / 72, height / 72), dpi=72)
     left, bottom, right, top = margins
-    axes = figure.add_axes(
-        (
-            left / width,
-            bottom / height,
-            (width - left - right) / width,
-            (height - bottom - top) / height,
-        )
-    )
+    size = (width - left - right, height - bottom - top)
+    axes = figure.add_axes((left / width, bottom / height, size[0] / width, size[1] / height))
     axes.patch.set_visible(False)
     figure.patch.set_visible(False)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(MUTED)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(MUTED)
     axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=10.5, length=3)
     axes.grid(color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     return figure, axes
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Suppress a logger's messages below errors."""
+    log = logging.getLogger(name)
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
 
 
 def svg(figure: Figure, label: str) -> str:
@@ -148,47 +139,32 @@ def lines(
         x of frames without a value, marked by crosses on the axis.
     """
     figure, axes = make_figure(*size, (52, 36, 10, 20))
-    single = len(x) == 1
     for y, color, style in series:
-        sparse = int(np.isfinite(y).sum()) <= 30
-        axes.plot(
-            x,
-            y,
-            color=color,
-            linestyle=style,
-            linewidth=1.6,
-            marker="o" if single or (sparse and style == "-") else None,
-            markersize=3,
-        )
+        sparse = len(x) == 1 or (int(np.isfinite(y).sum()) <= 30 and style == "-")
+        marker = "o" if sparse else None
+        axes.plot(x, y, color=color, linestyle=style, linewidth=1.6, marker=marker, markersize=3)
     if log:
         values = np.concatenate([y for y, _, _ in series])
-        positive = values[np.isfinite(values) & (values > 0)]
-        if len(positive) and (values[np.isfinite(values)] > 0).all():
+        values = values[np.isfinite(values)]
+        if (values > 0).all():
             axes.set_yscale("log")
-        elif len(positive):
-            axes.set_yscale("symlog", linthresh=float(positive.min()))
+        elif (values > 0).any():
+            axes.set_yscale("symlog", linthresh=float(values[values > 0].min()))
+    else:
+        axes.locator_params(axis="y", nbins=5)
     if zero:
         axes.axhline(0, color=MUTED, linewidth=0.8)
     if floor:
         axes.set_ylim(0, 1.03 * axes.get_ylim()[1])
     if bad is not None and len(bad):
-        axes.plot(
-            bad,
-            np.zeros(len(bad)),
-            "x",
-            color=BAD,
-            markersize=5,
-            transform=axes.get_xaxis_transform(),
-            clip_on=False,
-        )
-    if not single and len(x):
+        on_axis = axes.get_xaxis_transform()
+        axes.plot(bad, 0 * bad, "x", color=BAD, markersize=5, transform=on_axis, clip_on=False)
+    if len(x) > 1:
         padding = 0.01 * (x[-1] - x[0])
         axes.set_xlim(x[0] - padding, x[-1] + padding)
-    axes.set_xlabel(xlabel, color=MUTED, fontsize=10.5, labelpad=2)
+    axes.set_xlabel(xlabel, **_LABEL)
     axes.set_title(ylabel, color=INK, fontsize=11, loc="left", pad=6, x=-0.1)
     axes.locator_params(axis="x", nbins=6, integer=True)
-    if not log:
-        axes.locator_params(axis="y", nbins=5)
     return svg(figure, label)
 
 
@@ -224,8 +200,8 @@ def limits(
     return np.stack([low - border, high + border])
 
 
-def _plan(box: Float64, view: str, width: int = _WIDTH) -> Any:
-    """Make axes with equal scales for a (2, 2) box."""
+def plan(box: Float64, view: str, width: int = _WIDTH) -> Any:
+    """Make a figure with axes of equal scales for a (2, 2) box, m."""
     left, bottom, right, top = 46, 36, 12, 8
     extent = box[1] - box[0]
     inner = width - left - right
@@ -239,11 +215,14 @@ def _plan(box: Float64, view: str, width: int = _WIDTH) -> Any:
     (a, sa), (b, sb) = VIEWS[view]
     # In metres, the ticks of a camera that hardly moves would need three digits.
     unit, per_m = ("mm", 1000) if max(extent) < _MAX_MM_EXTENT_M else ("m", 1)
-    for axis, sign in ((axes.xaxis, sa), (axes.yaxis, sb)):
-        axis.set_major_locator(locator(inner / 60 if axis is axes.xaxis else height / 40))
+    for axis, sign, k, ticks in (
+        (axes.xaxis, sa, a, inner / 60),
+        (axes.yaxis, sb, b, height / 40),
+    ):
+        axis.set_major_locator(locator(ticks))
         axis.set_major_formatter(partial(_tick, by=sign * per_m))
-    axes.set_xlabel(f"{_NAMES[a]}, {unit}", color=MUTED, fontsize=10.5, labelpad=2)
-    axes.set_ylabel(f"{_NAMES[b]}, {unit}", color=MUTED, fontsize=10.5, labelpad=2)
+        axis.set_label_text(f"{_NAMES[k]}, {unit}", color=MUTED, fontsize=10.5)
+        axis.labelpad = 2
     return figure, axes
 
 
@@ -280,37 +259,26 @@ def model(
     true = None if truth is None else project(truth, view)
     box = limits(flat, outer=0.25)
     box = limits(box, path, *([] if true is None else [true]))
-    figure, axes = _plan(box, view)
+    figure, axes = plan(box, view)
     (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
     columns = int(0.8 * (_WIDTH - 58))
     rows = max(2, int(columns * (y1 - y0) / (x1 - x0)))
-    j, i = np.floor((columns, rows) * (flat - (x0, y0)) / (x1 - x0, y1 - y0)).T
-    inside = (i >= 0) & (j >= 0) & (i < rows) & (j < columns)
-    cell = (columns * i[inside] + j[inside]).astype(np.intp)
-    density = np.bincount(cell, minlength=rows * columns).reshape(rows, columns)
-    max_density = np.percentile(density[density > 0], 99) if (density > 0).any() else 1.0
-    image = np.zeros((rows, columns, 4), np.uint8)
-    image[..., :3] = _MODEL_COLOR
+    bounds = ((y0, y1), (x0, x1))
+    density, _, _ = np.histogram2d(flat[:, 1], flat[:, 0], bins=(rows, columns), range=bounds)
+    covered = density > 0
+    max_density = np.percentile(density[covered], 99) if covered.any() else 1.0
     alpha = (np.log1p(density) / np.log1p(max_density)).clip(0, 1)
-    image[..., 3] = np.round(255 * np.where(density > 0, 0.3 + 0.7 * alpha, 0))
-    axes.imshow(
-        image,
-        extent=(x0, x1, y0, y1),
-        origin="lower",
-        interpolation="none",
-        aspect="auto",
-        zorder=1,  # over the grid
-    )
+    image = np.full((rows, columns, 4), (*_MODEL_COLOR, 0), np.uint8)
+    image[..., 3] = np.round(255 * np.where(covered, 0.3 + 0.7 * alpha, 0))
+    # Over the grid.
+    style: Any = {"origin": "lower", "interpolation": "none", "aspect": "auto", "zorder": 1}
+    axes.imshow(image, extent=(x0, x1, y0, y1), **style)
     if true is not None and len(true):
         _outline(axes, true)
     if measured is not None:
         low, high = np.sort(project(measured, view), axis=0)
-        axes.plot(
-            [low[0], high[0], high[0], low[0], low[0]],
-            [low[1], low[1], high[1], high[1], low[1]],
-            color=AFTER,
-            linewidth=1.2,
-        )
+        corners = np.array([low, (high[0], low[1]), high, (low[0], high[1]), low])
+        axes.plot(*corners.T, color=AFTER, linewidth=1.2)
     if len(path):
         axes.plot(path[:, 0], path[:, 1], color=INK, linewidth=1)
         axes.plot(path[0, 0], path[0, 1], "o", color=INK, markersize=4)
@@ -325,66 +293,13 @@ def _outline(axes: Axes, flat: Float64) -> None:
     extent = np.maximum(high - low, 1e-3)
     # Cells wide enough for a few samples in each, so that surfaces have no holes.
     cell = max(extent.max() / 160, 1.5 * np.sqrt(extent[0] * extent[1] / len(flat)))
-    shape = tuple(int(n) + 9 for n in np.ceil(extent / cell))
-    ij = np.floor((flat - low) / cell).astype(int) + 4
-    mask = np.zeros(shape, bool)
-    mask[ij[:, 0], ij[:, 1]] = True
-    mask = ndimage.binary_fill_holes(ndimage.binary_closing(mask, iterations=3))
-    # Draw half a cell inside the cells' rim, which is half a cell outside the surface.
-    x = low[0] + cell * (np.arange(shape[0]) - 3.5)
-    y = low[1] + cell * (np.arange(shape[1]) - 3.5)
-    axes.contour(
-        x, y, mask.T.astype(float), levels=[0.5], colors=BAD, linewidths=1.6, linestyles="dashed"
-    )
-
-
-def cameras(
-    poses: Float64,
-    box: Float64,
-    view: str,
-    *,
-    color: str,
-    label: str,
-    loops: Float64 | None = None,
-    reference: Float64 | None = None,
-    width: int = _WIDTH,
-) -> str:
-    """Draw camera positions and viewing directions (figures 5.4 and 5.5).
-
-    Parameters
-    ----------
-    poses
-        (n, 4, 4) T_world_camera.
-    box
-        (2, 2) corners of the picture, m, so that pictures are comparable.
-    loops
-        (L, 2, 3) ends of loops.
-    reference
-        (m, 4, 4) true poses.
-    """
-    from matplotlib.collections import LineCollection
-
-    figure, axes = _plan(box, view, width)
-    size = 0.05 * float((box[1] - box[0]).max())
-    centers = project(poses[:, :3, 3], view)
-    if reference is not None and len(reference):
-        path = project(reference[:, :3, 3], view)
-        axes.plot(path[:, 0], path[:, 1], color=REFERENCE, linewidth=1.4, linestyle=(0, (1, 1.2)))
-    if loops is not None and len(loops):
-        ends = np.stack([project(loops[:, 0], view), project(loops[:, 1], view)], axis=1)
-        axes.add_collection(LineCollection(list(ends), colors=LOOP, linewidths=1, alpha=0.8))
-    axes.plot(centers[:, 0], centers[:, 1], color=color, linewidth=1)
-    step = -(-len(poses) // 72)
-    shape = np.array([[-0.5, 0, 1], [0, 0, 0], [0.5, 0, 1], [-0.5, 0, 1]])
-    if view == "side":
-        shape = shape[:, [1, 0, 2]]
-    for k in range(0, len(poses), step):
-        scale = 1.7 if k == 0 else 1.0
-        world = poses[k, :3, :3] @ (scale * size * shape.T) + poses[k, :3, 3:]
-        flat = project(world.T, view)
-        axes.plot(flat[:, 0], flat[:, 1], color=color, linewidth=1.8 if k == 0 else 0.9)
-    axes.plot(centers[:1, 0], centers[:1, 1], "o", color=color, markersize=4)
-    return svg(figure, label)
+    edges = [a + cell * np.arange(-4, int(n) + 6) for a, n in zip(low, extent / cell, strict=True)]
+    counts, x, y = np.histogram2d(*flat.T, bins=edges)
+    mask = ndimage.binary_fill_holes(ndimage.binary_closing(counts > 0, iterations=3))
+    # Half a cell inside the cells' rim, which is half a cell outside the surface.
+    x, y = x[:-1] + cell / 2, y[:-1] + cell / 2
+    style: Any = {"colors": BAD, "linewidths": 1.6, "linestyles": "dashed"}
+    axes.contour(x, y, mask.T.astype(float), levels=[0.5], **style)
 
 
 def rig(
@@ -416,21 +331,15 @@ def rig(
     corners = np.array([[-0.5, -0.4, 1], [0.5, -0.4, 1], [0.5, 0.4, 1], [-0.5, 0.4, 1]])
     frusta = np.einsum("nij,kj->nki", poses[:, :3, :3], size * corners) + centres[:, None]
     box = limits(project(centres, view), project(frusta.reshape(-1, 3), view), margin=0.16)
-    figure, axes = _plan(box, view)
+    figure, axes = plan(box, view)
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     per_pixel = float(high[0] - low[0]) / (_WIDTH - 58)
     for a, b, text in pairs:
         ends = project(centres[[a, b]], view)
         axes.plot(*ends.T, color=MUTED, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
-        axes.annotate(
-            text,
-            ends.mean(0),
-            color=MUTED,
-            fontsize=10,
-            ha="center",
-            va="center",
-            bbox={"facecolor": PAGE, "edgecolor": "none", "pad": 1.5},
-        )
+        style: Any = {"ha": "center", "va": "center", "fontsize": 10, "color": MUTED}
+        background = {"facecolor": PAGE, "edgecolor": "none", "pad": 1.5}
+        axes.annotate(text, ends.mean(0), bbox=background, **style)
     for k, name in enumerate(names):
         eye, flat = project(centres[k : k + 1], view)[0], project(frusta[k], view)
         color, linewidth = (AFTER, 1.8) if k == 0 else (INK, 1.1)

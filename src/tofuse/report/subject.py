@@ -1,14 +1,14 @@
-"""The input of the sections of a report, and the elements that they consist of."""
+"""The input of the sections of a report, in the axes in which the model is shown."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import permutations, product
 from typing import Any
 
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.report import display_axes
 from tofuse.report.extras import ReportExtras
 from tofuse.report.scene import Scene, finite_poses, make_scene
 from tofuse.results.types import Reconstruction
@@ -17,14 +17,9 @@ Values = dict[str, Any]
 
 OUTER = 0.25  # percent of the points at each end that the measured size excludes
 ROWS = 150  # maximum in a table
-
-
-@dataclass(frozen=True)
-class Figure:
-    """An inline SVG and its caption."""
-
-    svg: str
-    caption: str = ""
+_ANGLES = np.radians(np.arange(0, 90, 0.5))
+_MIN_BOX_FILL = 0.9  # minimum fraction of a box in the hull of points that have its shape
+_MAX_SAMPLES = 5000  # maximum number of sampled points
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +30,8 @@ class Subject:
     ----------
     index
         (N,) frame index of each row of the trajectory.
-    rows
-        The row of each frame index.
+    sequential
+        (N, 4, 4) poses before optimisation, NaN where there is none.
     scene
         Content of the 3D view; plans and sizes are of its points, too.
     truth
@@ -49,7 +44,7 @@ class Subject:
     result: Reconstruction
     extras: ReportExtras
     index: Float64
-    rows: dict[int, int]
+    sequential: Float64
     reference: Float64 | None
     scene: Scene
     truth: Float64 | None
@@ -60,6 +55,9 @@ class Subject:
         """Prepare a result; a reference without any pose in common is ignored."""
         index = _row_indices(result)
         rows = {int(k): row for row, k in enumerate(index)}
+        sequential = result.diagnostics.sequential
+        if sequential.shape != result.trajectory.shape:
+            sequential = np.full_like(result.trajectory, np.nan)
         reference = extras.reference
         if reference is not None and (
             reference.shape != result.trajectory.shape
@@ -72,17 +70,12 @@ class Subject:
             truth = truth[np.isfinite(truth).all(1)]
         truth_points = truth.astype(float) if truth is not None and len(truth) else None
         R_up_world = np.diag([1.0, -1.0, -1.0]) @ result.T_up_world[:3, :3]
-        points = (
-            scene.points @ R_up_world.T if truth_points is None else truth_points @ R_up_world.T
-        )
-        R_display_up = (
-            display_axes.upright_axes(points, OUTER)
-            if truth_points is None
-            else display_axes.box_axes(points)
-        )
-        return cls(
-            result, extras, index, rows, reference, scene, truth_points, R_display_up @ R_up_world
-        )
+        if truth_points is None:
+            R_display_up = _upright_axes(scene.points @ R_up_world.T, OUTER)
+        else:
+            R_display_up = _box_axes(truth_points @ R_up_world.T)
+        R = R_display_up @ R_up_world
+        return cls(result, extras, index, sequential, reference, scene, truth_points, R)
 
 
 def _row_indices(result: Reconstruction) -> Float64:
@@ -93,3 +86,77 @@ def _row_indices(result: Reconstruction) -> Float64:
         if len(candidates) == rows:
             return np.array([r.index for r in candidates], float)
     return np.arange(rows, dtype=float)
+
+
+def _upright_axes(points: Float64, outer: float) -> Float64:
+    """Find the rotation about the vertical that minimises the bounding rectangle from above.
+
+    Parameters
+    ----------
+    points
+        (N, 3) in m, y vertical.
+    outer
+        Percent of the points at each end that are ignored.
+
+    Returns
+    -------
+    (3, 3) rotation; its rows are the model's axes, as close to x, y, z as possible.
+    """
+    if len(points) < 3:
+        return np.eye(3)
+    sampled = points[:: -(-len(points) // _MAX_SAMPLES)]
+    axes = _rotated_axes(np.array([0.0, 1.0, 0.0]))
+    coordinates = np.einsum("aki,ni->akn", axes[:, ::2], sampled)
+    extents = np.ptp(np.percentile(coordinates, [outer, 100 - outer], axis=2), axis=0)
+    return _nearest_axes(axes[int(extents.prod(1).argmin())])
+
+
+def _box_axes(points: Float64) -> Float64:
+    """Return the axes of the smallest box around exact points, with one side on a hull face.
+
+    Like `_upright_axes`, but any direction may be vertical if the points have the shape of a box;
+    otherwise, and for coplanar points, only rotations about y are tried.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return _upright_axes(points, 0.0)
+    corners = points[hull.vertices]
+    faces = np.unique(np.round(np.abs(hull.equations[:, :3]), 2), axis=0, return_index=True)[1]
+    best, min_volume = np.eye(3), np.inf
+    for face in faces[:400]:
+        axes = _rotated_axes(hull.equations[face, :3])
+        volumes = np.ptp(axes @ corners.T, axis=2).prod(1)
+        k = int(volumes.argmin())
+        # Earlier boxes are preferred to ones that are hardly smaller.
+        if volumes[k] < (1 - 1e-6) * min_volume:
+            best, min_volume = axes[k], float(volumes[k])
+    if hull.volume < _MIN_BOX_FILL * min_volume:
+        return _upright_axes(points, 0.0)
+    return _nearest_axes(best)
+
+
+def _rotated_axes(vertical: Float64) -> Float64:
+    """Return (A, 3, 3) axes with the second along `vertical`, rotated about it."""
+    vertical = vertical / np.linalg.norm(vertical)
+    helper = np.eye(3)[int(np.abs(vertical).argmin())]
+    first = np.cross(helper, vertical)
+    first /= np.linalg.norm(first)
+    third = np.cross(first, vertical)
+    c, s = np.cos(_ANGLES)[:, None], np.sin(_ANGLES)[:, None]
+    a = c * first + s * third
+    b = -s * first + c * third
+    return np.stack([a, np.broadcast_to(vertical, a.shape), b], axis=1)
+
+
+def _nearest_axes(axes: Float64) -> Float64:
+    """Reorder and flip rows so that they are right-handed and closest to x, y and z."""
+    best, max_trace = np.eye(3), -np.inf
+    for order in permutations(range(3)):
+        for signs in product((1, -1), repeat=3):
+            R = axes[list(order)] * np.array(signs)[:, None]
+            if np.linalg.det(R) > 0 and np.trace(R) > max_trace:
+                best, max_trace = R, float(np.trace(R))
+    return best

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import Bool, Float32, Float64, Int32, UInt8
+from tofuse.arrays import Bool, Float32, Float64, UInt8
 from tofuse.kernels.splat import nearest_points
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 
@@ -17,36 +19,24 @@ NO_MEASUREMENT = (128, 128, 132)
 REMOVED = (225, 40, 135)  # removed by the filter shown; not in the colour map
 BACKGROUND = (22, 25, 30)  # of the 3D view
 
-# Viridis at nine places (matplotlib's, CC0): near is dark, far is bright, in grey print as well.
-_VIRIDIS = np.array(
-    [
-        [68, 1, 84],
-        [71, 44, 122],
-        [59, 81, 139],
-        [44, 113, 142],
-        [33, 144, 141],
-        [39, 173, 129],
-        [92, 200, 99],
-        [170, 220, 50],
-        [253, 231, 37],
-    ],
-    float,
-)
-
 
 def viridis(value: Float64) -> UInt8:
-    """Return viridis colours (..., 3) of values from 0 to 1."""
-    position = np.clip(np.nan_to_num(value), 0, 1) * (len(_TABLE) - 1)
-    return _TABLE[np.round(position).astype(np.intp)]
+    """Return viridis colours (..., 3) of values from 0 to 1: near is dark, far is bright."""
+    return _ramp()[np.round(255 * np.clip(np.nan_to_num(value), 0, 1)).astype(np.intp)]
 
 
-def _interpolate(position: Float64) -> UInt8:
-    low = np.minimum(position.astype(int), len(_VIRIDIS) - 2)
-    t = (position - low)[..., None]
-    return np.round(_VIRIDIS[low] * (1 - t) + _VIRIDIS[low + 1] * t).astype(np.uint8)
+@cache
+def _ramp() -> UInt8:
+    """The 256 colours of the map, (256, 3) RGB."""
+    import cv2
+
+    levels = np.arange(256, dtype=np.uint8)[:, None]
+    return np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8)
 
 
-_TABLE = _interpolate(np.linspace(0, len(_VIRIDIS) - 1, 1025))
+def css(color: Sequence[int]) -> str:
+    """Return an RGB colour as in a style sheet."""
+    return f"rgb{tuple(color)}"
 
 
 def encode(image: UInt8, *, jpeg: bool = False) -> bytes:
@@ -167,33 +157,15 @@ def splat(
     -------
     (H, W, 4) RGBA, transparent where there is no point.
     """
-    indices = nearest(points, T_view_world, size, scale=scale, distance=distance, radius=radius)
-    return _to_image(indices, colors[indices[indices >= 0]])
-
-
-def nearest(
-    points: Float64,
-    T_view_world: Float64,
-    size: tuple[int, int],
-    *,
-    scale: float,
-    distance: float | None = None,
-    radius: int = 1,
-) -> Int32:
-    """Return the index of the visible point at each pixel (H, W), as `splat` draws them; or -1."""
     indices = np.full(size[::-1], -1, np.int32)
     depth = np.full(indices.shape, np.inf)
     nearest_points(
         np.ascontiguousarray(points), T_view_world, scale, distance or 0.0, radius, depth, indices
     )
-    return indices
-
-
-def _to_image(indices: Int32, colors: UInt8) -> UInt8:
-    """RGBA image (H, W, 4) of point indices (H, W), with colours (K, 3) of pixels with a point."""
+    covered = indices >= 0
     image = np.zeros((*indices.shape, 4), np.uint8)
-    image[indices >= 0, :3] = colors
-    image[indices >= 0, 3] = 255
+    image[covered, :3] = colors[indices[covered]]
+    image[covered, 3] = 255
     return image
 
 
@@ -243,14 +215,14 @@ class Framing:
 def cloud_image(frame: Frame, limits: tuple[float, float], framing: Framing) -> UInt8:
     """Render a view's points in the colours of `depth_image`, (H, W, 4) RGBA."""
     points = frame.points.astype(float)
-    radius = 1 if len(points) > 60_000 else 2
-    indices = nearest(
-        points, framing.T_view_world, framing.size, scale=framing.scale, radius=radius
-    )
-    visible = points[indices[indices >= 0]]
-    if isinstance(frame, RangeFrame):
-        depth = visible[:, 2]
-    else:
-        depth = np.linalg.norm(visible - frame.origin, axis=1)
+    is_range = isinstance(frame, RangeFrame)
+    depth = points[:, 2] if is_range else np.linalg.norm(points - frame.origin, axis=1)
     low, high = limits
-    return _to_image(indices, viridis((depth - low) / (high - low)))
+    return splat(
+        points,
+        viridis((depth - low) / (high - low)),
+        framing.T_view_world,
+        framing.size,
+        scale=framing.scale,
+        radius=1 if len(points) > 60_000 else 2,
+    )

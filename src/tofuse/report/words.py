@@ -30,6 +30,11 @@ def signed_length(metres: float) -> str:
     return ("+" if metres >= 0 else "−") + length(abs(metres))
 
 
+def coordinates(values: Iterable[float], digits: int) -> str:
+    """Return the coordinates of a point as text."""
+    return ", ".join(f"{value:.{digits}f}" for value in values).replace("-", "−")
+
+
 def percent(value: float | None) -> str:
     """Return a fraction as text, in percent."""
     if value is None or not np.isfinite(value):
@@ -47,6 +52,16 @@ def seconds(value: float) -> str:
 def count(number: int, noun: str) -> str:
     """Return a number of things as text: "1 frame", "12,000 points"."""
     return f"{number:,} {noun}" + ("" if number == 1 else "s")
+
+
+def thinned(shown: int, total: int, noun: str) -> str:
+    """Return how many of a number of things are shown; empty if that is all."""
+    return "" if shown == total else f"{shown:,} of {total:,} {noun} are shown."
+
+
+def more(number: int) -> str:
+    """Return how many further rows a table doesn't show; empty if none."""
+    return f"{number:,} more are not shown." if number > 0 else ""
 
 
 def frame_range(first: int, last: int) -> str:

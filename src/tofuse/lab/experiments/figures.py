@@ -131,18 +131,27 @@ def cameras(before: Float64, after: Float64, truth: Float64) -> tuple[str, str]:
     projected = [plots.project(p[:, :3, 3], "above") for p in (before, after, truth)]
     box = plots.limits(*projected)
     pictures = [
-        plots.cameras(
-            poses,
-            box,
-            "above",
-            color=color,
-            label=f"Cameras {name} optimisation, from above",
-            reference=truth,
-            width=380,
-        )
+        _cameras(poses, box, truth, color, f"Cameras {name} optimisation, from above")
         for poses, color, name in ((before, BEFORE, "before"), (after, AFTER, "after"))
     ]
     return pictures[0], pictures[1]
+
+
+def _cameras(poses: Float64, box: Float64, truth: Float64, color: str, label: str) -> str:
+    """Draw camera positions and viewing directions (n, 4, 4), and the true trajectory, in a box."""
+    figure, axes = plots.plan(box, "above", 380)
+    size = 0.05 * float((box[1] - box[0]).max())
+    path, centers = (plots.project(p[:, :3, 3], "above") for p in (truth, poses))
+    axes.plot(path[:, 0], path[:, 1], color=REFERENCE, linewidth=1.4, linestyle=(0, (1, 1.2)))
+    axes.plot(centers[:, 0], centers[:, 1], color=color, linewidth=1)
+    shape = size * np.array([[-0.5, 0, 1], [0, 0, 0], [0.5, 0, 1], [-0.5, 0, 1]])
+    for k in range(0, len(poses), -(-len(poses) // 72)):
+        scale, linewidth = (1.7, 1.8) if k == 0 else (1.0, 0.9)
+        world = poses[k, :3, :3] @ (scale * shape.T) + poses[k, :3, 3:]
+        flat = plots.project(world.T, "above")
+        axes.plot(flat[:, 0], flat[:, 1], color=color, linewidth=linewidth)
+    axes.plot(centers[:1, 0], centers[:1, 1], "o", color=color, markersize=4)
+    return svg(figure, label)
 
 
 def sweep(result: PeaksSweep) -> list[str]:
