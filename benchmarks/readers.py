@@ -33,7 +33,6 @@ import test_recordings_fuzz as folders  # noqa: E402
 import camera_files as cameras  # noqa: E402
 import ros_bags as bags  # noqa: E402
 from damaged_files import damage  # noqa: E402
-from made_cwipc import make_cwipc  # noqa: E402
 from tofuse.errors import TofuseError  # noqa: E402
 from tofuse.geometry.cameras import Pinhole  # noqa: E402
 from tofuse.recordings.frames import RangeFrame  # noqa: E402
@@ -48,7 +47,6 @@ def makers() -> dict[str, tuple[Callable[[Path], None], str | None]]:
         name: (make, None) for name, make in folders.MAKERS.items()
     }
     found |= {name: (make, file) for name, (make, file, _) in cameras.MAKERS.items()}
-    found |= {"cwipc": (make_cwipc, None)}
     if importlib.util.find_spec("rosbags") is not None:
         found |= {"realsense": (make_realsense, "a.bag"), "orbbec": (make_orbbec, "a.bag")}
     return found

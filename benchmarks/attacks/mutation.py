@@ -229,7 +229,6 @@ def _possible(
 
 def _small() -> dict[str, Subject]:
     """Single files: graphs, poses, cameras, configurations, meshes, checkpoints."""
-    import made_cwipc
     from tofuse.batch.jobs import read_jobs
     from tofuse.calibration.lens_files import read_lens_file
     from tofuse.cli.batching import run_arguments
@@ -244,7 +243,6 @@ def _small() -> dict[str, Subject]:
     from tofuse.posegraph.g2o import read_g2o
     from tofuse.posegraph.given_loops import read_loops
     from tofuse.recordings.camera_file import read_camera_file
-    from tofuse.recordings.cwipc import read_cameras
     from tofuse.recordings.open import read_reference
     from tofuse.recordings.rig import read_rig
     from tofuse.sensor.noise import NoiseModel, RangeLaw
@@ -304,9 +302,6 @@ def _small() -> dict[str, Subject]:
         "camera.json": ("camera.json", json.dumps(_CAMERA), read_camera_file),
         "a lens": ("a.json", json.dumps(lens), read_lens_file),
         "rig.json": ("rig.json", json.dumps(rig), read_rig),
-        "cameraconfig.json": (
-            "cameraconfig.json", json.dumps(made_cwipc.config()), read_cameras
-        ),
         "loops": ("loops.txt", "0 3 0 0 0 0 0 0 1\n1 2\n", read_loops),
         "columns": ("imu.csv", "t,ax,ay\n" + "0.1,1,2\n" * 5, read_columns),
         "config": ("a.toml", toml, configure),

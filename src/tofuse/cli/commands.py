@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tofuse.errors import InputError
     from tofuse.pipeline.run import exit_status
     from tofuse.pipeline.run import run as run_pipeline
-    from tofuse.recordings.rig_folder import recordings_of, rig_file_in
+    from tofuse.recordings.rig import recordings_of, rig_file_in
 
     options = run_options(arguments)
     if arguments.rig is None and len(arguments.inputs) == 1:

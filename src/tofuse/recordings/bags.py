@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import importlib
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator
@@ -15,7 +14,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
-from tofuse.files.reading import input_error, is_folder, read_text
+from tofuse.files.reading import is_file, is_folder, list_folder, required_package
 from tofuse.geometry.cameras import Camera
 from tofuse.recordings.camera_file import ColorCamera, check_size
 from tofuse.recordings.color import sampled_color
@@ -25,12 +24,9 @@ from tofuse.recordings.reader import ReaderOptions
 from tofuse.recordings.ros_messages import ENCODINGS, GREY, color_image, header_time, image
 from tofuse.recordings.sources import FileSource
 
-MISSING = "run `pip install 'tofuse[ros]'`, which installs rosbags"
 MAX_GAP_S = 0.02  # between the images of one frame
 ROS1_MAGIC = b"#ROSBAG V2"
 MAGIC = (ROS1_MAGIC, b"\x89MCAP0\r\n")
-_MAX_METADATA_BYTES = 16 << 20
-_MAX_DEPTH = 100  # of brackets in metadata.yaml, of which rosbag2 writes 5
 
 
 def open_bag(path: Path) -> Any:
@@ -41,10 +37,16 @@ def open_bag(path: Path) -> Any:
     InputError
         If rosbags is missing, or can't open it.
     """
-    rosbags = _rosbags(path)
+    highlevel = required_package("rosbags.highlevel", "ros", path)
+    typesys = required_package("rosbags.typesys", "ros", path)
     if is_folder(path):
-        _check_folder(path)
-    return _opened(path, rosbags.AnyReader)
+        for entry in list_folder(path):
+            if not is_file(entry) and not is_folder(entry):  # rosbags would wait for a pipe
+                raise InputError(
+                    "is not a regular file", where=entry, remedy="remove it from the bag"
+                )
+    types = typesys.get_typestore(typesys.Stores.LATEST)
+    return _opened(path, lambda: highlevel.AnyReader([path], default_typestore=types))
 
 
 def open_container(path: Path) -> Any:
@@ -52,55 +54,15 @@ def open_container(path: Path) -> Any:
 
     The message definitions in the bags of some makers are incomplete.
     """
-    return _opened(path, _rosbags(path).Rosbag1)
+    rosbag1 = required_package("rosbags.rosbag1", "ros", path)
+    return _opened(path, lambda: rosbag1.Reader(path))
 
 
-def _rosbags(path: Path) -> Any:
+def _opened(path: Path, reader: Callable[[], Any]) -> Any:
     try:
-        return importlib.import_module("tofuse.recordings.bounded_bags")
-    except (ImportError, AttributeError) as error:  # the latter of another version
-        raise InputError("is a ROS bag", where=path, remedy=MISSING) from error
-
-
-def _check_folder(path: Path) -> None:
-    """Reject files on which rosbags would block or never finish.
-
-    It opens any file that metadata.yaml names, and a YAML file of a few hundred bytes with aliases
-    of its own parts can expand to gigabytes.
-    """
-    try:
-        for entry in path.iterdir():
-            if entry.exists() and not (entry.is_file() or entry.is_dir()):
-                raise InputError(
-                    "is not a regular file", where=entry, remedy="remove it from the bag"
-                )
-    except OSError as error:
-        raise input_error(error, path) from error
-    metadata = path / "metadata.yaml"
-    text = read_text(metadata, limit=_MAX_METADATA_BYTES)
-    yaml = importlib.import_module("ruamel.yaml")  # as rosbags does
-    depth = 0
-    try:
-        for event in yaml.YAML(typ="safe").parse(text):
-            depth += isinstance(event, yaml.events.CollectionStartEvent)
-            depth -= isinstance(event, yaml.events.CollectionEndEvent)
-            if isinstance(event, yaml.events.AliasEvent) or depth > _MAX_DEPTH:
-                raise InputError(
-                    "refers to its own parts, or is nested too deeply",
-                    where=metadata,
-                    remedy="reindex the bag",
-                )
-    except (yaml.error.YAMLError, ValueError, RecursionError):
-        return  # rosbags raises a better error
-
-
-def _opened(path: Path, factory: Callable[[Path], Any]) -> Any:
-    try:
-        bag = factory(path)
+        bag = reader()
         bag.open()
         return bag
-    except InputError:
-        raise
     except Exception as error:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             raise InputError(
@@ -108,11 +70,7 @@ def _opened(path: Path, factory: Callable[[Path], Any]) -> Any:
                 where=tempfile.gettempdir(),
                 remedy="free some space, or set TMPDIR to another folder",
             ) from error
-        raise InputError(
-            f"can't be opened as a bag ({type(error).__name__}: {str(error)[:200]})",
-            where=path,
-            remedy="check the bag, or reindex it",
-        ) from error
+        raise damaged(error, path) from error
 
 
 def damaged(error: Exception, where: str | Path) -> InputError:

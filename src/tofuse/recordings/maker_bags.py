@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import Camera
@@ -89,11 +88,6 @@ class MakerBagSource(BagSource):
         except InputError as error:
             self.warnings.append(f"colour is ignored: {error}")
             self.color = None
-
-    @property
-    def T_color_depth(self) -> Float64 | None:
-        """(4, 4) maps points from the depth to the colour camera's frame; None if unknown."""
-        return None if self.color_camera is None else self.color_camera.T_color_depth
 
     def track(self, topic: str) -> Track | None:
         """Return the messages of a topic; None if there are none."""

@@ -14,7 +14,7 @@ from tofuse.files.trajectory_formats import TimedPoses, read_poses
 from tofuse.parts import discover, name_of, registered
 from tofuse.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.recordings.recording import Recording, Source
-from tofuse.recordings.rig_folder import recordings_of, rig_file_in, rig_from
+from tofuse.recordings.rig import read_rig, recordings_of, rig_file_in
 from tofuse.recordings.rig_source import RigSource
 from tofuse.recordings.sources import JoinedSource, LimitedSource
 
@@ -55,8 +55,7 @@ def open_recording(
     ----------
     paths
         Files or folders; several are joined in the order given. A folder of native or SR4000
-        recordings is joined in name order; if it contains a rig.json (or a cameraconfig.json of
-        cwipc), its recordings are the cameras of a rig, one image of each in turn.
+        recordings is joined in name order; if it contains a rig.json, its recordings are the cameras of a rig, one image of each in turn.
     format
         Name of a reader, instead of detection.
     camera
@@ -122,7 +121,7 @@ def _rig_source(
         source = located[0].reader.open(located[0].path, options)
         _check_usable(source, path)
         recordings.append(Recording.of(source, path, name_of(located[0].reader)))
-    return RigSource(rig_from(rig_file, recordings), recordings)
+    return RigSource(read_rig(rig_file), recordings)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
+from tofuse.files.reading import if_file
 from tofuse.geometry.se3 import check_pose
 from tofuse.recordings.camera_file import number_in, numbers_in, read_json
 
@@ -154,7 +155,17 @@ def read_rig(path: str | Path) -> Rig:
     return Rig(cameras, pairs, _unplaced(data.get("unplaced", []), path))
 
 
-def is_plain_name(name: str) -> bool:
+def rig_file_in(folder: str | Path) -> Path | None:
+    """Return the rig.json in a folder; None if there is none."""
+    return if_file(Path(folder) / FILE_NAME)
+
+
+def recordings_of(rig_file: Path) -> dict[str, Path]:
+    """Return the recordings in the folder of a rig.json, by the names of its cameras."""
+    return {c.name: rig_file.parent / c.name for c in read_rig(rig_file).cameras}
+
+
+def _is_plain_name(name: str) -> bool:
     """Whether a name can't refer to another folder on any system."""
     return name not in (".", "..") and not any(c in "/\\:" or ord(c) < 32 for c in name)
 
@@ -166,7 +177,7 @@ def _camera(row: object, k: int, path: str | Path) -> RigCamera:
     name, recording = row.get("name"), row.get("recording", "")
     if not isinstance(name, str) or not name.strip():
         raise InputError(f"{location}.name is {name!r}, not a name", where=path, remedy=_REMEDY)
-    if not is_plain_name(name):
+    if not _is_plain_name(name):
         raise InputError(
             f"{location}.name is {name!r:.80}, which is not a folder name",
             where=path,

@@ -122,15 +122,7 @@ class AzureKinect(Reader):
 
 
 class AzureKinectSource(FileSource):
-    """Depth frames, with the simultaneous infrared image and registered colour.
-
-    Attributes
-    ----------
-    T_color_depth
-        (4, 4) maps points from the depth to the colour camera's frame; None if unknown.
-    """
-
-    T_color_depth: Float64 | None = None
+    """Depth frames, with the simultaneous infrared image and registered colour."""
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.file = Matroska(path)
@@ -237,9 +229,6 @@ class AzureKinectSource(FileSource):
         self.calibration = _calibration(self.file.attachments.get(name), where)
         lens, T_depth = _lens(self.calibration, "depth", DEPTH_MODES[self.mode], where)
         self.camera = depth_camera(lens)
-        with suppress(InputError):  # the colour camera's pose is the same in all modes
-            _, T_color = _lens(self.calibration, "color", COLOR_MODES[1280, 720], where)
-            self.T_color_depth = T_color @ np.linalg.inv(T_depth)
         if color is not None and color.blocks:
             self.color_camera = self._color_camera(color, T_depth, where)
 
