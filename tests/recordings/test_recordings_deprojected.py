@@ -12,9 +12,9 @@ from tofuse.errors import UnreadableFrameError
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import write_ply
 from tofuse.geometry.cameras import BrownConrady, Camera, Pinhole, Rational
-from tofuse.recordings.deprojected import find_deprojection
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
+from tofuse.recordings.organised import find_deprojection
 
 PINHOLE = Pinhole(160, 120, 140.0, 141.0, 82.3, 57.9)
 LENSES: dict[str, Camera] = {

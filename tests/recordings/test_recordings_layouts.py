@@ -11,8 +11,8 @@ import tofuse
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
 from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, RayTable, points_from_z
+from tofuse.recordings.convert import convert_to
 from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.recordings.layouts import convert_to
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.recordings.rectify import Rectifier, pinhole_of
 

@@ -41,7 +41,7 @@ from tofuse.geometry.se3 import exp, inverse, log
 from tofuse.recordings import bags
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
-from tofuse.recordings.readers.realsense_bag import RealSenseSource
+from tofuse.recordings.readers.maker_bags import RealSenseSource
 
 KINDS = ("ros1", "ros2", "mcap")
 

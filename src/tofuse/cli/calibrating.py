@@ -17,8 +17,7 @@ from tofuse.files.atomic import make_folder, replacing
 from tofuse.geometry.cameras import Pinhole
 from tofuse.recordings.camera_file import camera_fields
 from tofuse.recordings.correction_file import read_correction
-from tofuse.recordings.open import open_recording
-from tofuse.recordings.opening import Opening
+from tofuse.recordings.open import Opening, open_recording
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.depth_correction import DepthCorrection
 

@@ -479,7 +479,7 @@ def simulate(arguments: argparse.Namespace) -> int:
 def inspect(arguments: argparse.Namespace) -> int:
     """``tofuse inspect``."""
     from tofuse.inspection.inspect import inspect_recording
-    from tofuse.recordings.opening import Opening
+    from tofuse.recordings.open import Opening
 
     recording = Opening.of(arguments.inputs, arguments).open()
     inspection = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
@@ -508,8 +508,8 @@ def inspect(arguments: argparse.Namespace) -> int:
 def convert(arguments: argparse.Namespace) -> int:
     """``tofuse convert``."""
     from tofuse.recordings.convert import convert as convert_recording
-    from tofuse.recordings.layouts import convert_to
-    from tofuse.recordings.opening import Opening
+    from tofuse.recordings.convert import convert_to
+    from tofuse.recordings.open import Opening
 
     recording = Opening.of(arguments.inputs, arguments).open()
     if arguments.to == "native":
@@ -608,7 +608,7 @@ def noise(arguments: argparse.Namespace) -> int:
     """``tofuse noise``."""
     from tofuse.calibration.camera_json import check_new
     from tofuse.calibration.noise_estimation import estimate_noise
-    from tofuse.recordings.opening import Opening
+    from tofuse.recordings.open import Opening
 
     if arguments.out is not None:
         check_new(arguments.out, overwrite=arguments.overwrite)

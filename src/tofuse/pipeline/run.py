@@ -28,7 +28,7 @@ from tofuse.pipeline.report_files import write_report_files
 from tofuse.pipeline.run_options import Options, check_guess, check_unwrap, resolve, seed_of
 from tofuse.posegraph.given_loops import read_loops
 from tofuse.posegraph.loops import PriorLoop
-from tofuse.recordings.opening import Opening
+from tofuse.recordings.open import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import OutputFolder, check_output, is_result
 from tofuse.results.output import write_result

@@ -15,9 +15,8 @@ from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder
 from tofuse.files.tables import read_numbers
 from tofuse.geometry.quaternion import length, to_pose
-from tofuse.recordings.deprojected import Deprojection, find_deprojection
 from tofuse.recordings.frames import CloudFrame, Frame
-from tofuse.recordings.organised import SAMPLES
+from tofuse.recordings.organised import SAMPLES, Deprojection, find_deprojection
 from tofuse.recordings.reader import CERTAIN, Sniff
 from tofuse.recordings.sources import FileSource
 

@@ -12,9 +12,8 @@ from tofuse.errors import InputError
 from tofuse.files.images import read_color, read_image
 from tofuse.geometry.cameras import Pinhole, scaled
 from tofuse.recordings.camera_file import checked_pinhole
-from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.sources import FileSource, read_matrix_pose
+from tofuse.recordings.sources import FileSource, depth_from_counts, read_matrix_pose
 
 # ARKit's camera looks along -z with y up.
 ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])

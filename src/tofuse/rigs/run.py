@@ -27,8 +27,7 @@ from tofuse.posegraph.refinement import AlreadyRefined, NoRefinement
 from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
-from tofuse.recordings.rig import Disagreement, Rig, read_rig, recordings_of
-from tofuse.recordings.rig_source import RigSource
+from tofuse.recordings.rig import Disagreement, Rig, RigSource, read_rig, recordings_of
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
 from tofuse.results.types import Reason, Reconstruction

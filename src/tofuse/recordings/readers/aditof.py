@@ -17,11 +17,10 @@ from tofuse.files.reading import files_with, input_error, is_file, is_folder
 from tofuse.geometry.cameras import Camera, RayTable
 from tofuse.parts import part
 from tofuse.recordings.camera_file import load_camera
-from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 from tofuse.recordings.recording import evenly_spaced
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.sources import FileSource, depth_from_counts
 
 HEADER_BYTES = 128
 # Width, height, kind of output, bits of depth, of brightness and of confidence, 11 other bytes,
@@ -100,7 +99,6 @@ class _Images:
 
 
 @part("reader", "aditof", label="experimental")
-@dataclass(frozen=True)
 class AdiTof(Reader):
     """A .bin file of frames of Analog Devices' ToF SDK, or a folder of them."""
 

@@ -14,10 +14,9 @@ from tofuse.files.images import read_raw
 from tofuse.files.reading import files_named, is_file
 from tofuse.parts import part
 from tofuse.recordings.camera_file import CameraFile, camera_file_of, check_size, load_camera
-from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.sources import FileSource, depth_from_numbers
 
 # Width and height in pixels, and the time at which the file was written in ms.
 _NAME = re.compile(r"(depth|confidence)_(\d{1,5})_(\d{1,5})_f32_(\d{1,15})\.raw")
@@ -25,7 +24,6 @@ CONFIDENCE_MAX = 255.0
 
 
 @part("reader", "arducam", label="experimental")
-@dataclass(frozen=True)
 class Arducam(Reader):
     """Folders of depth_W_H_f32_*.raw (Arducam ToF), with the camera in a camera.json."""
 

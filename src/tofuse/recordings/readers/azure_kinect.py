@@ -22,11 +22,16 @@ from tofuse.geometry.cameras import Camera, Rational, RayTable
 from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.parts import part
 from tofuse.recordings.camera_file import ColorCamera, load_camera
-from tofuse.recordings.color import sampled_color
 from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.single_files import begins_with, file_of, required_file
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.reader import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    begins_with,
+    file_of,
+    required_file,
+)
+from tofuse.recordings.sources import FileSource, sampled_color
 
 DEPTH_UNIT_M = 0.001
 
@@ -107,7 +112,6 @@ def depth_camera(lens: KinectLens) -> Camera:
 
 
 @part("reader", "azure-kinect", label="validated")
-@dataclass(frozen=True)
 class AzureKinect(Reader):
     """A .mkv file of k4arecorder: depth, infrared, and colour if it is MJPG."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,6 @@ CONFIDENCE_MAX = 7.0
 
 
 @part("reader", "depth16", label="experimental")
-@dataclass(frozen=True)
 class Depth16(Reader):
     """Folders of *_depth16.bin or *.depth16, with the camera in a camera.json."""
 

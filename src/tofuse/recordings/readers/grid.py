@@ -41,7 +41,6 @@ _MAX_RAY_DISTANCE_PX, _MIN_ON_RAYS = 0.3, 0.8
 
 
 @part("reader", "grid")
-@dataclass(frozen=True)
 class Grid(Reader):
     """A folder of .ply, .csv or .pcd files with one point per pixel, row-major; m or mm."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import tarfile
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +18,10 @@ from tofuse.files.tables import read_numbers
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
-from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import FileSource, poses_of, read_matrix_pose
+from tofuse.recordings.sources import FileSource, depth_from_counts, poses_of, read_matrix_pose
 
 # The streams by preference, with their ambiguity range in m.
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
@@ -34,7 +32,6 @@ _REMEDY = "copy the recording again"
 
 
 @part("reader", "hololens2", label="experimental")
-@dataclass(frozen=True)
 class HoloLens2(Reader):
     """Folders with 'Depth Long Throw_lut.bin' and .tar, or those of 'Depth AHaT'."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +22,7 @@ from tofuse.recordings.camera_file import (
     read_camera_file,
     read_rays,
 )
-from tofuse.recordings.color import sampled_color
 from tofuse.recordings.correction_file import corrected_depth, read_correction
-from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import (
     DepthKind,
     Frame,
@@ -33,7 +31,7 @@ from tofuse.recordings.frames import (
 from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.native import LENS_COLUMNS
 from tofuse.recordings.reader import CERTAIN, UNCERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import FileSource, ply_frame
+from tofuse.recordings.sources import FileSource, depth_from_counts, ply_frame, sampled_color
 from tofuse.sensor.depth_correction import DepthCorrection
 from tofuse.sensor.frequencies import DISAGREEMENT, SPEED_OF_LIGHT, combined
 
@@ -327,7 +325,6 @@ class NativeSource(FileSource):
 
 
 @part("reader", "native", label="validated")
-@dataclass(frozen=True)
 class Native(Reader):
     """Folders with a camera.json and depth/ (PNG) or cloud/ (PLY)."""
 

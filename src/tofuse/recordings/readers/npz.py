@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +22,14 @@ from tofuse.recordings.camera_file import (
     load_camera,
     pinhole_values,
 )
-from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.single_files import file_of, required_file
-from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, file_of, required_file
+from tofuse.recordings.sources import (
+    FileSource,
+    check_timestamps,
+    depth_from_numbers,
+    read_matrix_pose,
+)
 
 MAX_BYTES = 1 << 30
 _IMAGES = {"amplitude": 3, "confidence": 3, "sigma": 3, "color": 4}
@@ -40,7 +42,6 @@ _NAMES = ("depth", *_IMAGES, *_TABLES, *_VALUES)
 
 
 @part("reader", "npz", label="validated")
-@dataclass(frozen=True)
 class Npz(Reader):
     """A .npz file with depth (N, H, W), a camera (K or rays), and optional channels."""
 

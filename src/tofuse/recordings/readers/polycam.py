@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,6 @@ _LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and
 
 
 @part("reader", "polycam", label="experimental")
-@dataclass(frozen=True)
 class Polycam(Reader):
     """Folders with keyframes/depth, images, cameras and maybe confidence, corrected_cameras."""
 

@@ -6,7 +6,6 @@ import json
 import re
 import zipfile
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from tofuse.geometry import quaternion
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import image_size, number_in, numbers_in, read_json
-from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import (
     ARKIT_AXES,
@@ -32,9 +30,16 @@ from tofuse.recordings.phones import (
     lens,
     resized,
 )
-from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.single_files import begins_with, file_of
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.reader import (
+    PER_FRAME,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    begins_with,
+    file_of,
+    refuse_camera,
+)
+from tofuse.recordings.sources import FileSource, depth_from_numbers
 
 MAX_MEMBER_BYTES = 1 << 26
 _MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")
@@ -43,7 +48,6 @@ _REMEDY = "export the recording again"
 
 
 @part("reader", "record3d", label="validated")
-@dataclass(frozen=True)
 class Record3D(Reader):
     """Folders with metadata.json, depth/*.exr and rgb/*.jpg; or .r3d files."""
 

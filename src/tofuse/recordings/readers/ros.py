@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +12,29 @@ from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.parts import part
-from tofuse.recordings.bags import MAGIC, MAX_GAP_S, BagSource, Track, damaged
-from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
-from tofuse.recordings.depth_counts import depth_from_numbers
-from tofuse.recordings.frames import Frame
-from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.ros_frames import Transforms, frame_name
-from tofuse.recordings.ros_messages import (
+from tofuse.recordings.bags import (
     COLORS,
     ENCODINGS,
     GREY,
+    MAGIC,
+    MAX_GAP_S,
+    BagSource,
+    Track,
+    Transforms,
     cloud,
     color_image,
+    damaged,
     decompressed,
     decompressed_color,
+    frame_name,
     image,
     lens,
 )
-from tofuse.recordings.sources import cloud_frame
+from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
+from tofuse.recordings.frames import Frame
+from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
+from tofuse.recordings.sources import cloud_frame, depth_from_numbers
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -42,7 +45,6 @@ _ODOMETRY = "odom"
 
 
 @part("reader", "ros")
-@dataclass(frozen=True)
 class Ros(Reader):
     """A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag, with depth images or clouds."""
 

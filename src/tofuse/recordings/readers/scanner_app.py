@@ -30,7 +30,6 @@ _REMEDY = "export the recording again"
 
 
 @part("reader", "3dscannerapp", label="validated")
-@dataclass(frozen=True)
 class ScannerApp(Reader):
     """Folders of depth_NNNNN.png, conf_NNNNN.png, frame_NNNNN.json and some .jpg."""
 

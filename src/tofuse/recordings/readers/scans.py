@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import struct
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,8 +24,15 @@ from tofuse.recordings.cloud_files import (
     sniff_clouds,
 )
 from tofuse.recordings.frames import CloudFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.single_files import begins_with, file_of, required_file
+from tofuse.recordings.reader import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    begins_with,
+    file_of,
+    refuse_camera,
+    required_file,
+)
 from tofuse.recordings.sources import FileSource, cloud_frame, poses_of, read_matrix_pose
 
 MAX_POINTS = 100_000_000
@@ -36,7 +42,6 @@ _COPY = "copy the file again, or export it again"
 
 
 @part("reader", "las")
-@dataclass(frozen=True)
 class LasScans(Reader):
     """A .las or .laz file, or a folder of them; metres."""
 
@@ -180,7 +185,6 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
 
 
 @part("reader", "e57")
-@dataclass(frozen=True)
 class E57Scans(Reader):
     """A .e57 file: one view per scan, in the scanner's frame; its poses as reference."""
 

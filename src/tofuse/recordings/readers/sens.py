@@ -19,12 +19,23 @@ from tofuse.geometry.cameras import Camera
 from tofuse.geometry.se3 import inverse
 from tofuse.parts import part
 from tofuse.recordings.camera_file import ColorCamera, checked_pinhole, load_camera
-from tofuse.recordings.color import sampled_color
-from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.single_files import begins_with, file_of, required_file
-from tofuse.recordings.sources import FileSource, check_timestamps, poses_of, read_matrix_pose
+from tofuse.recordings.reader import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    begins_with,
+    file_of,
+    required_file,
+)
+from tofuse.recordings.sources import (
+    FileSource,
+    check_timestamps,
+    depth_from_counts,
+    poses_of,
+    read_matrix_pose,
+    sampled_color,
+)
 
 VERSION = 4
 RAW, ZLIB, OCCI = 0, 1, 2  # compression of depth
@@ -38,7 +49,6 @@ _RATE_HZ = 30.0
 
 
 @part("reader", "sens")
-@dataclass(frozen=True)
 class Sens(Reader):
     """A .sens file: depth, colour, both intrinsics, and ScanNet's poses as reference."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,8 @@ from tofuse.files.tables import read_numbers
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_pinhole
-from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import poses_from_files, read_matrix_pose
+from tofuse.recordings.sources import DepthImageSource, poses_from_files, read_matrix_pose
 
 FRAME_RATE_HZ = 30.0
 SENSOR, SIZE = "Kinect v1 (structured light)", (640, 480)
@@ -29,7 +27,6 @@ _DEPTH = re.compile(r"frame-([0-9]{1,9})\.depth\.png", re.IGNORECASE)
 
 
 @part("reader", "7scenes", label="validated")
-@dataclass(frozen=True)
 class SevenScenes(Reader):
     """Folders of frame-NNNNNN.depth.png, .pose.txt and .color.png or .jpg."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +35,6 @@ _TIME = re.compile(rb"%[^\n]*time stamp \[ms\][^\n]*\n\s*([0-9.eE+-]+)", re.IGNO
 
 
 @part("reader", "sr4000", label="validated")
-@dataclass(frozen=True)
 class Sr4000(Reader):
     """Folders of .dat files with blocks of Z, x and y vectors, amplitude and confidence."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +39,6 @@ _IMU = {
 
 
 @part("reader", "stray", label="validated")
-@dataclass(frozen=True)
 class Stray(Reader):
     """Folders with depth/, confidence/, odometry.csv, camera_matrix.csv, imu.csv and rgb.mp4."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +12,9 @@ from tofuse.files.reading import files_with, is_folder
 from tofuse.files.tiff import read_tiff
 from tofuse.parts import part
 from tofuse.recordings.camera_file import load_camera
-from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.sources import FileSource, depth_from_numbers
 
 _SUFFIXES = (".tif", ".tiff")
 _RANGE = ".range"
@@ -25,7 +23,6 @@ _NOT_DEPTH = (*_AMPLITUDE_KEYWORDS, "conf")
 
 
 @part("reader", "tiff")
-@dataclass(frozen=True)
 class Tiff(Reader):
     """A folder of depth images as TIFF, with a camera.json given; amplitude in *intens*.tif."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +13,14 @@ from tofuse.files.reading import files_with, is_file, is_folder, parse_toml, rea
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, image_size, number_in
-from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
+from tofuse.recordings.sources import DepthImageSource
 
 FRAME_RATE_HZ = 30.0
 _LENS = {"fx": "camera_fx", "fy": "camera_fy", "cx": "camera_cx", "cy": "camera_cy"}
 
 
 @part("reader", "zense", label="validated")
-@dataclass(frozen=True)
 class Zense(Reader):
     """Folders of depth*.png in mm and a .toml with camera_fx, _fy, _cx and _cy."""
 
