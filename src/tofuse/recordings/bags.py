@@ -19,12 +19,19 @@ from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.reading import is_file, is_folder, list_folder, required_package
 from tofuse.geometry import quaternion, se3
-from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole
-from tofuse.recordings.camera_file import ColorCamera, check_size, checked_lens
-from tofuse.recordings.frames import DepthKind, Frame, RangeFrame
+from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole
+from tofuse.recordings.camera_file import check_size, checked_lens
+from tofuse.recordings.frames import Frame
 from tofuse.recordings.reader import ReaderOptions
-from tofuse.recordings.sources import FileSource, depth_from_counts, sampled_color
+from tofuse.recordings.sources import (
+    FileSource,
+    depth_from_counts,
+    finite_float32,
+    library_errors,
+    sampled_color,
+)
 
+REMEDY = "check the bag, or reindex it"
 MAX_GAP_S = 0.02  # between the images of one frame
 ROS1_MAGIC = b"#ROSBAG V2"
 MAGIC = (ROS1_MAGIC, b"\x89MCAP0\r\n")
@@ -60,27 +67,19 @@ def open_container(path: Path) -> Any:
 
 
 def _opened(path: Path, reader: Callable[[], Any]) -> Any:
-    try:
-        bag = reader()
-        bag.open()
-        return bag
-    except Exception as error:
-        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+    with library_errors(path, REMEDY):
+        try:
+            bag = reader()
+            bag.open()
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
             raise InputError(
                 "has no space for the decompressed files of a bag",
                 where=tempfile.gettempdir(),
                 remedy="free some space, or set TMPDIR to another folder",
             ) from error
-        raise damaged(error, path) from error
-
-
-def damaged(error: Exception, where: str | Path) -> InputError:
-    """Return an InputError for any exception that rosbags raises for a damaged bag."""
-    return InputError(
-        f"can't be read ({type(error).__name__}: {str(error)[:200]})",
-        where=where,
-        remedy="check the bag, or reindex it",
-    )
+        return bag
 
 
 class Track:
@@ -150,33 +149,22 @@ class BagSource(FileSource):
 
     Attributes
     ----------
-    camera, unit, kind
-        Of the depth images: metres per count, and "z" or "range".
     depth, amplitude, color
         The messages of each topic; None where the bag has none.
-    color_camera
-        None if colour is registered to depth.
     """
 
-    camera: Camera
-    unit: float
-    kind: DepthKind = "z"
+    amplitude_kind = "ir"
     depth: Track
     amplitude: Track | None = None
     color: Track | None = None
-    color_camera: ColorCamera | None = None
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.path = path
         self.bag = self.open_bag(path)
         weakref.finalize(self, self.bag.close)
         super().__init__(np.zeros(0))
-        try:
+        with library_errors(path, REMEDY):
             self.find_streams(options)
-        except InputError:
-            raise
-        except Exception as error:
-            raise damaged(error, path) from error
 
     @staticmethod
     def open_bag(path: Path) -> Any:
@@ -196,12 +184,8 @@ class BagSource(FileSource):
     def load(self, index: int) -> Frame:
         """See `FileSource.load`."""
         where = self.where(index)
-        try:
+        with library_errors(where, REMEDY):
             return self.read_frame(index, where)
-        except InputError:
-            raise
-        except Exception as error:
-            raise damaged(error, where) from error
 
     def where(self, index: int) -> str:
         """Return the name of a frame for errors."""
@@ -210,15 +194,8 @@ class BagSource(FileSource):
     def read_frame(self, index: int, where: str) -> Frame:
         """Read a frame, which `where` names in errors."""
         time = float(self.timestamps[index])
-        frame = RangeFrame(
-            index,
-            time,
-            self.camera,
-            self.read_depth(index, where),
-            self.kind,
-            amplitude_at(self.amplitude, time, self.camera, where, self.message),
-            amplitude_kind="ir",
-        )
+        depth = self.read_depth(index, where)
+        frame = self.image(index, depth, amplitude_image=self._amplitude_at(time, where))
         k = None if self.color is None else self.color.nearest(time, MAX_GAP_S)
         if self.color is None or k is None:
             return frame
@@ -240,43 +217,17 @@ class BagSource(FileSource):
         """Return a message of a track."""
         return track.message(index)
 
-
-def amplitude_at(
-    track: Track | None,
-    time: float,
-    camera: Camera,
-    where: str,
-    read: Callable[[Track, int], Any],
-) -> Float32 | None:
-    """Return the amplitude (H, W) at the time of a depth image; zeros if there is none.
-
-    Parameters
-    ----------
-    track
-        Amplitude images; None if the bag has none.
-    time
-        Of the depth image, s.
-    camera
-        Of the depth image.
-    where
-        For errors.
-    read
-        Returns a message of a track by its index.
-
-    Raises
-    ------
-    InputError
-        If the image is of another size or encoding, or cut off.
-    """
-    if track is None:
-        return None
-    k = track.nearest(time, MAX_GAP_S)
-    if k is None:
-        return np.zeros((camera.height, camera.width), np.float32)
-    counts = image(read(track, k), f"{where}, amplitude", GREY)
-    check_size(counts, camera, f"{where}, amplitude")
-    with np.errstate(all="ignore"):
-        return np.nan_to_num(counts.astype(np.float32), posinf=0, neginf=0)
+    def _amplitude_at(self, time: float, where: str) -> Float32 | None:
+        """The amplitude (H, W) within `MAX_GAP_S` of a time in s; zeros if there is none."""
+        if self.amplitude is None:
+            return None
+        k = self.amplitude.nearest(time, MAX_GAP_S)
+        if k is None:
+            return np.zeros((self.camera.height, self.camera.width), np.float32)
+        where = f"{where}, amplitude"
+        counts = image(self.message(self.amplitude, k), where, GREY)
+        check_size(counts, self.camera, where)
+        return finite_float32(counts)
 
 
 def first_message(bag: Any, topic: str) -> Any:

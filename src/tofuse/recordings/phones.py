@@ -90,11 +90,10 @@ class PhoneSource(FileSource):
             raise camera
         size = (camera.width, camera.height)
         confidence = self.confidence[index]
-        return RangeFrame(
+        return self.image(
             index,
-            float(self.timestamps[index]),
-            camera,
             self.read_depth(index, size),
+            camera=camera,
             confidence_image=None if confidence is None else self.read_confidence(confidence, size),
             color_image=self._read_color(index, size),
         )

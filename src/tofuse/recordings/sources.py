@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,13 +16,13 @@ from tofuse.arrays import Bool, Float32, Float64, Intp, UInt8
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.images import check_first_size, read_color, read_image
 from tofuse.files.ply import read_ply
-from tofuse.files.reading import is_file
+from tofuse.files.reading import input_error, is_file
 from tofuse.files.tables import read_numbers
 from tofuse.files.trajectory import associated_poses, read_tum
-from tofuse.geometry.cameras import Camera
+from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.geometry.se3 import MAX_COORDINATE_M, check_pose, orthonormalise
-from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
-from tofuse.recordings.frames import CloudFrame, DepthKind, Frame, RangeFrame
+from tofuse.recordings.camera_file import CameraFile, ColorCamera, check_size, load_camera
+from tofuse.recordings.frames import AmplitudeKind, CloudFrame, DepthKind, Frame, RangeFrame
 from tofuse.recordings.reader import ReaderOptions
 from tofuse.recordings.recording import Source
 
@@ -35,9 +36,19 @@ class FileSource(ABC):
     ----------
     concurrent
         Whether several threads can read frames concurrently: `load` has no side effects.
+    camera, unit, kind, amplitude_kind, ambiguity_m
+        Of depth images: the common camera, metres per count, and those of `RangeFrame`.
+    color_camera
+        None if colour is registered to depth, or there is none.
     """
 
     concurrent = False
+    camera: Camera
+    unit: float = 0.001
+    kind: DepthKind = "z"
+    amplitude_kind: AmplitudeKind = "raw"
+    ambiguity_m: float | None = None
+    color_camera: ColorCamera | None = None
 
     def __init__(self, timestamps: Float64) -> None:
         self.timestamps = timestamps
@@ -50,6 +61,24 @@ class FileSource(ABC):
     @abstractmethod
     def load(self, index: int) -> Frame:
         """Read frame `index`; raise InputError if it can't be read."""
+
+    def use_camera(self, path: Path, size: tuple[int, int] | None = None) -> CameraFile:
+        """Take camera, unit and kind of depth from a camera.json; see `load_camera`."""
+        description, self.camera = load_camera(path, size)
+        self.unit, self.kind = description.depth_unit_m, description.depth_kind
+        self.color_camera = description.color or self.color_camera
+        return description
+
+    def image(self, index: int, depth: Float32, **others: Any) -> RangeFrame:
+        """Return frame `index` with this depth and other attributes of `RangeFrame` by name."""
+        common = {
+            "camera": self.camera if "camera" not in others else None,
+            "depth_kind": self.kind,
+            "amplitude_kind": self.amplitude_kind,
+            "ambiguity_m": self.ambiguity_m,
+        }
+        time = float(self.timestamps[index])
+        return RangeFrame(index=index, timestamp=time, depth=depth, **(common | others))
 
     def full_resolution_color(self, index: int) -> UInt8 | None:
         """Return the colour of a frame at its recorded resolution, if it has the view of depth.
@@ -164,6 +193,41 @@ def _read_timestamps(path: Path, count: int, warnings: list[str]) -> Float64:
     return times
 
 
+def read_part(path: Path, offset: int, size: int) -> bytes:
+    """Return up to `size` bytes of a file from an offset; InputError if it can't be read."""
+    try:
+        with path.open("rb") as file:
+            file.seek(offset)
+            return file.read(size)
+    except OSError as error:
+        raise input_error(error, path) from error
+
+
+@contextmanager
+def library_errors(where: str | Path, remedy: str = "copy the file again") -> Iterator[None]:
+    """Turn any exception of a library that reads a damaged file into an InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        line = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"can't be read ({type(error).__name__}: {line})", where=where, remedy=remedy
+        ) from error
+
+
+def cameras_of(items: Iterable[T], read: Callable[[T], Pinhole]) -> list[Pinhole | InputError]:
+    """Return the camera of each frame, or the error that makes only this frame unusable."""
+    cameras: list[Pinhole | InputError] = []
+    for item in items:
+        try:
+            cameras.append(read(item))
+        except InputError as error:
+            cameras.append(error)
+    return cameras
+
+
 def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
     """Raise InputError if timestamps are not finite; warn if they repeat or decrease."""
     if not np.isfinite(times).all():
@@ -200,6 +264,12 @@ def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = 
         color=ply.color,
         shift=shift,
     )
+
+
+def finite_float32(values: NDArray[Any]) -> Float32:
+    """Return numbers of a file as float32, 0 where they are not finite."""
+    with np.errstate(all="ignore"):
+        return np.nan_to_num(values.astype(np.float32), posinf=0, neginf=0)
 
 
 def to_float32(values: NDArray[Any]) -> Float32:
@@ -455,23 +525,23 @@ class DepthImageSource(FileSource):
         super().__init__(timestamps)
         self.files, self.color = list(files), None if color is None else list(color)
         self.color_registered = color_registered
-        kind: DepthKind = "z"
         where = "the camera of this format"
         if options is not None and options.camera is not None:
-            description, camera = load_camera(options.camera)
-            depth_unit_m, kind = description.depth_unit_m, description.depth_kind
-            where, sensor = str(options.camera), description.sensor or sensor
-        if camera is None:
+            sensor = self.use_camera(options.camera).sensor or sensor
+            where = str(options.camera)
+        elif camera is None:
             raise InputError(
                 "has no camera", where=self.files[0].parent, remedy="pass one with --camera"
             )
-        self.camera, self.depth_unit_m, self.depth_kind = camera, depth_unit_m, kind
-        self.metadata |= {"depth_unit_m": depth_unit_m, "depth_kind": kind}
+        else:
+            self.camera, self.unit = camera, depth_unit_m
+        size = (self.camera.width, self.camera.height)
+        self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
         if sensor:
             self.metadata["sensor"] = sensor
         self.note_missing_color(self.color or ())
         remedy = "pass the camera of these images with --camera"
-        check_first_size(self.files, (camera.width, camera.height), where, remedy)
+        check_first_size(self.files, size, where, remedy)
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
@@ -487,12 +557,5 @@ class DepthImageSource(FileSource):
                     where=path,
                     remedy="register colour to depth, or leave it out",
                 )
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth_from_counts(counts, self.depth_unit_m),
-            self.depth_kind,
-            color_image=color,
-            color_registered=self.color_registered,
-        )
+        depth = depth_from_counts(counts, self.unit)
+        return self.image(index, depth, color_image=color, color_registered=self.color_registered)

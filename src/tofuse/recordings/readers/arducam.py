@@ -13,7 +13,7 @@ from tofuse.errors import InputError
 from tofuse.files.images import read_raw
 from tofuse.files.reading import files_named, is_file
 from tofuse.parts import part
-from tofuse.recordings.camera_file import CameraFile, camera_file_of, check_size, load_camera
+from tofuse.recordings.camera_file import camera_file_of, check_size
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource, depth_from_numbers
@@ -63,26 +63,20 @@ class ArducamSource(FileSource):
     concurrent = True
 
     def __init__(self, path: Path, camera: Path) -> None:
-        self.description: CameraFile
-        self.description, self.camera = load_camera(camera)
+        description = self.use_camera(camera)
         self.depth = _images(path, "depth")
         super().__init__(np.array([image.time_ms for image in self.depth]) / 1000)
         self.confidence = _next_image(self.depth, _images(path, "confidence"))
-        self.metadata |= {**self.description.metadata, "confidence_max": CONFIDENCE_MAX}
+        self.metadata |= {**description.metadata, "confidence_max": CONFIDENCE_MAX}
         missing = sum(image is None for image in self.confidence)
         if missing > 0:
             self.warnings.append(f"{missing} of {len(self.depth)} frames have no confidence")
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth_from_numbers(self._floats(self.depth[index]), self.description.depth_unit_m),
-            self.description.depth_kind,
-            confidence_image=self._confidence(self.confidence[index]),
-        )
+        depth = depth_from_numbers(self._floats(self.depth[index]), self.unit)
+        confidence = self._confidence(self.confidence[index])
+        return self.image(index, depth, confidence_image=confidence)
 
     def _confidence(self, image: _Image | None) -> UInt8 | None:
         if image is None:

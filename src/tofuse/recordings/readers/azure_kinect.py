@@ -21,8 +21,8 @@ from tofuse.files.trajectory import associate
 from tofuse.geometry.cameras import Camera, Rational, RayTable
 from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.parts import part
-from tofuse.recordings.camera_file import ColorCamera, load_camera
-from tofuse.recordings.frames import DepthKind, RangeFrame
+from tofuse.recordings.camera_file import ColorCamera
+from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import (
     Reader,
     ReaderOptions,
@@ -32,8 +32,6 @@ from tofuse.recordings.reader import (
     required_file,
 )
 from tofuse.recordings.sources import FileSource, sampled_color
-
-DEPTH_UNIT_M = 0.001
 
 
 @dataclass(frozen=True)
@@ -128,6 +126,8 @@ class AzureKinect(Reader):
 class AzureKinectSource(FileSource):
     """Depth frames, with the simultaneous infrared image and registered colour."""
 
+    amplitude_kind = "ir"
+
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.file = Matroska(path)
         tracks = {track.name.upper(): track for track in self.file.tracks}
@@ -165,15 +165,7 @@ class AzureKinectSource(FileSource):
         depth = self._image(self.depth[index]).astype(np.float32) * np.float32(self.unit)
         block = self.infrared[index]
         infrared = None if block is None else self._image(block).astype(np.float32)
-        frame = RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth,
-            self.kind,
-            infrared,
-            amplitude_kind="ir",
-        )
+        frame = self.image(index, depth, amplitude_image=infrared)
         color = self._color_image(index, frame)
         return frame if color is None else replace(frame, color_image=color)
 
@@ -213,17 +205,12 @@ class AzureKinectSource(FileSource):
         return [track.blocks[k] if k >= 0 else None for k in pairs]
 
     def _read_cameras(self, options: ReaderOptions, color: Track | None) -> None:
-        self.unit = DEPTH_UNIT_M
-        self.kind: DepthKind = "z"
-        self.color_camera: ColorCamera | None = None
         if options.camera is None:
             self._read_calibration(color)
         else:
             with suppress(InputError):  # possibly the reason for a camera passed by the user
                 self._read_calibration(color)
-            description, self.camera = load_camera(options.camera, self.size)
-            self.unit, self.kind = description.depth_unit_m, description.depth_kind
-            self.color_camera = description.color or self.color_camera
+            self.use_camera(options.camera, self.size)
         if self.color_camera is None:
             self.color = [None] * len(self.depth)
 

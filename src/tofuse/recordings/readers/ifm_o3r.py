@@ -30,7 +30,7 @@ from tofuse.recordings.reader import (
     refuse_camera,
     required_file,
 )
-from tofuse.recordings.sources import FileSource, interpolated
+from tofuse.recordings.sources import FileSource, finite_float32, interpolated, library_errors
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
 _IMAGES = {"flags": CONFIDENCE, "noise": NOISE, "amplitude": AMPLITUDE}
@@ -216,7 +216,7 @@ def head_frame(
             raise InputError("has flags that are not integers", where=where)
         depth = np.where(flags & _INVALID, np.float32(0), depth)
     if amplitude is not None:
-        amplitude = np.nan_to_num(amplitude.astype(np.float32), posinf=0, neginf=0)
+        amplitude = finite_float32(amplitude)
     return RangeFrame(
         index,
         timestamp,
@@ -224,9 +224,7 @@ def head_frame(
         depth,
         "range",
         amplitude,
-        sigma_image=None
-        if noise is None
-        else np.nan_to_num(info.metres(noise), posinf=0, neginf=0),
+        sigma_image=None if noise is None else finite_float32(info.metres(noise)),
     )
 
 
@@ -308,15 +306,11 @@ class IfmH5Source(FileSource):
         self.path = path
         h5py = required_package("h5py", "hdf5", path)
         self._lock = threading.Lock()
-        try:
+        with library_errors(path):
             file = h5py.File(path, "r")
             weakref.finalize(self, file.close)
             self._find(file, stream)
             times = self._times()
-        except InputError:
-            raise
-        except Exception as error:  # any exception of h5py for a damaged file
-            raise self._damaged(error) from error
         super().__init__(times)
         self.metadata |= {"sensor": "ifm O3R (ToF)", "depth_kind": "range", "amplitude_kind": "raw"}
         if len(self.names) > 1 and stream is None:
@@ -362,14 +356,10 @@ class IfmH5Source(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         where = f"{self.path}: {self.name}, frame {index}"
-        try:
+        with library_errors(where):
             with self._lock:
                 row = self.rows[index]
             return self._frame(row, index, where)
-        except InputError:
-            raise
-        except Exception as error:
-            raise self._damaged(error, where) from error
 
     def _frame(self, row: Any, index: int, where: str) -> RangeFrame:
         counts = self._image(row, "distance", where)
@@ -394,11 +384,3 @@ class IfmH5Source(FileSource):
         if shape is not None and image.shape != shape:
             raise InputError(f"{name} is of shape {image.shape}, distance {shape}", where=where)
         return image
-
-    def _damaged(self, error: Exception, where: str | None = None) -> InputError:
-        line = " ".join(str(error).split())[:200]
-        return InputError(
-            f"can't be read ({type(error).__name__}: {line})",
-            where=where or self.path,
-            remedy="copy the file again",
-        )

@@ -30,7 +30,7 @@ from tofuse.recordings.bags import (
     open_bag,
     open_container,
 )
-from tofuse.recordings.camera_file import ColorCamera, checked_lens, load_camera
+from tofuse.recordings.camera_file import ColorCamera, checked_lens
 from tofuse.recordings.lenses import forward_brown, inverse_brown, simplest_lens
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
 
@@ -83,9 +83,7 @@ class MakerBagSource(BagSource):
         if options.camera is None:
             self.camera = self.lens()
         else:
-            description, self.camera = load_camera(options.camera)
-            self.unit, self.kind = description.depth_unit_m, description.depth_kind
-            self.color_camera = description.color
+            self.use_camera(options.camera)
         self._find_color()
         self.set_timestamps()
         self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}

@@ -113,11 +113,10 @@ class NerfstudioSource(FileSource):
             counts = read_image(sigma, size=size, dtype="uint16")
             sigma_z = counts.astype(np.float32) * np.float32(self.sigma_unit_m)
             sigma_image = np.nan_to_num(sigma_z * ray_lengths(camera))
-        return RangeFrame(
+        return self.image(
             index,
-            float(self.timestamps[index]),
-            camera,
             depth,
+            camera=camera,
             color_image=None if color is None else resized(read_color(color), size, color),
             sigma_image=sigma_image,
         )

@@ -28,11 +28,13 @@ from tofuse.recordings.sources import (
     FileSource,
     check_timestamps,
     depth_from_numbers,
+    finite_float32,
     read_matrix_pose,
 )
 
 MAX_BYTES = 1 << 30
 _IMAGES = {"amplitude": 3, "confidence": 3, "sigma": 3, "color": 4}
+_FLOATS = ("amplitude", "sigma")
 _TABLES = ("timestamps", "reference", "odometry", "K", "rays", "distortion")
 _VALUES = (
     *("depth_unit_m", "depth_kind", "model", "frame_rate_hz", "ambiguity_m", "confidence_max"),
@@ -96,6 +98,7 @@ class NpzSource(FileSource):
         for name in ("frame_rate_hz", "ambiguity_m", "confidence_max"):
             if name in arrays:
                 self.metadata[name] = self._number(arrays, name)
+        self.ambiguity_m = self.metadata.get("ambiguity_m")
         if "sensor" in arrays:
             self.metadata["sensor"] = str(arrays["sensor"])[:200]
         unknown = [name for name in arrays if name not in _NAMES]
@@ -104,27 +107,11 @@ class NpzSource(FileSource):
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
-        with np.errstate(all="ignore"):
-            images = {name: stack[index] for name, stack in self.images.items()}
-            amplitude, sigma = (
-                np.nan_to_num(images[n].astype(np.float32), posinf=0, neginf=0)
-                if n in images
-                else None
-                for n in ("amplitude", "sigma")
-            )
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth_from_numbers(self.depth[index], self.unit),
-            self.kind,  # type: ignore[arg-type]
-            amplitude,
-            images.get("confidence"),
-            images.get("color"),
-            sigma,
-            amplitude_kind=self.amplitude_kind,  # type: ignore[arg-type]
-            ambiguity_m=self.metadata.get("ambiguity_m"),
-        )
+        images = {
+            f"{name}_image": finite_float32(stack[index]) if name in _FLOATS else stack[index]
+            for name, stack in self.images.items()
+        }
+        return self.image(index, depth_from_numbers(self.depth[index], self.unit), **images)
 
     def _read_camera(
         self, arrays: dict[str, NDArray[Any]], options: ReaderOptions

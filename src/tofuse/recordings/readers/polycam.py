@@ -22,7 +22,7 @@ from tofuse.recordings.phones import (
     lens,
 )
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import poses_from_files
+from tofuse.recordings.sources import cameras_of, poses_from_files
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 _LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and 255
@@ -61,12 +61,8 @@ class PolycamSource(PhoneSource):
             confidence=[if_file(folder / "confidence" / file.name) for file in files],
             color=[if_file(folder / "images" / f"{file.stem}.jpg") for file in files],
         )
-        for file in files:
-            path = folder / "cameras" / f"{file.stem}.json"
-            try:
-                self.cameras.append(_lens(read_json(path), size, path))
-            except InputError as error:
-                self.cameras.append(error)  # only this frame is unusable
+        paths = [folder / "cameras" / f"{file.stem}.json" for file in files]
+        self.cameras = cameras_of(paths, lambda path: _lens(read_json(path), size, path))
         self._read_poses(folder)
 
     def _read_poses(self, folder: Path) -> None:

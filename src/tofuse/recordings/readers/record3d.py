@@ -109,16 +109,10 @@ class Record3DSource(FileSource):
         number = self.store.numbers[index]
         depth = self.store.depth(number, self.size)
         color = self.store.color(number)
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth,
-            confidence_image=self.store.confidence(number, self.size),
-            color_image=None
-            if color is None
-            else resized(as_color(parse_image(*color)), self.size, color[1]),
-        )
+        if color is not None:
+            color = resized(as_color(parse_image(*color)), self.size, color[1])
+        confidence = self.store.confidence(number, self.size)
+        return self.image(index, depth, confidence_image=confidence, color_image=color)
 
 
 class _Folder:

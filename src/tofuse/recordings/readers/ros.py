@@ -18,23 +18,23 @@ from tofuse.recordings.bags import (
     GREY,
     MAGIC,
     MAX_GAP_S,
+    REMEDY,
     BagSource,
     Track,
     Transforms,
     cloud,
     color_image,
-    damaged,
     decompressed,
     decompressed_color,
     frame_name,
     image,
     lens,
 )
-from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
+from tofuse.recordings.camera_file import ColorCamera, check_size
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import cloud_frame, depth_from_numbers
+from tofuse.recordings.sources import cloud_frame, depth_from_numbers, library_errors
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -169,8 +169,8 @@ class RosSource(BagSource):
 
     def _read_camera(self, options: ReaderOptions) -> None:
         if options.camera is not None:
-            description, self.camera = load_camera(options.camera)
-            self.kind, self.unit = description.depth_kind, description.depth_unit_m
+            self.use_camera(options.camera)
+            self.color_camera = None  # the bag's own is found below
             return
         infos = [c for c in self.bag.connections if c.msgtype == INFO]
         adjacent = self._camera_infos(self.connection)
@@ -196,9 +196,10 @@ class RosSource(BagSource):
 
     def _transforms(self) -> Transforms:
         try:
-            return Transforms.read(self.bag)
-        except Exception as error:  # any exception of rosbags for damaged data
-            self.warnings.append(f"tf is ignored: {damaged(error, self.path)}")
+            with library_errors(self.path, REMEDY):
+                return Transforms.read(self.bag)
+        except InputError as error:
+            self.warnings.append(f"tf is ignored: {error}")
             return Transforms({})
 
     def _frame_of(self, track: Track) -> str:
@@ -210,9 +211,10 @@ class RosSource(BagSource):
         if not transforms:
             return
         try:
-            frame = self._frame_of(self.depth)
-        except Exception as error:  # a damaged message affects only its frame
-            self.warnings.append(f"tf is ignored: {damaged(error, self.where(0))}")
+            with library_errors(self.where(0), REMEDY):
+                frame = self._frame_of(self.depth)
+        except InputError as error:  # affects only this frame
+            self.warnings.append(f"tf is ignored: {error}")
             return
         ancestors = transforms.ancestors(frame)
         odometry = next((name for name in ancestors if _ODOMETRY in name.lower()), None)
@@ -229,37 +231,39 @@ class RosSource(BagSource):
         """Find a colour camera with known intrinsics and pose relative to depth."""
         missing: list[str] = []
         for connection in sorted(self.bag.connections, key=lambda c: (c.msgtype, c.topic)):
-            if not self._is_color(connection):
-                continue
-            track = Track(self.bag, connection)
-            if not len(track):
+            if not self._is_color(connection) or not len(track := Track(self.bag, connection)):
                 continue
             try:
-                first = self.read_color(track, 0, f"{self.path}: {connection.topic}")
-                depth_frame, color_frame = self._frame_of(self.depth), self._frame_of(track)
-                registered = _rank(self.connection) == 1  # depth is registered to colour
-                same_size = first.shape[:2] == (self.camera.height, self.camera.width)
-                T = transforms.static_transform(color_frame, depth_frame)
-                infos = self._camera_infos(connection)
-                if same_size and (registered or depth_frame == color_frame):
-                    self.color = track
-                elif T is not None and infos:
-                    self.color_camera = ColorCamera(self._lens_of(infos[0]), T)
-                    self.color = track
-                else:
-                    missing.append(connection.topic)
-                    continue
-            except Exception as error:  # an InputError, or one of rosbags for a damaged message
-                cause = error if isinstance(error, InputError) else damaged(error, self.path)
-                missing.append(f"{connection.topic} ({cause.problem})")
+                with library_errors(self.path, REMEDY):
+                    found = self._relate_color(track, transforms)
+            except InputError as error:
+                missing.append(f"{connection.topic} ({error.problem})")
                 continue
-            self.metadata["color_topic"] = connection.topic
-            return
+            if found:
+                self.metadata["color_topic"] = connection.topic
+                return
+            missing.append(connection.topic)
         if missing:
             self.warnings.append(
                 f"colour is ignored: the relation of {missing[0]} to depth is not in the bag "
                 "(its camera_info, and tf_static between the two cameras)"
             )
+
+    def _relate_color(self, track: Track, transforms: Transforms) -> bool:
+        """Use a colour camera, if its intrinsics and pose relative to depth are known."""
+        topic = track.connection.topic
+        first = self.read_color(track, 0, f"{self.path}: {topic}")
+        depth_frame, color_frame = self._frame_of(self.depth), self._frame_of(track)
+        registered = _rank(self.connection) == 1  # depth is registered to colour
+        same_size = first.shape[:2] == (self.camera.height, self.camera.width)
+        T = transforms.static_transform(color_frame, depth_frame)
+        infos = self._camera_infos(track.connection)
+        if not (same_size and (registered or depth_frame == color_frame)):
+            if T is None or not infos:
+                return False
+            self.color_camera = ColorCamera(self._lens_of(infos[0]), T)
+        self.color = track
+        return True
 
     def _is_color(self, connection: Any) -> bool:
         topic = connection.topic.lower()

@@ -70,6 +70,9 @@ class Sr4000Source(FileSource):
     `frame.points` equals the vectors of the file.
     """
 
+    amplitude_kind = "range_compensated"
+    ambiguity_m = AMBIGUITY_M
+
     def __init__(self, files: list[Path]) -> None:
         self.files = files
         super().__init__(np.zeros(len(files)))
@@ -113,18 +116,16 @@ class Sr4000Source(FileSource):
         rays = np.stack([-blocks["x"] / safe, -blocks["y"] / safe], -1)
         confidence = blocks.get("confidence")
         amplitude = blocks.get("amplitude")
-        return RangeFrame(
+        if confidence is not None:
+            confidence = np.clip(np.nan_to_num(confidence), 0, 255).astype(np.uint8)
+        return self.image(
             index,
-            float(self.timestamps[index]),
-            RayTable(rays.astype(np.float32)),
             depth.astype(np.float32),
-            "z",
-            None if amplitude is None else np.nan_to_num(amplitude).astype(np.float32),
-            None
-            if confidence is None
-            else np.clip(np.nan_to_num(confidence), 0, 255).astype(np.uint8),
-            amplitude_kind="range_compensated",
-            ambiguity_m=AMBIGUITY_M,
+            camera=RayTable(rays.astype(np.float32)),
+            amplitude_image=None
+            if amplitude is None
+            else np.nan_to_num(amplitude).astype(np.float32),
+            confidence_image=confidence,
         )
 
 
