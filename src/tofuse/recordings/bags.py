@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
-from tofuse.files.reading import is_file, is_folder, list_folder, required_package
+from tofuse.files.reading import (
+    files_with,
+    is_file,
+    is_folder,
+    list_folder,
+    read_head,
+    required_package,
+)
 from tofuse.geometry import quaternion, se3
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole
 from tofuse.recordings.camera_file import check_size, checked_lens
@@ -33,8 +40,18 @@ from tofuse.recordings.sources import (
 
 REMEDY = "check the bag, or reindex it"
 MAX_GAP_S = 0.02  # between the images of one frame
-ROS1_MAGIC = b"#ROSBAG V2"
-MAGIC = (ROS1_MAGIC, b"\x89MCAP0\r\n")
+_MAGIC = {"ros1": b"#ROSBAG V2", "mcap": b"\x89MCAP0\r\n"}
+
+
+def bag_kind(path: Path) -> str | None:
+    """Return "folder" for that of a ROS 2 bag, "ros1", "mcap" or "db3" for such files, or None."""
+    if is_folder(path):
+        is_bag = is_file(path / "metadata.yaml") and files_with(path, ".db3", ".mcap", ".zstd")
+        return "folder" if is_bag else None
+    head = read_head(path, 16)
+    if head.startswith(b"SQLite format 3"):
+        return "db3" if path.suffix.lower() == ".db3" else None
+    return next((kind for kind, magic in _MAGIC.items() if head.startswith(magic)), None)
 
 
 def open_bag(path: Path) -> Any:

@@ -316,22 +316,22 @@ def read_reference(path: str | Path) -> TimedPoses:
         If it can't be read, or the recording has no reference poses.
     """
     path = Path(path)
-    if not path.is_dir() or (path / "groundtruth.txt").is_file():  # the images are not needed then
+    poses_file = path / "groundtruth.txt" if path.is_dir() else path
+    readers_of_poses = [lambda: read_poses(poses_file), lambda: open_recording(path)]
+    if not poses_file.is_file():  # else the images are not needed
+        readers_of_poses = [lambda: open_recording(path), lambda: read_poses(path)]
+    errors: list[InputError] = []
+    for read in readers_of_poses:
         try:
-            return read_poses(path / "groundtruth.txt" if path.is_dir() else path)
-        except InputError as no_trajectory:
-            try:
-                recording = open_recording(path)
-            except InputError:
-                raise no_trajectory from None
-    else:
-        try:
-            recording = open_recording(path)
-        except InputError as no_recording:
-            try:
-                return read_poses(path)
-            except InputError:
-                raise no_recording from None
+            found = read()
+        except InputError as error:
+            errors.append(error)
+            continue
+        return found if isinstance(found, TimedPoses) else _reference_of(found, path)
+    raise errors[0] from None
+
+
+def _reference_of(recording: Recording, path: Path) -> TimedPoses:
     poses = recording.reference
     if poses is None or not np.isfinite(poses).all((1, 2)).any():
         raise InputError(
@@ -396,16 +396,10 @@ class Opening(OpeningOptions):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data, with absolute paths."""
-        return {
-            "paths": [str(path.absolute()) for path in self.paths],
-            "format": self.format,
-            "camera": None if self.camera is None else str(self.camera.absolute()),
-            "topic": self.topic,
-            "start": self.start,
-            "end": self.end,
-            "every": self.every,
-            "average_still": self.average_still,
-        }
+        options = {field.name: getattr(self, field.name) for field in fields(OpeningOptions)}
+        camera = None if self.camera is None else str(self.camera.absolute())
+        paths = [str(path.absolute()) for path in self.paths]
+        return {"paths": paths} | options | {"camera": camera}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], where: str | Path) -> Opening:

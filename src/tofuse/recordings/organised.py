@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -290,32 +291,19 @@ class Deprojection:
         shape = camera.height, camera.width
         on_lattice &= (pixel >= 0).all(1) & (pixel < (camera.width, camera.height)).all(1)
         column, row = pixel[on_lattice].T
-        amplitude, color, normals = cloud.amplitude, cloud.color, cloud.normals
-        depth = np.zeros(shape, np.float32)
-        depth[row, column] = points[on_lattice, 2]
-        if amplitude is not None:
-            image = np.zeros(shape, np.float32)
-            image[row, column] = amplitude[on_lattice]
-            amplitude = image
-        if color is not None:
-            colors = np.zeros((*shape, 3), np.uint8)
-            colors[row, column] = color[on_lattice]
-            color = colors
-        if normals is not None:
-            vectors = np.full((*shape, 3), np.nan, np.float32)
-            vectors[row, column] = normals[on_lattice]
-            normals = vectors
         # The relation of the amplitude to the received light is unknown.
-        return RangeFrame(
-            cloud.index,
-            cloud.timestamp,
-            camera,
-            depth,
-            amplitude_image=amplitude,
-            color_image=color,
-            normal_image=normals,
-            amplitude_kind="ir",
-        )
+        images: dict[str, Any] = {"amplitude_kind": "ir"}
+        for name, values, missing in (
+            ("depth", points[:, 2], 0),
+            ("amplitude_image", cloud.amplitude, 0),
+            ("color_image", cloud.color, 0),
+            ("normal_image", cloud.normals, np.nan),
+        ):
+            if values is not None:
+                image = np.full((*shape, *values.shape[1:]), missing, values.dtype)
+                image[row, column] = values[on_lattice]
+                images[name] = image
+        return RangeFrame(cloud.index, cloud.timestamp, camera, **images)
 
 
 def find_deprojection(clouds: Sequence[CloudFrame]) -> Deprojection | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, TypeVar
 
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head
@@ -13,6 +13,8 @@ from tofuse.recordings.recording import Source
 CERTAIN = 0.9
 UNCERTAIN = 0.5
 PER_FRAME = "a camera per frame"
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,13 @@ class Reader(Protocol):
         ...
 
 
+def required(files: list[T], name: str, where: Path, remedy: str = "check the path") -> list[T]:
+    """Return the files; raise InputError, that `where` has no `name`, if there are none."""
+    if not files:
+        raise InputError(f"has no {name}", where=where, remedy=remedy)
+    return files
+
+
 def refuse_camera(options: ReaderOptions, name: str, stores: str = "points") -> None:
     """Raise InputError if a camera was passed for the format `name`, which stores `stores`."""
     if options.camera is not None:
@@ -122,3 +131,10 @@ def required_file(path: Path, *suffixes: str) -> Path:
         where=path,
         remedy="pass the file",
     )
+
+
+def files_at(path: Path, *suffixes: str) -> list[Path]:
+    """Return the file itself or the files of a folder, if they have one of the suffixes."""
+    if is_file(path):
+        return [path] if path.suffix.lower() in suffixes else []
+    return files_with(path, *suffixes) if is_folder(path) else []

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64, UInt16
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, input_error, is_file, is_folder
+from tofuse.files.reading import input_error, is_file
 from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, files_at
 from tofuse.recordings.recording import evenly_spaced
 from tofuse.recordings.sources import FileSource, depth_from_counts, read_part
 
@@ -210,9 +210,7 @@ class AdiTofSource(FileSource):
 
 
 def _files(path: Path) -> list[Path]:
-    if is_folder(path):
-        return [file for file in files_with(path, ".bin") if is_file(file)]
-    return [path] if is_file(path) and path.suffix.lower() == ".bin" else []
+    return [file for file in files_at(path, ".bin") if is_file(file)]
 
 
 def _frames_in(path: Path) -> tuple[list[_FrameLocation], bool]:

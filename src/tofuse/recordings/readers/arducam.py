@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.arrays import Float32, UInt8
-from tofuse.errors import InputError
 from tofuse.files.images import read_raw
 from tofuse.files.reading import files_named, is_file
 from tofuse.parts import part
 from tofuse.recordings.camera_file import camera_file_of, check_size
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
 from tofuse.recordings.sources import FileSource, depth_from_numbers
 
 # Width and height in pixels, and the time at which the file was written in ms.
@@ -40,12 +39,8 @@ class Arducam(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> ArducamSource:
         """See `Reader.open`."""
-        if not _images(path, "depth"):
-            raise InputError(
-                "has no depth_*_f32_*.raw",
-                where=path,
-                remedy="save depth, not the sensor's raw phases",
-            )
+        remedy = "save depth, not the sensor's raw phases"
+        required(_images(path, "depth"), "depth_*_f32_*.raw", path, remedy)
         camera = camera_file_of(path, options.camera, "neither lens nor unit")
         return ArducamSource(path, camera)
 

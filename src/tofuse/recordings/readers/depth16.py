@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.errors import InputError
 from tofuse.files.images import read_color, read_raw
 from tofuse.files.reading import files_named, if_file, is_file
 from tofuse.parts import part
 from tofuse.recordings.camera_file import camera_file_of
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
-from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
 from tofuse.recordings.sources import FileSource
 
 _SUFFIXES = ("_depth16.bin", ".depth16")
@@ -38,9 +37,7 @@ class Depth16(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
         """See `Reader.open`."""
-        files = _files(path)
-        if not files:
-            raise InputError("has no *_depth16.bin or *.depth16", where=path, remedy="check it")
+        files = required(_files(path), "*_depth16.bin or *.depth16", path)
         camera = camera_file_of(path, options.camera, "neither size nor lens")
         return Depth16Source(files, camera)
 

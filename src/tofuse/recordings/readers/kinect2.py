@@ -14,7 +14,7 @@ from tofuse.files.reading import files_named, is_file, is_folder, list_folder, r
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_pinhole
-from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
 from tofuse.recordings.sources import DepthImageSource
 
 _DEPTH = re.compile(r"([0-9]{1,9})_depth\.png", re.IGNORECASE)
@@ -46,9 +46,7 @@ class Kinect2(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = files_named(path, _DEPTH.fullmatch)
-        if not files:
-            raise InputError("has no NNNN_depth.png", where=path, remedy="check the path")
+        files = required(files_named(path, _DEPTH.fullmatch), "NNNN_depth.png", path)
         color = [_color(file) for file in files]
         source = DepthImageSource(
             files,

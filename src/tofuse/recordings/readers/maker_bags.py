@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,17 +15,16 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhole, RayTable
 from tofuse.geometry.quaternion import to_pose
 from tofuse.geometry.se3 import check_pose, inverse, orthonormalise
 from tofuse.parts import part
 from tofuse.recordings.bags import (
     GREY,
-    ROS1_MAGIC,
     BagSource,
     Info,
     Track,
+    bag_kind,
     camera_info,
     first_message,
     open_bag,
@@ -48,24 +48,14 @@ def topics(path: Path) -> frozenset[str]:
 def _topics_of(path: Path, changed_ns: int, size: int) -> frozenset[str]:
     """See `topics`; cached, as several readers call it and opening a large bag is slow."""
     try:
-        if is_folder(path):
-            is_bag = is_file(path / "metadata.yaml") and bool(
-                files_with(path, ".db3", ".mcap", ".zstd")
-            )
-            is_ros1 = False
-        else:
-            head = read_head(path, 16)
-            is_ros1 = head.startswith(ROS1_MAGIC)
-            is_bag = is_ros1 or (path.suffix == ".db3" and head.startswith(b"SQLite format 3"))
-        if not is_bag:
+        kind = bag_kind(path)
+        if kind in (None, "mcap"):  # in which no maker's viewer records
             return frozenset()
-        bag = open_container(path) if is_ros1 else open_bag(path)
+        bag = open_container(path) if kind == "ros1" else open_bag(path)
     except InputError:
         return frozenset()
-    try:
+    with closing(bag):
         return frozenset(c.topic for c in bag.connections)
-    finally:
-        bag.close()
 
 
 class MakerBagSource(BagSource):
@@ -109,7 +99,7 @@ class MakerBagSource(BagSource):
             self.warnings.append(f"colour is ignored: {error}")
             self.color = None
 
-    def track(self, topic: str) -> Track | None:
+    def track(self, topic: str | None) -> Track | None:
         """Return the messages of a topic; None if there are none."""
         for connection in self.bag.connections:
             if connection.topic == topic:
@@ -150,31 +140,24 @@ class RealSenseSource(MakerBagSource):
 
     def find_tracks(self) -> None:
         """See `MakerBagSource.find_tracks`."""
-        matches = sorted(
-            c.topic for c in self.bag.connections if re.fullmatch(_REALSENSE_DEPTH, c.topic)
-        )
-        if not matches:
+        topic = self._first(_REALSENSE_DEPTH)
+        if topic is None:
             raise InputError("has no depth of a RealSense", where=self.path, remedy="record it")
-        stream = matches[0].removesuffix("/image/data")
-        sensor = stream.rsplit("/", 1)[0]
-        self.depth = self.required_track(matches[0], "depth")
-        self.stream = stream
+        self.stream = topic.removesuffix("/image/data")
+        sensor = self.stream.rsplit("/", 1)[0]
+        device = sensor.rsplit("/", 1)[0]
+        self.depth = self.required_track(topic, "depth")
         self.unit = self._unit(sensor)
-        name = self._name(sensor.rsplit("/", 1)[0])
+        name = self._name(device)
         self.metadata["sensor"] = name
         if "L5" in name:  # a stereo camera's infrared is another view
-            matches = [
-                c.topic
-                for c in self.bag.connections
-                if re.fullmatch(re.escape(sensor) + r"/Infrared_\d+/image/data", c.topic)
-            ]
-            if matches:
-                self.amplitude = self.track(sorted(matches)[0])
-        device = sensor.rsplit("/", 1)[0]
-        pattern = re.escape(device) + r"/sensor_\d+/Color_\d+/image/data"
-        matches = [c.topic for c in self.bag.connections if re.fullmatch(pattern, c.topic)]
-        if matches:
-            self.color = self.track(sorted(matches)[0])
+            self.amplitude = self.track(self._first(rf"{sensor}/Infrared_\d+/image/data"))
+        self.color = self.track(self._first(rf"{device}/sensor_\d+/Color_\d+/image/data"))
+
+    def _first(self, pattern: str) -> str | None:
+        """The first topic, by name, that matches a pattern."""
+        topics_of_bag = (c.topic for c in self.bag.connections)
+        return min((t for t in topics_of_bag if re.fullmatch(pattern, t)), default=None)
 
     def lens(self) -> Camera:
         """See `MakerBagSource.lens`."""

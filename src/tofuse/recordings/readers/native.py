@@ -30,7 +30,7 @@ from tofuse.recordings.frames import (
 )
 from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.native import LENS_COLUMNS
-from tofuse.recordings.reader import CERTAIN, UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import CERTAIN, UNCERTAIN, Reader, ReaderOptions, Sniff, required
 from tofuse.recordings.sources import (
     FileSource,
     cameras_of,
@@ -70,13 +70,9 @@ class NativeSource(FileSource):
         self.folder = folder
         self.is_clouds = not is_folder(folder / "depth") and is_folder(folder / "cloud")
         name, suffixes = ("cloud", (".ply",)) if self.is_clouds else ("depth", (".png",))
-        self.files = files_with(folder / name, *suffixes)
-        if not self.files:
-            raise InputError(
-                f"has no {suffixes[0]} files",
-                where=folder / name,
-                remedy="check that the recording is complete",
-            )
+        remedy = "check that the recording is complete"
+        files = files_with(folder / name, *suffixes)
+        self.files = required(files, f"{suffixes[0]} files", folder / name, remedy)
         self.description, self.camera = self._read_camera(camera_file)
         self.unit, self.kind = self.description.depth_unit_m, self.description.depth_kind
         self.amplitude_kind = self.description.amplitude_kind or "raw"

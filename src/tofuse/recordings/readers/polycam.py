@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from tofuse.arrays import Float64, UInt8
-from tofuse.errors import InputError
 from tofuse.files.images import first_size
 from tofuse.files.reading import files_with, if_file, is_file, is_folder
 from tofuse.geometry.cameras import Pinhole
@@ -21,7 +20,14 @@ from tofuse.recordings.phones import (
     arkit_pose,
     lens,
 )
-from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import (
+    PER_FRAME,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    refuse_camera,
+    required,
+)
 from tofuse.recordings.sources import cameras_of, poses_from_files
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
@@ -50,10 +56,7 @@ class PolycamSource(PhoneSource):
 
     def __init__(self, folder: Path) -> None:
         files = files_with(folder / "depth", ".png") if is_folder(folder / "depth") else []
-        if not files:
-            raise InputError(
-                "has no .png files", where=folder / "depth", remedy="export 'raw data' again"
-            )
+        required(files, ".png files", folder / "depth", "export 'raw data' again")
         size = first_size(files)
         super().__init__(
             files,

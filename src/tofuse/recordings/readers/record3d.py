@@ -16,7 +16,7 @@ from tofuse.errors import InputError
 from tofuse.files.exr import parse_exr
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.lzfse import lzfse_decompress
-from tofuse.files.reading import input_error, is_file, is_folder, list_folder, read_bytes
+from tofuse.files.reading import files_named, input_error, is_file, is_folder, read_bytes
 from tofuse.geometry import quaternion
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
@@ -38,6 +38,7 @@ from tofuse.recordings.reader import (
     begins_with,
     file_of,
     refuse_camera,
+    required,
 )
 from tofuse.recordings.sources import FileSource, depth_from_numbers
 
@@ -125,9 +126,7 @@ class _Folder:
         self.where = path / "metadata.json"
         self.path = path
         self.files = _numbered(path / "depth", _EXR)
-        if not self.files:
-            raise InputError("has no .exr files", where=path / "depth", remedy="export it again")
-        self.numbers = sorted(self.files)
+        self.numbers = required(sorted(self.files), ".exr files", path / "depth", _REMEDY)
 
     def metadata(self) -> dict[str, Any]:
         return read_json(self.where)
@@ -274,13 +273,7 @@ class _Metadata:
 
 
 def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
-    if not is_folder(folder):
-        return {}
-    try:
-        matches = [(pattern.fullmatch(p.name), p) for p in list_folder(folder)]
-    except InputError:
-        return {}
-    return {int(match.group(1)): p for match, p in matches if match}
+    return {int(file.stem): file for file in files_named(folder, pattern.fullmatch)}
 
 
 def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float32:

@@ -21,7 +21,7 @@ from tofuse.recordings.camera_file import (
     numbers_in,
     read_json,
 )
-from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
 from tofuse.recordings.sources import DepthImageSource
 
 # Open3D's PinholeCameraIntrinsicParameters.PrimeSenseDefault.
@@ -58,9 +58,7 @@ class Redwood(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = files_with(path / "depth", ".png")
-        if not files:
-            raise InputError("has no .png files", where=path / "depth", remedy="check the path")
+        files = required(files_with(path / "depth", ".png"), ".png files", path / "depth")
         warnings: list[str] = []
         camera: Pinhole | None = None
         if options.camera is None:

@@ -9,19 +9,18 @@ import numpy as np
 
 from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.parts import part
 from tofuse.recordings.bags import (
     COLORS,
     ENCODINGS,
     GREY,
-    MAGIC,
     MAX_GAP_S,
     REMEDY,
     BagSource,
     Track,
     Transforms,
+    bag_kind,
     cloud,
     color_image,
     decompressed,
@@ -50,16 +49,10 @@ class Ros(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        if is_folder(path):
-            if is_file(path / "metadata.yaml") and files_with(path, ".db3", ".mcap", ".zstd"):
-                return Sniff(0.95, "metadata.yaml and a bag")
+        kind = bag_kind(path)
+        if kind is None:
             return None
-        head = read_head(path, 16)
-        if any(head.startswith(magic) for magic in MAGIC):
-            return Sniff(0.95, "a bag")
-        if path.suffix.lower() == ".db3" and head.startswith(b"SQLite format 3"):
-            return Sniff(0.95, "a bag")
-        return None
+        return Sniff(0.95, "metadata.yaml and a bag" if kind == "folder" else "a bag")
 
     def open(self, path: Path, options: ReaderOptions) -> RosSource:
         """See `Reader.open`."""

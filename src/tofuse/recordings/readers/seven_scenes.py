@@ -11,12 +11,12 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.images import first_size
-from tofuse.files.reading import is_file, is_folder, list_folder
+from tofuse.files.reading import files_named, is_file
 from tofuse.files.tables import read_numbers
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_pinhole
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, required
 from tofuse.recordings.sources import DepthImageSource, poses_from_files, read_matrix_pose
 
 FRAME_RATE_HZ = 30.0
@@ -37,9 +37,7 @@ class SevenScenes(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        numbered = _depth_files(path)
-        if not numbered:
-            raise InputError("has no frame-*.depth.png", where=path, remedy="check the path")
+        numbered = required(_depth_files(path), "frame-*.depth.png", path)
         numbers = np.array([number for number, _ in numbered])
         files = [file for _, file in numbered]
         color = [image for file in files if (image := _color(file)) is not None]
@@ -75,13 +73,7 @@ def read_pose(path: Path) -> Float64:
 
 
 def _depth_files(path: Path) -> list[tuple[int, Path]]:
-    if not is_folder(path):
-        return []
-    try:
-        matches = [(match, p) for p in list_folder(path) if (match := _DEPTH.fullmatch(p.name))]
-    except InputError:
-        return []
-    return sorted((int(match.group(1)), p) for match, p in matches)
+    return sorted((int(p.name[6:].split(".")[0]), p) for p in files_named(path, _DEPTH.fullmatch))
 
 
 def _color(file: Path) -> Path | None:

@@ -9,11 +9,11 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_file, is_folder, read_head, read_text
+from tofuse.files.reading import is_file, read_head, read_text
 from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, files_at, refuse_camera, required
 from tofuse.recordings.sources import FileSource, interpolated
 
 FRAME_RATE_HZ = 32.0
@@ -50,16 +50,12 @@ class Sr4000(Reader):
     def open(self, path: Path, options: ReaderOptions) -> Sr4000Source:
         """See `Reader.open`."""
         refuse_camera(options, "sr4000")
-        files = _files(path)
-        if not files:
-            raise InputError("has no .dat files", where=path, remedy="pass the export's folder")
-        return Sr4000Source(files)
+        remedy = "pass the export's folder"
+        return Sr4000Source(required(_files(path), ".dat files", path, remedy))
 
 
 def _files(path: Path) -> list[Path]:
-    if is_file(path):
-        return [path] if path.suffix.lower() == ".dat" else []
-    return files_with(path, ".dat") if is_folder(path) else []
+    return files_at(path, ".dat")
 
 
 class Sr4000Source(FileSource):

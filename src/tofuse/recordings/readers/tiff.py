@@ -12,7 +12,7 @@ from tofuse.files.reading import files_with, is_folder
 from tofuse.files.tiff import read_tiff
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
 from tofuse.recordings.sources import FileSource, depth_from_numbers, finite_float32
 
 _SUFFIXES = (".tif", ".tiff")
@@ -40,8 +40,7 @@ class Tiff(Reader):
         """See `Reader.open`."""
         files = files_with(path, *_SUFFIXES) if is_folder(path) else []
         depth = [f for f in files if _is_range(f)] or [f for f in files if not _is_other(f)]
-        if not depth:
-            raise InputError("has no .tif of depth", where=path, remedy="pass the folder of images")
+        required(depth, ".tif of depth", path, "pass the folder of images")
         if options.camera is None:
             raise InputError(
                 "has no camera: the layout of .t3c files isn't published, and TIFF has none",
