@@ -57,18 +57,12 @@ class Subject:
 @cache
 def subjects() -> dict[str, Subject]:
     """Return all subjects by name, except those whose optional packages are missing."""
-    import test_recordings_fuzz as plain
-    import test_recordings_fuzz_cameras as cameras
-
     import made_exports
-    import made_ifm
+    from camera_files import MAKERS, OTHERS
 
-    found = {
-        name: Subject(_in(make, "freiburg1"), _recording("freiburg1", name))
-        for name, make in plain.MAKERS.items()
-    }
-    for name, (make, file, format_) in cameras.MAKERS.items():
-        inside = f"original/{file}" if file else "original"
+    found = {}
+    for name, (make, file, format_) in (MAKERS | OTHERS).items():
+        inside = f"freiburg1/{file}" if file else "freiburg1"
         found[name] = Subject(_in(make, inside), _recording(inside, format_))
     found["redwood"] = Subject(_redwood, _recording("freiburg1", "redwood"))
     found["tiff"] = _with_camera(made_exports.make_tiff3d, "original", "tiff")
@@ -76,8 +70,7 @@ def subjects() -> dict[str, Subject]:
     for name in ("blaze", "royale"):
         make = getattr(made_exports, f"make_{name}")
         found[name] = Subject(_in(make, "original"), _recording("original", None))
-    h5 = _possible({"ifm-h5": made_ifm.make_h5}, lambda _name: "original/a.h5")
-    return found | h5 | _scans() | _bags() | _small() | _results()
+    return found | _scans() | _bags() | _small() | _results()
 
 
 def _redwood(folder: Path) -> None:

@@ -48,7 +48,7 @@ MAKERS: dict[str, tuple[Callable[[Path], object], str | None, str]] = {
 
 
 def make_mcap(path: Path) -> None:
-    bag = ros_bags.Bag(path, "mcap")
+    bag = ros_bags.Bag(path.parent, "mcap")
     bag.info("/camera/depth/camera_info")
     for k in range(3):
         bag.image(ros_bags.TOPIC, 10 + k, ros_bags.COUNTS[k], "16UC1")
@@ -76,7 +76,7 @@ OTHERS: dict[str, tuple[Callable[[Path], object], str | None, str]] = {
     "xyz": (damaged_files.make_xyz, None, "xyz"),
     "slam6d": (damaged_files.make_slam6d, None, "slam6d"),
     "h5": (made_ifm.make_h5, "a.h5", "ifm-h5"),
-    "mcap": (make_mcap, None, "ros"),
+    "mcap": (make_mcap, "a", "ros"),
     "realsense": (make_realsense, "a.bag", "realsense-bag"),
     "orbbec": (make_orbbec, "a.bag", "orbbec-bag"),
 }

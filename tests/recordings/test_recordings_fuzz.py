@@ -21,10 +21,7 @@ def made(name: str, folder: Path) -> tuple[Path, str]:
     """Write the recording of a maker into `folder`; return its path there, and its format."""
     make, file, format_ = EVERY[name]
     path = folder / "freiburg1" / (file or ".")
-    if file is not None or name == "mcap":
-        path.parent.mkdir(parents=True, exist_ok=True)
-    if name == "mcap":
-        path.mkdir(exist_ok=True)
+    (folder if file is None else path.parent).mkdir(parents=True, exist_ok=True)
     make(path)
     return path.relative_to(folder), format_
 
