@@ -1,4 +1,4 @@
-"""ROS bags and the messages of their topics, read by the package rosbags."""
+"""ROS bags by the package rosbags: topics, messages, and the tf tree."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Converting any recording to a native folder."""
+"""Converting any recording to a native folder, or to the layouts of TUM RGB-D and Open3D."""
 
 from __future__ import annotations
 

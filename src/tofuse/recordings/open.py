@@ -1,4 +1,4 @@
-"""Opening a recording: choice of the reader, and joining of several paths."""
+"""Opening a recording, again as it was opened before, or a single view of it by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""Organised clouds: points in rows and columns, on the rays of a camera's pixels."""
+"""The cameras of clouds that were images: organised ones, and deprojected ones.
+
+Organised clouds have points in rows and columns, on the rays of a camera's pixels. Programs that
+export a depth image as a cloud often drop the pixels without a measurement, and so the grid. The
+points are still on the rays of the pixels, whose slopes x/z and y/z form a lattice that is smoothly
+distorted by the lens. It is traced from its centre outwards: a polynomial from slopes to columns
+and rows is fitted to increasingly large parts of it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The interface of a reader."""
+"""The interface of a reader, and the files that a recording consists of."""
 
 from __future__ import annotations
 

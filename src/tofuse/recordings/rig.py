@@ -1,4 +1,4 @@
-"""rig.json: several cameras that are rigidly connected."""
+"""rig.json: rigidly connected cameras, and their recordings as one."""
 
 from __future__ import annotations
 

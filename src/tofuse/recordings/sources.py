@@ -1,4 +1,4 @@
-"""Sources for readers: files, pose files, joined recordings and depth limits."""
+"""Sources for readers: files, depth images, colour, pose files, joined recordings, depth limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reader of PLY clouds."""
+"""Readers of clouds: PLY, PCD (organised ones become images), plain text, and slam6D scans."""
 
 from __future__ import annotations
 

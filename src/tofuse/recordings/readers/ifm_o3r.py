@@ -1,4 +1,4 @@
-"""Reader of the PCIC buffers of ifm's O3R heads."""
+"""Readers of ifm's O3R heads: PCIC buffers, and .h5 recordings by the package h5py."""
 
 from __future__ import annotations
 

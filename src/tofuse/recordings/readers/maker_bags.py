@@ -1,4 +1,4 @@
-"""Bags of camera makers' viewers: ROS containers with proprietary messages."""
+"""Readers of bags of RealSense's and Orbbec's viewers: ROS containers with their own messages."""
 
 from __future__ import annotations
 
