@@ -221,7 +221,7 @@ class NpzSource(FileSource):
 
     def _text(
         self, arrays: dict[str, NDArray[Any]], name: str, default: str, choices: tuple[str, ...]
-    ) -> str:
+    ) -> Any:
         value = str(arrays[name]) if name in arrays else default
         if value not in choices:
             raise self._error(name, f"is {value!r:.60}", f"save one of {', '.join(choices)}")
