@@ -23,7 +23,7 @@ test: .venv/.ready          ## run the tests of up to a second and a half each, 
 	$(PYTEST) -m "not slow and not nightly"
 
 slow: .venv/.ready          ## run the tests of whole runs, clusters and killed processes, 10 to 15 minutes
-	$(PYTEST) -m slow
+	$(PYTEST) -m "slow and not nightly"
 
 nightly: .venv/.ready       ## run the tests of the pages in a browser
 	$(PYTEST) -m nightly

@@ -12,7 +12,6 @@ read-ahead, and prints frames per second. Finally prints the peak memory of the 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import resource
 import shutil
 import signal
@@ -28,12 +27,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests" / "helpers"), str(ROOT / "tests" / "recordings")]
 
-import test_recordings_fuzz as folders  # noqa: E402
-
-import camera_files as cameras  # noqa: E402
-import ros_bags as bags  # noqa: E402
+from camera_files import MAKERS, OTHERS  # noqa: E402
 from damaged_files import damage  # noqa: E402
-from made_cwipc import make_cwipc  # noqa: E402
 from tofuse.errors import TofuseError  # noqa: E402
 from tofuse.geometry.cameras import Pinhole  # noqa: E402
 from tofuse.recordings.frames import RangeFrame  # noqa: E402
@@ -43,25 +38,8 @@ from tofuse.recordings.open import open_recording  # noqa: E402
 LIMIT_S = 20
 
 
-def makers() -> dict[str, tuple[Callable[[Path], None], str | None]]:
-    found: dict[str, tuple[Callable[[Path], None], str | None]] = {
-        name: (make, None) for name, make in folders.MAKERS.items()
-    }
-    found |= {name: (make, file) for name, (make, file, _) in cameras.MAKERS.items()}
-    found |= {"cwipc": (make_cwipc, None)}
-    if importlib.util.find_spec("rosbags") is not None:
-        found |= {"realsense": (make_realsense, "a.bag"), "orbbec": (make_orbbec, "a.bag")}
-    return found
-
-
-def make_realsense(path: Path) -> None:
-    path.parent.mkdir(parents=True)
-    bags.real_sense(path.parent, "ros1", "None", name="Intel RealSense L515", color="rgb8")
-
-
-def make_orbbec(path: Path) -> None:
-    path.parent.mkdir(parents=True)
-    bags.orbbec(path.parent, (0.0,) * 8, color="jpeg", R=bags.T_COLOR[:3, :3])
+def makers() -> dict[str, tuple[Callable[[Path], object], str | None]]:
+    return {name: (make, file) for name, (make, file, _) in (MAKERS | OTHERS).items()}
 
 
 class TooSlowError(Exception):

@@ -57,18 +57,12 @@ class Subject:
 @cache
 def subjects() -> dict[str, Subject]:
     """Return all subjects by name, except those whose optional packages are missing."""
-    import test_recordings_fuzz as plain
-    import test_recordings_fuzz_cameras as cameras
-
     import made_exports
-    import made_ifm
+    from camera_files import MAKERS, OTHERS
 
-    found = {
-        name: Subject(_in(make, "freiburg1"), _recording("freiburg1", name))
-        for name, make in plain.MAKERS.items()
-    }
-    for name, (make, file, format_) in cameras.MAKERS.items():
-        inside = f"original/{file}" if file else "original"
+    found = {}
+    for name, (make, file, format_) in (MAKERS | OTHERS).items():
+        inside = f"freiburg1/{file}" if file else "freiburg1"
         found[name] = Subject(_in(make, inside), _recording(inside, format_))
     found["redwood"] = Subject(_redwood, _recording("freiburg1", "redwood"))
     found["tiff"] = _with_camera(made_exports.make_tiff3d, "original", "tiff")
@@ -76,8 +70,7 @@ def subjects() -> dict[str, Subject]:
     for name in ("blaze", "royale"):
         make = getattr(made_exports, f"make_{name}")
         found[name] = Subject(_in(make, "original"), _recording("original", None))
-    h5 = _possible({"ifm-h5": made_ifm.make_h5}, lambda _name: "original/a.h5")
-    return found | h5 | _scans() | _bags() | _small() | _results()
+    return found | _scans() | _bags() | _small() | _results()
 
 
 def _redwood(folder: Path) -> None:
@@ -229,7 +222,6 @@ def _possible(
 
 def _small() -> dict[str, Subject]:
     """Single files: graphs, poses, cameras, configurations, meshes, tracked frames."""
-    import made_cwipc
     from tofuse.batch.jobs import read_jobs
     from tofuse.calibration.lens_files import read_lens_file
     from tofuse.cli.batching import run_arguments
@@ -246,7 +238,6 @@ def _small() -> dict[str, Subject]:
     from tofuse.posegraph.g2o import read_g2o
     from tofuse.posegraph.given_loops import read_loops
     from tofuse.recordings.camera_file import read_camera_file
-    from tofuse.recordings.cwipc import read_cameras
     from tofuse.recordings.open import read_reference
     from tofuse.recordings.rig import read_rig
     from tofuse.results.types import FrameRecord
@@ -308,9 +299,6 @@ def _small() -> dict[str, Subject]:
         "camera.json": ("camera.json", json.dumps(_CAMERA), read_camera_file),
         "a lens": ("a.json", json.dumps(lens), read_lens_file),
         "rig.json": ("rig.json", json.dumps(rig), read_rig),
-        "cameraconfig.json": (
-            "cameraconfig.json", json.dumps(made_cwipc.config()), read_cameras
-        ),
         "loops": ("loops.txt", "0 3 0 0 0 0 0 0 1\n1 2\n", read_loops),
         "columns": ("imu.csv", "t,ax,ay\n" + "0.1,1,2\n" * 5, read_columns),
         "config": ("a.toml", toml, configure),

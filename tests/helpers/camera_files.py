@@ -8,20 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
+import damaged_files
 import made_arrays
 import made_dumps
 import made_exports
 import made_ifm
 import made_kinect
 import made_phones
+import made_recordings
 import made_sens
 import made_tof
+import ros_bags
 from tofuse.errors import TofuseError
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.open import open_recording
 
 # Function that writes a recording, name of its file (None: a folder), and its format.
-MAKERS: dict[str, tuple[Callable[[Path], None], str | None, str]] = {
+MAKERS: dict[str, tuple[Callable[[Path], object], str | None, str]] = {
     "3dscannerapp": (made_phones.make_scanner_app, None, "3dscannerapp"),
     "stray": (made_phones.make_stray, None, "stray"),
     "record3d": (made_phones.make_record3d, None, "record3d"),
@@ -41,6 +44,41 @@ MAKERS: dict[str, tuple[Callable[[Path], None], str | None, str]] = {
     "depth16": (made_dumps.make_depth16, None, "depth16"),
     "arducam": (made_tof.make_arducam, None, "arducam"),
     "aditof": (made_tof.make_aditof, "a.bin", "aditof"),
+}
+
+
+def make_mcap(path: Path) -> None:
+    bag = ros_bags.Bag(path.parent, "mcap")
+    bag.info("/camera/depth/camera_info")
+    for k in range(3):
+        bag.image(ros_bags.TOPIC, 10 + k, ros_bags.COUNTS[k], "16UC1")
+    bag.close()
+
+
+def make_realsense(path: Path) -> None:
+    ros_bags.real_sense(path.parent, "ros1", "None", name="Intel RealSense L515", color="yuyv")
+
+
+def make_orbbec(path: Path) -> None:
+    R = ros_bags.T_COLOR[:3, :3]
+    ros_bags.orbbec(path.parent, (0.0,) * 8, color="jpeg", R=R)
+
+
+# The same of formats with clouds, with a camera by name or in the recording, and of bags.
+OTHERS: dict[str, tuple[Callable[[Path], object], str | None, str]] = {
+    "native": (damaged_files.make_native, None, "native"),
+    "sr4000": (made_recordings.make_sr4000, None, "sr4000"),
+    "tum": (made_recordings.make_tum, None, "tum"),
+    "7scenes": (made_recordings.make_7scenes, None, "7scenes"),
+    "redwood": (made_recordings.make_redwood, None, "redwood"),
+    "pcd": (damaged_files.make_pcd, None, "pcd"),
+    "ply": (damaged_files.make_ply, None, "ply"),
+    "xyz": (damaged_files.make_xyz, None, "xyz"),
+    "slam6d": (damaged_files.make_slam6d, None, "slam6d"),
+    "h5": (made_ifm.make_h5, "a.h5", "ifm-h5"),
+    "mcap": (make_mcap, "a", "ros"),
+    "realsense": (make_realsense, "a.bag", "realsense-bag"),
+    "orbbec": (make_orbbec, "a.bag", "orbbec-bag"),
 }
 
 

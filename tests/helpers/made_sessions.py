@@ -15,7 +15,7 @@ from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
-from tofuse.recordings.opening import Opening
+from tofuse.recordings.open import Opening
 from tofuse.registration.search import SearchOptions
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result

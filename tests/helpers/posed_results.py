@@ -14,7 +14,7 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Camera
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
-from tofuse.recordings.opening import Opening
+from tofuse.recordings.open import Opening
 
 SIZE = (48, 36)
 

@@ -28,7 +28,7 @@ from tofuse.pipeline.run import exit_status
 from tofuse.pipeline.sessions import read_sessions
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.native import RecordingWriter
-from tofuse.recordings.opening import Opening
+from tofuse.recordings.open import Opening
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
 from tofuse.results.run_json import read_run_json

@@ -11,14 +11,12 @@ import numpy as np
 import pytest
 
 import made_exports as made
-from camera_files import read_through
-from damaged_files import damage
 from made_exports import BEHIND_M, CAMERA
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import read_ply, write_ply
 from tofuse.files.tiff import read_tiff
-from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.open import open_recording
 
 Maker = Callable[[Path], None]
@@ -40,7 +38,6 @@ def test_organised_clouds_become_images(tmp_path: Path, name: str) -> None:
     z = made.depths()
     for k in (2, 0):
         frame = recording[k]
-        assert isinstance(frame, RangeFrame)
         np.testing.assert_array_equal(frame.valid, z[k] > 0)
         np.testing.assert_allclose(frame.points, made.points(z)[k][z[k] > 0], atol=off)
         if name == "royale":
@@ -130,7 +127,6 @@ def test_tiff3d_with_camera(tmp_path: Path) -> None:
     z = made.depths()
     for k in range(3):
         frame = recording[k]
-        assert isinstance(frame, RangeFrame)
         assert (frame.depth_kind, frame.ambiguity_m) == ("range", 7.5)
         np.testing.assert_allclose(frame.points, made.points(z)[k][z[k] > 0], atol=1e-5)
         np.testing.assert_array_equal(frame.amplitude_image, made.amplitudes()[k])
@@ -147,7 +143,6 @@ def test_other_tiffs_are_depth_on_request(tmp_path: Path) -> None:
         open_recording(folder)
     camera = camera_json(tmp_path, depth_unit_m=1e-4, depth_kind="z")
     frame = open_recording(folder, format="tiff", camera=camera)[0]
-    assert isinstance(frame, RangeFrame)
     assert frame.amplitude_image is None
     counts[0, 0] = 0
     np.testing.assert_allclose(frame.z, counts * 1e-4, rtol=1e-6)
@@ -172,24 +167,6 @@ def test_damaged_tiffs_are_refused(tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(InputError, match=problem):
             read_tiff(path)
-
-
-@pytest.mark.slow
-def test_damage_raises_only_package_errors(tmp_path: Path) -> None:
-    original = tmp_path / "a"
-    made.make_tiff3d(original)
-    camera = camera_json(tmp_path)
-    contents = {p: p.read_bytes() for p in sorted(original.iterdir())}
-    seen = np.zeros(3, int)
-    for k in range(40):
-        damage(sorted(original.iterdir()), np.random.default_rng([320, k]))
-        seen += read_through(original, None, camera)
-        for file, content in contents.items():
-            if file.is_dir():
-                file.rmdir()
-            file.write_bytes(content)
-    assert seen[0] > 0
-    assert seen[1] + seen[2] > 0
 
 
 @pytest.mark.parametrize("inside", [False, True])

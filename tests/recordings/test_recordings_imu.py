@@ -26,14 +26,12 @@ def test_each_frame_uses_nearest_samples():
     at = np.arange(-0.3, 2.0, 0.01)
     felt = np.where((at < 0.5)[:, None], UP, -UP) * 9.81
     found = gravity_at(times, columns(at, felt))
-    assert found is not None
     np.testing.assert_allclose(found[:, :3], [-UP, UP, UP], atol=1e-12)
     assert (found[:, 3] < 0.005).all()
     # In units of g, or as fused by the phone: the same.
     np.testing.assert_allclose(gravity_at(times, columns(at, felt / 9.81)), found, atol=1e-12)
     fused = {f"gravity_{axis}": -felt[:, k] for k, axis in enumerate("xyz")}
     fused_found = gravity_at(times, {"timestamp": at, **fused})
-    assert fused_found is not None
     np.testing.assert_allclose(fused_found[:, :3], found[:, :3], atol=1e-12)
 
 
@@ -44,7 +42,6 @@ def test_variation_along_gravity_estimates_the_error():
     moved = 9.81 * UP + 0.8 * rng.standard_normal((200, 3))
     for felt, low, high in ((still, 0.002, 0.006), (moved, 0.06, 0.13)):
         found = gravity_at(times, columns(times, felt))
-        assert found is not None
         assert low < np.median(found[:, 3]) < high
         away = np.linalg.norm(found[:, :3] + UP, axis=1)
         # Two perpendicular directions, each with that sigma.
@@ -55,12 +52,10 @@ def test_missing_measurements_are_unknown():
     times = np.array([0.0, 10.0, 20.0])
     felt = np.stack([9.81 * UP, 9.81 * UP, [np.nan, 0, 0]])
     found = gravity_at(times, columns(np.array([0.1, 14.0, 20.0]), felt))
-    assert found is not None
     assert np.isfinite(found).all(1).tolist() == [True, False, False]
     assert gravity_at(times, {"timestamp": times, "temperature": times}) is None
     assert gravity_at(times, {"ax": times, "ay": times, "az": times}) is None
     falling = gravity_at(times, columns(times, np.stack([9.81 * UP, 9.81 * UP, 0.1 * UP])))
-    assert falling is not None
     assert np.isfinite(falling).all(1).tolist() == [True, True, False]
 
 
@@ -76,13 +71,10 @@ def test_gravity_of_native_recordings_and_selections(tmp_path: Path):
     felt = np.tile(9.81 * UP, (4, 1))
     recording = open_recording(folder(tmp_path / "a", columns(np.arange(4) / 10, felt)))
     assert recording.warnings == []
-    assert recording.gravity is not None
     np.testing.assert_allclose(recording.gravity[:, :3], np.tile(-UP, (4, 1)), atol=1e-9)
     chosen = recording.select(1, None, 2).gravity
-    assert chosen is not None
     assert chosen.shape == (2, 4)
     joined = open_recording(tmp_path / "a", folder(tmp_path / "b", {"strange": np.zeros(3)}))
-    assert joined.gravity is not None
     assert np.isfinite(joined.gravity).all(1).tolist() == [True] * 4 + [False] * 4
     assert any("gravity is unknown" in warning for warning in joined.warnings)
 
@@ -90,7 +82,6 @@ def test_gravity_of_native_recordings_and_selections(tmp_path: Path):
 def test_samples_of_zero_leave_gravity_unknown(tmp_path: Path):
     zeros = columns(np.arange(4) / 10, np.zeros((4, 3)))
     recording = open_recording(folder(tmp_path / "a", zeros))
-    assert recording.gravity is not None
     assert not np.isfinite(recording.gravity).any()
     (warning,) = recording.warnings
     assert warning.endswith("imu.csv: has no samples other than zero near the time of any frame")
@@ -104,7 +95,6 @@ def test_simulated_accelerometer_gives_camera_tilt(tmp_path: Path):
     rate = made.sequence.frame_rate_hz
     times = made.raw / rate
     found = gravity_at(times, accelerations(made.sequence, times[0], times[-1], 0))
-    assert found is not None
     seen = np.einsum("kij,kj->ki", made.poses[:, :3, :3], found[:, :3])
     mean = seen.mean(0) / np.linalg.norm(seen.mean(0))
     assert np.degrees(np.linalg.norm(seen - mean, axis=1)).max() < 2
@@ -115,8 +105,6 @@ def test_simulated_accelerometer_gives_camera_tilt(tmp_path: Path):
 
 def test_accelerometer_of_phone_agrees_with_its_poses(shared_data):
     recording = open_recording(shared_data / "iphone_stray")
-    assert recording.gravity is not None
-    assert recording.reference is not None
     known = np.isfinite(recording.gravity).all(1)
     assert known.mean() > 0.9
     T, d = recording.reference[known], recording.gravity[known]

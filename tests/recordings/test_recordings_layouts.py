@@ -11,8 +11,8 @@ import tofuse
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
 from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, RayTable, points_from_z
+from tofuse.recordings.convert import convert_to
 from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.recordings.layouts import convert_to
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.recordings.rectify import Rectifier, pinhole_of
 
@@ -23,7 +23,7 @@ NORMAL, DISTANCE = np.array([0.2, -0.1, 0.97]), 1.8
 
 def plane_depth(camera: object) -> np.ndarray:
     """z of a tilted plane at each pixel."""
-    rays = camera.rays().astype(float)  # type: ignore[attr-defined]
+    rays = camera.rays().astype(float)
     slope = rays @ NORMAL[:2] + NORMAL[2]
     z = DISTANCE / slope
     return np.where(np.isfinite(z) & (z > 0) & (z < 20), z, 0).astype(np.float32)
@@ -31,8 +31,8 @@ def plane_depth(camera: object) -> np.ndarray:
 
 @pytest.mark.parametrize("camera", [BARREL, WIDE, RayTable(np.array(BARREL.rays()))])
 def test_rectified_plane_stays_planar(camera: object) -> None:
-    frame = RangeFrame(0, 0.0, camera, plane_depth(camera))  # type: ignore[arg-type]
-    pinhole = pinhole_of(camera)  # type: ignore[arg-type]
+    frame = RangeFrame(0, 0.0, camera, plane_depth(camera))
+    pinhole = pinhole_of(camera)
     out = Rectifier(pinhole)(frame)
     points = points_from_z(pinhole, out.z)[out.valid].astype(float)
     assert len(points) > 0.8 * out.depth.size
@@ -88,15 +88,11 @@ def test_tum_is_read_back(tmp_path: Path) -> None:
     back = tofuse.open(tmp_path / "out", camera=tmp_path / "out" / "lens.json")
     assert (back.format, len(back)) == ("tum", 4)
     assert back.timestamps == pytest.approx(recording.timestamps)
-    expected = Rectifier(pinhole_of(BARREL))(recording[1])  # type: ignore[arg-type]
+    expected = Rectifier(pinhole_of(BARREL))(recording[1])
     frame = back[1]
-    assert isinstance(frame, RangeFrame)
     assert np.abs(frame.z - expected.z).max() < 1.1e-4
     assert frame.camera == pinhole_of(BARREL)
-    assert frame.color_image is not None
     assert frame.color_image.max() == 255
-    assert recording.reference is not None
-    assert back.reference is not None
     assert np.allclose(back.reference[[0, 1, 3]], recording.reference[[0, 1, 3]])
     assert np.isnan(back.reference[2]).all()
 
@@ -107,12 +103,10 @@ def test_open3d_is_read_back(tmp_path: Path) -> None:
     back = tofuse.open(tmp_path / "out")
     assert back.format == "redwood"
     frame = back[3]
-    assert isinstance(frame, RangeFrame)
-    expected = Rectifier(pinhole_of(BARREL))(recording[3])  # type: ignore[arg-type]
+    expected = Rectifier(pinhole_of(BARREL))(recording[3])
     assert np.abs(frame.z - expected.z).max() < 6e-4
     assert frame.camera == pinhole_of(BARREL)
     assert np.diff(back.timestamps) == pytest.approx(0.1, abs=1e-5)
-    assert back.reference is not None
     assert np.allclose(back.reference[3][:3, 3], [0.3, 0, 0])
 
 

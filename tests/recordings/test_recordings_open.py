@@ -47,7 +47,6 @@ def test_several_paths_are_joined_in_given_order(tmp_path: Path) -> None:
     assert [f.index for f in recording] == [0, 1, 2, 3, 4]
     np.testing.assert_allclose(recording.timestamps, [0, 0.1, 0.2, 0.3, 0.4])
     assert [f.timestamp for f in recording] == recording.timestamps.tolist()
-    assert recording.reference is not None
     assert np.isfinite(recording.reference[:, 0, 0]).tolist() == [True] * 3 + [False] * 2
     assert recording.metadata["parts"] == [{"name": "b", "frames": 3}, {"name": "a", "frames": 2}]
 
@@ -100,7 +99,7 @@ def test_limits_of_depth(tmp_path: Path) -> None:
     assert [len(f) for f in recording] == [0, 1200, 0]
     for limits in ({"min_depth": -1.0}, {"max_depth": float("nan")}):
         with pytest.raises(InputError, match="depth"):
-            open_recording(folder, **limits)  # type: ignore[arg-type]
+            open_recording(folder, **limits)
     with pytest.raises(InputError, match="smaller one first"):
         open_recording(folder, min_depth=2.0, max_depth=1.0)
 

@@ -41,7 +41,6 @@ def test_sr4000_corridor(shared_data: Path) -> None:
     assert (np.diff(recording.timestamps) > 0.02).all()
     boxes = []
     for k, frame in enumerate(recording):
-        assert isinstance(frame, RangeFrame)
         assert isinstance(frame.camera, RayTable)
         station, number = divmod(k, 4)
         path = shared_data / "sr4000_corridor" / f"Y{station + 1}" / f"frm_{number + 1:04d}.dat"
@@ -66,7 +65,6 @@ def test_kinectv2_clouds_match_images(shared_data: Path) -> None:
     for k in range(2):
         image, cloud = native[k], clouds[k]
         assert isinstance(image, RangeFrame)
-        assert isinstance(cloud, RangeFrame)
         assert isinstance(cloud.camera, Pinhole)
         np.testing.assert_array_equal(image.valid, cloud.valid)
         assert np.abs(image.points - cloud.points).max() < 0.001
@@ -74,14 +72,12 @@ def test_kinectv2_clouds_match_images(shared_data: Path) -> None:
         assert cloud.camera.fx == pytest.approx(365.7449, abs=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sevenscenes_kitchen(shared_data: Path) -> None:
     recording = open_recording(shared_data / "sevenscenes_kitchen")
     assert (recording.format, len(recording)) == ("7scenes", 500)
-    assert recording.reference is not None
     assert np.isfinite(recording.reference).all()
     frame = recording[0]
-    assert isinstance(frame, RangeFrame)
     assert frame.camera == Pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
     T = inverse(recording.reference[0]) @ recording.reference[10]
     assert overlap(recording, 0, 10, T, 0.02) > 0.9
@@ -89,26 +85,24 @@ def test_sevenscenes_kitchen(shared_data: Path) -> None:
     assert overlap(recording, 0, 10, inverse(T), 0.02) < 0.5
 
 
+@pytest.mark.nightly
 def test_open3d_rgbd5(shared_data: Path) -> None:
     recording = open_recording(shared_data / "open3d_rgbd5")
     assert (recording.format, len(recording)) == ("redwood", 5)
     frame = recording[4]
-    assert isinstance(frame, RangeFrame)
     assert frame.camera == Pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
     assert frame.color_image is not None
-    assert recording.reference is not None
-    assert recording.odometry is not None
     for poses in (recording.reference, recording.odometry):
         T = inverse(poses[0]) @ poses[4]
         assert overlap(recording, 0, 4, T, 0.02) > 0.9
         assert overlap(recording, 0, 4, inverse(T), 0.02) < 0.4
 
 
+@pytest.mark.nightly
 def test_pcl_pairwise(shared_data: Path) -> None:
     recording = open_recording(shared_data / "pcl_pairwise")
     assert (recording.format, len(recording)) == ("pcd", 5)
     for k, frame in enumerate(recording):
-        assert isinstance(frame, RangeFrame)
         assert isinstance(frame.camera, Pinhole)
         assert (frame.camera.fx, frame.camera.cx) == pytest.approx((525, 319.5), abs=0.001)
         assert 2e5 < len(frame) < 3e5
@@ -118,7 +112,7 @@ def test_pcl_pairwise(shared_data: Path) -> None:
             assert struct.unpack_from("<I", data, body + 4)[0] == 640 * 480 * 12
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_slam6d_scans(shared_data: Path) -> None:
     recording = open_recording(shared_data / "slam6d_scans")
     assert (recording.format, len(recording)) == ("slam6d", 3)
@@ -137,6 +131,7 @@ def test_slam6d_scans(shared_data: Path) -> None:
         assert with_pose > overlap(recording, k, k + 1, turned, 0.1)
 
 
+@pytest.mark.nightly
 def test_lidar_pair_gt(shared_data: Path) -> None:
     recording = open_recording(shared_data / "lidar_pair_gt")
     assert (recording.format, len(recording)) == ("ply", 2)
@@ -154,7 +149,7 @@ def test_unknown_formats_are_refused(shared_data: Path, name: str) -> None:
         open_recording(shared_data / name)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("name", "format_", "sensor"),
     [

@@ -10,8 +10,14 @@ import pytest
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.lab.simulation.paths import rotation
-from tofuse.recordings.rig import Disagreement, Rig, RigCamera, read_rig, write_rig
-from tofuse.recordings.rig_source import with_range_added
+from tofuse.recordings.rig import (
+    Disagreement,
+    Rig,
+    RigCamera,
+    read_rig,
+    with_range_added,
+    write_rig,
+)
 
 
 def made() -> Rig:

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import errno
 import gc
-import importlib
 import os
-import sqlite3
 import struct
+import sys
 import tempfile
-from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from camera_files import read_through
-from damaged_files import damage
 from ros_bags import (
     COLOR_LENS,
     COLOR_U,
@@ -38,10 +32,9 @@ from tofuse.errors import InputError
 from tofuse.files.images import png_bytes
 from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, Rational
 from tofuse.geometry.se3 import exp, inverse, log
-from tofuse.recordings import bags
-from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.open import open_recording
-from tofuse.recordings.readers.realsense_bag import RealSenseSource
+from tofuse.recordings.readers.maker_bags import RealSenseSource
 
 KINDS = ("ros1", "ros2", "mcap")
 
@@ -62,7 +55,6 @@ def test_depth_images(tmp_path: Path, kind: str) -> None:
     assert any("/camera/color/depth_like" in line for line in recording.warnings)
     for k in (0, 1, 2, 1):  # in order, and back
         frame = recording[k]
-        assert isinstance(frame, RangeFrame)
         assert frame.camera == BrownConrady(16, 12, 20.0, 21.0, 7.5, 5.5, k1=0.1, k2=0.02)
         np.testing.assert_allclose(frame.z, COUNTS[k] / 1000, rtol=1e-6)
         assert frame.timestamp == recording.timestamps[k]
@@ -75,7 +67,6 @@ def test_metres_and_a_fisheye(tmp_path: Path) -> None:
     image[0, 0] = np.nan
     bag.image("/tof/depth/image_raw", 10, image, "32FC1")
     frame = open_recording(bag.close())[0]
-    assert isinstance(frame, RangeFrame)
     assert isinstance(frame.camera, Fisheye)
     assert frame.camera.k2 == 0.01
     assert not frame.valid[0, 0]
@@ -91,17 +82,14 @@ def test_compressed_depth(tmp_path: Path) -> None:
     bag.compressed(topic, 10, head + png_bytes(COUNTS[0]), "16UC1; compressedDepth png")
     recording = open_recording(bag.close())
     frame = recording[0]
-    assert isinstance(frame, RangeFrame)
     np.testing.assert_allclose(frame.z, COUNTS[0] / 1000, rtol=1e-6)
     # Floats are stored as a / depth + b.
     a, b = 4000.0, -10.0
     second = Bag(tmp_path / "second", "ros1") if (tmp_path / "second").mkdir() is None else None
-    assert second is not None
     second.info("/a/depth/camera_info")
     data = struct.pack("<Iff", 0, a, b) + png_bytes(COUNTS[1])
     second.compressed(topic, 10, data, "32FC1; compressedDepth png")
     frame = open_recording(second.close())[0]
-    assert isinstance(frame, RangeFrame)
     np.testing.assert_allclose(frame.z, a / (COUNTS[1] - b), rtol=1e-5)
 
 
@@ -131,7 +119,6 @@ def test_organised_clouds_become_images(tmp_path: Path) -> None:
     recording = open_recording(bag.close())
     for k in (0, 3):
         frame = recording[k]
-        assert isinstance(frame, RangeFrame)
         np.testing.assert_allclose(frame.z[frame.valid], z[k][np.isfinite(z[k])], rtol=1e-6)
         assert frame.valid.sum() == 191
         np.testing.assert_allclose(frame.camera.rays()[4, 9], (1.5 / 20, -1.5 / 21), atol=1e-5)
@@ -151,7 +138,6 @@ def test_infrared_of_same_pixels_is_the_amplitude(tmp_path: Path) -> None:
     assert recording.metadata["amplitude_topic"] == "/camera/ir/image_raw"
     for k, expected in ((0, bright[0]), (1, np.zeros((12, 16))), (2, bright[2])):
         frame = recording[k]
-        assert isinstance(frame, RangeFrame)
         np.testing.assert_array_equal(frame.amplitude_image, expected)
 
 
@@ -166,7 +152,6 @@ def test_topic_can_be_chosen(tmp_path: Path) -> None:
     recording = open_recording(path, topic="/b/depth/image_raw")
     assert recording.warnings == []
     frame = recording[0]
-    assert isinstance(frame, RangeFrame)
     np.testing.assert_allclose(frame.z, COUNTS[1] / 1000, rtol=1e-6)
     with pytest.raises(InputError, match=r"has no images or clouds at /c .*/a/depth/image_raw"):
         open_recording(path, topic="/c")
@@ -194,7 +179,6 @@ def check_colors(found: np.ndarray | None, expected: np.ndarray, off: int = 0) -
 
     Occlusion depends on the assumed size of points, so single pixels may differ.
     """
-    assert found is not None
     both = found.any(-1) & expected.any(-1)
     assert np.abs(found[both].astype(int) - expected[both]).max() <= off
     assert both.sum() > 0.8 * expected.any(-1).sum()
@@ -210,7 +194,6 @@ def test_realsense_bags(tmp_path: Path, kind: str) -> None:
     assert recording.metadata["sensor"] == "Intel RealSense L515"
     for k in (0, 2, 1):
         frame = recording[k]
-        assert isinstance(frame, RangeFrame)
         assert frame.camera == Pinhole(16, 12, 20.0, 21.0, 7.5, 5.5)
         np.testing.assert_allclose(frame.z, COUNTS[k] * 0.00025, rtol=1e-6)
         np.testing.assert_array_equal(frame.amplitude_image, COUNTS[k] % 250)
@@ -219,7 +202,6 @@ def test_realsense_bags(tmp_path: Path, kind: str) -> None:
 def test_realsense_stereo_and_lenses(tmp_path: Path) -> None:
     path = real_sense(tmp_path, "ros2", "Inverse Brown Conrady", name="Intel RealSense D435")
     frame = open_recording(path)[0]
-    assert isinstance(frame, RangeFrame)
     assert frame.amplitude_image is None  # infrared of another viewpoint
     brown = BrownConrady(16, 12, 20.0, 21.0, 7.5, 5.5, 0.1, 0.02, 0.001, -0.002, 0.01)
     straight = np.array([(3 - 7.5) / 20, (9 - 5.5) / 21, 1.0])
@@ -240,10 +222,8 @@ def test_realsense_color_matches_points(tmp_path: Path, kind: str, encoding: str
     expected = expected_colors(STEP * 0.00025, T_COLOR @ inverse(T_DEPTH))
     for k in (0, 2):
         frame = recording[k]
-        assert isinstance(frame, RangeFrame)
         check_colors(frame.color_image, expected, off)
     without = recording[1]
-    assert isinstance(without, RangeFrame)
     assert without.color_image is None
 
 
@@ -254,7 +234,6 @@ def test_realsense_color_with_inverse_distortion(tmp_path: Path) -> None:
     path = real_sense(tmp_path, "ros2", "None", name=name, color="rgb8", distortion=k)
     source = open_recording(path).source
     assert isinstance(source, RealSenseSource)
-    assert source.color_camera is not None
     lens = source.color_camera.camera
     stated = BrownConrady(48, 40, 40.0, 41.0, 23.0, 20.0, k[0], k[1], k[2], k[3], k[4])
     slopes = np.stack([(COLOR_U - 23.0) / 40, (COLOR_V - 20.0) / 41, 0.0 * COLOR_U + 1], -1)
@@ -266,7 +245,6 @@ def test_realsense_color_with_inverse_distortion(tmp_path: Path) -> None:
 def test_orbbec_color_without_pose_is_ignored(tmp_path: Path) -> None:
     recording = open_recording(orbbec(tmp_path, (0.0,) * 8, color="jpeg", R=np.zeros((3, 3))))
     frame = recording[0]
-    assert isinstance(frame, RangeFrame)
     assert frame.color_image is None
     assert ["colour is ignored" in line for line in recording.warnings] == [True]
 
@@ -275,7 +253,6 @@ def test_orbbec_color_without_pose_is_ignored(tmp_path: Path) -> None:
 def test_orbbec_color_matches_points(tmp_path: Path, encoding: str, off: int) -> None:
     R = T_COLOR[:3, :3] * 0.999  # as stored
     frame = open_recording(orbbec(tmp_path, (0.0,) * 8, color=encoding, R=R))[2]
-    assert isinstance(frame, RangeFrame)
     check_colors(frame.color_image, expected_colors(STEP * 0.00025, T_COLOR), off)
 
 
@@ -286,28 +263,10 @@ def test_orbbec_bags(tmp_path: Path) -> None:
     assert np.diff(recording.timestamps) == pytest.approx(1 / 15, abs=1e-6)
     for index in (0, 2, 1):
         frame = recording[index]
-        assert isinstance(frame, RangeFrame)
         assert isinstance(frame.camera, Rational)
         assert (frame.camera.k3, frame.camera.p1) == pytest.approx((1.4, 0.0001))
         np.testing.assert_allclose(frame.z, COUNTS[index] / 1000, rtol=1e-6)
         np.testing.assert_array_equal(frame.amplitude_image, COUNTS[index] // 2)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("maker", ["realsense", "orbbec"])
-def test_damaged_bags_of_manufacturers(tmp_path: Path, maker: str) -> None:
-    if maker == "realsense":
-        path = real_sense(tmp_path, "ros1", "None", name="Intel RealSense L515", color="yuyv")
-    else:
-        path = orbbec(tmp_path, (0.0,) * 8, color="jpeg", R=T_COLOR[:3, :3])
-    content, seen = path.read_bytes(), np.zeros(3, int)
-    for k in range(15):
-        damage([path], np.random.default_rng([102, k]))
-        seen += read_through(path, f"{maker}-bag")
-        if path.is_dir():
-            path.rmdir()
-        path.write_bytes(content)
-    assert seen[1] + seen[2] > 0
 
 
 def test_missing_topics_are_named(tmp_path: Path) -> None:
@@ -324,26 +283,6 @@ def test_missing_topics_are_named(tmp_path: Path) -> None:
         open_recording(bag.close())
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_damage_raises_only_package_errors(tmp_path: Path, kind: str) -> None:
-    bag = Bag(tmp_path, kind)
-    bag.info("/camera/depth/camera_info")
-    for k in range(3):
-        bag.image(TOPIC, 10 + k, COUNTS[k], "16UC1")
-    path = bag.close()
-    files = sorted(p for p in tmp_path.rglob("*") if p.is_file())
-    contents = [p.read_bytes() for p in files]
-    seen = np.zeros(3, int)
-    for k in range(15):
-        damage(files, np.random.default_rng([101, k]))
-        seen += read_through(path, "ros")
-        for file, content in zip(files, contents, strict=True):
-            if file.is_dir():
-                file.rmdir()
-            file.write_bytes(content)
-    assert seen[2] + seen[1] > 0
-
-
 def fifo(path: Path) -> None:
     if not hasattr(os, "mkfifo"):
         pytest.skip("no FIFOs on this system")
@@ -351,103 +290,34 @@ def fifo(path: Path) -> None:
     os.mkfifo(path)
 
 
-HOSTILE: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "metadata is a FIFO": ("not a regular file", lambda bag: fifo(bag / "metadata.yaml")),
-    "data is a FIFO": ("not a regular file", lambda bag: fifo(bag / "a.db3")),
-    "parts that double": (
-        "refers to its own parts",
-        lambda bag: (bag / "metadata.yaml").write_text(
-            "a0: &a0 {x: 1}\n"
-            + "".join(f"a{k + 1}: &a{k + 1} {{<<: [*a{k}, *a{k}]}}\n" for k in range(40))
-        ),
-    ),
-    "brackets": ("nested too deeply", lambda bag: (bag / "metadata.yaml").write_text("[" * 10**4)),
-    "too long": (
-        "more than the limit of 16 MiB",
-        lambda bag: os.truncate(bag / "metadata.yaml", 1 << 30),
-    ),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", HOSTILE)
-def test_hostile_folders_are_rejected(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["metadata.yaml", "a.db3"])
+def test_fifos_in_folders_are_rejected(tmp_path: Path, name: str) -> None:
     bag = Bag(tmp_path, "ros2")
-    bag.info("/camera/depth/camera_info")
-    bag.image(TOPIC, 10, COUNTS[0], "16UC1")
+    depth_bag(bag)
     path = bag.close()
-    message, corrupt = HOSTILE[name]
-    corrupt(path)
+    fifo(path / name)
     for format_ in ("ros", "realsense-bag"):
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(InputError, match="not a regular file"):
             open_recording(path, format=format_)
 
 
 @pytest.mark.parametrize(
     ("kind", "packed"),
     [("ros1", "BZ2"), ("ros1", "LZ4"), ("mcap", "STORAGE"), ("mcap", "MESSAGE"),
-     ("ros2", "MESSAGE")],
+     ("ros2", "MESSAGE"), ("ros2", "FILE"), ("mcap", "FILE")],
 )  # fmt: skip
-def test_chunks_that_expand_too_much_are_rejected(
+def test_compressed_bags(
     tmp_path: Path, kind: str, packed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bag = Bag(tmp_path, kind, packed)
-    bag.info("/camera/depth/camera_info")
-    for k in range(3):
-        bag.image(TOPIC, 10 + k, COUNTS[k], "16UC1")
-    path = bag.close()
-    frame = open_recording(path)[2]
-    assert isinstance(frame, RangeFrame)
-    np.testing.assert_allclose(frame.z, COUNTS[2] / 1000, rtol=1e-6)
-    monkeypatch.setattr(bounded_bags(), "MAX_CHUNK_BYTES", 100)
-    monkeypatch.setattr(bounded_bags(), "MAX_RATIO", 10**6)
-    with pytest.raises(InputError, match="more than 100 bytes"):
-        open_recording(path)
-
-
-def bounded_bags() -> Any:
-    return importlib.import_module("tofuse.recordings.bounded_bags")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["ros2", "mcap"])
-def test_compressed_files(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are decompressed into a temporary folder, which is removed, up to a limit."""
+    """Compressed files are decompressed into a temporary folder, which is removed."""
     (temporary := tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    bag = Bag(tmp_path, kind, "FILE")
+    bag = Bag(tmp_path, kind, packed)
     depth_bag(bag)
-    path = bag.close()
-    before = {file.name: file.read_bytes() for file in path.iterdir()}
-    recording = open_recording(path)
-    frame = recording[2]
-    assert isinstance(frame, RangeFrame)
-    np.testing.assert_allclose(frame.z, COUNTS[2] / 1000, rtol=1e-6)
-    assert len(list(temporary.iterdir())) == 1
+    recording = open_recording(bag.close())
+    np.testing.assert_allclose(recording[2].z, COUNTS[2] / 1000, rtol=1e-6)
     del recording
     gc.collect()
-    assert list(temporary.iterdir()) == []
-    assert {file.name: file.read_bytes() for file in path.iterdir()} == before
-
-    limits = bounded_bags()
-    (file,) = path.glob("*.zstd")
-    monkeypatch.setattr(limits, "MAX_CHUNK_BYTES", 4 << 20)
-    content = file.read_bytes()
-    file.write_bytes(limits.zstd.compress(bytes(300 << 20)))
-    assert file.stat().st_size * limits.MAX_RATIO < 8 << 20
-    for format_ in ("ros", "realsense-bag", None):
-        with pytest.raises(InputError, match=r"GB; convert it to a bag without compression"):
-            open_recording(path, format=format_)
-        assert list(temporary.iterdir()) == []
-
-    # A small file that is listed many times is limited, too.
-    file.write_bytes(content)
-    metadata = path / "metadata.yaml"
-    text = metadata.read_text()
-    (line,) = (line for line in text.splitlines(True) if line.strip() == f"- {file.name}")
-    metadata.write_text(text.replace(line, line * 2000))
-    with pytest.raises(InputError, match="expands to more than"):
-        open_recording(path)
     assert list(temporary.iterdir()) == []
 
 
@@ -459,58 +329,9 @@ def test_no_space_for_decompressed_files(tmp_path: Path, monkeypatch: pytest.Mon
     def full(*_words: object, **_options: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(bounded_bags(), "TemporaryDirectory", full)
+    monkeypatch.setattr(tempfile, "mkdtemp", full)
     with pytest.raises(InputError, match=r"no space for the decompressed files .* TMPDIR"):
         open_recording(path)
-
-
-def test_chunks_with_excessive_total_size_are_rejected(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Chunks with forged times would all be in memory at once."""
-    bag = Bag(tmp_path, "mcap", "STORAGE")
-    bag.info("/camera/depth/camera_info")
-    for k in range(8):
-        bag.image(TOPIC, 10 + k, np.zeros((1200, 1600), np.uint16), "16UC1")
-    path = bag.close()
-    (file,) = path.glob("*.mcap")
-    assert file.stat().st_size < 50_000
-    monkeypatch.setattr(bounded_bags(), "MAX_CHUNK_BYTES", 10 << 20)
-    for each in (path, file):
-        with pytest.raises(InputError, match=r"\.mcap: expands to more than 0.0105 GB"):
-            open_recording(each)
-
-
-DATABASES = {
-    "a view": "CREATE VIEW more AS WITH RECURSIVE c(x) AS"
-    " (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x FROM c",
-    "a virtual table": "CREATE VIRTUAL TABLE more USING fts5(x)",
-    "topics twice": "CREATE TABLE t AS SELECT * FROM topics; DROP TABLE topics;"
-    "ALTER TABLE t RENAME TO topics; INSERT INTO topics SELECT * FROM topics",
-}
-
-
-@pytest.mark.parametrize("name", DATABASES)
-def test_databases_with_excessive_rows_are_rejected(tmp_path: Path, name: str) -> None:
-    bag = Bag(tmp_path, "ros2")
-    depth_bag(bag)
-    path = bag.close()
-    (file,) = path.glob("*.db3")
-    with closing(sqlite3.connect(file)) as db:
-        db.executescript(DATABASES[name])
-        db.commit()
-    for each in (path, file):
-        with pytest.raises(InputError, match="is not a database of ROS messages"):
-            open_recording(each)
-
-
-def test_decompressors_of_rosbags_are_unchanged() -> None:
-    mcap = pytest.importorskip("rosbags.rosbag2.storage_mcap")
-    limits = bounded_bags()
-    assert set(limits._mcap.DECOMPRESSORS) == set(mcap.DECOMPRESSORS)
-    for name in ("lz4", "zstd"):
-        assert mcap.DECOMPRESSORS[name].__module__ == mcap.__name__
-        assert limits._mcap.DECOMPRESSORS[name].__module__ == limits.__name__
 
 
 def test_missing_rosbags_is_reported_with_remedy(
@@ -518,15 +339,8 @@ def test_missing_rosbags_is_reported_with_remedy(
 ) -> None:
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(4096))
 
-    found = importlib.import_module
-
-    def missing(name: str) -> Any:
-        if name == "tofuse.recordings.bounded_bags":  # which imports rosbags
-            raise ImportError(name)
-        return found(name)
-
-    monkeypatch.setattr(bags.importlib, "import_module", missing)
-    with pytest.raises(InputError, match=r"is a ROS bag; run `pip install 'tofuse\[ros\]'`"):
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(InputError, match=r"needs the package rosbags.*pip install 'tofuse\[ros\]'"):
         open_recording(tmp_path / "a.bag")
 
 
@@ -571,7 +385,6 @@ def test_colour_of_separate_camera(tmp_path: Path, kind: str, compressed: bool) 
     assert recording.metadata["color_topic"].startswith(COLOR_TOPIC)
     T = inverse(T_RIG_COLOR) @ T_RIG_DEPTH
     for k, frame in enumerate(recording):
-        assert isinstance(frame, RangeFrame)
         np.testing.assert_allclose(frame.depth, COUNTS[k] / 1000, atol=1e-6)
         assert (frame.color_image is None) == (k == 2)
         if frame.color_image is None:
@@ -593,7 +406,6 @@ def test_colour_registered_to_depth(tmp_path: Path) -> None:
     image = np.ascontiguousarray(color_at(0)[:12, :16])
     bag.image(COLOR_TOPIC, 10.0, image, "rgb8", frame="color", width=16)
     frame = open_recording(bag.close())[0]
-    assert isinstance(frame, RangeFrame)
     np.testing.assert_array_equal(frame.color_image, image)
 
 
@@ -603,7 +415,6 @@ def test_colour_without_pose_is_ignored(tmp_path: Path) -> None:
     bag.image(COLOR_TOPIC, 10.0, color_at(0), "rgb8", frame="color", width=32)
     recording = open_recording(bag.close())
     frame = recording[0]
-    assert isinstance(frame, RangeFrame)
     assert frame.color_image is None
     assert any(f"colour is ignored: the relation of {COLOR_TOPIC}" in w for w in recording.warnings)
 

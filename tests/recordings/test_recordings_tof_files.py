@@ -14,7 +14,6 @@ from made_phones import DEPTH, HEIGHT, WIDTH
 from made_tof import ADI_LENS, adi_frame
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.geometry.cameras import Rational
-from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 
 
@@ -25,11 +24,9 @@ def test_arducam(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.timestamps, 1.7e9 + np.arange(3) / 10)
     assert recording.metadata["confidence_max"] == 255
     for k, frame in enumerate(recording):
-        assert isinstance(frame, RangeFrame)
         expected = DEPTH[k].copy()
         expected[0, :4] = 0
         np.testing.assert_allclose(frame.depth, expected, atol=1e-6)
-        assert frame.confidence_image is not None
         assert frame.confidence_image[1, :3].tolist() == [0, 255, 0]
         assert (frame.confidence_image[2:] == 40 + k).all()
     assert recording.warnings == []
@@ -42,7 +39,6 @@ def test_arducam_in_metres_along_ray(tmp_path: Path) -> None:
     about = json.loads(path.read_text()) | {"depth_unit_m": 1.0, "depth_kind": "range"}
     path.write_text(json.dumps(about))
     frame = open_recording(tmp_path / "scan")[0]
-    assert isinstance(frame, RangeFrame)
     assert frame.depth_kind == "range"
     np.testing.assert_allclose(frame.depth[2:], 1000 * DEPTH[0][2:], rtol=1e-6)
 
@@ -62,7 +58,6 @@ def test_incomplete_arducam(tmp_path: Path) -> None:
     for k, message in ((0, "bytes, not 4 for each of"), (2, "has 0 bytes"), (3, "is 33 x 24")):
         assert isinstance(items[k], UnreadableFrameError)
         assert message in str(items[k])
-    assert isinstance(items[1], RangeFrame)
     assert items[1].confidence_image is None
     assert recording.warnings == ["2 of 4 frames have no confidence"]
 
@@ -96,7 +91,6 @@ def test_arducam_links(tmp_path: Path) -> None:
 
 
 def check_adi(frame: object, k: int) -> None:
-    assert isinstance(frame, RangeFrame)
     assert frame.depth_kind == "range"
     assert not frame.valid[2:5, 2:9].any()
     assert frame.valid.sum() == 64 * 48 - 21
@@ -104,7 +98,6 @@ def check_adi(frame: object, k: int) -> None:
     x, y, z = frame.points.T
     wall = (z + 0.3 * x + 0.1 * y - (1.8 + 0.1 * k)) / np.linalg.norm((1, 0.3, 0.1))
     assert np.abs(wall).max() < 0.001
-    assert frame.amplitude_image is not None
     ranges = np.rint(1000 * frame.depth)
     np.testing.assert_array_equal(frame.amplitude_image, ranges // 3)
 

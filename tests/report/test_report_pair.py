@@ -7,7 +7,7 @@ import pytest
 
 from registration_scenes import relief, view
 from tofuse.geometry import se3
-from tofuse.recordings.single import SingleView
+from tofuse.recordings.open import SingleView
 from tofuse.registration.base import Registration
 from tofuse.report import thumbnails
 from tofuse.report.pair import (

@@ -26,7 +26,7 @@ from tofuse.files.trajectory import write_tum
 from tofuse.files.trajectory_formats import read_poses
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
-from tofuse.recordings.opening import Opening
+from tofuse.recordings.open import Opening
 from tofuse.results.export import export
 
 PLAIN = Pinhole(*SIZE, 40.0, 41.0, 23.0, 18.0)

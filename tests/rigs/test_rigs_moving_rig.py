@@ -13,7 +13,7 @@ from tofuse.lab.simulation.paths import look_at, rotation
 from tofuse.pipeline.config import changed, from_method
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.recordings.rig_source import RigSource
+from tofuse.recordings.rig import RigSource
 from tofuse.rigs.calibrate import Calibration, calibrate_cameras
 from tofuse.rigs.hand_eye import HandEye, Track, hand_eye
 from tofuse.rigs.inputs import Camera

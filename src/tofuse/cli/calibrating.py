@@ -14,11 +14,10 @@ from tofuse.calibration.lens_files import read_lens_file
 from tofuse.calibration.plane_views import board_planes, scene_planes
 from tofuse.errors import InputError
 from tofuse.files.atomic import make_folder, replacing
-from tofuse.geometry.cameras import Pinhole, RayTable
+from tofuse.geometry.cameras import Pinhole
 from tofuse.recordings.camera_file import camera_fields
 from tofuse.recordings.correction_file import read_correction
-from tofuse.recordings.open import open_recording
-from tofuse.recordings.opening import Opening
+from tofuse.recordings.open import Opening, open_recording
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.depth_correction import DepthCorrection
 
@@ -105,9 +104,9 @@ def import_lens(arguments: argparse.Namespace) -> Summary:
     """``tofuse calibrate import``."""
     if len(arguments.inputs) != 1:
         raise InputError("takes one file", where="calibrate import", remedy="pass one INPUT")
-    lens_file = read_lens_file(arguments.inputs[0], arguments.index)
+    lens_file = read_lens_file(arguments.inputs[0])
     metadata: dict[str, Any] = {}
-    warnings = list(lens_file.warnings)
+    warnings: list[str] = []
     if arguments.recording is None:
         warnings.append(
             "depth is assumed to be z in mm; pass --recording to take it from a recording"
@@ -117,9 +116,6 @@ def import_lens(arguments: argparse.Namespace) -> Summary:
         metadata = recording_fields(recording)
     fields = camera_fields(lens_file.camera)
     lines = [f"{name} {value}" for name, value in fields.items()]
-    if isinstance(lens_file.camera, RayTable):
-        pinhole = lens_file.camera.fit
-        lines.append(f"about a pinhole of f {pinhole.fx:.2f}, {pinhole.fy:.2f} px")
     lines.append(f"read as a file of {lens_file.format}")
     if arguments.out is not None:
         written = write_camera_json(

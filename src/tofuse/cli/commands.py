@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tofuse.errors import InputError
     from tofuse.pipeline.run import exit_status
     from tofuse.pipeline.run import run as run_pipeline
-    from tofuse.recordings.rig_folder import recordings_of, rig_file_in
+    from tofuse.recordings.rig import recordings_of, rig_file_in
 
     options = run_options(arguments)
     if arguments.rig is None and len(arguments.inputs) == 1:
@@ -495,7 +495,7 @@ def simulate(arguments: argparse.Namespace) -> int:
 def inspect(arguments: argparse.Namespace) -> int:
     """``tofuse inspect``."""
     from tofuse.inspection.inspect import inspect_recording
-    from tofuse.recordings.opening import Opening
+    from tofuse.recordings.open import Opening
 
     recording = Opening.of(arguments.inputs, arguments).open()
     inspection = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
@@ -524,8 +524,8 @@ def inspect(arguments: argparse.Namespace) -> int:
 def convert(arguments: argparse.Namespace) -> int:
     """``tofuse convert``."""
     from tofuse.recordings.convert import convert as convert_recording
-    from tofuse.recordings.layouts import convert_to
-    from tofuse.recordings.opening import Opening
+    from tofuse.recordings.convert import convert_to
+    from tofuse.recordings.open import Opening
 
     recording = Opening.of(arguments.inputs, arguments).open()
     if arguments.to == "native":
@@ -624,7 +624,7 @@ def noise(arguments: argparse.Namespace) -> int:
     """``tofuse noise``."""
     from tofuse.calibration.camera_json import check_new
     from tofuse.calibration.noise_estimation import estimate_noise
-    from tofuse.recordings.opening import Opening
+    from tofuse.recordings.open import Opening
 
     if arguments.out is not None:
         check_new(arguments.out, overwrite=arguments.overwrite)

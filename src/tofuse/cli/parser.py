@@ -589,7 +589,7 @@ def _calibrate(commands: Any) -> None:
         "estimate intrinsics or depth errors of a camera, or import intrinsics",
         epilog="lens: from views of a checkerboard, writes a camera.json.\n"
         "depth: from views of planes, writes a correction.npz.\n"
-        "import: from a file of Bouguet's toolbox, CalLab, OpenCV or ROS, writes a camera.json.\n",
+        "import: from a file of OpenCV or ROS, writes a camera.json.\n",
     )
     _choice(p, "subject", ("lens", "depth", "import"), "what to calibrate")
     _value(p, "inputs INPUT", str, "recordings; import: one file", nargs="+")
@@ -621,7 +621,6 @@ def _calibrate(commands: Any) -> None:
     )
     g = p.add_argument_group("import")
     _value(g, "--recording REC", str, "take depth unit and kind from this recording")
-    _value(g, "--index N", _integer, "camera index in a CalLab file")
 
 
 def _noise(commands: Any) -> None:

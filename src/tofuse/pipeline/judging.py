@@ -44,8 +44,7 @@ from tofuse.pipeline.reconstruct import reconstruct_with_views, view_kind
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.posegraph.pair_measurements import measured_pairs
 from tofuse.posegraph.view_store import PosedView
-from tofuse.recordings.open import read_reference
-from tofuse.recordings.opening import Opening, OpeningOptions
+from tofuse.recordings.open import Opening, OpeningOptions, read_reference
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import Recording, evenly_spaced
 from tofuse.registration.prepared_view import PreparedView

@@ -17,7 +17,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.recordings.frames import CloudFrame
-from tofuse.recordings.single import SingleView, open_view
+from tofuse.recordings.open import SingleView, open_view
 from tofuse.registration.register import register
 from tofuse.results.folder import OutputFolder
 from tofuse.results.pair import LocalView, PairResult, pair_folder, write_pair

@@ -33,7 +33,7 @@ from tofuse.pipeline.run_options import Options, check_guess, check_unwrap, reso
 from tofuse.pipeline.tracked_file import TrackedFile
 from tofuse.posegraph.given_loops import read_loops
 from tofuse.posegraph.loops import PriorLoop
-from tofuse.recordings.opening import Opening
+from tofuse.recordings.open import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import TRACKED, OutputFolder, check_output
 from tofuse.results.output import write_result

@@ -18,7 +18,7 @@ from tofuse.pipeline.config import (
 )
 from tofuse.pipeline.paint import TEXTURE
 from tofuse.pipeline.priors import Prior
-from tofuse.recordings.opening import OpeningOptions
+from tofuse.recordings.open import OpeningOptions
 from tofuse.recordings.recording import Recording
 from tofuse.results.run_json import read_run_json
 

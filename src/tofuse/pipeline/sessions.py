@@ -18,7 +18,7 @@ from tofuse.odometry.keyframes import Keyframes
 from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import Config, changed, from_method, kind_of
 from tofuse.pipeline.progress import Progress
-from tofuse.recordings.opening import Opening
+from tofuse.recordings.open import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import component_name, finish_interrupted, is_result
 from tofuse.results.reopening import StoredRecording, locate_recording, reopen, stored_recordings

@@ -12,13 +12,12 @@ from numpy.typing import ArrayLike
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_file, is_folder
+from tofuse.files.reading import is_file, is_folder
 from tofuse.files.tables import read_numbers
 from tofuse.geometry.quaternion import length, to_pose
-from tofuse.recordings.deprojected import Deprojection, find_deprojection
 from tofuse.recordings.frames import CloudFrame, Frame
-from tofuse.recordings.organised import SAMPLES
-from tofuse.recordings.reader import CERTAIN, Sniff
+from tofuse.recordings.organised import SAMPLES, Deprojection, find_deprojection
+from tofuse.recordings.reader import CERTAIN, Sniff, files_at
 from tofuse.recordings.sources import FileSource
 
 # The resolution of float32 is coarser than half a millimetre beyond.
@@ -189,16 +188,9 @@ def note_shift(source: FileSource, path: Path, shift: Float64) -> None:
     source.odometry = None if source.odometry is None else source.odometry @ T_file_frame
 
 
-def cloud_files(path: Path, *suffixes: str) -> list[Path]:
-    """Return the file itself or the files of a folder, if they have one of the suffixes."""
-    if is_file(path):
-        return [path] if path.suffix.lower() in suffixes else []
-    return files_with(path, *suffixes) if is_folder(path) else []
-
-
 def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
     """Detect a file or a folder of files with one of the suffixes."""
-    files = cloud_files(path, *suffixes)
+    files = files_at(path, *suffixes)
     if not files:
         return None
     if is_folder(path) and is_file(path / "run.json"):
@@ -209,7 +201,7 @@ def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
 
 def required_files(path: Path, *suffixes: str) -> list[Path]:
     """Return the same as `cloud_files`; InputError if there are none."""
-    files = cloud_files(path, *suffixes)
+    files = files_at(path, *suffixes)
     if not files:
         raise InputError(f"has no {suffixes[0]} files", where=path, remedy="check the path")
     return files

@@ -15,9 +15,9 @@ from tofuse.geometry.cameras import Camera, Pinhole, RayTable
 from tofuse.geometry.se3 import check_poses
 from tofuse.parts import check_number
 from tofuse.recordings.camera_file import pinhole_values
-from tofuse.recordings.depth_counts import INVALID_DEPTH
 from tofuse.recordings.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.recordings.sources import INVALID_DEPTH
 
 # The unit of integer depth for nearly all cameras.
 _MILLIMETRES = 1e-3

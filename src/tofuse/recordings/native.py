@@ -24,7 +24,6 @@ from tofuse.recordings.camera_file import (
     SCHEMA,
     camera_fields,
 )
-from tofuse.recordings.depth_counts import INVALID_DEPTH, MAX_COUNTS
 from tofuse.recordings.frames import (
     SATURATED_AMPLITUDE,
     CloudFrame,
@@ -32,6 +31,7 @@ from tofuse.recordings.frames import (
     Frame,
     RangeFrame,
 )
+from tofuse.recordings.sources import INVALID_DEPTH, MAX_COUNTS
 from tofuse.sensor.depth_correction import DepthCorrection
 
 # Columns of frames.csv that give each frame its own lens.

@@ -1,22 +1,28 @@
-"""Opening a recording: choice of the reader, and joining of several paths."""
+"""Opening a recording, again as it was opened before, or a single view of it by name."""
 
 from __future__ import annotations
 
+import os
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.reading import input_error, is_folder, list_folder, path_of
 from tofuse.files.trajectory_formats import TimedPoses, read_poses
 from tofuse.parts import discover, name_of, registered
+from tofuse.recordings.cloud_files import describe_shift
+from tofuse.recordings.frames import Frame
 from tofuse.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.recordings.recording import Recording, Source
-from tofuse.recordings.rig_folder import recordings_of, rig_file_in, rig_from
-from tofuse.recordings.rig_source import RigSource
+from tofuse.recordings.rig import RigSource, read_rig, recordings_of, rig_file_in
 from tofuse.recordings.sources import JoinedSource, LimitedSource
+from tofuse.recordings.still import average_still
 
 # Proprietary recordings: problem and remedy by suffix.
 CLOSED = {
@@ -55,8 +61,8 @@ def open_recording(
     ----------
     paths
         Files or folders; several are joined in the order given. A folder of native or SR4000
-        recordings is joined in name order; if it contains a rig.json (or a cameraconfig.json of
-        cwipc), its recordings are the cameras of a rig, one image of each in turn.
+        recordings is joined in name order; if it contains a rig.json, its recordings are the
+        cameras of a rig, one image of each in turn.
     format
         Name of a reader, instead of detection.
     camera
@@ -122,7 +128,7 @@ def _rig_source(
         source = located[0].reader.open(located[0].path, options)
         _check_usable(source, path)
         recordings.append(Recording.of(source, path, name_of(located[0].reader)))
-    return RigSource(rig_from(rig_file, recordings), recordings)
+    return RigSource(read_rig(rig_file), recordings)
 
 
 @dataclass(frozen=True)
@@ -310,22 +316,22 @@ def read_reference(path: str | Path) -> TimedPoses:
         If it can't be read, or the recording has no reference poses.
     """
     path = Path(path)
-    if not path.is_dir() or (path / "groundtruth.txt").is_file():  # the images are not needed then
+    poses_file = path / "groundtruth.txt" if path.is_dir() else path
+    readers_of_poses = [lambda: read_poses(poses_file), lambda: open_recording(path)]
+    if not poses_file.is_file():  # else the images are not needed
+        readers_of_poses = [lambda: open_recording(path), lambda: read_poses(path)]
+    errors: list[InputError] = []
+    for read in readers_of_poses:
         try:
-            return read_poses(path / "groundtruth.txt" if path.is_dir() else path)
-        except InputError as no_trajectory:
-            try:
-                recording = open_recording(path)
-            except InputError:
-                raise no_trajectory from None
-    else:
-        try:
-            recording = open_recording(path)
-        except InputError as no_recording:
-            try:
-                return read_poses(path)
-            except InputError:
-                raise no_recording from None
+            found = read()
+        except InputError as error:
+            errors.append(error)
+            continue
+        return found if isinstance(found, TimedPoses) else _reference_of(found, path)
+    raise errors[0] from None
+
+
+def _reference_of(recording: Recording, path: Path) -> TimedPoses:
     poses = recording.reference
     if poses is None or not np.isfinite(poses).all((1, 2)).any():
         raise InputError(
@@ -335,3 +341,174 @@ def read_reference(path: str | Path) -> TimedPoses:
         )
     posed = np.isfinite(poses).all((1, 2))
     return TimedPoses(poses[posed], timestamps=recording.timestamps[posed])
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpeningOptions:
+    """Options with which a recording is opened.
+
+    Attributes
+    ----------
+    format, camera, topic
+        See `open_recording`.
+    start, end, every
+        The selected frames, see `Recording.select`.
+    average_still
+        Whether stationary intervals are averaged to one frame each.
+    """
+
+    format: str | None = None
+    camera: Path | None = None
+    topic: str | None = None
+    start: int = 0
+    end: int | None = None
+    every: int = 1
+    average_still: bool = False
+
+
+@dataclass(frozen=True)
+class Opening(OpeningOptions):
+    """Arguments with which a recording was opened; see `open_recording` and `tofuse run`.
+
+    Attributes
+    ----------
+    paths
+        Files or folders.
+    """
+
+    paths: tuple[Path, ...]
+
+    @classmethod
+    def of(cls, inputs: Iterable[str | Path], options: object) -> Opening:
+        """Return the opening of files or folders with options named like the fields.
+
+        Fields without an option keep their defaults.
+        """
+        names = [f.name for f in fields(cls) if hasattr(options, f.name)]
+        return cls(tuple(map(Path, inputs)), **{name: getattr(options, name) for name in names})
+
+    def open(self) -> Recording:
+        """Open the recording; InputError if that fails."""
+        recording = open_recording(
+            *self.paths, format=self.format, camera=self.camera, topic=self.topic
+        ).select(self.start, self.end, self.every)
+        return average_still(recording) if self.average_still else recording
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data, with absolute paths."""
+        options = {field.name: getattr(self, field.name) for field in fields(OpeningOptions)}
+        camera = None if self.camera is None else str(self.camera.absolute())
+        paths = [str(path.absolute()) for path in self.paths]
+        return {"paths": paths} | options | {"camera": camera}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], where: str | Path) -> Opening:
+        """Return the inverse of `to_dict`; InputError naming `where` if the data is invalid."""
+        try:
+            paths = tuple(Path(str(path)) for path in data["paths"])
+            camera, end = data["camera"], data["end"]
+            opening = cls(
+                paths,
+                format=data["format"],
+                camera=None if camera is None else Path(str(camera)),
+                topic=data["topic"],
+                start=int(data["start"]),
+                end=None if end is None else int(end),
+                every=int(data["every"]),
+                average_still=bool(data["average_still"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError("does not state how its recording was opened", where=where) from error
+        if not paths:
+            raise InputError("names no recording", where=where)
+        return opening
+
+
+MIN_POINTS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class SingleView:
+    """A frame and its origin.
+
+    Attributes
+    ----------
+    name
+        As the user wrote it.
+    path, format, index
+        The recording, its reader, and the index of the frame.
+    frame
+        The view.
+    shift
+        (3,) m, to add to coordinates of the frame to get those of the file. Nonzero only for clouds
+        in map coordinates.
+    warnings
+        Notes for the user on how it was read.
+    """
+
+    name: str
+    path: str
+    format: str
+    index: int
+    frame: Frame
+    shift: Float64
+    warnings: tuple[str, ...] = ()
+
+
+def open_view(
+    name: str,
+    *,
+    format: str | None = None,  # noqa: A002
+    camera: Path | None = None,
+    topic: str | None = None,
+) -> SingleView:
+    """Read the view called `name`; for the options see `open_recording`.
+
+    Raises
+    ------
+    InputError
+        If there is no such frame, the recording has several and `name` doesn't state which, or the
+        frame can't be read or has fewer than ten points.
+    """
+    path, index = split_name(name)
+    recording = open_recording(path, format=format, camera=camera, topic=topic)
+    count = len(recording)
+    if index is None and count > 1:
+        raise InputError(
+            f"contains {count} frames",
+            where=name,
+            remedy=f"choose one: {name}#0 to {name}#{count - 1}",
+        )
+    index = index or 0
+    if index >= count:
+        available = "its only frame is 0" if count == 1 else f"its frames are 0 to {count - 1}"
+        raise InputError(f"has no frame {index}", where=path, remedy=available)
+    frame = recording[index]
+    if len(frame) < MIN_POINTS:
+        raise InputError(
+            f"has {len(frame)} valid points",
+            where=name,
+            remedy=f"use a view with {MIN_POINTS} or more",
+        )
+    shift = np.asarray(recording.metadata.get("shift_m", np.zeros(3)), float)
+    # The shift is returned with the view, so a warning about it would mislead.
+    shift_note = describe_shift(shift)
+    warnings = tuple(line for line in recording.warnings if not line.endswith(shift_note))
+    return SingleView(name, path, recording.format, index, frame, shift, warnings)
+
+
+def split_name(name: str) -> tuple[str, int | None]:
+    """Return the path and the frame index in `name`; None if it has no index.
+
+    An existing path is taken literally, with any # in it.
+    """
+    if "#" not in name or os.path.lexists(name):
+        return name, None
+    path, _, frame = name.rpartition("#")
+    if not (frame.isascii() and frame.isdecimal()):
+        raise InputError(
+            f"has the frame index {frame!r}",
+            where=name,
+            remedy="write a whole number after the #, such as recording#12",
+        )
+    return path, int(frame)

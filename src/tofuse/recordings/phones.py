@@ -12,9 +12,8 @@ from tofuse.errors import InputError
 from tofuse.files.images import read_color, read_image
 from tofuse.geometry.cameras import Pinhole, scaled
 from tofuse.recordings.camera_file import checked_pinhole
-from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.sources import FileSource, read_matrix_pose
+from tofuse.recordings.sources import FileSource, depth_from_counts, read_matrix_pose
 
 # ARKit's camera looks along -z with y up.
 ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -91,11 +90,10 @@ class PhoneSource(FileSource):
             raise camera
         size = (camera.width, camera.height)
         confidence = self.confidence[index]
-        return RangeFrame(
+        return self.image(
             index,
-            float(self.timestamps[index]),
-            camera,
             self.read_depth(index, size),
+            camera=camera,
             confidence_image=None if confidence is None else self.read_confidence(confidence, size),
             color_image=self._read_color(index, size),
         )

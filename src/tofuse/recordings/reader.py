@@ -1,17 +1,20 @@
-"""The interface of a reader."""
+"""The interface of a reader, and the files that a recording consists of."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, TypeVar
 
 from tofuse.errors import InputError
+from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.recordings.recording import Source
 
 CERTAIN = 0.9
 UNCERTAIN = 0.5
 PER_FRAME = "a camera per frame"
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,7 @@ class ReaderOptions:
     topic: str | None = None
 
 
+@dataclass(frozen=True)
 class Reader(Protocol):
     """A reader of one format, registered by ``@part("reader", name)`` in a module of `readers`.
 
@@ -80,6 +84,13 @@ class Reader(Protocol):
         ...
 
 
+def required(files: list[T], name: str, where: Path, remedy: str = "check the path") -> list[T]:
+    """Return the files; raise InputError, that `where` has no `name`, if there are none."""
+    if not files:
+        raise InputError(f"has no {name}", where=where, remedy=remedy)
+    return files
+
+
 def refuse_camera(options: ReaderOptions, name: str, stores: str = "points") -> None:
     """Raise InputError if a camera was passed for the format `name`, which stores `stores`."""
     if options.camera is not None:
@@ -88,3 +99,42 @@ def refuse_camera(options: ReaderOptions, name: str, stores: str = "points") -> 
             where="--camera",
             remedy="leave it out",
         )
+
+
+def file_of(path: Path, *suffixes: str) -> Path | None:
+    """Return the file at `path`, or the only one with these suffixes in that folder; else None."""
+    if is_file(path):
+        return path if path.suffix.lower() in suffixes else None
+    if not is_folder(path):
+        return None
+    try:
+        files = files_with(path, *suffixes)
+    except InputError:
+        return None
+    return files[0] if len(files) == 1 else None
+
+
+def begins_with(file: Path | None, head: bytes) -> bool:
+    """Return whether there is a file that begins with these bytes; errors as `read_head`."""
+    return file is not None and read_head(file, len(head)) == head
+
+
+def required_file(path: Path, *suffixes: str) -> Path:
+    """Return the same as `file_of`, or any file given by its path; else raise InputError."""
+    file = file_of(path, *suffixes)
+    if file is not None:
+        return file
+    if is_file(path):
+        return path
+    raise InputError(
+        f"doesn't contain exactly one {' or '.join(suffixes)} file",
+        where=path,
+        remedy="pass the file",
+    )
+
+
+def files_at(path: Path, *suffixes: str) -> list[Path]:
+    """Return the file itself or the files of a folder, if they have one of the suffixes."""
+    if is_file(path):
+        return [path] if path.suffix.lower() in suffixes else []
+    return files_with(path, *suffixes) if is_folder(path) else []

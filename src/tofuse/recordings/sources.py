@@ -1,9 +1,10 @@
-"""Sources for readers: files, pose files, joined recordings and depth limits."""
+"""Sources for readers: files, depth images, colour, pose files, joined recordings, depth limits."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,14 +12,18 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import Float32, Float64, UInt8
+from tofuse.arrays import Bool, Float32, Float64, Intp, UInt8
 from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.images import check_first_size, read_color, read_image
 from tofuse.files.ply import read_ply
-from tofuse.files.reading import is_file
+from tofuse.files.reading import input_error, is_file
 from tofuse.files.tables import read_numbers
 from tofuse.files.trajectory import associated_poses, read_tum
+from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.geometry.se3 import MAX_COORDINATE_M, check_pose, orthonormalise
-from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
+from tofuse.recordings.camera_file import CameraFile, ColorCamera, check_size, load_camera
+from tofuse.recordings.frames import AmplitudeKind, CloudFrame, DepthKind, Frame, RangeFrame
+from tofuse.recordings.reader import ReaderOptions
 from tofuse.recordings.recording import Source
 
 T = TypeVar("T")
@@ -31,9 +36,19 @@ class FileSource(ABC):
     ----------
     concurrent
         Whether several threads can read frames concurrently: `load` has no side effects.
+    camera, unit, kind, amplitude_kind, ambiguity_m
+        Of depth images: the common camera, metres per count, and those of `RangeFrame`.
+    color_camera
+        None if colour is registered to depth, or there is none.
     """
 
     concurrent = False
+    camera: Camera
+    unit: float = 0.001
+    kind: DepthKind = "z"
+    amplitude_kind: AmplitudeKind = "raw"
+    ambiguity_m: float | None = None
+    color_camera: ColorCamera | None = None
 
     def __init__(self, timestamps: Float64) -> None:
         self.timestamps = timestamps
@@ -46,6 +61,24 @@ class FileSource(ABC):
     @abstractmethod
     def load(self, index: int) -> Frame:
         """Read frame `index`; raise InputError if it can't be read."""
+
+    def use_camera(self, path: Path, size: tuple[int, int] | None = None) -> CameraFile:
+        """Take camera, unit and kind of depth from a camera.json; see `load_camera`."""
+        description, self.camera = load_camera(path, size)
+        self.unit, self.kind = description.depth_unit_m, description.depth_kind
+        self.color_camera = description.color or self.color_camera
+        return description
+
+    def image(self, index: int, depth: Float32, **others: Any) -> RangeFrame:
+        """Return frame `index` with this depth and other attributes of `RangeFrame` by name."""
+        common = {
+            "camera": self.camera if "camera" not in others else None,
+            "depth_kind": self.kind,
+            "amplitude_kind": self.amplitude_kind,
+            "ambiguity_m": self.ambiguity_m,
+        }
+        time = float(self.timestamps[index])
+        return RangeFrame(index=index, timestamp=time, depth=depth, **(common | others))
 
     def full_resolution_color(self, index: int) -> UInt8 | None:
         """Return the colour of a frame at its recorded resolution, if it has the view of depth.
@@ -160,6 +193,41 @@ def _read_timestamps(path: Path, count: int, warnings: list[str]) -> Float64:
     return times
 
 
+def read_part(path: Path, offset: int, size: int) -> bytes:
+    """Return up to `size` bytes of a file from an offset; InputError if it can't be read."""
+    try:
+        with path.open("rb") as file:
+            file.seek(offset)
+            return file.read(size)
+    except OSError as error:
+        raise input_error(error, path) from error
+
+
+@contextmanager
+def library_errors(where: str | Path, remedy: str = "copy the file again") -> Iterator[None]:
+    """Turn any exception of a library that reads a damaged file into an InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        line = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"can't be read ({type(error).__name__}: {line})", where=where, remedy=remedy
+        ) from error
+
+
+def cameras_of(items: Iterable[T], read: Callable[[T], Pinhole]) -> list[Pinhole | InputError]:
+    """Return the camera of each frame, or the error that makes only this frame unusable."""
+    cameras: list[Pinhole | InputError] = []
+    for item in items:
+        try:
+            cameras.append(read(item))
+        except InputError as error:
+            cameras.append(error)
+    return cameras
+
+
 def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
     """Raise InputError if timestamps are not finite; warn if they repeat or decrease."""
     if not np.isfinite(times).all():
@@ -196,6 +264,12 @@ def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = 
         color=ply.color,
         shift=shift,
     )
+
+
+def finite_float32(values: NDArray[Any]) -> Float32:
+    """Return numbers of a file as float32, 0 where they are not finite."""
+    with np.errstate(all="ignore"):
+        return np.nan_to_num(values.astype(np.float32), posinf=0, neginf=0)
 
 
 def to_float32(values: NDArray[Any]) -> Float32:
@@ -329,3 +403,159 @@ class LimitedSource:
             return frame.keep((frame.z >= self.min_depth) & (frame.z <= self.max_depth))
         distance = np.linalg.norm(frame.points - frame.origin, axis=1)
         return frame.keep((distance >= self.min_depth) & (distance <= self.max_depth))
+
+
+INVALID_DEPTH = 65535
+MAX_COUNTS = 65535
+
+
+def depth_from_counts(counts: NDArray[np.generic], unit_m: float) -> Float32:
+    """Return depth in m (float32) of stored counts (H, W); 0 and 65535 give 0."""
+    depth = counts.astype(np.float32) * np.float32(unit_m)
+    depth[counts == INVALID_DEPTH] = 0
+    return depth
+
+
+def depth_from_numbers(numbers: NDArray[np.generic], unit_m: float) -> Float32:
+    """Return depth in m (float32) of stored integers or floats (H, W) in units of `unit_m`.
+
+    Depth that is not finite or implausibly large is 0, and so are integers of 65535.
+    """
+    with np.errstate(all="ignore"):
+        depth = numbers.astype(np.float32) * np.float32(unit_m)
+        depth[~(np.abs(depth) < MAX_COORDINATE_M)] = 0
+    if numbers.dtype.kind in "ui":
+        depth[numbers == INVALID_DEPTH] = 0
+    return depth
+
+
+# A point is occluded if another one in its cell is nearer by more than this fraction.
+OCCLUSION_FRACTION = 0.05
+
+
+def sampled_color(
+    frame: RangeFrame, image: UInt8, color: ColorCamera | None, where: str | Path
+) -> UInt8:
+    """Return the colour (H, W, 3) of the depth pixels, by projecting their points into an image.
+
+    Black where the point is outside of the colour image, or occluded there by a nearer surface that
+    the depth camera observes too. Without a colour camera (None) the image has the pixels of depth.
+
+    Raises
+    ------
+    InputError
+        Naming `where`, if the image does not have the size of its camera.
+    """
+    check_size(image, frame.camera if color is None else color.camera, where)
+    if color is None:
+        return image
+    T = color.T_color_depth
+    points = frame.points @ T[:3, :3].T + T[:3, 3]
+    uv = color.camera.project(points)
+    with np.errstate(invalid="ignore"):
+        pixel = np.nan_to_num(np.rint(uv), nan=-1.0, posinf=-1.0, neginf=-1.0)
+    u, v = np.clip(pixel, -1, 1 << 20).astype(np.intp).T
+    inside = (u >= 0) & (v >= 0) & (u < image.shape[1]) & (v < image.shape[0])
+    cell = _cell(frame, color)
+    occluded = _occluded(u[inside] // cell, v[inside] // cell, points[inside, 2])
+    inside[inside] = ~occluded
+    sampled = np.zeros((len(u), 3), np.uint8)
+    sampled[inside] = image[v[inside], u[inside]]
+    out = np.zeros((*frame.depth.shape, 3), np.uint8)
+    out[frame.valid] = sampled
+    return out
+
+
+def _cell(frame: RangeFrame, color: ColorCamera) -> int:
+    """Size in colour pixels of cells that each contain points of a continuous surface."""
+    rays = frame.camera.rays()
+    pitch = float(np.nanmedian(np.abs(np.diff(rays[..., 0], axis=1))))
+    return max(1, int(np.ceil(2 * pitch * color.camera.fx)))
+
+
+def _occluded(u: Intp, v: Intp, z: Float64) -> Bool:
+    """Whether each point is behind the nearest one of its cell."""
+    if len(z) == 0:
+        return np.zeros(0, bool)
+    nearest = np.full((int(v.max()) + 1, int(u.max()) + 1), np.inf)
+    np.minimum.at(nearest, (v, u), z)
+    return np.asarray(z > nearest[v, u] * (1 + OCCLUSION_FRACTION))
+
+
+class DepthImageSource(FileSource):
+    """Depth images, with colour images registered to them where given.
+
+    Parameters
+    ----------
+    files
+        16-bit PNGs, one for each frame.
+    timestamps
+        (N,) seconds.
+    camera, depth_unit_m
+        Of all frames, unless `options` has a camera.json, which replaces both.
+    color
+        None, or one image per frame, None where there is none.
+    color_registered
+        Whether colour is registered to depth.
+    sensor
+        Name of the camera, unless `options` has a camera.json that names it; empty if unknown.
+    options
+        Of the reader.
+
+    Raises
+    ------
+    InputError
+        If the camera does not have the size of the images.
+    """
+
+    concurrent = True
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        timestamps: Float64,
+        camera: Camera | None,
+        depth_unit_m: float,
+        *,
+        color: Sequence[Path | None] | None = None,
+        color_registered: bool = True,
+        sensor: str = "",
+        options: ReaderOptions | None = None,
+    ) -> None:
+        super().__init__(timestamps)
+        self.files, self.color = list(files), None if color is None else list(color)
+        self.color_registered = color_registered
+        where = "the camera of this format"
+        if options is not None and options.camera is not None:
+            sensor = self.use_camera(options.camera).sensor or sensor
+            where = str(options.camera)
+        elif camera is None:
+            raise InputError(
+                "has no camera", where=self.files[0].parent, remedy="pass one with --camera"
+            )
+        else:
+            self.camera, self.unit = camera, depth_unit_m
+        size = (self.camera.width, self.camera.height)
+        self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
+        if sensor:
+            self.metadata["sensor"] = sensor
+        self.note_missing_color(self.color or ())
+        remedy = "pass the camera of these images with --camera"
+        check_first_size(self.files, size, where, remedy)
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        size = (self.camera.width, self.camera.height)
+        counts = read_image(self.files[index], size=size, dtype="uint16")
+        color = None
+        path = None if self.color is None else self.color[index]
+        if path is not None:
+            color = read_color(path)
+            if color.shape[:2] != counts.shape:
+                raise InputError(
+                    f"is {color.shape[1]} x {color.shape[0]} pixels, depth {size[0]} x {size[1]}",
+                    where=path,
+                    remedy="register colour to depth, or leave it out",
+                )
+        depth = depth_from_counts(counts, self.unit)
+        return self.image(index, depth, color_image=color, color_registered=self.color_registered)

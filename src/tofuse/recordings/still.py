@@ -292,10 +292,9 @@ def _mean_camera(frames: Sequence[RangeFrame]) -> Camera:
 
 def _mean_amplitude(frames: Sequence[RangeFrame], inlier: Bool) -> Float32 | None:
     """The mean over the frames whose depth was used; saturated where most of them are."""
-    images = [f.amplitude_image for f in frames if f.amplitude_image is not None]
-    if len(images) < len(frames):
+    stack = _stack(frames, "amplitude_image")
+    if stack is None:
         return None
-    stack = np.stack(images)
     saturated = (stack >= SATURATED_AMPLITUDE) & inlier
     used = inlier & ~saturated
     count = used.sum(0)
@@ -305,17 +304,16 @@ def _mean_amplitude(frames: Sequence[RangeFrame], inlier: Bool) -> Float32 | Non
 
 
 def _best_confidence(frames: Sequence[RangeFrame], inlier: Bool) -> UInt8 | None:
-    images = [f.confidence_image for f in frames if f.confidence_image is not None]
-    if len(images) < len(frames):
-        return None
-    return np.where(inlier, np.stack(images), 0).max(0).astype(np.uint8)
+    stack = _stack(frames, "confidence_image")
+    return None if stack is None else np.where(inlier, stack, 0).max(0).astype(np.uint8)
 
 
 def _mean_color(frames: Sequence[RangeFrame]) -> UInt8 | None:
-    images = [f.color_image for f in frames if f.color_image is not None]
-    if len(images) < len(frames):
-        return None
-    total = np.zeros(images[0].shape)
-    for image in images:
-        total += image
-    return np.rint(total / len(images)).astype(np.uint8)
+    stack = _stack(frames, "color_image")
+    return None if stack is None else np.rint(stack.mean(0, dtype=float)).astype(np.uint8)
+
+
+def _stack(frames: Sequence[RangeFrame], name: str) -> NDArray[Any] | None:
+    """The images of a channel (N, H, W, ...); None if a frame has none."""
+    images = [getattr(frame, name) for frame in frames]
+    return None if any(image is None for image in images) else np.stack(images)

@@ -21,7 +21,7 @@ from tofuse.files.pose import pose_text
 from tofuse.geometry import se3
 from tofuse.recordings.cloud_files import MAP_COORDINATES_M
 from tofuse.recordings.frames import Frame
-from tofuse.recordings.single import SingleView
+from tofuse.recordings.open import SingleView
 from tofuse.registration.base import Registration
 from tofuse.results.folder import Contract, OutputFolder, read_json_object
 from tofuse.results.run_json import plain

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.errors import InputError
-from tofuse.recordings.opening import Opening
+from tofuse.recordings.open import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import RECORDING
 

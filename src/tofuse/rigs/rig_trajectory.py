@@ -24,8 +24,7 @@ from tofuse.posegraph.submaps import support_fell
 from tofuse.posegraph.view_store import SampledView, Spacing
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
-from tofuse.recordings.rig import RigCamera
-from tofuse.recordings.rig_source import RigSource
+from tofuse.recordings.rig import RigCamera, RigSource
 from tofuse.results.types import Reconstruction
 from tofuse.rigs.hand_eye import Track, median_pose
 from tofuse.rigs.inputs import Camera

@@ -27,9 +27,7 @@ from tofuse.posegraph.refinement import AlreadyRefined, NoRefinement
 from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
-from tofuse.recordings.rig import Disagreement, Rig
-from tofuse.recordings.rig_folder import recordings_of, rig_from
-from tofuse.recordings.rig_source import RigSource
+from tofuse.recordings.rig import Disagreement, Rig, RigSource, read_rig, recordings_of
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
 from tofuse.results.types import Reason, Reconstruction
@@ -93,7 +91,7 @@ def run_rig(
         progress.stage("opening")
         cameras = cameras_of(names, inputs, options.format)
         recordings = [camera.recording for camera in cameras]
-        rig = rig_from(rig_file, recordings)
+        rig = read_rig(rig_file)
         source = RigSource(rig, recordings)
         full_recording = Recording.of(source, " ".join(map(str, inputs)), "rig")
         recording = _selected(full_recording, source, options)

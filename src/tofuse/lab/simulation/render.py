@@ -12,8 +12,8 @@ from tofuse.lab.simulation import optics, sensor
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.simulation.scene import Scene, Sequence
-from tofuse.recordings.depth_counts import INVALID_DEPTH, depth_from_counts
 from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.sources import INVALID_DEPTH, depth_from_counts
 
 _DEFAULT = Effects()
 _FLAG_THRESHOLD_M = 0.003

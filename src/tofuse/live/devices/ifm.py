@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tofuse.live.device import TIMEOUT_S, Settings, Stream, no_frame, not_started, vendor
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.ifm_lens import head_camera, head_frame, read_info
+from tofuse.recordings.readers.ifm_o3r import head_camera, head_frame, read_info
 
 
 @part("device", "ifm-o3r")

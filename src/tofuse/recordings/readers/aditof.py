@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64, UInt16
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, input_error, is_file, is_folder
-from tofuse.geometry.cameras import Camera, RayTable
+from tofuse.files.reading import input_error, is_file
+from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
-from tofuse.recordings.camera_file import load_camera
-from tofuse.recordings.depth_counts import depth_from_counts
-from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, files_at
 from tofuse.recordings.recording import evenly_spaced
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.sources import FileSource, depth_from_counts, read_part
 
 HEADER_BYTES = 128
 # Width, height, kind of output, bits of depth, of brightness and of confidence, 11 other bytes,
@@ -29,7 +27,6 @@ HEADER_BYTES = 128
 _HEADER = struct.Struct("<2H4B11xB16x4Q")
 _SIDES = range(2, 4097)
 _MAX_BITS = 32
-DEPTH_UNIT_M = 0.001
 SENSOR = "Analog Devices (ToF)"
 # Number of frames whose points determine the rays, and degree in either axis of the polynomial of
 # the pixel's position that is fitted to them: it smooths the rounding of the points to whole mm.
@@ -100,7 +97,6 @@ class _Images:
 
 
 @part("reader", "aditof", label="experimental")
-@dataclass(frozen=True)
 class AdiTof(Reader):
     """A .bin file of frames of Analog Devices' ToF SDK, or a folder of them."""
 
@@ -121,6 +117,8 @@ class AdiTofSource(FileSource):
     """Radial range in mm with active brightness; the rays are those of the stored points."""
 
     concurrent = True
+    kind = "range"
+    amplitude_kind = "ir"
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.locations: list[_FrameLocation] = []
@@ -137,12 +135,9 @@ class AdiTofSource(FileSource):
             )
         first = self.locations[0].layout
         self.size = first.width, first.height
-        self.kind: DepthKind = "range"
-        self.unit, sensor, rate = DEPTH_UNIT_M, SENSOR, 1.0
-        self.camera: Camera
+        sensor, rate = SENSOR, 1.0
         if options.camera is not None:
-            description, self.camera = load_camera(options.camera, self.size)
-            self.kind, self.unit = description.depth_kind, description.depth_unit_m
+            description = self.use_camera(options.camera, self.size)
             sensor, rate = description.sensor or sensor, description.frame_rate_hz or rate
         else:
             self.camera = self._camera_of_points(path)
@@ -161,15 +156,9 @@ class AdiTofSource(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         images = self._images(index)
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth_from_counts(images.depth, self.unit),
-            self.kind,
-            None if images.brightness is None else images.brightness.astype(np.float32),
-            amplitude_kind="ir",
-        )
+        amplitude = None if images.brightness is None else images.brightness.astype(np.float32)
+        depth = depth_from_counts(images.depth, self.unit)
+        return self.image(index, depth, amplitude_image=amplitude)
 
     def _images(self, index: int) -> _Images:
         place = self.locations[index]
@@ -181,12 +170,7 @@ class AdiTofSource(FileSource):
                 where=f"{place.path}: frame {index}",
                 remedy="pass frames of one mode",
             )
-        try:
-            with place.path.open("rb") as file:
-                file.seek(place.offset + HEADER_BYTES)
-                data = file.read(layout.length - HEADER_BYTES)
-        except OSError as error:
-            raise input_error(error, place.path) from error
+        data = read_part(place.path, place.offset + HEADER_BYTES, layout.length - HEADER_BYTES)
         if len(data) < layout.length - HEADER_BYTES:
             raise InputError("is cut off", where=f"{place.path}: frame {index}")
         shape, count = (layout.height, layout.width), layout.width * layout.height
@@ -226,9 +210,7 @@ class AdiTofSource(FileSource):
 
 
 def _files(path: Path) -> list[Path]:
-    if is_folder(path):
-        return [file for file in files_with(path, ".bin") if is_file(file)]
-    return [path] if is_file(path) and path.suffix.lower() == ".bin" else []
+    return [file for file in files_at(path, ".bin") if is_file(file)]
 
 
 def _frames_in(path: Path) -> tuple[list[_FrameLocation], bool]:

@@ -9,15 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.arrays import Float32, UInt8
-from tofuse.errors import InputError
 from tofuse.files.images import read_raw
 from tofuse.files.reading import files_named, is_file
 from tofuse.parts import part
-from tofuse.recordings.camera_file import CameraFile, camera_file_of, check_size, load_camera
-from tofuse.recordings.depth_counts import depth_from_numbers
+from tofuse.recordings.camera_file import camera_file_of, check_size
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
+from tofuse.recordings.sources import FileSource, depth_from_numbers
 
 # Width and height in pixels, and the time at which the file was written in ms.
 _NAME = re.compile(r"(depth|confidence)_(\d{1,5})_(\d{1,5})_f32_(\d{1,15})\.raw")
@@ -25,7 +23,6 @@ CONFIDENCE_MAX = 255.0
 
 
 @part("reader", "arducam", label="experimental")
-@dataclass(frozen=True)
 class Arducam(Reader):
     """Folders of depth_W_H_f32_*.raw (Arducam ToF), with the camera in a camera.json."""
 
@@ -42,12 +39,8 @@ class Arducam(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> ArducamSource:
         """See `Reader.open`."""
-        if not _images(path, "depth"):
-            raise InputError(
-                "has no depth_*_f32_*.raw",
-                where=path,
-                remedy="save depth, not the sensor's raw phases",
-            )
+        remedy = "save depth, not the sensor's raw phases"
+        required(_images(path, "depth"), "depth_*_f32_*.raw", path, remedy)
         camera = camera_file_of(path, options.camera, "neither lens nor unit")
         return ArducamSource(path, camera)
 
@@ -65,26 +58,20 @@ class ArducamSource(FileSource):
     concurrent = True
 
     def __init__(self, path: Path, camera: Path) -> None:
-        self.description: CameraFile
-        self.description, self.camera = load_camera(camera)
+        description = self.use_camera(camera)
         self.depth = _images(path, "depth")
         super().__init__(np.array([image.time_ms for image in self.depth]) / 1000)
         self.confidence = _next_image(self.depth, _images(path, "confidence"))
-        self.metadata |= {**self.description.metadata, "confidence_max": CONFIDENCE_MAX}
+        self.metadata |= {**description.metadata, "confidence_max": CONFIDENCE_MAX}
         missing = sum(image is None for image in self.confidence)
         if missing > 0:
             self.warnings.append(f"{missing} of {len(self.depth)} frames have no confidence")
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth_from_numbers(self._floats(self.depth[index]), self.description.depth_unit_m),
-            self.description.depth_kind,
-            confidence_image=self._confidence(self.confidence[index]),
-        )
+        depth = depth_from_numbers(self._floats(self.depth[index]), self.unit)
+        confidence = self._confidence(self.confidence[index])
+        return self.image(index, depth, confidence_image=confidence)
 
     def _confidence(self, image: _Image | None) -> UInt8 | None:
         if image is None:

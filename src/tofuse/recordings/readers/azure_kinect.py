@@ -21,14 +21,17 @@ from tofuse.files.trajectory import associate
 from tofuse.geometry.cameras import Camera, Rational, RayTable
 from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.parts import part
-from tofuse.recordings.camera_file import ColorCamera, load_camera
-from tofuse.recordings.color import sampled_color
-from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.single_files import begins_with, file_of, required_file
-from tofuse.recordings.sources import FileSource
-
-DEPTH_UNIT_M = 0.001
+from tofuse.recordings.camera_file import ColorCamera
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.reader import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    begins_with,
+    file_of,
+    required_file,
+)
+from tofuse.recordings.sources import FileSource, sampled_color
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,6 @@ def depth_camera(lens: KinectLens) -> Camera:
 
 
 @part("reader", "azure-kinect", label="validated")
-@dataclass(frozen=True)
 class AzureKinect(Reader):
     """A .mkv file of k4arecorder: depth, infrared, and colour if it is MJPG."""
 
@@ -122,15 +124,9 @@ class AzureKinect(Reader):
 
 
 class AzureKinectSource(FileSource):
-    """Depth frames, with the simultaneous infrared image and registered colour.
+    """Depth frames, with the simultaneous infrared image and registered colour."""
 
-    Attributes
-    ----------
-    T_color_depth
-        (4, 4) maps points from the depth to the colour camera's frame; None if unknown.
-    """
-
-    T_color_depth: Float64 | None = None
+    amplitude_kind = "ir"
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.file = Matroska(path)
@@ -169,15 +165,7 @@ class AzureKinectSource(FileSource):
         depth = self._image(self.depth[index]).astype(np.float32) * np.float32(self.unit)
         block = self.infrared[index]
         infrared = None if block is None else self._image(block).astype(np.float32)
-        frame = RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth,
-            self.kind,
-            infrared,
-            amplitude_kind="ir",
-        )
+        frame = self.image(index, depth, amplitude_image=infrared)
         color = self._color_image(index, frame)
         return frame if color is None else replace(frame, color_image=color)
 
@@ -217,17 +205,12 @@ class AzureKinectSource(FileSource):
         return [track.blocks[k] if k >= 0 else None for k in pairs]
 
     def _read_cameras(self, options: ReaderOptions, color: Track | None) -> None:
-        self.unit = DEPTH_UNIT_M
-        self.kind: DepthKind = "z"
-        self.color_camera: ColorCamera | None = None
         if options.camera is None:
             self._read_calibration(color)
         else:
             with suppress(InputError):  # possibly the reason for a camera passed by the user
                 self._read_calibration(color)
-            description, self.camera = load_camera(options.camera, self.size)
-            self.unit, self.kind = description.depth_unit_m, description.depth_kind
-            self.color_camera = description.color or self.color_camera
+            self.use_camera(options.camera, self.size)
         if self.color_camera is None:
             self.color = [None] * len(self.depth)
 
@@ -237,9 +220,6 @@ class AzureKinectSource(FileSource):
         self.calibration = _calibration(self.file.attachments.get(name), where)
         lens, T_depth = _lens(self.calibration, "depth", DEPTH_MODES[self.mode], where)
         self.camera = depth_camera(lens)
-        with suppress(InputError):  # the colour camera's pose is the same in all modes
-            _, T_color = _lens(self.calibration, "color", COLOR_MODES[1280, 720], where)
-            self.T_color_depth = T_color @ np.linalg.inv(T_depth)
         if color is not None and color.blocks:
             self.color_camera = self._color_camera(color, T_depth, where)
 

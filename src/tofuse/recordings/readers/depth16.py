@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from tofuse.errors import InputError
 from tofuse.files.images import read_color, read_raw
 from tofuse.files.reading import files_named, if_file, is_file
 from tofuse.parts import part
-from tofuse.recordings.camera_file import CameraFile, camera_file_of, load_camera
+from tofuse.recordings.camera_file import camera_file_of
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
-from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
 from tofuse.recordings.sources import FileSource
 
 _SUFFIXES = ("_depth16.bin", ".depth16")
@@ -23,7 +21,6 @@ CONFIDENCE_MAX = 7.0
 
 
 @part("reader", "depth16", label="experimental")
-@dataclass(frozen=True)
 class Depth16(Reader):
     """Folders of *_depth16.bin or *.depth16, with the camera in a camera.json."""
 
@@ -40,9 +37,7 @@ class Depth16(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
         """See `Reader.open`."""
-        files = _files(path)
-        if not files:
-            raise InputError("has no *_depth16.bin or *.depth16", where=path, remedy="check it")
+        files = required(_files(path), "*_depth16.bin or *.depth16", path)
         camera = camera_file_of(path, options.camera, "neither size nor lens")
         return Depth16Source(files, camera)
 
@@ -53,17 +48,12 @@ class Depth16Source(FileSource):
     concurrent = True
 
     def __init__(self, files: list[Path], camera: Path) -> None:
-        self.description: CameraFile
-        self.description, self.camera = load_camera(camera)
-        rate = self.description.frame_rate_hz or 1.0
-        super().__init__(np.arange(len(files)) / rate)
+        description = self.use_camera(camera)
+        super().__init__(np.arange(len(files)) / (description.frame_rate_hz or 1.0))
         self.files = files
         self.color = [_color(file) for file in files]
-        self.metadata |= {
-            **self.description.metadata,
-            "depth_unit_m": self.description.depth_unit_m,
-            "confidence_max": CONFIDENCE_MAX,
-        }
+        self.metadata |= description.metadata
+        self.metadata |= {"depth_unit_m": self.unit, "confidence_max": CONFIDENCE_MAX}
         self.note_missing_color(self.color)
 
     def load(self, index: int) -> RangeFrame:
@@ -72,17 +62,14 @@ class Depth16Source(FileSource):
         remedy = "pass the camera of these images with --camera"
         samples = read_raw(self.files[index], "<u2", size, remedy)
         counts = samples & ((1 << _BITS) - 1)
-        depth = counts.astype(np.float32) * np.float32(self.description.depth_unit_m)
+        depth = counts.astype(np.float32) * np.float32(self.unit)
         # 0 means unknown and counts as full confidence; 1 is 0 %, 7 is 6/7.
         level = (samples >> _BITS).astype(np.uint8)
         confidence = np.where(level == 0, np.uint8(CONFIDENCE_MAX), level - np.uint8(1))
         color = self.color[index]
-        return RangeFrame(
+        return self.image(
             index,
-            float(self.timestamps[index]),
-            self.camera,
             depth,
-            self.description.depth_kind,
             confidence_image=confidence.astype(np.uint8),
             color_image=None if color is None else resized(read_color(color), size, color),
         )

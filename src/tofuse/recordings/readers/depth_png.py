@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,11 @@ from tofuse.errors import InputError
 from tofuse.files.images import read_header
 from tofuse.files.reading import files_with, is_file
 from tofuse.parts import part
-from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.sources import DepthImageSource
 
 
 @part("reader", "depth-png")
-@dataclass(frozen=True)
 class DepthPng(Reader):
     """A 16-bit .png, with a camera.json given or in its folder."""
 

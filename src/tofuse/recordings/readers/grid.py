@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from tofuse.files.tables import parse_numbers
 from tofuse.geometry.cameras import Camera
 from tofuse.geometry.se3 import MAX_COORDINATE_M
 from tofuse.parts import part
-from tofuse.recordings.cloud_files import CloudFileSource, cloud_files, required_files
+from tofuse.recordings.cloud_files import CloudFileSource, required_files
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.organised import (
     SAMPLES,
@@ -28,7 +29,7 @@ from tofuse.recordings.organised import (
     organised_frame,
     ray_origin_offset,
 )
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, files_at, refuse_camera
 from tofuse.recordings.sources import to_float32
 
 _SUFFIXES = (".ply", ".csv", ".pcd")
@@ -41,14 +42,13 @@ _MAX_RAY_DISTANCE_PX, _MIN_ON_RAYS = 0.3, 0.8
 
 
 @part("reader", "grid")
-@dataclass(frozen=True)
 class Grid(Reader):
     """A folder of .ply, .csv or .pcd files with one point per pixel, row-major; m or mm."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         try:
-            files = cloud_files(path, *_SUFFIXES)
+            files = files_at(path, *_SUFFIXES)
             if not files or (is_folder(path) and is_file(path / "run.json")):
                 return None
             status = files[0].stat()
@@ -210,15 +210,14 @@ class _Frames:
             )
         image = np.full((count, 3), np.nan, np.float32)
         image[pixel] = points[measured]
-        amplitude, color = cells.amplitude, cells.color
-        if amplitude is not None:
-            amplitude, measured_amplitude = np.zeros(count, np.float32), amplitude[measured]
-            amplitude[pixel] = measured_amplitude
-        if color is not None:
-            color, measured_color = np.zeros((count, 3), np.uint8), color[measured]
-            color[pixel] = measured_color
+        columns: dict[str, Any] = {}
+        for name in ("amplitude", "color"):
+            values = getattr(cells, name)
+            if values is not None:
+                columns[name] = np.zeros((count, *values.shape[1:]), values.dtype)
+                columns[name][pixel] = values[measured]
         shape = (self.raster.height, self.raster.width, 3)
-        return image.reshape(shape), Cells(image, amplitude, color)
+        return image.reshape(shape), Cells(image, **columns)
 
 
 def _shifted(points: Float32, offset: float) -> Float32:

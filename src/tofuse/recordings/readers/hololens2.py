@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import tarfile
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +18,16 @@ from tofuse.files.tables import read_numbers
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
-from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import FileSource, poses_of, read_matrix_pose
+from tofuse.recordings.sources import (
+    FileSource,
+    depth_from_counts,
+    poses_of,
+    read_matrix_pose,
+    read_part,
+)
 
 # The streams by preference, with their ambiguity range in m.
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
@@ -34,7 +38,6 @@ _REMEDY = "copy the recording again"
 
 
 @part("reader", "hololens2", label="experimental")
-@dataclass(frozen=True)
 class HoloLens2(Reader):
     """Folders with 'Depth Long Throw_lut.bin' and .tar, or those of 'Depth AHaT'."""
 
@@ -61,6 +64,8 @@ class HoloLens2Source(FileSource):
     """Radial range in mm with active brightness, and the headset's poses as reference."""
 
     concurrent = True
+    kind = "range"
+    amplitude_kind = "ir"
 
     def __init__(self, folder: Path, stream: str) -> None:
         self.images, complete = _images(folder, stream)
@@ -143,29 +148,15 @@ class HoloLens2Source(FileSource):
                     where=f"{tick}.pgm",
                     remedy=_REMEDY,
                 )
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth_from_counts(depth, 0.001),
-            "range",
-            None if bright is None else bright.astype(np.float32),
-            amplitude_kind="ir",
-            ambiguity_m=self.ambiguity_m,
-        )
+        amplitude = None if bright is None else bright.astype(np.float32)
+        return self.image(index, depth_from_counts(depth, self.unit), amplitude_image=amplitude)
 
     def _image(self, tick: int, *, bright: bool) -> NDArray[np.generic]:
         path, begin, size = self.images[tick, bright]
         where = f"{path}: {tick}{'_ab' if bright else ''}.pgm"
         if size > _MAX_BYTES:
             raise InputError("is too large", where=where, remedy=_REMEDY)
-        try:
-            with path.open("rb") as file:
-                file.seek(begin)
-                data = file.read(size)
-        except OSError as error:
-            raise input_error(error, path) from error
-        image = parse_pgm(data, where)
+        image = parse_pgm(read_part(path, begin, size), where)
         if image.dtype != np.uint16 or min(image.shape) < 2:
             raise InputError("is not a 16-bit image", where=where, remedy=_REMEDY)
         return image

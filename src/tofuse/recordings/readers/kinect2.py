@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,8 @@ from tofuse.files.reading import files_named, is_file, is_folder, list_folder, r
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_pinhole
-from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
+from tofuse.recordings.sources import DepthImageSource
 
 _DEPTH = re.compile(r"([0-9]{1,9})_depth\.png", re.IGNORECASE)
 # Camera of an image, and its scale relative to the calibration, by the image size.
@@ -29,7 +28,6 @@ _MATRIX = re.compile(r"^cameraMatrix:.*?data:\s*\[(.*?)\]", re.DOTALL | re.MULTI
 
 
 @part("reader", "kinect2", label="experimental")
-@dataclass(frozen=True)
 class Kinect2(Reader):
     """Folders of NNNN_depth.png and NNNN_color.jpg, with kinect2_bridge's calib_*.yaml."""
 
@@ -48,9 +46,7 @@ class Kinect2(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = files_named(path, _DEPTH.fullmatch)
-        if not files:
-            raise InputError("has no NNNN_depth.png", where=path, remedy="check the path")
+        files = required(files_named(path, _DEPTH.fullmatch), "NNNN_depth.png", path)
         color = [_color(file) for file in files]
         source = DepthImageSource(
             files,

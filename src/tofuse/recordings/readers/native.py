@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
@@ -22,18 +24,20 @@ from tofuse.recordings.camera_file import (
     read_camera_file,
     read_rays,
 )
-from tofuse.recordings.color import sampled_color
 from tofuse.recordings.correction_file import corrected_depth, read_correction
-from tofuse.recordings.depth_counts import depth_from_counts
 from tofuse.recordings.frames import (
-    DepthKind,
     Frame,
-    RangeFrame,
 )
 from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.native import LENS_COLUMNS
-from tofuse.recordings.reader import CERTAIN, UNCERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import FileSource, ply_frame
+from tofuse.recordings.reader import CERTAIN, UNCERTAIN, Reader, ReaderOptions, Sniff, required
+from tofuse.recordings.sources import (
+    FileSource,
+    cameras_of,
+    depth_from_counts,
+    ply_frame,
+    sampled_color,
+)
 from tofuse.sensor.depth_correction import DepthCorrection
 from tofuse.sensor.frequencies import DISAGREEMENT, SPEED_OF_LIGHT, combined
 
@@ -66,14 +70,13 @@ class NativeSource(FileSource):
         self.folder = folder
         self.is_clouds = not is_folder(folder / "depth") and is_folder(folder / "cloud")
         name, suffixes = ("cloud", (".ply",)) if self.is_clouds else ("depth", (".png",))
-        self.files = files_with(folder / name, *suffixes)
-        if not self.files:
-            raise InputError(
-                f"has no {suffixes[0]} files",
-                where=folder / name,
-                remedy="check that the recording is complete",
-            )
+        remedy = "check that the recording is complete"
+        files = files_with(folder / name, *suffixes)
+        self.files = required(files, f"{suffixes[0]} files", folder / name, remedy)
         self.description, self.camera = self._read_camera(camera_file)
+        self.unit, self.kind = self.description.depth_unit_m, self.description.depth_kind
+        self.amplitude_kind = self.description.amplitude_kind or "raw"
+        self.ambiguity_m = self.description.ambiguity_m
         rate = self.description.frame_rate_hz
         super().__init__(np.arange(len(self.files)) / (rate or 1.0))
         self.read_sidecars(folder)
@@ -104,44 +107,36 @@ class NativeSource(FileSource):
         timestamp = float(self.timestamps[index])
         if self.camera is None:
             return ply_frame(self.files[index], index, timestamp)
-        size = (self.camera.width, self.camera.height)
         camera = self._camera_of(index, self.camera)
-        kind = self.description.depth_kind
         if self.by_frequency:
-            depth = self._unwrapped_depth(index, camera, size, kind)
+            depth = self._unwrapped_depth(index, camera)
         else:
-            counts = read_image(self.files[index], size=size, dtype="uint16")
-            depth = depth_from_counts(counts, self.description.depth_unit_m)
+            depth = depth_from_counts(self._read(self.files, index, "uint16"), self.unit)
         if self.correction is not None:
-            depth = corrected_depth(self.correction, camera, depth, kind)
-        frame = RangeFrame(index, timestamp, camera, depth, kind)
-        amplitude = confidence = color = sigma = None
-        if self.amplitude:
-            amplitude = read_image(self.amplitude[index], size=size, dtype="uint16")
-            amplitude = amplitude.astype(np.float32)
-        if self.confidence:
-            confidence = read_image(self.confidence[index], size=size, dtype="uint8")
-            confidence = confidence.astype(np.uint8, copy=False)
+            depth = corrected_depth(self.correction, camera, depth, self.kind)
+        images: dict[str, Any] = {"camera": camera}
         if self.color:
-            path = self.color[index]
-            color = sampled_color(frame, read_color(path), self.description.color, path)
+            path, frame = self.color[index], self.image(index, depth, camera=camera)
+            images["color_image"] = sampled_color(
+                frame, read_color(path), self.description.color, path
+            )
+        if self.amplitude:
+            counts = self._read(self.amplitude, index, "uint16")
+            images["amplitude_image"] = counts.astype(np.float32)
+        if self.confidence:
+            images["confidence_image"] = self._read(self.confidence, index, "uint8")
         if self.sigma:
-            counts = read_image(self.sigma[index], size=size, dtype="uint16")
-            sigma = counts.astype(np.float32) * np.float32(self.description.sigma_unit_m or 0)
-        return RangeFrame(
-            index,
-            timestamp,
-            camera,
-            frame.depth,
-            kind,
-            amplitude,
-            confidence,
-            color,
-            sigma,
-            color_registered=self.description.color_registered,
-            amplitude_kind=self.description.amplitude_kind or "raw",
-            ambiguity_m=self.description.ambiguity_m,
+            counts = self._read(self.sigma, index, "uint16").astype(np.float32)
+            images["sigma_image"] = counts * np.float32(self.description.sigma_unit_m or 0)
+        return self.image(
+            index, depth, color_registered=self.description.color_registered, **images
         )
+
+    def _read(self, files: list[Path], index: int, dtype: str) -> NDArray[Any]:
+        """The counts (H, W) in a file of a channel."""
+        assert self.camera is not None
+        size = (self.camera.width, self.camera.height)
+        return read_image(files[index], size=size, dtype=dtype).astype(dtype, copy=False)
 
     def _camera_of(self, index: int, camera: Camera) -> Camera:
         """Return the camera of a frame: its own, if the recording has one per frame."""
@@ -170,20 +165,19 @@ class NativeSource(FileSource):
             or not set(LENS_COLUMNS) <= set(columns)
         ):
             return []
-        cameras: list[Pinhole | InputError] = []
+        path, size = self.folder / "frames.csv", (camera.width, camera.height)
+        common = {f.name: getattr(camera, f.name) for f in fields(camera)[2:]}
+        rows = enumerate(zip(*(columns[name].tolist() for name in LENS_COLUMNS), strict=True), 1)
         lenses: dict[tuple[float, ...], Pinhole] = {}
-        for k, row in enumerate(zip(*(columns[name] for name in LENS_COLUMNS), strict=True)):
-            try:
-                values = {f.name: getattr(camera, f.name) for f in fields(camera)[2:]}
-                values |= {name: float(v) for name, v in zip(LENS_COLUMNS, row, strict=True)}
-                where = f"{self.folder / 'frames.csv'}, row {k + 1}"
-                size = (camera.width, camera.height)
-                if row not in lenses:
-                    lenses[row] = checked_lens(type(camera), size, values, where)
-                cameras.append(lenses[row])
-            except InputError as error:
-                cameras.append(error)
-        return cameras
+
+        def lens(numbered: tuple[int, tuple[float, ...]]) -> Pinhole:
+            k, row = numbered
+            if row not in lenses:  # frames with the same lens share it
+                values = common | dict(zip(LENS_COLUMNS, row, strict=True))
+                lenses[row] = checked_lens(type(camera), size, values, f"{path}, row {k}")
+            return lenses[row]
+
+        return cameras_of(rows, lens)
 
     def _read_camera(self, camera_file: Path | None) -> tuple[CameraFile, Camera | None]:
         path = self.folder / "camera.json"
@@ -234,16 +228,13 @@ class NativeSource(FileSource):
             )
         return images
 
-    def _unwrapped_depth(
-        self, index: int, camera: Camera, size: tuple[int, int], kind: DepthKind
-    ) -> Float32:
+    def _unwrapped_depth(self, index: int, camera: Camera) -> Float32:
         """Depth unwrapped with all frequencies; 0 where they are inconsistent."""
-        unit = self.description.depth_unit_m
+        kind = self.kind
         periods = [SPEED_OF_LIGHT / (2 * hertz) for hertz in self.by_frequency]
         ranges = []
         for files in self.by_frequency.values():
-            counts = read_image(files[index], size=size, dtype="uint16")
-            depth = depth_from_counts(counts, unit)
+            depth = depth_from_counts(self._read(files, index, "uint16"), self.unit)
             ranges.append(depth if kind == "range" else range_from_z(camera, depth))
         radial, disagreement = combined(ranges, periods)
         consistent = np.where(disagreement < DISAGREEMENT * min(periods), radial, np.float32(0))
@@ -327,7 +318,6 @@ class NativeSource(FileSource):
 
 
 @part("reader", "native", label="validated")
-@dataclass(frozen=True)
 class Native(Reader):
     """Folders with a camera.json and depth/ (PNG) or cloud/ (PLY)."""
 

@@ -17,11 +17,16 @@ from tofuse.files.trajectory_formats import OPENGL
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, image_size, number_in, read_json
-from tofuse.recordings.depth_counts import depth_from_counts, depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import resized
 from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import FileSource, poses_of, read_matrix_pose
+from tofuse.recordings.sources import (
+    FileSource,
+    depth_from_counts,
+    depth_from_numbers,
+    poses_of,
+    read_matrix_pose,
+)
 
 NAME = "transforms.json"
 _DEPTH = ("depth_file_path", "depth_path")
@@ -38,7 +43,6 @@ _REMEDY = "correct it there"
 
 
 @part("reader", "nerfstudio", label="experimental")
-@dataclass(frozen=True)
 class Nerfstudio(Reader):
     """A transforms.json whose frames have depth, or the folder of one."""
 
@@ -109,11 +113,10 @@ class NerfstudioSource(FileSource):
             counts = read_image(sigma, size=size, dtype="uint16")
             sigma_z = counts.astype(np.float32) * np.float32(self.sigma_unit_m)
             sigma_image = np.nan_to_num(sigma_z * ray_lengths(camera))
-        return RangeFrame(
+        return self.image(
             index,
-            float(self.timestamps[index]),
-            camera,
             depth,
+            camera=camera,
             color_image=None if color is None else resized(read_color(color), size, color),
             sigma_image=sigma_image,
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +22,19 @@ from tofuse.recordings.camera_file import (
     load_camera,
     pinhole_values,
 )
-from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.single_files import file_of, required_file
-from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, file_of, required_file
+from tofuse.recordings.sources import (
+    FileSource,
+    check_timestamps,
+    depth_from_numbers,
+    finite_float32,
+    read_matrix_pose,
+)
 
 MAX_BYTES = 1 << 30
 _IMAGES = {"amplitude": 3, "confidence": 3, "sigma": 3, "color": 4}
+_FLOATS = ("amplitude", "sigma")
 _TABLES = ("timestamps", "reference", "odometry", "K", "rays", "distortion")
 _VALUES = (
     *("depth_unit_m", "depth_kind", "model", "frame_rate_hz", "ambiguity_m", "confidence_max"),
@@ -40,7 +44,6 @@ _NAMES = ("depth", *_IMAGES, *_TABLES, *_VALUES)
 
 
 @part("reader", "npz", label="validated")
-@dataclass(frozen=True)
 class Npz(Reader):
     """A .npz file with depth (N, H, W), a camera (K or rays), and optional channels."""
 
@@ -95,6 +98,7 @@ class NpzSource(FileSource):
         for name in ("frame_rate_hz", "ambiguity_m", "confidence_max"):
             if name in arrays:
                 self.metadata[name] = self._number(arrays, name)
+        self.ambiguity_m = self.metadata.get("ambiguity_m")
         if "sensor" in arrays:
             self.metadata["sensor"] = str(arrays["sensor"])[:200]
         unknown = [name for name in arrays if name not in _NAMES]
@@ -103,27 +107,11 @@ class NpzSource(FileSource):
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
-        with np.errstate(all="ignore"):
-            images = {name: stack[index] for name, stack in self.images.items()}
-            amplitude, sigma = (
-                np.nan_to_num(images[n].astype(np.float32), posinf=0, neginf=0)
-                if n in images
-                else None
-                for n in ("amplitude", "sigma")
-            )
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth_from_numbers(self.depth[index], self.unit),
-            self.kind,  # type: ignore[arg-type]
-            amplitude,
-            images.get("confidence"),
-            images.get("color"),
-            sigma,
-            amplitude_kind=self.amplitude_kind,  # type: ignore[arg-type]
-            ambiguity_m=self.metadata.get("ambiguity_m"),
-        )
+        images = {
+            f"{name}_image": finite_float32(stack[index]) if name in _FLOATS else stack[index]
+            for name, stack in self.images.items()
+        }
+        return self.image(index, depth_from_numbers(self.depth[index], self.unit), **images)
 
     def _read_camera(
         self, arrays: dict[str, NDArray[Any]], options: ReaderOptions
@@ -233,7 +221,7 @@ class NpzSource(FileSource):
 
     def _text(
         self, arrays: dict[str, NDArray[Any]], name: str, default: str, choices: tuple[str, ...]
-    ) -> str:
+    ) -> Any:
         value = str(arrays[name]) if name in arrays else default
         if value not in choices:
             raise self._error(name, f"is {value!r:.60}", f"save one of {', '.join(choices)}")

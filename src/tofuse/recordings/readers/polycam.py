@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tofuse.arrays import Float64, UInt8
-from tofuse.errors import InputError
 from tofuse.files.images import first_size
 from tofuse.files.reading import files_with, if_file, is_file, is_folder
 from tofuse.geometry.cameras import Pinhole
@@ -22,15 +20,21 @@ from tofuse.recordings.phones import (
     arkit_pose,
     lens,
 )
-from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import poses_from_files
+from tofuse.recordings.reader import (
+    PER_FRAME,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    refuse_camera,
+    required,
+)
+from tofuse.recordings.sources import cameras_of, poses_from_files
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 _LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and 255
 
 
 @part("reader", "polycam", label="experimental")
-@dataclass(frozen=True)
 class Polycam(Reader):
     """Folders with keyframes/depth, images, cameras and maybe confidence, corrected_cameras."""
 
@@ -52,10 +56,7 @@ class PolycamSource(PhoneSource):
 
     def __init__(self, folder: Path) -> None:
         files = files_with(folder / "depth", ".png") if is_folder(folder / "depth") else []
-        if not files:
-            raise InputError(
-                "has no .png files", where=folder / "depth", remedy="export 'raw data' again"
-            )
+        required(files, ".png files", folder / "depth", "export 'raw data' again")
         size = first_size(files)
         super().__init__(
             files,
@@ -63,12 +64,8 @@ class PolycamSource(PhoneSource):
             confidence=[if_file(folder / "confidence" / file.name) for file in files],
             color=[if_file(folder / "images" / f"{file.stem}.jpg") for file in files],
         )
-        for file in files:
-            path = folder / "cameras" / f"{file.stem}.json"
-            try:
-                self.cameras.append(_lens(read_json(path), size, path))
-            except InputError as error:
-                self.cameras.append(error)  # only this frame is unusable
+        paths = [folder / "cameras" / f"{file.stem}.json" for file in files]
+        self.cameras = cameras_of(paths, lambda path: _lens(read_json(path), size, path))
         self._read_poses(folder)
 
     def _read_poses(self, folder: Path) -> None:

@@ -6,7 +6,6 @@ import json
 import re
 import zipfile
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +17,10 @@ from tofuse.files.exr import parse_exr
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.lzfse import lzfse_decompress
 from tofuse.files.reading import (
+    files_named,
     input_error,
     is_file,
     is_folder,
-    list_folder,
     read_bytes,
     required_package,
 )
@@ -29,7 +28,6 @@ from tofuse.geometry import quaternion
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import image_size, number_in, numbers_in, read_json
-from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import (
     ARKIT_AXES,
@@ -39,9 +37,17 @@ from tofuse.recordings.phones import (
     lens,
     resized,
 )
-from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.single_files import begins_with, file_of
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.reader import (
+    PER_FRAME,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    begins_with,
+    file_of,
+    refuse_camera,
+    required,
+)
+from tofuse.recordings.sources import FileSource, depth_from_numbers
 
 MAX_MEMBER_BYTES = 1 << 26
 _MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")
@@ -50,7 +56,6 @@ _REMEDY = "export the recording again"
 
 
 @part("reader", "record3d", label="validated")
-@dataclass(frozen=True)
 class Record3D(Reader):
     """Folders with metadata.json, depth/*.exr and rgb/*.jpg; or .r3d files."""
 
@@ -112,16 +117,10 @@ class Record3DSource(FileSource):
         number = self.store.numbers[index]
         depth = self.store.depth(number, self.size)
         color = self.store.color(number)
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth,
-            confidence_image=self.store.confidence(number, self.size),
-            color_image=None
-            if color is None
-            else resized(as_color(parse_image(*color)), self.size, color[1]),
-        )
+        if color is not None:
+            color = resized(as_color(parse_image(*color)), self.size, color[1])
+        confidence = self.store.confidence(number, self.size)
+        return self.image(index, depth, confidence_image=confidence, color_image=color)
 
 
 class _Folder:
@@ -134,9 +133,7 @@ class _Folder:
         self.where = path / "metadata.json"
         self.path = path
         self.files = _numbered(path / "depth", _EXR)
-        if not self.files:
-            raise InputError("has no .exr files", where=path / "depth", remedy="export it again")
-        self.numbers = sorted(self.files)
+        self.numbers = required(sorted(self.files), ".exr files", path / "depth", _REMEDY)
 
     def metadata(self) -> dict[str, Any]:
         return read_json(self.where)
@@ -284,13 +281,7 @@ class _Metadata:
 
 
 def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
-    if not is_folder(folder):
-        return {}
-    try:
-        matches = [(pattern.fullmatch(p.name), p) for p in list_folder(folder)]
-    except InputError:
-        return {}
-    return {int(match.group(1)): p for match, p in matches if match}
+    return {int(file.stem): file for file in files_named(folder, pattern.fullmatch)}
 
 
 def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float32:

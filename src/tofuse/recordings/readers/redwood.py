@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +21,8 @@ from tofuse.recordings.camera_file import (
     numbers_in,
     read_json,
 )
-from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
+from tofuse.recordings.sources import DepthImageSource
 
 # Open3D's PinholeCameraIntrinsicParameters.PrimeSenseDefault.
 SENSOR, SIZE = "PrimeSense (structured light)", (640, 480)
@@ -34,7 +33,6 @@ _MICROSECONDS = re.compile(r"[0-9]+-([0-9]{12})")
 
 
 @part("reader", "redwood", label="validated")
-@dataclass(frozen=True)
 class Redwood(Reader):
     """Folders with depth/, color/ (or image/, rgb/), maybe a camera .json and trajectory.log."""
 
@@ -60,9 +58,7 @@ class Redwood(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = files_with(path / "depth", ".png")
-        if not files:
-            raise InputError("has no .png files", where=path / "depth", remedy="check the path")
+        files = required(files_with(path / "depth", ".png"), ".png files", path / "depth")
         warnings: list[str] = []
         camera: Pinhole | None = None
         if options.camera is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,28 +9,31 @@ import numpy as np
 
 from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.parts import part
-from tofuse.recordings.bags import MAGIC, MAX_GAP_S, BagSource, Track, damaged
-from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
-from tofuse.recordings.depth_counts import depth_from_numbers
-from tofuse.recordings.frames import Frame
-from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.ros_frames import Transforms, frame_name
-from tofuse.recordings.ros_messages import (
+from tofuse.recordings.bags import (
     COLORS,
     ENCODINGS,
     GREY,
+    MAX_GAP_S,
+    REMEDY,
+    BagSource,
+    Track,
+    Transforms,
+    bag_kind,
     cloud,
     color_image,
     decompressed,
     decompressed_color,
+    frame_name,
     image,
     lens,
 )
-from tofuse.recordings.sources import cloud_frame
+from tofuse.recordings.camera_file import ColorCamera, check_size
+from tofuse.recordings.frames import Frame
+from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
+from tofuse.recordings.sources import cloud_frame, depth_from_numbers, library_errors
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -42,22 +44,15 @@ _ODOMETRY = "odom"
 
 
 @part("reader", "ros")
-@dataclass(frozen=True)
 class Ros(Reader):
     """A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag, with depth images or clouds."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        if is_folder(path):
-            if is_file(path / "metadata.yaml") and files_with(path, ".db3", ".mcap", ".zstd"):
-                return Sniff(0.95, "metadata.yaml and a bag")
+        kind = bag_kind(path)
+        if kind is None:
             return None
-        head = read_head(path, 16)
-        if any(head.startswith(magic) for magic in MAGIC):
-            return Sniff(0.95, "a bag")
-        if path.suffix.lower() == ".db3" and head.startswith(b"SQLite format 3"):
-            return Sniff(0.95, "a bag")
-        return None
+        return Sniff(0.95, "metadata.yaml and a bag" if kind == "folder" else "a bag")
 
     def open(self, path: Path, options: ReaderOptions) -> RosSource:
         """See `Reader.open`."""
@@ -167,8 +162,8 @@ class RosSource(BagSource):
 
     def _read_camera(self, options: ReaderOptions) -> None:
         if options.camera is not None:
-            description, self.camera = load_camera(options.camera)
-            self.kind, self.unit = description.depth_kind, description.depth_unit_m
+            self.use_camera(options.camera)
+            self.color_camera = None  # the bag's own is found below
             return
         infos = [c for c in self.bag.connections if c.msgtype == INFO]
         adjacent = self._camera_infos(self.connection)
@@ -194,9 +189,10 @@ class RosSource(BagSource):
 
     def _transforms(self) -> Transforms:
         try:
-            return Transforms.read(self.bag)
-        except Exception as error:  # any exception of rosbags for damaged data
-            self.warnings.append(f"tf is ignored: {damaged(error, self.path)}")
+            with library_errors(self.path, REMEDY):
+                return Transforms.read(self.bag)
+        except InputError as error:
+            self.warnings.append(f"tf is ignored: {error}")
             return Transforms({})
 
     def _frame_of(self, track: Track) -> str:
@@ -208,9 +204,10 @@ class RosSource(BagSource):
         if not transforms:
             return
         try:
-            frame = self._frame_of(self.depth)
-        except Exception as error:  # a damaged message affects only its frame
-            self.warnings.append(f"tf is ignored: {damaged(error, self.where(0))}")
+            with library_errors(self.where(0), REMEDY):
+                frame = self._frame_of(self.depth)
+        except InputError as error:  # affects only this frame
+            self.warnings.append(f"tf is ignored: {error}")
             return
         ancestors = transforms.ancestors(frame)
         odometry = next((name for name in ancestors if _ODOMETRY in name.lower()), None)
@@ -227,37 +224,39 @@ class RosSource(BagSource):
         """Find a colour camera with known intrinsics and pose relative to depth."""
         missing: list[str] = []
         for connection in sorted(self.bag.connections, key=lambda c: (c.msgtype, c.topic)):
-            if not self._is_color(connection):
-                continue
-            track = Track(self.bag, connection)
-            if not len(track):
+            if not self._is_color(connection) or not len(track := Track(self.bag, connection)):
                 continue
             try:
-                first = self.read_color(track, 0, f"{self.path}: {connection.topic}")
-                depth_frame, color_frame = self._frame_of(self.depth), self._frame_of(track)
-                registered = _rank(self.connection) == 1  # depth is registered to colour
-                same_size = first.shape[:2] == (self.camera.height, self.camera.width)
-                T = transforms.static_transform(color_frame, depth_frame)
-                infos = self._camera_infos(connection)
-                if same_size and (registered or depth_frame == color_frame):
-                    self.color = track
-                elif T is not None and infos:
-                    self.color_camera = ColorCamera(self._lens_of(infos[0]), T)
-                    self.color = track
-                else:
-                    missing.append(connection.topic)
-                    continue
-            except Exception as error:  # an InputError, or one of rosbags for a damaged message
-                cause = error if isinstance(error, InputError) else damaged(error, self.path)
-                missing.append(f"{connection.topic} ({cause.problem})")
+                with library_errors(self.path, REMEDY):
+                    found = self._relate_color(track, transforms)
+            except InputError as error:
+                missing.append(f"{connection.topic} ({error.problem})")
                 continue
-            self.metadata["color_topic"] = connection.topic
-            return
+            if found:
+                self.metadata["color_topic"] = connection.topic
+                return
+            missing.append(connection.topic)
         if missing:
             self.warnings.append(
                 f"colour is ignored: the relation of {missing[0]} to depth is not in the bag "
                 "(its camera_info, and tf_static between the two cameras)"
             )
+
+    def _relate_color(self, track: Track, transforms: Transforms) -> bool:
+        """Use a colour camera, if its intrinsics and pose relative to depth are known."""
+        topic = track.connection.topic
+        first = self.read_color(track, 0, f"{self.path}: {topic}")
+        depth_frame, color_frame = self._frame_of(self.depth), self._frame_of(track)
+        registered = _rank(self.connection) == 1  # depth is registered to colour
+        same_size = first.shape[:2] == (self.camera.height, self.camera.width)
+        T = transforms.static_transform(color_frame, depth_frame)
+        infos = self._camera_infos(track.connection)
+        if not (same_size and (registered or depth_frame == color_frame)):
+            if T is None or not infos:
+                return False
+            self.color_camera = ColorCamera(self._lens_of(infos[0]), T)
+        self.color = track
+        return True
 
     def _is_color(self, connection: Any) -> bool:
         topic = connection.topic.lower()

@@ -22,7 +22,14 @@ from tofuse.recordings.phones import (
     arkit_pose,
     lens,
 )
-from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import (
+    PER_FRAME,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    refuse_camera,
+    required,
+)
 from tofuse.recordings.sources import interpolated, poses_of
 
 _DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
@@ -30,7 +37,6 @@ _REMEDY = "export the recording again"
 
 
 @part("reader", "3dscannerapp", label="validated")
-@dataclass(frozen=True)
 class ScannerApp(Reader):
     """Folders of depth_NNNNN.png, conf_NNNNN.png, frame_NNNNN.json and some .jpg."""
 
@@ -45,8 +51,7 @@ class ScannerApp(Reader):
         """See `Reader.open`."""
         refuse_camera(options, "3dscannerapp", PER_FRAME)
         files = files_named(path, _DEPTH.fullmatch)
-        if not files:
-            raise InputError("has no depth_*.png", where=path, remedy="export with all data")
+        required(files, "depth_*.png", path, "export with all data")
         size = first_size(files)
         source = PhoneSource(
             files,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
-from dataclasses import dataclass
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,22 @@ from tofuse.recordings.cloud_files import (
     sniff_clouds,
 )
 from tofuse.recordings.frames import CloudFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.single_files import begins_with, file_of, required_file
-from tofuse.recordings.sources import FileSource, cloud_frame, poses_of, read_matrix_pose
+from tofuse.recordings.reader import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    begins_with,
+    file_of,
+    refuse_camera,
+    required_file,
+)
+from tofuse.recordings.sources import (
+    FileSource,
+    cloud_frame,
+    library_errors,
+    poses_of,
+    read_matrix_pose,
+)
 
 MAX_POINTS = 100_000_000
 _E57 = b"ASTM-E57"
@@ -36,7 +49,6 @@ _COPY = "copy the file again, or export it again"
 
 
 @part("reader", "las")
-@dataclass(frozen=True)
 class LasScans(Reader):
     """A .las or .laz file, or a folder of them; metres."""
 
@@ -60,11 +72,8 @@ def _las_header(path: Path) -> Any:
     if head[:4] != b"LASF":
         raise InputError("isn't a LAS file", where=path, remedy="check the file")
     _check_records(head, path)
-    try:
-        with laspy.open(path) as file:
-            header = file.header
-    except Exception as error:  # laspy raises arbitrary exceptions
-        raise _damaged(error, path) from error
+    with library_errors(path, _COPY), laspy.open(path) as file:
+        header = file.header
     count, size = int(header.point_count), int(header.point_format.size)
     file_size = path.stat().st_size
     compressed = bool(getattr(header, "are_points_compressed", False))
@@ -75,12 +84,8 @@ def _las_header(path: Path) -> Any:
             remedy=_COPY,
         )
     if compressed and count:
-        try:
+        with library_errors(path, _COPY):
             _check_chunks(path, header)
-        except InputError:
-            raise
-        except Exception as error:  # lazrs has its own exception types
-            raise _damaged(error, path) from error
     return header
 
 
@@ -155,7 +160,7 @@ def _shift(path: Path) -> Float64:
 
 def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> CloudFrame:
     _las_header(path)
-    try:
+    with library_errors(path, _COPY):
         points = required_package("laspy", "scan", path).read(path)
         xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1)
         names = set(points.point_format.dimension_names)
@@ -165,10 +170,6 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
             values = np.stack([np.asarray(points[c]) for c in ("red", "green", "blue")], 1)
             # The standard uses 16 bits; many programs write 8-bit values.
             color = (values >> 8 if values.max(initial=0) > 255 else values).astype(np.uint8)
-    except InputError:
-        raise
-    except Exception as error:
-        raise _damaged(error, path) from error
     return cloud_frame(
         index,
         timestamp,
@@ -180,7 +181,6 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
 
 
 @part("reader", "e57")
-@dataclass(frozen=True)
 class E57Scans(Reader):
     """A .e57 file: one view per scan, in the scanner's frame; its poses as reference."""
 
@@ -202,16 +202,10 @@ class E57Source(FileSource):
         if read_head(path, 8) != _E57:
             raise InputError("isn't an E57 file", where=path, remedy="check the file")
         self._pye57 = required_package("pye57", "scan", path)
-        try:
-            file = self._pye57.E57(str(path))
-            try:
-                headers = [file.get_header(k) for k in range(file.scan_count)]
-                self.counts = [int(header.point_count) for header in headers]
-                poses = [self._pose(header) for header in headers]
-            finally:
-                file.close()
-        except Exception as error:  # the library raises arbitrary exceptions
-            raise _damaged(error, path) from error
+        with library_errors(path, _COPY), closing(self._pye57.E57(str(path))) as file:
+            headers = [file.get_header(k) for k in range(file.scan_count)]
+            self.counts = [int(header.point_count) for header in headers]
+            poses = [self._pose(header) for header in headers]
         if not self.counts:
             raise InputError(
                 "contains no scan", where=path, remedy="export scans, not only pictures"
@@ -237,17 +231,11 @@ class E57Source(FileSource):
                 where=where,
                 remedy="export the scan with fewer points",
             )
-        try:
-            file = self._pye57.E57(str(self.path))
-            try:
-                data = file.read_scan(
-                    index, intensity=True, colors=True, ignore_missing_fields=True, transform=False
-                )
-            finally:
-                file.close()
+        with library_errors(where, _COPY), closing(self._pye57.E57(str(self.path))) as file:
+            data = file.read_scan(
+                index, intensity=True, colors=True, ignore_missing_fields=True, transform=False
+            )
             points = np.stack([np.asarray(data[f"cartesian{a}"], float) for a in "XYZ"], 1)
-        except Exception as error:
-            raise _damaged(error, where) from error
         color = None
         if all(f"color{c}" in data for c in ("Red", "Green", "Blue")):
             color = np.stack([np.asarray(data[f"color{c}"]) for c in ("Red", "Green", "Blue")], 1)
@@ -267,11 +255,3 @@ class E57Source(FileSource):
             return np.eye(4)
         w, x, y, z = (float(value) for value in header.rotation)
         return to_pose([x, y, z, w], header.translation)
-
-
-def _damaged(error: Exception, where: str | Path) -> InputError:
-    return InputError(
-        f"can't be read ({type(error).__name__}: {str(error)[:200]})",
-        where=where,
-        remedy=_COPY,
-    )

@@ -15,16 +15,27 @@ from tofuse.arrays import Float64, UInt8, UInt16
 from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.reading import input_error
-from tofuse.geometry.cameras import Camera
 from tofuse.geometry.se3 import inverse
 from tofuse.parts import part
-from tofuse.recordings.camera_file import ColorCamera, checked_pinhole, load_camera
-from tofuse.recordings.color import sampled_color
-from tofuse.recordings.depth_counts import depth_from_counts
-from tofuse.recordings.frames import DepthKind, RangeFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.single_files import begins_with, file_of, required_file
-from tofuse.recordings.sources import FileSource, check_timestamps, poses_of, read_matrix_pose
+from tofuse.recordings.camera_file import ColorCamera, checked_pinhole
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.reader import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    begins_with,
+    file_of,
+    required_file,
+)
+from tofuse.recordings.sources import (
+    FileSource,
+    check_timestamps,
+    depth_from_counts,
+    poses_of,
+    read_matrix_pose,
+    read_part,
+    sampled_color,
+)
 
 VERSION = 4
 RAW, ZLIB, OCCI = 0, 1, 2  # compression of depth
@@ -38,7 +49,6 @@ _RATE_HZ = 30.0
 
 
 @part("reader", "sens")
-@dataclass(frozen=True)
 class Sens(Reader):
     """A .sens file: depth, colour, both intrinsics, and ScanNet's poses as reference."""
 
@@ -63,11 +73,6 @@ class _Entry:
 
 class SensSource(FileSource):
     """Frames located in one pass over the file, and read on demand."""
-
-    camera: Camera
-    unit: float
-    kind: DepthKind = "z"
-    color: ColorCamera | None = None
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.path = path
@@ -95,9 +100,7 @@ class SensSource(FileSource):
             lambda k: read_matrix_pose(frames[k][2], f"{path}: pose of frame {k}"),
         )
         if options.camera is not None:
-            description, self.camera = load_camera(options.camera, self.depth_size)
-            self.unit, self.kind = description.depth_unit_m, description.depth_kind
-            self.color = description.color or self.color
+            self.use_camera(options.camera, self.depth_size)
         self.metadata |= {
             "sensor": self.sensor,
             "depth_unit_m": self.unit,
@@ -108,20 +111,15 @@ class SensSource(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         entry, where = self.entries[index], f"{self.path}: frame {index}"
-        try:
-            with self.path.open("rb") as file:
-                file.seek(entry.start)
-                packed_color, packed_depth = file.read(entry.color), file.read(entry.depth)
-        except OSError as error:
-            raise input_error(error, self.path) from error
+        data = read_part(self.path, entry.start, entry.color + entry.depth)
+        packed_color, packed_depth = data[: entry.color], data[entry.color :]
         counts = self._depth(packed_depth, where)
-        depth = depth_from_counts(counts, self.unit)
-        frame = RangeFrame(index, float(self.timestamps[index]), self.camera, depth, self.kind)
-        if not packed_color or self.color is None:
+        frame = self.image(index, depth_from_counts(counts, self.unit))
+        if not packed_color or self.color_camera is None:
             return frame
         where = f"{where}: colour"
         image = self._color(packed_color, where)
-        return replace(frame, color_image=sampled_color(frame, image, self.color, where))
+        return replace(frame, color_image=sampled_color(frame, image, self.color_camera, where))
 
     def _read_header(self, file: BinaryIO) -> int:
         version, length = struct.unpack("<IQ", self._take(file, 12))
@@ -145,7 +143,7 @@ class SensSource(FileSource):
         color_lens, T_device_color, depth_lens, T_device_depth = matrices
         self.camera = checked_pinhole(depth_lens, self.depth_size, f"{self.path}: depth lens")
         if all(1 < side <= _MAX_SIDE for side in color_size) and self.color_packing in _COLORS:
-            self.color = ColorCamera(
+            self.color_camera = ColorCamera(
                 checked_pinhole(color_lens, color_size, f"{self.path}: color lens"),
                 self._T_color_depth(T_device_color, T_device_depth),
             )
@@ -200,8 +198,8 @@ class SensSource(FileSource):
         return np.frombuffer(data, "<u2").reshape(height, width)
 
     def _color(self, data: bytes, where: str) -> UInt8:
-        assert self.color is not None
-        size = (self.color.camera.width, self.color.camera.height)
+        assert self.color_camera is not None
+        size = (self.color_camera.camera.width, self.color_camera.camera.height)
         if self.color_packing != RAW:
             return as_color(parse_image(data, where, size=size))
         if len(data) != 3 * size[0] * size[1]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +11,13 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.images import first_size
-from tofuse.files.reading import is_file, is_folder, list_folder
+from tofuse.files.reading import files_named, is_file
 from tofuse.files.tables import read_numbers
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_pinhole
-from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import poses_from_files, read_matrix_pose
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, required
+from tofuse.recordings.sources import DepthImageSource, poses_from_files, read_matrix_pose
 
 FRAME_RATE_HZ = 30.0
 SENSOR, SIZE = "Kinect v1 (structured light)", (640, 480)
@@ -29,7 +27,6 @@ _DEPTH = re.compile(r"frame-([0-9]{1,9})\.depth\.png", re.IGNORECASE)
 
 
 @part("reader", "7scenes", label="validated")
-@dataclass(frozen=True)
 class SevenScenes(Reader):
     """Folders of frame-NNNNNN.depth.png, .pose.txt and .color.png or .jpg."""
 
@@ -40,9 +37,7 @@ class SevenScenes(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        numbered = _depth_files(path)
-        if not numbered:
-            raise InputError("has no frame-*.depth.png", where=path, remedy="check the path")
+        numbered = required(_depth_files(path), "frame-*.depth.png", path)
         numbers = np.array([number for number, _ in numbered])
         files = [file for _, file in numbered]
         color = [image for file in files if (image := _color(file)) is not None]
@@ -78,13 +73,7 @@ def read_pose(path: Path) -> Float64:
 
 
 def _depth_files(path: Path) -> list[tuple[int, Path]]:
-    if not is_folder(path):
-        return []
-    try:
-        matches = [(match, p) for p in list_folder(path) if (match := _DEPTH.fullmatch(p.name))]
-    except InputError:
-        return []
-    return sorted((int(match.group(1)), p) for match, p in matches)
+    return sorted((int(p.name[6:].split(".")[0]), p) for p in files_named(path, _DEPTH.fullmatch))
 
 
 def _color(file: Path) -> Path | None:

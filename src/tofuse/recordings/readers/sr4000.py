@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_file, is_folder, read_head, read_text
+from tofuse.files.reading import is_file, read_head, read_text
 from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, files_at, refuse_camera, required
 from tofuse.recordings.sources import FileSource, interpolated
 
 FRAME_RATE_HZ = 32.0
@@ -36,7 +35,6 @@ _TIME = re.compile(rb"%[^\n]*time stamp \[ms\][^\n]*\n\s*([0-9.eE+-]+)", re.IGNO
 
 
 @part("reader", "sr4000", label="validated")
-@dataclass(frozen=True)
 class Sr4000(Reader):
     """Folders of .dat files with blocks of Z, x and y vectors, amplitude and confidence."""
 
@@ -52,16 +50,12 @@ class Sr4000(Reader):
     def open(self, path: Path, options: ReaderOptions) -> Sr4000Source:
         """See `Reader.open`."""
         refuse_camera(options, "sr4000")
-        files = _files(path)
-        if not files:
-            raise InputError("has no .dat files", where=path, remedy="pass the export's folder")
-        return Sr4000Source(files)
+        remedy = "pass the export's folder"
+        return Sr4000Source(required(_files(path), ".dat files", path, remedy))
 
 
 def _files(path: Path) -> list[Path]:
-    if is_file(path):
-        return [path] if path.suffix.lower() == ".dat" else []
-    return files_with(path, ".dat") if is_folder(path) else []
+    return files_at(path, ".dat")
 
 
 class Sr4000Source(FileSource):
@@ -71,6 +65,9 @@ class Sr4000Source(FileSource):
     origin, so that x/z of a pixel depends slightly on z: each frame has its own table, with which
     `frame.points` equals the vectors of the file.
     """
+
+    amplitude_kind = "range_compensated"
+    ambiguity_m = AMBIGUITY_M
 
     def __init__(self, files: list[Path]) -> None:
         self.files = files
@@ -115,18 +112,16 @@ class Sr4000Source(FileSource):
         rays = np.stack([-blocks["x"] / safe, -blocks["y"] / safe], -1)
         confidence = blocks.get("confidence")
         amplitude = blocks.get("amplitude")
-        return RangeFrame(
+        if confidence is not None:
+            confidence = np.clip(np.nan_to_num(confidence), 0, 255).astype(np.uint8)
+        return self.image(
             index,
-            float(self.timestamps[index]),
-            RayTable(rays.astype(np.float32)),
             depth.astype(np.float32),
-            "z",
-            None if amplitude is None else np.nan_to_num(amplitude).astype(np.float32),
-            None
-            if confidence is None
-            else np.clip(np.nan_to_num(confidence), 0, 255).astype(np.uint8),
-            amplitude_kind="range_compensated",
-            ambiguity_m=AMBIGUITY_M,
+            camera=RayTable(rays.astype(np.float32)),
+            amplitude_image=None
+            if amplitude is None
+            else np.nan_to_num(amplitude).astype(np.float32),
+            confidence_image=confidence,
         )
 
 

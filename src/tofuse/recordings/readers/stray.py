@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,14 @@ from tofuse.recordings.phones import (
     PhoneSource,
     lens,
 )
-from tofuse.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.reader import (
+    PER_FRAME,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    refuse_camera,
+    required,
+)
 from tofuse.recordings.sources import interpolated
 
 FRAME_RATE_HZ = 60.0
@@ -40,7 +46,6 @@ _IMU = {
 
 
 @part("reader", "stray", label="validated")
-@dataclass(frozen=True)
 class Stray(Reader):
     """Folders with depth/, confidence/, odometry.csv, camera_matrix.csv, imu.csv and rgb.mp4."""
 
@@ -66,9 +71,7 @@ class StraySource(PhoneSource):
     """
 
     def __init__(self, folder: Path) -> None:
-        files = files_with(folder / "depth", ".png")
-        if not files:
-            raise InputError("has no .png files", where=folder / "depth", remedy="copy it again")
+        files = required(files_with(folder / "depth", ".png"), ".png files", folder / "depth")
         confidence = {p.stem: p for p in _images(folder / "confidence")}
         super().__init__(
             files,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,9 @@ from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_folder
 from tofuse.files.tiff import read_tiff
 from tofuse.parts import part
-from tofuse.recordings.camera_file import load_camera
-from tofuse.recordings.depth_counts import depth_from_numbers
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import FileSource
+from tofuse.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
+from tofuse.recordings.sources import FileSource, depth_from_numbers, finite_float32
 
 _SUFFIXES = (".tif", ".tiff")
 _RANGE = ".range"
@@ -25,7 +22,6 @@ _NOT_DEPTH = (*_AMPLITUDE_KEYWORDS, "conf")
 
 
 @part("reader", "tiff")
-@dataclass(frozen=True)
 class Tiff(Reader):
     """A folder of depth images as TIFF, with a camera.json given; amplitude in *intens*.tif."""
 
@@ -44,8 +40,7 @@ class Tiff(Reader):
         """See `Reader.open`."""
         files = files_with(path, *_SUFFIXES) if is_folder(path) else []
         depth = [f for f in files if _is_range(f)] or [f for f in files if not _is_other(f)]
-        if not depth:
-            raise InputError("has no .tif of depth", where=path, remedy="pass the folder of images")
+        required(depth, ".tif of depth", path, "pass the folder of images")
         if options.camera is None:
             raise InputError(
                 "has no camera: the layout of .t3c files isn't published, and TIFF has none",
@@ -67,11 +62,9 @@ class TiffSource(FileSource):
     def __init__(
         self, folder: Path, depth: Sequence[Path], amplitude: Sequence[Path], camera: Path
     ) -> None:
-        description, self.camera = load_camera(camera)
-        rate = description.frame_rate_hz
-        super().__init__(np.arange(len(depth)) / (rate or 1.0))
+        description = self.use_camera(camera)
+        super().__init__(np.arange(len(depth)) / (description.frame_rate_hz or 1.0))
         self.depth, self.amplitude = list(depth), list(amplitude)
-        self.unit, self.kind = description.depth_unit_m, description.depth_kind
         self.amplitude_kind = description.amplitude_kind or "raw"
         self.ambiguity_m = description.ambiguity_m
         if self.amplitude and len(self.amplitude) != len(self.depth):
@@ -89,19 +82,9 @@ class TiffSource(FileSource):
         size = (self.camera.width, self.camera.height)
         amplitude = None
         if self.amplitude:
-            with np.errstate(all="ignore"):
-                image = read_tiff(self.amplitude[index], size).astype(np.float32)
-            amplitude = np.nan_to_num(image, posinf=0, neginf=0)
-        return RangeFrame(
-            index,
-            float(self.timestamps[index]),
-            self.camera,
-            depth_from_numbers(read_tiff(self.depth[index], size), self.unit),
-            self.kind,
-            amplitude,
-            amplitude_kind=self.amplitude_kind,
-            ambiguity_m=self.ambiguity_m,
-        )
+            amplitude = finite_float32(read_tiff(self.amplitude[index], size))
+        depth = depth_from_numbers(read_tiff(self.depth[index], size), self.unit)
+        return self.image(index, depth, amplitude_image=amplitude)
 
 
 def _is_range(file: Path) -> bool:

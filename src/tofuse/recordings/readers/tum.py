@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,8 @@ from tofuse.files.reading import is_file, is_folder, read_text
 from tofuse.files.trajectory import associate
 from tofuse.geometry.cameras import BrownConrady
 from tofuse.parts import part
-from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.recordings.sources import check_timestamps, tum_poses
+from tofuse.recordings.sources import DepthImageSource, check_timestamps, tum_poses
 
 DEPTH_UNIT_M = 1 / 5000
 COLOR_LIMIT_S = 0.1
@@ -37,7 +35,6 @@ CAMERAS = {
 
 
 @part("reader", "tum")
-@dataclass(frozen=True)
 class Tum(Reader):
     """Folders with depth.txt (timestamp and file name), depth/, and maybe rgb.txt, rgb/."""
 

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tofuse.errors import InputError
 from tofuse.files.images import first_size
 from tofuse.files.reading import files_with, is_file, is_folder, parse_toml, read_text
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, image_size, number_in
-from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import Reader, ReaderOptions, Sniff
+from tofuse.recordings.reader import Reader, ReaderOptions, Sniff, required
+from tofuse.recordings.sources import DepthImageSource
 
 FRAME_RATE_HZ = 30.0
 _LENS = {"fx": "camera_fx", "fy": "camera_fy", "cx": "camera_cx", "cy": "camera_cy"}
 
 
 @part("reader", "zense", label="validated")
-@dataclass(frozen=True)
 class Zense(Reader):
     """Folders of depth*.png in mm and a .toml with camera_fx, _fy, _cx and _cy."""
 
@@ -36,8 +33,7 @@ class Zense(Reader):
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
         files = _depth_files(path) if is_folder(path) else []
-        if not files:
-            raise InputError("has no depth*.png", where=path, remedy="pass the recording's folder")
+        required(files, "depth*.png", path, "pass the recording's folder")
         settings = _settings(path)
         camera: Pinhole | None = None
         rate = FRAME_RATE_HZ
