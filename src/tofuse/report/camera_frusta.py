@@ -9,7 +9,9 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole, RayTable
 from tofuse.normal import OF_95_PERCENT
+from tofuse.recordings.frames import RangeFrame
 from tofuse.report.fields import normalized_accuracy
 from tofuse.report.packing import pack
 from tofuse.report.scene import RigCameras
@@ -43,6 +45,16 @@ def packed(s: Subject) -> dict[str, Any]:
         "after": _poses(s.result.trajectory, s.R_display_world),
         "before": _poses(before, s.R_display_world),
     }
+
+
+def lens(s: Subject) -> dict[str, float] | None:
+    """Return the intrinsics of the images without distortion, in pixels; None if not known."""
+    raw = s.extras.filter_steps[0][1] if s.extras.filter_steps else None
+    if not isinstance(raw, RangeFrame) or rig_cameras(s) is not None:
+        return None
+    camera = raw.camera.fit() if isinstance(raw.camera, RayTable) else raw.camera
+    assert isinstance(camera, Pinhole)
+    return {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 
 
 def rig_cameras(s: Subject) -> RigCameras | None:

@@ -34,6 +34,8 @@ def model(s: Subject) -> Values:
     data = packed(displayed) | {
         "fields": {name: field.packed() for name, field in fields_by_name.items()},
         "frames": camera_frusta.packed(s),
+        "lens": camera_frusta.lens(s),
+        "axes": s.R_display_world.tolist(),
     }
     return {
         "scene": data,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from tofuse.files.memory import give_back
 from tofuse.recordings.frames import RangeFrame
 from tofuse.report import thumbnails, words
-from tofuse.report.pictures import FATES, KINDS, depth_range
+from tofuse.report.pictures import FATES, KINDS, depth_range, draw
 from tofuse.report.section_frames import frame_text
 from tofuse.report.subject import Subject, Values
 
@@ -86,7 +87,8 @@ def clouds(s: Subject) -> Values:
 
 def player(s: Subject) -> Values:
     """Return the images of frames, with the status of each."""
-    shown = s.extras.pictures
+    shown = draw(s.result.diagnostics.samples)
+    give_back()
     if not shown:
         return {"player": None, "player_kinds": [], "player_note": "", "fates": []}
     records = {r.index: r for r in s.result.diagnostics.frames}

@@ -53,7 +53,6 @@ FILES = (
     "mesh.usdz",
     "mesh.stl",
     "report.html",
-    "view.npz",
     "run.json",
     "judge.json",
     "rig_trajectory.txt",
@@ -64,13 +63,12 @@ FILES = (
     "mesh.gltf",
     "trajectory.kitti.txt",
     "trajectory.log",
+    "view.npz",  # of version 0.2, like the tiles
 )
-# Large surfaces are in tiles, in their own folder (`results.tiles`).
-TILES, TILESET = "tiles", "tileset.json"
 _TILES = Names(
-    frozenset({TILESET}), file_pattern=re.compile(r"\d{1,4}(-\d{1,9}){3}\.glb", re.ASCII)
+    frozenset({"tileset.json"}), file_pattern=re.compile(r"\d{1,4}(-\d{1,9}){3}\.glb", re.ASCII)
 )
-_WITH_TILES = (re.compile(re.escape(TILES)), _TILES)
+_WITH_TILES = (re.compile("tiles"), _TILES)
 # The model of a separate component is in its own folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
 
@@ -100,7 +98,7 @@ class OutputFolder:
     The constructor checks everything that can be checked before hours of work: that the folder is
     empty or has an earlier result, that no other process writes into it, and that it is writable.
 
-    Files and folders (`tiles`, `component-1` and so on) are moved into place as a whole. Links are
+    Files and folders (`component-1` and so on) are moved into place as a whole. Links are
     moved as links, and never followed.
 
     The lock is released when the result is written; in a `with` statement, at its end.
