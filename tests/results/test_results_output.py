@@ -178,7 +178,6 @@ def test_run_json_matches_contract(tmp_path) -> None:
         "reasons",
         "frames",
         "T_up_world",
-        "tiles",
         "rig",
         "components",
         "sessions",

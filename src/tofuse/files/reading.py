@@ -6,8 +6,10 @@ import errno
 import importlib
 import os
 import re
+import struct
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,16 @@ MAX_TEXT_BYTES = 256 << 20
 MAX_BYTES = 4 << 30
 _MAX_DOTS = 1000  # on a line of TOML
 # Errors that malformed data cause in code that parses it.
+_MALFORMED = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    RecursionError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
+
 _REASONS = {
     errno.ENOENT: ("doesn't exist", "check the path"),
     errno.EACCES: ("may not be read (permission denied)", "change its permissions"),
@@ -119,6 +131,27 @@ def read_head(path: str | Path, size: int) -> bytes:
             return file.read(size)
     except OSError as error:
         raise input_error(error, path) from error
+
+
+@contextmanager
+def damage_reported(path: str | Path, kind: str) -> Iterator[None]:
+    """Turn errors of a block that parses a file written by tofuse into InputError.
+
+    Parameters
+    ----------
+    path
+        The file.
+    kind
+        Kind of file, for the message, such as "a run.json".
+    """
+    try:
+        yield
+    except _MALFORMED as error:
+        raise InputError(
+            f"is damaged, or not {kind} written by tofuse ({type(error).__name__}: {error})",
+            where=path,
+            remedy="copy the whole folder again, or create it again",
+        ) from error
 
 
 def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, format_name: str) -> Any:

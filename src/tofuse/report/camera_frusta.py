@@ -52,7 +52,7 @@ def lens(s: Subject) -> dict[str, float] | None:
     raw = s.extras.filter_steps[0][1] if s.extras.filter_steps else None
     if not isinstance(raw, RangeFrame) or rig_cameras(s) is not None:
         return None
-    camera = raw.camera.fit() if isinstance(raw.camera, RayTable) else raw.camera
+    camera = raw.camera.fit if isinstance(raw.camera, RayTable) else raw.camera
     assert isinstance(camera, Pinhole)
     return {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 
