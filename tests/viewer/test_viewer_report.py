@@ -179,7 +179,8 @@ def test_camera_shows_its_image_over_the_model(browser, server) -> None:
 
         def choose(frame: int) -> None:
             page.mouse.click(line["x"] + (frame + 0.5) / 24 * line["width"], line["y"] + 10)
-            page.locator(f"#viewer .inset img[src$='frame/{frame}.png']").wait_for()
+            served = page.locator(f"#viewer .inset img[src$='frame/{frame}.png']")
+            served.wait_for(state="attached")
 
         def shown(opacity: int) -> np.ndarray:
             page.locator("#viewer .inset input").fill(str(opacity))

@@ -1,6 +1,6 @@
 // Taps points of the model: where one is, how far two are apart, and how well that is known.
 function makeMeasure(box, view, painter, { sigmaOf, axes, changed }) {
-  const button = box.querySelector("[data-tool=measure]"), label = box.querySelector(".measured");
+  const button = box.querySelector("[data-tool=measure]"), label = box.querySelector(".measured"), pins = box.querySelectorAll(".pin");
   const line = { place: painter.buffer(new Float32Array(6)), color: [1, 0.88, 0.35], count: 0, over: 0.002 };
   const ends = [];
   let on = false;
@@ -50,6 +50,11 @@ function makeMeasure(box, view, painter, { sigmaOf, axes, changed }) {
   }
   // The words stand beside the points, or at the top until there is one.
   function place() {
+    pins.forEach((pin, k) => {
+      const there = ends[k] && view.onScreen(ends[k].point);
+      pin.hidden = !there;
+      if (there) pin.style.transform = `translate(${there[0]}px, ${there[1]}px)`;
+    });
     const middle = ends.length && along(ends[0].point, minus(ends[ends.length - 1].point, ends[0].point), 0.5);
     const shown = middle && view.onScreen(middle);
     label.classList.toggle("placed", Boolean(shown));
