@@ -28,7 +28,7 @@ from tofuse.results.output import write_result
 from tofuse.viewer.report_server import FrameImages, ReportServer, report_pages
 
 CAMERA = Pinhole(64, 48, 64 * 1.4, 64 * 1.4, 32, 24)
-# The world is tilted, so that the model is shown in other axes than its own.
+# The world is tilted and the model not shown upright: in other axes, and from rolled cameras.
 T_TILTED_WORLD = se3.exp([0.3, -0.2, 0.1, 0.5, 0.2, 0.3])
 
 
@@ -48,7 +48,7 @@ def made(tmp_path_factory):
             points=se3.transform(T_TILTED_WORLD, cloud.points.astype(float)).astype(np.float32),
             normals=cloud.normals @ T_TILTED_WORLD[:3, :3].T.astype(np.float32),
         ),
-        up=T_TILTED_WORLD[:3, :3] @ [0, -1, 0],
+        up=np.array([0.28, -0.96, 0.0]),
         recording=result.recording | {"path": str(folder / "recording")},
     )
     extras = replace(extras, reference=None, truth_points=None)
@@ -186,20 +186,21 @@ def test_camera_shows_its_image_over_the_model(browser, server) -> None:
             page.locator("#viewer .inset input").fill(str(opacity))
             seen.rest()
             picture = seen.pixels(CANVAS)[..., 1]
-            # Without the tools above and the inset below.
-            return picture[80 : picture.shape[0] * 2 // 3, 60 : picture.shape[1] * 2 // 3]
+            # Without the tools above, the inset below, and the gaps between points.
+            part = picture[80 : picture.shape[0] * 2 // 3, 60 : picture.shape[1] * 2 // 3]
+            return cv2.GaussianBlur(part.astype(np.float32), (0, 0), 8).ravel()
 
         # The frame has no small image, only one that is served.
         choose(3)
         assert page.locator("#viewer .overlay").is_hidden()
         page.get_by_role("button", name="Look through this camera").click()
         page.locator("#viewer .overlay").wait_for()
-        model, image = shown(0), shown(100)
-        assert np.corrcoef(model.ravel(), image.ravel())[0, 1] > 0.6
+        model = shown(0)
+        assert np.corrcoef(model, shown(100))[0, 1] > 0.7
         # The next camera is looked through, too.
         choose(4)
-        assert np.corrcoef(shown(0).ravel(), shown(100).ravel())[0, 1] > 0.6
-        assert np.corrcoef(model.ravel(), shown(100).ravel())[0, 1] < 0.5
+        assert np.corrcoef(shown(0), shown(100))[0, 1] > 0.7
+        assert np.corrcoef(model, shown(100))[0, 1] < 0.5
         page.get_by_role("button", name="Back to the model").click()
         page.locator("#viewer .overlay").wait_for(state="hidden")
         seen.check()
