@@ -225,8 +225,6 @@ def _small() -> dict[str, Subject]:
     from tofuse.batch.jobs import read_jobs
     from tofuse.calibration.lens_files import read_lens_file
     from tofuse.cli.batching import run_arguments
-    from tofuse.files.geometry_record import GeometryRecord
-    from tofuse.files.glb import read_glb, write_glb
     from tofuse.files.pose import read_pose
     from tofuse.files.tables import read_columns
     from tofuse.files.trajectory_formats import read_poses
@@ -279,16 +277,6 @@ def _small() -> dict[str, Subject]:
         tracked_file._MIN_TRACKING_S = 0.0
         file.finish(log)
 
-    def mesh(path: Path) -> None:
-        import wavy_surface
-
-        made = wavy_surface.waves(8)
-        scalars = {"sigma": made.sigma, "views": made.views}
-        record = GeometryRecord(
-            made.vertices, made.faces, made.normals, made.color, scalars=scalars
-        )
-        write_glb(path, record)
-
     texts: dict[str, tuple[str, str, Callable[[Path], object]]] = {
         "g2o": ("a.g2o", "\n".join([*vertices, *edges]) + "\n", read_g2o),
         "tum poses": ("a.txt", tum, read_reference),
@@ -309,7 +297,6 @@ def _small() -> dict[str, Subject]:
     for name, (file, text, read) in texts.items():
         found[name] = _file(file, lambda path, text=text: path.write_text(text), read)
     return found | {
-        "glb": _file("a.glb", mesh, read_glb),
         "tracked frames": _file("a.npz", track, replay),
     }
 
@@ -331,7 +318,6 @@ def _results() -> dict[str, Subject]:
     return {
         "a result": _file("out", _result, _load),
         "a result with images": _file("all", _with_images, _export),
-        "tiles": _file("tiles", _tiles, _load_tiles),
         "a session": _file("out", _session, _load_session),
     }
 
@@ -346,10 +332,8 @@ def _result(out: Path) -> None:
 
 def _load(out: Path) -> None:
     from tofuse.results.loading import load_result
-    from tofuse.viewer.content import read_content
 
     load_result(out)
-    read_content(out)
 
 
 def _with_images(folder: Path) -> None:
@@ -364,19 +348,6 @@ def _export(folder: Path) -> None:
     from tofuse.results.export import export
 
     export(folder / "result", ["log", "nerfstudio"], folder / "exported", overwrite=True)
-
-
-def _tiles(folder: Path) -> None:
-    import wavy_surface
-    from tofuse.results.tiles import write_tiles
-
-    write_tiles(wavy_surface.waves(8), np.eye(3), folder)
-
-
-def _load_tiles(folder: Path) -> None:
-    from tofuse.viewer.content import TiledLayer
-
-    TiledLayer.read(folder).overview()
 
 
 def _session(out: Path) -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
 from parsed_glb import parse
 from tofuse.errors import InputError
 from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.glb import unlit_glb, write_glb
+from tofuse.files.glb import write_glb
 
 
 def test_mesh_round_trips(tmp_path) -> None:
@@ -75,13 +73,3 @@ def test_node_transform_places_mesh(tmp_path) -> None:
     np.testing.assert_array_equal(mesh.vertices, points)  # in the node's frame
     found, _ = scene.graph[scene.graph.nodes_geometry[0]]
     np.testing.assert_allclose(found, T, atol=1e-12)
-
-
-def test_unlit_mesh_declares_extension() -> None:
-    points, faces = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]])
-    data = unlit_glb(points, faces, np.float32([[1.5, -0.1, 0], [0, 1, 0], [0, 0, 1]]))
-    length = int.from_bytes(data[12:16], "little")
-    document = json.loads(data[20 : 20 + length])
-    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
-    assert document["materials"][0]["doubleSided"] is False
-    assert len(data) == int.from_bytes(data[8:12], "little")

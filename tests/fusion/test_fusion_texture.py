@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from parsed_glb import parse
 from tofuse.cli import main
 from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.glb import read_glb, write_glb
+from tofuse.files.glb import linear, write_glb
 from tofuse.files.images import png_bytes
 from tofuse.files.obj import write_obj
 from tofuse.files.ply import read_ply
@@ -213,7 +214,10 @@ def test_missing_colour_does_not_darken(tmp_path) -> None:
     shown = baked(wall, 400, 256).image
     assert set(np.unique(shown).tolist()) == {NO_COLOR[0], 180}
     small.save(tmp_path / "shown.glb")
-    assert set(np.unique(read_glb(tmp_path / "shown.glb").color).tolist()) == {NO_COLOR[0], 180}
+    document, arrays = parse(tmp_path / "shown.glb")
+    colors = arrays[document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    light = linear(np.full((1, 3), [NO_COLOR[0], 180, 0], np.uint8))[0, :2]
+    assert set(np.unique(colors[:, :3]).tolist()) == set(light.tolist())
     small.save(tmp_path / "data.ply")
     assert set(np.unique(read_ply(tmp_path / "data.ply").color).tolist()) == {0, 180}
 

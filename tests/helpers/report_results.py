@@ -13,7 +13,6 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.posegraph.graph import LoopRecord, PoseGraph
 from tofuse.recordings.frames import RangeFrame
 from tofuse.report.extras import ReportExtras
-from tofuse.report.pictures import draw
 from tofuse.results.samples import FrameSample
 from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
 
@@ -142,7 +141,6 @@ def make_room(frames=24, width=64, height=48):
         (("raw", raw), ("confidence", step1), ("neighbours", step2)),
         truth,
         surface.astype(np.float32),
-        draw(samples),
     )
     return result, extras
 

@@ -28,7 +28,6 @@ from tofuse.report.extras import ReportExtras
 from tofuse.report.fields import fields
 from tofuse.report.html import write_report
 from tofuse.report.packing import pack
-from tofuse.report.pictures import draw
 from tofuse.report.scene import (
     MAX_FACES,
     PITCH,
@@ -580,8 +579,8 @@ POOR = {
     "objective of zero": (lonely(objective=(0.5, 0.0, 0.0)), ReportExtras("x")),
     "objective of one value": (lonely(objective=(0.5,)), ReportExtras("x")),
     "no valid pixel": (
-        lonely(),
-        ReportExtras("x", (("raw", unlit()), ("median", unlit())), None, None, draw((dark(),))),
+        lonely(samples=(dark(),)),
+        ReportExtras("x", (("raw", unlit()), ("median", unlit()))),
     ),
     "stationary camera": (
         lonely(

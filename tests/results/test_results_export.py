@@ -17,9 +17,7 @@ from tofuse.cli.parser import EXPORTS
 from tofuse.errors import InputError, OutputError
 from tofuse.files import las
 from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.glb import read_glb
 from tofuse.files.ply import read_ply, write_ply
-from tofuse.files.tileset import read_tileset
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry import se3
 from tofuse.results.export import FORMATS, export
@@ -263,7 +261,6 @@ def test_simplified_surfaces_keep_colours(result: Path) -> None:
 
 def test_laz_is_reproducible_and_written_in_blocks(result: Path, monkeypatch) -> None:
     laspy = pytest.importorskip("laspy")
-    pytest.importorskip("lazrs")
     (path,) = export(result, ["laz"])
     first = path.read_bytes()
     export(result, ["laz"], overwrite=True)
@@ -273,31 +270,6 @@ def test_laz_is_reproducible_and_written_in_blocks(result: Path, monkeypatch) ->
     np.testing.assert_array_equal(
         laspy.read(path).points.array, laspy.read(result / "cloud.las").points.array
     )
-    monkeypatch.setitem(__import__("sys").modules, "lazrs", None)
-    with pytest.raises(InputError, match=r"needs the package lazrs; pip install .tofuse\[scan\]"):
-        export(result, ["laz"], overwrite=True)
-
-
-def test_tiles(result: Path, expected) -> None:
-    (path,) = export(result, ["3dtiles"])
-    root, extras = read_tileset(path)
-    assert (root.faces, root.error_m, root.children) == (len(expected.faces), 0, [])
-    mesh = read_glb(path.parent / root.content)
-    R = np.array(extras["T_up_world"])[:3, :3]
-    np.testing.assert_allclose(mesh.points @ R, expected.points, atol=1e-6)
-    np.testing.assert_array_equal(mesh.scalars["sigma"], expected.sigma)
-    np.testing.assert_array_equal(mesh.scalars["views"], expected.views)
-    with pytest.raises(OutputError, match="--overwrite"):
-        export(result, ["3dtiles"])
-    export(result, ["3dtiles"], overwrite=True)
-    (path.parent / "mine.txt").write_text("kept")
-    with pytest.raises(OutputError, match="files that are not tiles"):
-        export(result, ["3dtiles"], overwrite=True)
-    assert (path.parent / "mine.txt").read_text() == "kept"
-    write_ply(result / "mesh.ply", GeometryRecord(np.zeros((3, 3))))
-    with pytest.raises(InputError, match="no triangles"):
-        export(result, ["3dtiles"], tmp_out := result / "new")
-    assert not (tmp_out / "tiles").exists()
 
 
 def test_kitti(result: Path) -> None:

@@ -13,12 +13,17 @@ import pytest
 
 from made_results import contents, result, torn
 from tofuse.errors import InputError, OutputError
+from tofuse.files.pcd import read_pcd
 from tofuse.files.staging import beside
 from tofuse.pipeline.run import exit_status
+from tofuse.results import output
+from tofuse.results.export import export
 from tofuse.results.folder import OutputFolder, component_number, is_result
+from tofuse.results.loading import load_result
 from tofuse.results.output import write_result
 from tofuse.results.run_json import frames_in_main_model, plain, read_run_json
 from tofuse.results.types import FrameRecord
+from wavy_surface import waves
 from written_run_json import run_json
 
 FILES = {"trajectory.txt", "pose_graph.g2o", "cloud.ply", "run.json"}
@@ -49,6 +54,34 @@ def test_earlier_result_is_replaced_only_on_request(tmp_path) -> None:
     assert contents(tmp_path) == before
     write_result(result(seed=5), OutputFolder(tmp_path, overwrite=True))
     assert read_run_json(tmp_path / "run.json")["seed"] == 5
+
+
+def test_large_model_is_compressed_and_has_an_overview(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(output, "MAX_PLY_POINTS", 20_000)
+    monkeypatch.setattr(output, "OVERVIEW_BYTES", 600_000)
+    mesh = waves()
+    whole = replace(result(), mesh=mesh, cloud=mesh.cloud())
+    write_result(whole, OutputFolder(tmp_path / "out"))
+    assert set(contents(tmp_path / "out")) == FILES - {"cloud.ply"} | {
+        "cloud.laz", "mesh.ply", "mesh.glb",
+    }  # fmt: skip
+    found = load_result(tmp_path / "out")
+    np.testing.assert_allclose(found.cloud.points, mesh.vertices, atol=0.51e-4)
+    for name in ("normals", "color", "views", "sigma"):
+        np.testing.assert_array_equal(getattr(found.cloud, name), getattr(whole.cloud, name))
+    assert found.mesh is not None
+    np.testing.assert_array_equal(found.mesh.vertices, mesh.vertices)
+    np.testing.assert_array_equal(found.mesh.faces, mesh.faces)
+    assert 400_000 < (tmp_path / "out/mesh.glb").stat().st_size <= 600_000
+    export(tmp_path / "out", ["pcd"])
+    assert len(read_pcd(tmp_path / "out/cloud.pcd").cloud) == len(mesh.vertices)
+    # A small result replaces all of it, and what version 0.2 wrote.
+    (tmp_path / "out/view.npz").write_bytes(b"")
+    (tmp_path / "out/tiles").mkdir()
+    (tmp_path / "out/tiles/tileset.json").write_text("{}")
+    (tmp_path / "out/tiles/0-0-0-1.glb").write_text("")
+    write_result(result(), OutputFolder(tmp_path / "out", overwrite=True))
+    assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
 
 
 @pytest.mark.parametrize("name", ["photo.jpg", "run.json", "trajectory.txt", ".hidden"])
@@ -147,7 +180,6 @@ def test_run_json_matches_contract(tmp_path) -> None:
         "reasons",
         "frames",
         "T_up_world",
-        "tiles",
         "rig",
         "components",
         "sessions",

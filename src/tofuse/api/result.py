@@ -7,7 +7,7 @@ import sys
 import tempfile
 import webbrowser
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -37,7 +37,7 @@ from tofuse.results.output import write_result
 from tofuse.results.types import Reconstruction
 
 if TYPE_CHECKING:
-    from viser import ViserServer
+    from tofuse.viewer.report_server import ReportServer
 
 
 _THUMBNAIL = (420, 262)  # pixels
@@ -108,14 +108,14 @@ class Result(Reconstruction):
 
     def _write_report(self, result: Reconstruction, folder: Path) -> None:
         from tofuse.report.extras import ReportExtras
-        from tofuse.viewer.view_file import write_report_and_view
+        from tofuse.report.html import write_report
 
         if self.source is not None:
             config = self.fitted or adapted(_configuration(self.config, self.source), self.source)
             write_report_files(self.source, config, result, folder)
             return
         title = Path(str(result.recording["path"])).name
-        write_report_and_view(result, folder, ReportExtras(title))
+        write_report(result, folder / "report.html", ReportExtras(title))
 
     def evaluate(
         self,
@@ -156,13 +156,11 @@ class Result(Reconstruction):
             config=self.config,
         )
 
-    def view(
-        self, *, port: int | None = None, open_browser: bool = True
-    ) -> AbstractContextManager[ViserServer]:
-        """Show the result in the browser, as ``tofuse view`` does, and return the server.
+    def view(self, *, port: int | None = None, open_browser: bool = True) -> ReportServer:
+        """Show the report in the browser, as ``tofuse view`` does, and return the server.
 
         The page is served by threads of this process, until the server is stopped or the process
-        ends. Requires viser.
+        ends; in a ``with`` statement, until its end.
 
         Parameters
         ----------
@@ -171,17 +169,18 @@ class Result(Reconstruction):
         open_browser
             Whether to open the page in the browser.
         """
-        from tofuse.viewer.app import ResultView
-        from tofuse.viewer.content import read_content
-        from tofuse.viewer.server import address, serve
+        from tofuse.viewer.report_server import FrameImages, ReportServer, report_pages
 
-        with tempfile.TemporaryDirectory(prefix="tofuse-") as folder:
-            self.save(Path(folder) / "result")
-            content = read_content(Path(folder) / "result")
-        server = serve(port)
-        ResultView(server, content)
+        images = None if self.source is None else FrameImages([(0, self.source)])
+        with tempfile.TemporaryDirectory(prefix="tofuse-") as temporary:
+            folder = self.save(Path(temporary) / "result")
+            pages = report_pages(folder)
+            if images is None:
+                with suppress(InputError):  # the recording of a loaded result is gone
+                    images = FrameImages.of(folder)
+        server = ReportServer(pages, images, port)
         if open_browser:
-            webbrowser.open(address(server))
+            webbrowser.open(server.address)
         return server
 
     def plot(self) -> Plot:
@@ -354,11 +353,4 @@ def load(folder: str | Path) -> Result:
     InputError
         If it is not an output folder, or its files are damaged or of different runs.
     """
-    from tofuse.viewer.view_file import read_view_file
-
-    reconstruction = load_result(folder)
-    before = read_view_file(Path(folder)).before
-    sequential = reconstruction.diagnostics.sequential
-    for k, frame in enumerate(reconstruction.diagnostics.frames):
-        sequential[k] = before.get(frame.index, np.nan)
-    return Result.of(reconstruction)
+    return Result.of(load_result(folder))

@@ -27,9 +27,9 @@ from tofuse.results.types import Reason, Reconstruction
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
-    from viser import ViserServer
 
     from tofuse.pipeline.run_options import Options
+    from tofuse.viewer.report_server import ReportServer
 
 _Options = TypeVar("_Options", bound="DataclassInstance")
 
@@ -181,44 +181,52 @@ def _run_live(arguments: argparse.Namespace, options: Options) -> int:
     from tofuse.pipeline.run import exit_status
     from tofuse.pipeline.run import run as run_pipeline
     from tofuse.viewer.live_view import LiveView
+    from tofuse.viewer.server import address, serve, stop
 
-    with _page(arguments) as server:
+    server = serve(arguments.port)
+    try:
+        _show(address(server), arguments)
         live = LiveView(server)
         with _run_progress(arguments) as progress:
             result = run_pipeline(arguments.inputs, options, CombinedProgress(progress, live))
         print_result(result, arguments.out, as_json=arguments.json)
-        live.finish(arguments.out)
-        _wait()
+        with _report_server(arguments.out) as report:
+            live.finish(report.address)
+            _show(report.address, arguments)
+            _wait()
+    finally:
+        stop(server)
     return exit_status(result)
 
 
 def view(arguments: argparse.Namespace) -> int:
     """``tofuse view``."""
-    from tofuse.viewer.app import ResultView
-    from tofuse.viewer.content import read_content
-
-    result = read_content(arguments.result)
-    with _page(arguments) as server:
-        ResultView(server, result)
+    with _report_server(arguments.result, arguments.port) as server:
+        _show(server.address, arguments)
         _wait()
     return 0
 
 
-@contextmanager
-def _page(arguments: argparse.Namespace) -> Iterator[ViserServer]:
-    """Serve a page, print its address, and open it in the browser."""
+def _report_server(folder: Path, port: int | None = None) -> ReportServer:
+    """Serve the report of a result, with the images of its recording where it still exists."""
+    from tofuse.errors import InputError
+    from tofuse.viewer.report_server import FrameImages, ReportServer, report_pages
+
+    pages, images = report_pages(folder), None
+    try:
+        images = FrameImages.of(folder)
+    except InputError as error:
+        print(f"only small images of some frames are shown: {error}", file=sys.stderr)
+    return ReportServer(pages, images, port)
+
+
+def _show(address: str, arguments: argparse.Namespace) -> None:
+    """Print the address of a page, and open it in the browser."""
     import webbrowser
 
-    from tofuse.viewer.server import address, serve, stop
-
-    server = serve(arguments.port)
-    try:
-        print(f"see {address(server)}", file=sys.stderr, flush=True)
-        if not arguments.no_open:
-            webbrowser.open(address(server))
-        yield server
-    finally:
-        stop(server)
+    print(f"see {address}", file=sys.stderr, flush=True)
+    if not arguments.no_open:
+        webbrowser.open(address)
 
 
 def _wait() -> None:

@@ -18,7 +18,7 @@ _Number = TypeVar("_Number", int, float)
 
 DEMO_SCENES = ("room", "empty-room", "rail", "torso", "box", "peaks")
 EXPORTS = (
-    *("pcd", "las", "laz", "e57", "glb", "gltf", "obj", "stl", "3dtiles"),
+    *("pcd", "las", "laz", "e57", "glb", "gltf", "obj", "stl"),
     *("kitti", "log", "nerfstudio", "colmap"),
 )
 

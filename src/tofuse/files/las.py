@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from tofuse.files.atomic import replacing, write_bytes
 from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.reading import required_package
 
 _HEADER_BYTES, _FIELD_BYTES = 375, 192
 _SCALE_M = 1e-4  # rounds by half of that; 31 bits of it span 200 km
@@ -96,11 +95,11 @@ def write_laz(
     Raises
     ------
     InputError
-        If the shapes disagree, or laspy or lazrs is not installed.
+        If the shapes disagree.
     """
+    import laspy
+
     cloud.check(path)
-    laspy = required_package("laspy", "scan", path)
-    required_package("lazrs", "scan", path)  # the compressor that laspy uses
     xyz, color, extra = cloud.points, cloud.color, cloud.scalars
     header = laspy.LasHeader(point_format=_PLAIN if color is None else _WITH_COLOR, version="1.4")
     header.scales = np.full(3, _SCALE_M)

@@ -142,7 +142,7 @@ def damage_reported(path: str | Path, kind: str) -> Iterator[None]:
     path
         The file.
     kind
-        Kind of file, for the message, such as "a tileset".
+        Kind of file, for the message, such as "a run.json".
     """
     try:
         yield

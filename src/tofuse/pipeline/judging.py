@@ -311,12 +311,12 @@ def _write(
 ) -> None:
     """Write the refined result, with `judge.json` and the judgement as headline of the report."""
     from tofuse.report.extras import ReportExtras
-    from tofuse.viewer.view_file import write_report_and_view
+    from tofuse.report.html import write_report
 
     def report(result: Reconstruction, path: Path) -> None:
         headline = sentence(judgement, trajectory.name) if result is judgement.refined else ""
         title = f"{trajectory.name} on {Path(recording.path).name}"
-        write_report_and_view(result, path, ReportExtras(title=title, headline=headline))
+        write_report(result, path / "report.html", ReportExtras(title, headline=headline))
         if result is judgement.refined:
             text = json.dumps(plain(judgement.to_dict()), indent=1, allow_nan=False)
             (path / "judge.json").write_text(text + "\n", encoding="utf-8")

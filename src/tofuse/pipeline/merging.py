@@ -334,11 +334,11 @@ def _merge_into(
 
 def _report(result: Reconstruction, folder: Path) -> None:
     from tofuse.report.extras import ReportExtras
-    from tofuse.viewer.view_file import write_report_and_view
+    from tofuse.report.html import write_report
 
     names = ", ".join(session.name for session in result.sessions)
     extras = ReportExtras(
         title=f"{names} merged" if names else f"{folder.name} of a merged result",
         headline=" ".join(session_sentences(result)),
     )
-    write_report_and_view(result, folder, extras)
+    write_report(result, folder / "report.html", extras)

@@ -1,4 +1,4 @@
-"""The report of a result and the data of the viewer, with data from the recording."""
+"""The report of a result, with data from the recording."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ _TRUTH_POINTS = 100_000
 def write_report_files(
     recording: Recording, config: Config, result: Reconstruction, folder: Path
 ) -> None:
-    """Write `report.html` and the data of the viewer into a folder."""
+    """Write `report.html` into a folder."""
     from tofuse.report.extras import ReportExtras
-    from tofuse.viewer.view_file import write_report_and_view
+    from tofuse.report.html import write_report
 
     title = _title(Path(recording.path)) or recording.path
     truth = truth_points(recording)
@@ -48,7 +48,7 @@ def write_report_files(
         truth_points=truth,
         clouds=tuple(item for item in clouds if isinstance(item, CloudFrame)),
     )
-    write_report_and_view(result, folder, extras)
+    write_report(result, folder / "report.html", extras)
 
 
 def _frames_of(recording: Recording, result: Reconstruction) -> Recording:

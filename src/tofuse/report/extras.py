@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from tofuse.arrays import Float32, Float64
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.rig import Rig
-from tofuse.report.pictures import Pictures
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +24,6 @@ class ReportExtras:
         identity), NaN where there is none; rows as `Reconstruction.trajectory`. Or None.
     truth_points
         (K, 3) points in m on the true surfaces, in the world frame; None if not known.
-    pictures
-        Images of the result's samples of frames, in their order (`viewer.view_file` adds them).
     clouds
         About a dozen evenly spaced, unfiltered views, if views are clouds.
     headline
@@ -39,7 +36,6 @@ class ReportExtras:
     filter_steps: tuple[tuple[str, Frame], ...] = ()
     reference: Float64 | None = None
     truth_points: Float32 | None = None
-    pictures: tuple[Pictures, ...] = ()
     clouds: tuple[CloudFrame, ...] = ()
     headline: str = ""
     rig: Rig | None = None

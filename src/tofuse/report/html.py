@@ -22,6 +22,7 @@ SCRIPTS = (
     "painter.js",
     "section.js",
     "measure.js",
+    "overlay.js",
     "cameras.js",
     "timeline.js",
     "viewer.js",

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tofuse.files.memory import trim_memory
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.report import plots, thumbnails, words
-from tofuse.report.pictures import FATES, KINDS, depth_range
+from tofuse.report.pictures import FATES, KINDS, depth_range, draw
 from tofuse.report.section_parts import component_color
 from tofuse.report.subject import ROWS, Subject, Values
 from tofuse.results.types import Component, FrameRecord, in_main_model
@@ -116,7 +117,8 @@ def frame_text(record: FrameRecord, components: Sequence[Component] = ()) -> str
 
 def _player(s: Subject) -> Values | None:
     """The images of frames, with the status of each."""
-    shown = s.extras.pictures
+    shown = draw(s.result.diagnostics.samples)
+    trim_memory()
     if not shown:
         return None
     records = {r.index: r for r in s.result.diagnostics.frames}

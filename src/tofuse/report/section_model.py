@@ -9,7 +9,9 @@ import numpy as np
 from tofuse.arrays import Float32, Float64
 from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole, RayTable
 from tofuse.normal import OF_95_PERCENT
+from tofuse.recordings.frames import RangeFrame
 from tofuse.report import plots, thumbnails, words
 from tofuse.report.fields import fields, normalized_accuracy
 from tofuse.report.packing import pack
@@ -36,6 +38,8 @@ def model(s: Subject) -> Values:
         | {
             "fields": {field.name: field.packed() for field in shown},
             "frames": _packed_cameras(s, errors, rig),
+            "lens": None if rig is not None else _lens(s),
+            "axes": s.R_display_world.tolist(),
         },
         "still": thumbnails.data_uri(render(displayed, yaw=opening_yaw(displayed))),
         "toggles": _toggles(scene),
@@ -101,6 +105,16 @@ def _packed_cameras(s: Subject, errors: Float64, rig: RigCameras | None) -> dict
         "after": displayed(s.result.trajectory),
         "before": displayed(s.sequential),
     }
+
+
+def _lens(s: Subject) -> dict[str, float] | None:
+    """Intrinsics of the images without distortion, in pixels; None if not known."""
+    raw = s.extras.filter_steps[0][1] if s.extras.filter_steps else None
+    if not isinstance(raw, RangeFrame):
+        return None
+    camera = raw.camera.fit if isinstance(raw.camera, RayTable) else raw.camera
+    assert isinstance(camera, Pinhole)
+    return {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 
 
 def position_errors(s: Subject) -> Float64:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -17,8 +15,7 @@ from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import make_folder
 from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.images import jpeg_bytes
-from tofuse.files.ply import read_ply
-from tofuse.files.staging import new_folder, replacing_folder
+from tofuse.files.staging import replacing_folder
 from tofuse.files.stamps import stamp
 from tofuse.files.trajectory import associate, read_tum, write_kitti, write_log
 from tofuse.fusion import exchange
@@ -27,17 +24,14 @@ from tofuse.fusion.texture import baked
 from tofuse.results.colmap import write_colmap
 from tofuse.results.folder import (
     RESULT,
-    TILES,
-    TILESET,
     claimed,
     finish_interrupted,
     is_result,
     result_folder,
 )
-from tofuse.results.loading import read_mesh
+from tofuse.results.loading import read_cloud, read_mesh
 from tofuse.results.nerfstudio import write_nerfstudio
 from tofuse.results.run_json import read_run_json, rotation_up_world, run_json_checked
-from tofuse.results.tiles import is_tiles, write_tiles
 
 # Default number of triangles, and the maximum size of a .glb with their texture.
 FACES = 60_000
@@ -61,9 +55,9 @@ class _Result:
     @cached_property
     def cloud(self) -> GeometryRecord:
         """The cloud, with the number of views and sigma of each point."""
-        ply = read_ply(self.folder / "cloud.ply")
-        scalars = {name: ply.scalars[name] for name in _SCALARS if name in ply.scalars}
-        return replace(ply, faces=None, scalars=scalars)
+        cloud = read_cloud(self.folder)
+        scalars = {name: cloud.scalars[name] for name in _SCALARS if name in cloud.scalars}
+        return replace(cloud, faces=None, scalars=scalars)
 
     @cached_property
     def trajectory(self) -> tuple[Float64, Float64]:
@@ -169,22 +163,6 @@ def _folder(path: Path) -> Iterator[Path]:
         yield folder
 
 
-def _tiles(result: _Result, path: Path) -> None:
-    if len(result.mesh.faces) == 0:
-        raise InputError("has no triangles", where=result.folder / "mesh.ply")
-    folder = path.parent
-    if os.path.lexists(folder):
-        if not is_tiles(folder):
-            raise OutputError(
-                "contains files that are not tiles",
-                where=folder,
-                remedy="move it away, or pass another --out",
-            )
-        shutil.rmtree(folder, ignore_errors=True)
-    with new_folder(folder) as new:
-        write_tiles(result.mesh, result.R_up_world, new)
-
-
 def _kitti(result: _Result, path: Path) -> None:
     write_kitti(path, result.trajectory[1])
 
@@ -203,7 +181,6 @@ FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
     "gltf": ("mesh.gltf", _mesh),
     "obj": ("mesh.obj", _mesh),
     "stl": ("mesh.stl", _stl),
-    "3dtiles": (f"{TILES}/{TILESET}", _tiles),
     "kitti": ("trajectory.kitti.txt", _kitti),
     "log": ("trajectory.log", _log),
     "nerfstudio": ("nerfstudio", _nerfstudio),

@@ -36,7 +36,6 @@ FILES = (
     "mesh.jpg",
     "mesh.stl",
     "report.html",
-    "view.npz",
     "run.json",
     "judge.json",
     "rig_trajectory.txt",
@@ -47,9 +46,8 @@ FILES = (
     "mesh.gltf",
     "trajectory.kitti.txt",
     "trajectory.log",
+    "view.npz",  # of version 0.2
 )
-# Large surfaces are in tiles, in their own folder (`results.tiles`).
-TILES, TILESET = "tiles", "tileset.json"
 # The model of a separate component is in its own folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
 _IMAGES = r"(images|depth|sigma|masks|sparse)/.+"  # exported, with their poses

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.errors import InputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import read_ply
 from tofuse.files.reading import path_of
 from tofuse.fusion.cloud import Cloud
@@ -16,6 +17,7 @@ from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.g2o import read_g2o
 from tofuse.posegraph.graph import GraphPart, LoopRecord
+from tofuse.recordings.readers.scans import read_las
 from tofuse.results.folder import component_name, finish_interrupted, is_result
 from tofuse.results.run_json import (
     frame_covariance,
@@ -85,7 +87,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         trajectory,
         np.array([frame.timestamp for frame in frames]),
         read_g2o(folder / "pose_graph.g2o"),
-        _cloud(folder / "cloud.ply"),
+        _cloud(folder),
         diagnostics,
         run["config"],
         {
@@ -165,14 +167,44 @@ def _component(folder: Path, number: int, data: dict[str, Any]) -> Component:
     )
 
 
-def _cloud(path: Path) -> Cloud:
-    ply = read_ply(path)
-    sigma = ply.scalars.get("sigma")
+def read_cloud(folder: Path) -> GeometryRecord:
+    """Read the points of a result: `cloud.ply`, or `cloud.laz` if they are many.
+
+    Raises
+    ------
+    InputError
+        If there are none, or they are damaged.
+    """
+    compressed = folder / "cloud.laz"
+    if compressed.is_file() and not (folder / "cloud.ply").exists():
+        return _compressed_cloud(compressed)
+    return read_ply(folder / "cloud.ply")
+
+
+def _compressed_cloud(path: Path) -> GeometryRecord:
+    points = read_las(path)
+    names = set(points.point_format.dimension_names)
+
+    def columns(*of: str) -> Any:
+        return np.stack([points[name] for name in of], 1) if names.issuperset(of) else None
+
+    color = columns("red", "green", "blue")
+    return GeometryRecord(
+        np.asarray(points.xyz),
+        normals=columns("normal x", "normal y", "normal z"),
+        color=None if color is None else (color >> 8).astype(np.uint8),
+        scalars={name: np.asarray(points[name]) for name in ("views", "sigma") if name in names},
+    )
+
+
+def _cloud(folder: Path) -> Cloud:
+    record = read_cloud(folder)
+    sigma = record.scalars.get("sigma")
     return Cloud(
-        ply.points.astype(np.float32),
-        ply.normals,
-        ply.color,
-        np.asarray(ply.scalars["views"], np.int32),
+        record.points.astype(np.float32),
+        record.normals,
+        record.color,
+        np.asarray(record.scalars["views"], np.int32),
         np.zeros(3),
         None if sigma is None else np.asarray(sigma, np.float32),
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,13 +20,17 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
 from tofuse.kernels.threads import job_pool
 from tofuse.posegraph.g2o import write_g2o
-from tofuse.results import tiles
-from tofuse.results.folder import TILES, OutputFolder, component_name
+from tofuse.results.folder import OutputFolder, component_name
 from tofuse.results.run_json import write_run_json
 from tofuse.results.types import Reconstruction
 
 # Colours of surfaces that changed between sessions, distinguishable by colour-blind people.
 CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
+
+MAX_PLY_POINTS = 4_000_000  # a larger cloud is compressed
+OVERVIEW_BYTES = 8_000_000  # of `mesh.glb`
+# A vertex has a position, normal and colour; a triangle has its corners.
+_VERTEX_BYTES, _FACE_BYTES, _HEAD_BYTES = 12 + 12 + 8, 12, 2000
 
 
 def write_result(
@@ -80,23 +83,20 @@ def _write_files(
         write_g2o(folder / "pose_graph.g2o", result.graph)
         if report is not None:
             report(result, folder)
-        write_run_json(folder / "run.json", result, model.result())
+        model.result()
+        write_run_json(folder / "run.json", result)
 
 
-def _write_model(
-    result: Reconstruction, folder: Path, texture: Textured | None
-) -> tiles.TilingSummary | None:
-    """Write clouds and surfaces; returns a summary of the tiles, or None without tiles."""
-    cloud = result.cloud
-    write_ply(folder / "cloud.ply", cloud.local_record())
-    tiling = None
+def _write_model(result: Reconstruction, folder: Path, texture: Textured | None) -> None:
+    """Write cloud and surface."""
+    if len(result.cloud) > MAX_PLY_POINTS:
+        result.cloud.save(folder / "cloud.laz")
+    else:
+        write_ply(folder / "cloud.ply", result.cloud.local_record())
     if result.mesh is not None:
-        tiling = _write_mesh(result.mesh, result, folder, texture)
-    if tiling is not None and importlib.util.find_spec("lazrs") is not None:
-        cloud.save(folder / "cloud.laz")
+        _write_mesh(result.mesh, result, folder, texture)
     if result.changes:
         _write_changes(result, folder / "changes.ply")
-    return tiling
 
 
 def _write_changes(result: Reconstruction, path: Path) -> None:
@@ -114,22 +114,16 @@ def _write_changes(result: Reconstruction, path: Path) -> None:
     )
 
 
-def _write_mesh(
-    mesh: Mesh, result: Reconstruction, folder: Path, texture: Textured | None
-) -> tiles.TilingSummary | None:
+def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textured | None) -> None:
     """Write `mesh.ply`, in the world frame, and `mesh.glb`, whose node makes it upright.
 
-    For a surface that is too large for one file, `mesh.glb` is a simplified overview, and the full
-    detail is written as tiles.
+    `mesh.glb` is an overview of at most `OVERVIEW_BYTES`, or has a texture.
     """
     write_ply(folder / "mesh.ply", mesh.local_record())
     upright: dict[str, Any] = {"T_scene_node": result.T_up_world}
     generator = f"tofuse {__version__}"
-    tiling = None
-    if len(mesh.faces) > tiles.MAX_UNTILED_FACES:
-        tiling = tiles.write_tiles(mesh, result.T_up_world[:3, :3], folder / TILES)
     if texture is None:
-        displayed = tiles.overview(mesh) if tiling is None else tiling.overview
+        displayed = overview(mesh)
         write_glb(
             folder / "mesh.glb",
             GeometryRecord(
@@ -141,7 +135,7 @@ def _write_mesh(
             generator=generator,
             **upright,
         )
-        return tiling
+        return
     atlas, image = texture.atlas, png_bytes(texture.image)
     points, normals = (
         values[atlas.vertices] for values in (texture.mesh.vertices, texture.mesh.normals)
@@ -157,4 +151,16 @@ def _write_mesh(
         folder / "mesh.obj",
         GeometryRecord(points @ R, atlas.faces, normals=normals @ R, uv=atlas.uv, texture=image),
     )
-    return tiling
+
+
+def overview(mesh: Mesh) -> Mesh:
+    """Return the surface, simplified until it fits into `OVERVIEW_BYTES` of glTF."""
+    faces = OVERVIEW_BYTES / (_FACE_BYTES + _VERTEX_BYTES / 2)
+    simplified = mesh
+    while (
+        _HEAD_BYTES + _VERTEX_BYTES * len(simplified) + (_FACE_BYTES * len(simplified.faces))
+        > OVERVIEW_BYTES
+    ):
+        simplified = mesh.decimated(int(faces))
+        faces *= 0.9
+    return simplified

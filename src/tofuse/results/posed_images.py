@@ -16,7 +16,6 @@ from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.atomic import make_folder
 from tofuse.files.images import write_png
-from tofuse.files.ply import read_ply
 from tofuse.fusion.texture import TextureView
 from tofuse.geometry.cameras import Camera, Pinhole, ray_lengths, scaled
 from tofuse.recordings.frames import RangeFrame
@@ -24,6 +23,7 @@ from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rectify import Rectifier, pinhole_of
 from tofuse.recordings.sources import FileSource
+from tofuse.results.loading import read_cloud
 from tofuse.results.reopening import StoredRecording, reopen, stored_recordings
 from tofuse.results.run_json import frame_covariance, main_poses, read_run_json, run_json_checked
 
@@ -258,8 +258,8 @@ def _counts(metres: Float32, unit_m: float) -> UInt16:
 
 def subsampled_points(folder: Path) -> tuple[Float32, UInt8]:
     """Return evenly sampled points (N, 3) of a result's cloud, and their colours (N, 3)."""
-    ply = read_ply(folder / "cloud.ply")
-    step = max(1, -(-len(ply) // _MAX_POINTS))
-    points = ply.points[::step].astype(np.float32)
-    color = np.full((len(points), 3), 128, np.uint8) if ply.color is None else ply.color[::step]
+    cloud = read_cloud(folder)
+    step = max(1, -(-len(cloud) // _MAX_POINTS))
+    points, color = cloud.points[::step].astype(np.float32), cloud.color
+    color = np.full((len(points), 3), 128, np.uint8) if color is None else color[::step]
     return points, color

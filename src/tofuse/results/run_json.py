@@ -20,12 +20,11 @@ from tofuse.geometry import se3
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.calibration_check import CalibrationCheck
 from tofuse.posegraph.refinement import Refinement
-from tofuse.results.folder import TILES, TILESET, is_result
-from tofuse.results.tiles import TilingSummary
+from tofuse.results.folder import is_result
 from tofuse.results.types import FrameRecord, Reason, Reconstruction, SelfCalibration
 
 
-def write_run_json(path: Path, result: Reconstruction, tiling: TilingSummary | None = None) -> None:
+def write_run_json(path: Path, result: Reconstruction) -> None:
     """Write `run.json`, schema 1: SI units and radians, null instead of NaN.
 
     It is written frame by frame, as all frames of a long recording would need much memory.
@@ -36,13 +35,11 @@ def write_run_json(path: Path, result: Reconstruction, tiling: TilingSummary | N
         The new file.
     result
         The result.
-    tiling
-        Summary of its tiles, if it has any.
     """
     with path.open("w", encoding="utf-8") as file:
         file.write("{")
         separator = ""
-        for key, value in _content(result, tiling).items():
+        for key, value in _content(result).items():
             file.write(f'{separator}\n "{key}": ')
             separator = ","
             if isinstance(value, Iterator):
@@ -67,7 +64,7 @@ def _indented(value: Any, level: int) -> str:
     return text.replace("\n", "\n" + level * " ")
 
 
-def _content(result: Reconstruction, tiling: TilingSummary | None) -> dict[str, Any]:
+def _content(result: Reconstruction) -> dict[str, Any]:
     """Return the content; that of `frames` is an iterator."""
     d = result.diagnostics
     return {
@@ -89,7 +86,6 @@ def _content(result: Reconstruction, tiling: TilingSummary | None) -> dict[str, 
         "reasons": reasons_json(d.reasons),
         "frames": (_frame(f, result) for f in d.frames),
         "T_up_world": result.T_up_world,
-        "tiles": _tiles(tiling),
         "rig": result.recording.get("rig"),
         "components": [
             _fields(c, "frames", "T_main_component", "joined") for c in result.components
@@ -125,17 +121,6 @@ def _fields(record: Any, *names: str) -> dict[str, Any]:
 def _frame(f: FrameRecord, result: Reconstruction) -> dict[str, Any]:
     covariance = None if f.covariance is None else f.covariance.ravel()
     return {**vars(f), "covariance": covariance, "session": _session_of(f.index, result)}
-
-
-def _tiles(tiling: TilingSummary | None) -> dict[str, Any] | None:
-    """The summary of the tiles; None without tiles."""
-    if tiling is None:
-        return None
-    return {
-        "tileset": f"{TILES}/{TILESET}",
-        **_fields(tiling, "levels", "tiles", "faces"),
-        "overview_faces": len(tiling.overview.faces),
-    }
 
 
 def _session_of(index: int, result: Reconstruction) -> int | None:

@@ -311,13 +311,14 @@ def _with_rig_reason(result: Reconstruction, displaced: Sequence[CameraMotion]) 
 
 def _write(rig_result: RigResult, recording: Recording, folder: OutputFolder) -> None:
     from tofuse.report.extras import ReportExtras
-    from tofuse.viewer.view_file import write_report_and_view
+    from tofuse.report.html import write_report
 
     def report(result: Reconstruction, target: Path) -> None:
         source = recording.source
         assert isinstance(source, RigSource)
         cameras = ", ".join(camera.name for camera in source.rig.cameras)
-        write_report_and_view(result, target, ReportExtras(f"rig of {cameras}", rig=rig_result.rig))
+        extras = ReportExtras(f"rig of {cameras}", rig=rig_result.rig)
+        write_report(result, target / "report.html", extras)
         if result is rig_result.result:
             posed = np.isfinite(rig_result.poses[:, 0, 0])
             write_tum(target / TRAJECTORY, rig_result.times[posed], rig_result.poses[posed])

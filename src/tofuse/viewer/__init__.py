@@ -1,1 +1,1 @@
-"""`tofuse view`: a result in the browser, and a run while it grows."""
+"""`tofuse view`: the report of a result in the browser; `run --view`: a run while it works."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -10,21 +11,20 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.geometry import se3
+from tofuse.geometry.quaternion import from_matrix
 from tofuse.normal import OF_95_PERCENT
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.report.thumbnails import data_uri, depth_image, depth_limits, subsample, viridis
 from tofuse.report.words import length
 from tofuse.results.types import FrameRecord
-from tofuse.viewer.app import AFTER, CHOSEN, FOV, ResultView, color_bar, wxyz
-from tofuse.viewer.content import read_content
 from tofuse.viewer.coverage import Coverage
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from viser import ViserServer
 
 
+_PATH, _CURRENT = (90, 176, 245), (255, 225, 90)
+_FOV = 2 * float(np.arctan(0.5))  # of the camera's pyramid as drawn
 _POINTS = 4000  # of each view shown
 _CLOUDS = 120  # views shown; beyond, every second one is removed
 _MIN_DISTANCE, _MIN_ANGLE = 0.15, np.radians(8.0)  # m and rad between views that are shown
@@ -103,15 +103,10 @@ class LiveView:
                 self._show_current(frame, T)
                 self._show_status()
 
-    def finish(self, folder: Path) -> ResultView:
-        """Show the result in place of the live view."""
-        result = read_content(folder)
-        with self._lock, self._server.atomic():
-            self._server.scene.reset()
-            self._server.gui.reset()
-            self._shown.clear()
-            self._cloud_data.clear()
-            return ResultView(self._server, result)
+    def finish(self, address: str) -> None:
+        """Link to the report of the result, which is served at an address."""
+        with self._lock:
+            self._status.content = f"**Finished.** [The report]({address})"
 
     def _show_status(self, detail: str = "") -> None:
         words = f"**{self._stage}**"
@@ -193,7 +188,7 @@ class LiveView:
             level = 0.5 + 0.5 * np.log(np.minimum(ratio, _COLOR_RATIO)) / np.log(_COLOR_RATIO)
             handle.colors = viridis(level)
         labels = [f"±{length(median * ratio)}" for ratio in (1 / _COLOR_RATIO, 1.0, _COLOR_RATIO)]
-        self._legend.content = color_bar("Accuracy so far (95 %), noise only", labels) + (
+        self._legend.content = _color_bar("Accuracy so far (95 %), noise only", labels) + (
             '<div style="padding:0 0.8em 0.6em;font-size:0.85em">Go to bright places next: they '
             "were seen from too far away or too rarely.</div>"
         )
@@ -212,18 +207,29 @@ class LiveView:
             )
         scene.add_camera_frustum(
             "/live_camera",
-            FOV,
+            _FOV,
             1.25 if image is None else image.shape[1] / image.shape[0],
             scale=0.15,
             thickness=2.5,
             thickness_units="screen",
-            color=CHOSEN,
-            wxyz=wxyz(T),
+            color=_CURRENT,
+            wxyz=np.roll(from_matrix(T[:3, :3]), 1),
             position=T[:3, 3],
         )
         path = np.stack(self._path[:: -(-len(self._path) // 2000)])
         if len(path) > 1:
             ends = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)
             scene.add_line_segments(
-                "/live_path", ends, AFTER, thickness=2.0, thickness_units="screen"
+                "/live_path", ends, _PATH, thickness=2.0, thickness_units="screen"
             )
+
+
+def _color_bar(label: str, labels: Sequence[str]) -> str:
+    """A colour bar with a title, and labels at its ends and in its middle, as HTML."""
+    stops = ", ".join(f"rgb{tuple(c)}" for c in viridis(np.linspace(0, 1, 9)).tolist())
+    ticks = "".join(f"<span>{text}</span>" for text in labels)
+    return (
+        f'<div style="padding:0 0.8em 0.5em;font-size:0.85em">{label}'
+        f'<div style="height:12px;border-radius:3px;background:linear-gradient(90deg,{stops})">'
+        f'</div><div style="display:flex;justify-content:space-between">{ticks}</div></div>'
+    )

@@ -1,4 +1,4 @@
-"""The server of the page, reachable from this machine only.
+"""The server of the live view, reachable from this machine only.
 
 It answers only requests whose Host and Origin are names of this machine, which excludes pages of
 other sites whose name resolves to this machine (DNS rebinding).
@@ -46,9 +46,7 @@ def serve(port: int | None = None) -> ViserServer:
         If viser is not installed, or the port is in use.
     """
     viser = required_package("viser", "viewer", "the viewer")
-    chosen = _free_port() if port is None else port
-    if port is not None and not _is_free(port):
-        raise InputError("is in use", where=f"--port {port}", remedy="use another, or none")
+    chosen = choose_port(port)
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     # Standard output is for results.
     with redirect_stdout(io.StringIO()), _guarded() as guards:
@@ -164,8 +162,19 @@ def _is_free(port: int) -> bool:
     return True
 
 
-def _free_port() -> int:
-    for port in range(PORT, PORT + _MAX_PORTS):
-        if _is_free(port):
-            return port
-    raise InputError(f"no port from {PORT} on is free", where="the viewer", remedy="use --port")
+def choose_port(port: int | None) -> int:
+    """Return a port if it is free, or for None the first free one from 8080 on.
+
+    Raises
+    ------
+    InputError
+        If it is in use.
+    """
+    if port is None:
+        free = next((p for p in range(PORT, PORT + _MAX_PORTS) if _is_free(p)), None)
+        if free is None:
+            raise InputError(f"no port from {PORT} on is free", where="--port", remedy="use it")
+        return free
+    if not _is_free(port):
+        raise InputError("is in use", where=f"--port {port}", remedy="use another, or none")
+    return port

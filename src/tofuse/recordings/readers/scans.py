@@ -67,7 +67,8 @@ class LasScans(Reader):
 
 
 def _las_header(path: Path) -> Any:
-    laspy = required_package("laspy", "scan", path)
+    import laspy
+
     head = read_head(path, 375)
     if head[:4] != b"LASF":
         raise InputError("isn't a LAS file", where=path, remedy="check the file")
@@ -108,7 +109,8 @@ def _check_chunks(path: Path, header: Any) -> None:
     consists of its version, the number of chunks and their compressed sizes. Its offset precedes
     the chunks or, if unknown at that time, is in the last 8 bytes (specification of LASzip 2.2).
     """
-    lazrs = required_package("lazrs", "scan", path)
+    import lazrs
+
     size, start = path.stat().st_size, int(header.offset_to_point_data)
     layout = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
     if layout.item_size() != header.point_format.size:
@@ -158,10 +160,24 @@ def _shift(path: Path) -> Float64:
     return map_shift(low, high)
 
 
-def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> CloudFrame:
+def read_las(path: Path) -> Any:
+    """Return the `laspy.LasData` of a file, whose header is checked first.
+
+    Raises
+    ------
+    InputError
+        If it is damaged.
+    """
+    import laspy
+
     _las_header(path)
     with library_errors(path, _COPY):
-        points = required_package("laspy", "scan", path).read(path)
+        return laspy.read(path)
+
+
+def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> CloudFrame:
+    points = read_las(path)
+    with library_errors(path, _COPY):
         xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1)
         names = set(points.point_format.dimension_names)
         amplitude = np.asarray(points["intensity"], np.float32)

@@ -4,20 +4,43 @@ const minus = (a, b) => a.map((value, k) => value - b[k]);
 const along = (from, direction, length) => from.map((value, k) => value + direction[k] * length);
 
 function makeEye(canvas, scene, changed) {
-  const eye = { yaw: scene.yaw, pitch: scene.pitch, distance: 1.2 * scene.size, target: scene.center.slice() };
+  // `blend` is 0 for the lens of the view and 1 for that of a camera one looks through.
+  const eye = { yaw: scene.yaw, pitch: scene.pitch, roll: 0, blend: 0, distance: 1.2 * scene.size, target: scene.center.slice() };
   const HALF = Math.tan(0.35);
-  let flight = 0, through = false;
+  let flight = 0, through = false, gliding = false;
 
   // Rows turn the world into the view: right, down, forward.
-  function turn() {
-    const cy = Math.cos(eye.yaw), sy = Math.sin(eye.yaw), cp = Math.cos(eye.pitch), sp = Math.sin(eye.pitch);
-    return [[cy, 0, sy], [sp * sy, cp, -sp * cy], [-cp * sy, sp, cp * cy]];
+  function turn({ yaw, pitch, roll } = eye) {
+    const cy = Math.cos(yaw), sy = Math.sin(yaw), cp = Math.cos(pitch), sp = Math.sin(pitch);
+    const right = [cy, 0, sy], down = [sp * sy, cp, -sp * cy], c = Math.cos(roll), s = Math.sin(roll);
+    return [
+      right.map((value, k) => c * value + s * down[k]), down.map((value, k) => c * value - s * right[k]),
+      [-cp * sy, sp, cp * cy],
+    ];
   }
   // Half the height that is seen at depth 1; less of a canvas that is narrow.
   function lens() {
     const aspect = canvas.clientWidth / Math.max(1, canvas.clientHeight);
-    const f = Math.min(1, aspect / 1.2) / HALF;
-    return [f / aspect, f];
+    const f = Math.min(1, aspect / 1.2) / HALF, own = [f / aspect, f];
+    if (!scene.lens || !eye.blend) return own;
+    const { fx, fy } = scene.lens, size = 2 * imageScale();
+    const camera = [size * fx / canvas.clientWidth, size * fy / canvas.clientHeight];
+    return own.map((value, k) => value * (camera[k] / value) ** eye.blend);
+  }
+  // CSS pixels per pixel of a camera's image that fits in the canvas, its optical axis in the middle.
+  function imageScale() {
+    const { width, height, cx, cy } = scene.lens;
+    const half = (centre, size) => Math.max(centre + 0.5, size - 0.5 - centre);
+    return Math.min(canvas.clientWidth / half(cx, width), canvas.clientHeight / half(cy, height)) / 2;
+  }
+  // Where the image of the camera that one looks through lies on the canvas, in CSS pixels, or null.
+  function window_() {
+    if (!through || gliding || !scene.lens) return null;
+    const { width, height, cx, cy } = scene.lens, scale = imageScale();
+    return {
+      left: canvas.clientWidth / 2 - scale * (cx + 0.5), top: canvas.clientHeight / 2 - scale * (cy + 0.5),
+      width: scale * width, height: scale * height,
+    };
   }
   const place = () => along(eye.target, turn()[2], -eye.distance);
 
@@ -64,11 +87,11 @@ function makeEye(canvas, scene, changed) {
   }
   function stop() {
     cancelAnimationFrame(flight);
-    through = false;
+    through = gliding = false;
   }
   function look(changes, points, nearest = 0.3 * scene.size) {
     stop();
-    Object.assign(eye, changes);
+    Object.assign(eye, { roll: 0, blend: 0 }, changes);
     const sum = points.reduce((total, point) => along(total, point, 1), [0, 0, 0]);
     eye.target = sum.map((value) => value / points.length);
     eye.distance = Math.max(nearest, scene.size);
@@ -79,40 +102,49 @@ function makeEye(canvas, scene, changed) {
   function flyTo(changes, points, nearest) {
     const from = { ...eye };
     look(changes, points, nearest);
-    const to = { ...eye };
-    if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
-    glide(from, to);
+    glide(from, { ...eye });
   }
   function glide(from, to) {
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches) { jump(to); return; }
+    gliding = true;
     const began = performance.now();
     const turned = Math.atan2(Math.sin(to.yaw - from.yaw), Math.cos(to.yaw - from.yaw));
     const step = (now) => {
       const t = Math.min(1, Math.max(0, (now - began) / 450)), s = t * t * (3 - 2 * t);
       eye.yaw = from.yaw + turned * s;
-      eye.pitch = from.pitch + (to.pitch - from.pitch) * s;
+      for (const name of ["pitch", "roll", "blend"]) eye[name] = from[name] + (to[name] - from[name]) * s;
       eye.distance = from.distance * (to.distance / from.distance) ** s;
       eye.target = from.target.map((value, k) => value + (to.target[k] - value) * s);
+      gliding = t < 1;
       changed();
-      if (t < 1) flight = requestAnimationFrame(step);
+      if (gliding) flight = requestAnimationFrame(step);
     };
     Object.assign(eye, from);
     flight = requestAnimationFrame(step);
   }
+  function jump(to) {
+    Object.assign(eye, to);
+    changed();
+  }
   // Stands where a camera stood and looks where it looked; T is (3, 4) row by row.
   function lookThrough(T) {
+    const move = through ? jump : (to) => glide({ ...eye }, to);
     stop();
     through = true;
-    const forward = [T[2], T[6], T[10]], distance = 0.25 * scene.size;
+    const [right, , forward] = [0, 1, 2].map((k) => [T[k], T[4 + k], T[8 + k]]), distance = 0.25 * scene.size;
     const to = {
       yaw: Math.atan2(-forward[0], forward[2]),
       pitch: Math.asin(Math.max(-1, Math.min(1, forward[1]))),
-      distance,
+      roll: 0, blend: 1, distance,
       target: along([T[3], T[7], T[11]], forward, distance),
     };
-    glide({ ...eye }, to);
+    const [level, down] = turn(to);
+    to.roll = Math.atan2(dot(right, down), dot(right, level));
+    move(to);
   }
   function orbit(dx, dy) {
     stop();
+    eye.roll *= 0.85;  // it becomes upright again while it is turned
     eye.yaw -= dx * 0.006;
     eye.pitch = Math.max(-1.57, Math.min(1.57, eye.pitch + dy * 0.006));
     changed();
@@ -133,7 +165,7 @@ function makeEye(canvas, scene, changed) {
     changed();
   }
   return {
-    eye, turn, lens, place, matrices, onScreen, behind, look, flyTo, lookThrough, orbit, pan, zoom,
+    eye, turn, lens, place, matrices, onScreen, behind, window: window_, look, flyTo, lookThrough, orbit, pan, zoom,
     get through() { return through; },
   };
 }

@@ -75,18 +75,36 @@ function startFrames(bus) {
   // The frame that is chosen, small in a corner of the 3D view.
   const inset = document.querySelector("#viewer .inset");
   if (inset) {
-    let index = 0;
+    // `tofuse view` serves the images of all frames as they were recorded.
+    const served = document.documentElement.dataset.frames, image = inset.querySelector("img");
+    const caption = inset.querySelector("figcaption");
+    let index = 0, waiting = 0;
+    function show(source, own) {
+      image.src = source;
+      image.hidden = false;
+      image.dataset.own = own ? "1" : "";
+      bus.dispatchEvent(new Event("pictured"));
+    }
+    function fetchLater(wanted) {
+      clearTimeout(waiting);
+      waiting = setTimeout(() => {
+        const full = new Image();
+        full.onload = () => {
+          if (wanted !== index) return;
+          caption.textContent = caption.textContent.replace(/ \(image: .*\)/, "");
+          show(full.src, true);
+        };
+        full.src = `${served}${wanted}.png`;
+      }, 120);
+    }
     bus.addEventListener("chosen", (e) => {
       index = e.detail.index;
       if (e.detail.shown) inset.hidden = false;
-      const row = pictures ? nearest(index) : -1, image = inset.querySelector("img");
-      const same = row >= 0 && pictures.index[row] === index;
-      image.hidden = row < 0;
-      if (row >= 0) {
-        const kinds = pictures.images;
-        image.src = (kinds.color || kinds.range)[row];
-      }
-      inset.querySelector("figcaption").textContent = same
+      const row = pictures ? nearest(index) : -1, same = row >= 0 && pictures.index[row] === index;
+      image.hidden = true;
+      if (row >= 0) show((pictures.images.color || pictures.images.range)[row], same);
+      if (served) fetchLater(index);
+      caption.textContent = same
         ? pictures.descriptions[row]
         : `Frame ${index}${row >= 0 ? ` (image: frame ${pictures.index[row]})` : ""}`;
     });

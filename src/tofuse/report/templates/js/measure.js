@@ -1,6 +1,6 @@
-// Taps two points of the model: their distance, and how well it is known.
-function makeMeasure(box, view, painter, sigmaOf, changed) {
-  const button = box.querySelector("[data-tool=measure]"), label = box.querySelector(".measured");
+// Taps points of the model: where one is, how far two are apart, and how well that is known.
+function makeMeasure(box, view, painter, { sigmaOf, axes, changed }) {
+  const button = box.querySelector("[data-tool=measure]"), label = box.querySelector(".measured"), pins = box.querySelectorAll(".pin");
   const line = { place: painter.buffer(new Float32Array(6)), color: [1, 0.88, 0.35], count: 0, over: 0.002 };
   const ends = [];
   let on = false;
@@ -12,7 +12,7 @@ function makeMeasure(box, view, painter, sigmaOf, changed) {
     line.count = 0;
     button.setAttribute("aria-pressed", String(on));
     box.classList.toggle("measuring", on);
-    say(on ? "Tap the first point" : "");
+    say(on ? "Tap a point, or two for their distance" : "");
     place();
     changed();
   }
@@ -29,20 +29,34 @@ function makeMeasure(box, view, painter, sigmaOf, changed) {
     painter.gl.bindBuffer(painter.gl.ARRAY_BUFFER, line.place);
     painter.gl.bufferData(painter.gl.ARRAY_BUFFER, new Float32Array(all), painter.gl.DYNAMIC_DRAW);
     line.count = all.length / 3;
-    say(ends.length === 1 ? "Tap the second point" : distance());
+    say(ends.length === 1 ? position() : distance());
     place();
     changed();
+  }
+  // Coordinates in the world of the trajectory and of the files; the model is shown in turned axes.
+  function position() {
+    const [{ point, sigma }] = ends;
+    const world = axes ? [0, 1, 2].map((k) => dot(axes.map((row) => row[k]), point)) : point;
+    return bounded(`${world.map((value) => value.toFixed(3).replace("-", "−")).join(", ")} m`, sigma, 1);
   }
   function distance() {
     const [a, b] = ends, length = Math.hypot(...minus(a.point, b.point));
     const known = a.sigma !== null && b.sigma !== null;
-    if (!known) return metres(length);
-    const sigma = Math.hypot(a.sigma, b.sigma);
-    return sigma > Math.max(length, 1) ? `${metres(length)}, not constrained` : `${metres(length)} ± ${metres(sigma)}`;
+    return bounded(metres(length), known ? Math.hypot(a.sigma, b.sigma) : null, Math.max(length, 1));
   }
-  // The words stand beside the line, or at the top until there is one.
+  function bounded(words, bound, most) {
+    if (bound === null) return words;
+    return bound > most ? `${words}, not constrained` : `${words} ± ${metres(bound)}`;
+  }
+  // The words stand beside the points, or at the top until there is one.
   function place() {
-    const shown = ends.length === 2 && view.onScreen(along(ends[0].point, minus(ends[1].point, ends[0].point), 0.5));
+    pins.forEach((pin, k) => {
+      const there = ends[k] && view.onScreen(ends[k].point);
+      pin.hidden = !there;
+      if (there) pin.style.transform = `translate(${there[0]}px, ${there[1]}px)`;
+    });
+    const middle = ends.length && along(ends[0].point, minus(ends[ends.length - 1].point, ends[0].point), 0.5);
+    const shown = middle && view.onScreen(middle);
     label.classList.toggle("placed", Boolean(shown));
     if (!shown) { label.style.transform = ""; return; }
     label.style.transform = `translate(${Math.round(shown[0])}px, ${Math.round(shown[1])}px) translate(-50%, -150%)`;

@@ -69,7 +69,8 @@ async function startViewer(box, scene, bus) {
     const field = fields.accuracy;
     return field ? field.span[0] * (field.span[1] / field.span[0]) ** (value / 255) : null;
   };
-  const measure = box.querySelector("[data-tool=measure]") ? makeMeasure(box, view, painter, sigmaOf, draw) : null;
+  const measure = box.querySelector("[data-tool=measure]") ? makeMeasure(box, view, painter, { sigmaOf, axes: scene.axes, changed: draw }) : null;
+  const overlay = makeOverlay(box, view, draw);
   let marked = null;
 
   // What is drawn of the model now, as sets for the painter.
@@ -112,6 +113,7 @@ async function startViewer(box, scene, bus) {
     }
     if (measure) { wires.push(measure.line); measure.place(); }
     painter.lines(wires, view);
+    overlay.place();
   }
 
   // Outermost points of what is to be seen.
@@ -137,7 +139,13 @@ async function startViewer(box, scene, bus) {
   }
 
   // Frames that are spoken of elsewhere on the page.
-  bus.addEventListener("chosen", (e) => { if (cameras) { cameras.choose(rowOf(e.detail.index)); draw(); } });
+  bus.addEventListener("chosen", (e) => {
+    if (!cameras) return;
+    const row = rowOf(e.detail.index), T = cameras.pose(row);
+    cameras.choose(row);
+    if (view.through && T) view.lookThrough(T); else draw();
+  });
+  bus.addEventListener("pictured", draw);
   bus.addEventListener("marked", (e) => {
     if (!cameras) return;
     const { ranges } = e.detail;
@@ -155,7 +163,7 @@ async function startViewer(box, scene, bus) {
   });
   bus.addEventListener("through", (e) => {
     const T = cameras && cameras.pose(rowOf(e.detail.index));
-    if (T) view.lookThrough(T);
+    if (view.through) reset(); else if (T) view.lookThrough(T);
   });
   function rowOf(index) {
     let low = 0, high = frames.index.length - 1;

@@ -1,0 +1,132 @@
+"""The live view of a run: it grows, and does not change the result."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import time
+
+import numpy as np
+import pytest
+from light_report import write_light_report
+
+from browser import changed, chromium, watched
+from tofuse.pipeline import run as run_module
+from tofuse.pipeline.progress import Silent
+from tofuse.pipeline.run import run
+from tofuse.pipeline.run_options import Options
+from tofuse.recordings.frames import CloudFrame
+from tofuse.viewer.coverage import Coverage
+from tofuse.viewer.server import serve, stop
+
+needs_viser = pytest.mark.skipif(
+    importlib.util.find_spec("viser") is None, reason="viser is not installed"
+)
+CANVAS = "canvas[data-engine]"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+def drawn(seen):
+    """The picture after rendering has settled."""
+    last = seen.pixels(CANVAS)
+    for _ in range(40):
+        seen.page.wait_for_timeout(250)
+        now = seen.pixels(CANVAS)
+        if changed(last, now) == 0:
+            return now
+        last = now
+    return last
+
+
+class Recorder(Silent):
+    def __init__(self):
+        self.frames, self.stages = [], []
+
+    def stage(self, name, total=None):
+        self.stages.append(name)
+
+    def placed(self, frame, T_world_camera):
+        self.frames.append((frame.index, T_world_camera.copy(), len(self.stages)))
+
+
+@pytest.mark.slow
+@needs_viser
+def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser, monkeypatch):
+    from tofuse.pipeline.progress import CombinedProgress
+    from tofuse.viewer.live_view import LiveView
+    from tofuse.viewer.server import address
+
+    same = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply")
+    quick = {"end": 4, "method": "thesis"}
+    recorder = Recorder()
+    server = serve()
+    try:
+        live = LiveView(server)
+        began = time.perf_counter()
+        watched_run = run(
+            [room_recording], Options(out=tmp_path / "a", **quick), CombinedProgress(recorder, live)
+        )
+        assert live.first_seconds <= time.perf_counter() - began
+        # The first frame is shown before any stage begins, and then each one with its pose.
+        assert recorder.frames[0][0::2] == (0, 0)
+        assert [k for k, *_ in recorder.frames[1:]] == [0, 1, 2, 3]
+        np.testing.assert_allclose(recorder.frames[-1][1], watched_run.trajectory[3], atol=0.05)
+        place = address(server)
+        with watched(browser, place, ours=place, viewport={"width": 700, "height": 460}) as seen:
+            seen.page.get_by_text("writing").wait_for(timeout=30_000)
+            growing = drawn(seen)
+            assert len(np.unique(growing.reshape(-1, 3), axis=0)) > 100
+            seen.page.get_by_label("Colour by").click()
+            seen.page.get_by_role("option", name="accuracy").click()
+            seen.page.get_by_text("Go to bright places next").wait_for(timeout=15_000)
+            assert changed(growing, drawn(seen)) > 0.01
+            live.finish("http://127.0.0.1:1")
+            seen.page.get_by_role("link", name="The report").wait_for(timeout=30_000)
+            seen.check()
+    finally:
+        stop(server)
+    monkeypatch.setattr(run_module, "write_report_files", write_light_report)
+    run([room_recording], Options(out=tmp_path / "b", **quick))
+    for name in same:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    assert json.loads((tmp_path / "a/run.json").read_text())["schema"] == 1
+
+
+def test_accuracy_improves_with_proximity_and_number_of_views():
+    rng = np.random.default_rng(1)
+    wall = np.float32(rng.uniform([-1, -1, 2], [1, 1, 2.001], (4000, 3)))
+    left = wall[:, 0] < 0
+    coverage = Coverage(0.05)
+    assert np.isinf(coverage.sigma(wall)).all()
+    coverage.add(wall, np.full(len(wall), 0.008))
+    for _ in range(3):
+        coverage.add(wall[left], np.full(left.sum(), 0.008))
+    inside = np.abs(wall[:, 0]) > 0.1
+    np.testing.assert_allclose(coverage.sigma(wall)[left & inside], 0.004, rtol=1e-6)
+    np.testing.assert_allclose(coverage.sigma(wall)[~left & inside], 0.008, rtol=1e-6)
+    assert np.isinf(coverage.sigma(wall + np.float32([0, 0, 1]))).all()
+
+
+@needs_viser
+def test_views_of_long_run_are_thinned():
+    from tofuse.viewer import live_view as live_module
+
+    server = serve()
+    try:
+        live = live_module.LiveView(server)
+        rng = np.random.default_rng(0)
+        for k in range(2 * live_module._CLOUDS):
+            T = np.eye(4)
+            T[0, 3] = 0.5 * k
+            live.placed(CloudFrame.of(rng.normal(0, 1, (50, 3)), index=k), T)
+        assert len(live._shown) <= live_module._CLOUDS
+        xs = [T[0, 3] for T, _ in live._shown]
+        assert xs == sorted(xs)
+        assert xs[0] == 0
+    finally:
+        stop(server)

@@ -1,0 +1,234 @@
+"""`tofuse view`: the report with the images of the recording, and nothing else, is served."""
+
+from __future__ import annotations
+
+import http.client
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from browser import chromium, watched
+from report_results import ROOM, circle, make_room, view
+from tofuse.cli import main
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.recordings.convert import convert
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.report.html import write_report
+from tofuse.results.folder import OutputFolder
+from tofuse.results.output import write_result
+from tofuse.viewer.report_server import FrameImages, ReportServer, report_pages
+
+CAMERA = Pinhole(64, 48, 64 * 1.4, 64 * 1.4, 32, 24)
+# The world is tilted and the model not shown upright: in other axes, and from rolled cameras.
+T_TILTED_WORLD = se3.exp([0.3, -0.2, 0.1, 0.5, 0.2, 0.3])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A recording of a room, and the folder of its result: frames, and folder."""
+    folder = tmp_path_factory.mktemp("view")
+    frames = [view(k, T, CAMERA, np.random.default_rng(k)) for k, T in enumerate(circle(24))]
+    convert(Recording.of(ArraySource(frames), "room", "arrays"), folder / "recording")
+    result, extras = make_room()
+    cloud = result.cloud
+    result = replace(
+        result,
+        trajectory=T_TILTED_WORLD @ result.trajectory,
+        cloud=replace(
+            cloud,
+            points=se3.transform(T_TILTED_WORLD, cloud.points.astype(float)).astype(np.float32),
+            normals=cloud.normals @ T_TILTED_WORLD[:3, :3].T.astype(np.float32),
+        ),
+        up=np.array([0.28, -0.96, 0.0]),
+        recording=result.recording | {"path": str(folder / "recording")},
+    )
+    extras = replace(extras, reference=None, truth_points=None)
+    write_result(
+        result,
+        OutputFolder(folder / "out"),
+        lambda r, out: write_report(r, out / "report.html", extras),
+    )
+    (folder / "out" / "component-1").mkdir()
+    (folder / "out" / "component-1" / "report.html").write_text("<html>another</html>")
+    return frames, folder / "out"
+
+
+@pytest.fixture(scope="module")
+def server(made):
+    with ReportServer(report_pages(made[1]), FrameImages.of(made[1])) as running:
+        yield running
+
+
+def ask(server, path: str, **headers: str) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    connection.putrequest("GET", path, skip_host="Host" in headers, skip_accept_encoding=True)
+    for name, value in headers.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    body = answer.read()
+    connection.close()
+    return answer.status, body
+
+
+def test_report_and_images_of_frames_are_served(made, server) -> None:
+    frames, out = made
+    status, page = ask(server, "/")
+    assert status == 200
+    report = (out / "report.html").read_bytes()
+    assert page == report.replace(b"<html", b'<html data-frames="/frame/"', 1) != report
+    assert ask(server, "/component-1/report.html")[0] == 200
+    for k in (0, 9, 23):  # lost frames, too
+        status, png = ask(server, f"/frame/{k}.png")
+        assert status == 200
+        image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert image.shape == (48, 64)
+        ranks = np.corrcoef(image.ravel(), np.sqrt(frames[k].amplitude_image.ravel()))
+        assert ranks[0, 1] > 0.95
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/run.json", "/frame/24.png", "/frame/-1.png", "/frame/0.png/", "/frame/%30.png",
+        "/../../etc/passwd", "/%2e%2e/run.json", "//etc/passwd", "/component-1/../run.json",
+        "/component-1/", "/report.html?x", "*",
+    ],
+)  # fmt: skip
+def test_nothing_else_is_served(server, path) -> None:
+    assert ask(server, path) == (404, b"not found\n")
+
+
+def test_pages_of_other_sites_are_refused(server) -> None:
+    for path in ("/", "/frame/0.png"):
+        for headers in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
+            assert ask(server, path, **headers)[0] == 403
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a signal of POSIX")
+def test_command_serves_until_interrupted_and_without_recording(made, tmp_path) -> None:
+    out = shutil.copytree(made[1], tmp_path / "out")
+    text = (out / "run.json").read_text()
+    (out / "run.json").write_text(text.replace(str(made[1].parent), str(tmp_path / "gone")))
+    command = [sys.executable, "-m", "tofuse", "view", str(out), "--no-open"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as p:
+        assert p.stderr is not None
+        lines = [p.stderr.readline() for _ in range(3)]
+        assert re.fullmatch(
+            r"only small images .*gone/recording, which doesn't exist.*\n", lines[0]
+        )
+        found = re.fullmatch(r"see (http://127\.0\.0\.1:(\d+))\n", lines[1])
+        assert found is not None
+        assert lines[2] == "press Ctrl-C to stop\n"
+        connection = http.client.HTTPConnection("127.0.0.1", int(found[2]), timeout=20)
+        connection.request("GET", "/")
+        assert connection.getresponse().read() == (out / "report.html").read_bytes()
+        p.send_signal(signal.SIGINT)
+        rest, err = p.communicate(timeout=60)
+    assert (p.returncode, rest, err) == (0, "", "")
+
+
+@pytest.mark.parametrize("what", ["no result", "nothing", "no report", "port in use"])
+def test_failures_are_reported_in_one_line(made, tmp_path, what, capsys) -> None:
+    out = tmp_path / "out"
+    options: list[str] = []
+    if what != "nothing":
+        shutil.copytree(made[1], out)
+    if what in ("no result", "no report"):
+        (out / {"no result": "run.json", "no report": "report.html"}[what]).unlink()
+    with socket.socket() as other:
+        if what == "port in use":
+            other.bind(("127.0.0.1", 0))
+            other.listen()
+            options = ["--port", str(other.getsockname()[1])]
+        assert main(["view", str(out), "--no-open", *options]) == 2
+    expected = f"--port {options[1]}" if options else str(out)
+    assert re.fullmatch(f"tofuse: .*{re.escape(expected)}.*\n", capsys.readouterr().err)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+def opened(browser, server):
+    size = {"width": 1200, "height": 900}
+    return watched(browser, server.address, ours=server.address, viewport=size)
+
+
+CANVAS = "#viewer .stage canvas"
+
+
+@pytest.mark.nightly
+def test_camera_shows_its_image_over_the_model(browser, server) -> None:
+    with opened(browser, server) as seen:
+        page = seen.page
+        page.locator("#viewer.live").wait_for(timeout=20_000)
+        line = page.locator("#viewer .timeline canvas").bounding_box()
+
+        def choose(frame: int) -> None:
+            page.mouse.click(line["x"] + (frame + 0.5) / 24 * line["width"], line["y"] + 10)
+            served = page.locator(f"#viewer .inset img[src$='frame/{frame}.png']")
+            served.wait_for(state="attached")
+
+        def shown(opacity: int) -> np.ndarray:
+            page.locator("#viewer .inset input").fill(str(opacity))
+            seen.rest()
+            picture = seen.pixels(CANVAS)[..., 1]
+            # Without the tools above, the inset below, and the gaps between points.
+            part = picture[80 : picture.shape[0] * 2 // 3, 60 : picture.shape[1] * 2 // 3]
+            return cv2.GaussianBlur(part.astype(np.float32), (0, 0), 8).ravel()
+
+        # The frame has no small image, only one that is served.
+        choose(3)
+        assert page.locator("#viewer .overlay").is_hidden()
+        page.get_by_role("button", name="Look through this camera").click()
+        page.locator("#viewer .overlay").wait_for()
+        model = shown(0)
+        assert np.corrcoef(model, shown(100))[0, 1] > 0.7
+        # The next camera is looked through, too.
+        choose(4)
+        assert np.corrcoef(shown(0), shown(100))[0, 1] > 0.7
+        assert np.corrcoef(model, shown(100))[0, 1] < 0.5
+        page.get_by_role("button", name="Back to the model").click()
+        page.locator("#viewer .overlay").wait_for(state="hidden")
+        seen.check()
+
+
+@pytest.mark.nightly
+def test_picked_point_has_coordinates_of_the_world_and_a_bound(browser, server) -> None:
+    with opened(browser, server) as seen:
+        page = seen.page
+        page.locator("#viewer.live").wait_for(timeout=20_000)
+        page.get_by_role("button", name="Measure").click()
+        seen.rest()
+        caption = page.locator("#viewer .measured")
+        bright = seen.pixels(CANVAS).min(-1) > 70
+        bright[:80] = bright[-150:] = False
+        rows, columns = np.nonzero(cv2.erode(bright.astype(np.uint8), np.ones((9, 9))))
+        for k in np.linspace(0, len(rows) - 1, 5).astype(int)[1:-1]:
+            page.get_by_role("button", name="Measure").click(click_count=2)
+            page.locator(CANVAS).click(
+                position={"x": int(columns[k]), "y": int(rows[k])}, force=True
+            )
+            words = caption.inner_text().replace("−", "-")
+            found = re.fullmatch(r"(\S+), (\S+), (\S+) m ± ([\d.]+) mm", words)
+            assert found is not None, words
+            *world, bound = map(float, found.groups())
+            # On a wall of the room, in the frame of the files; noise is 12 mm and outliers exist.
+            point = se3.transform(se3.inverse(T_TILTED_WORLD), np.array([world]))[0]
+            assert np.abs(point - ROOM).min() < 0.15
+            sigma = 0.002 + 0.004 * np.linalg.norm(point)
+            assert bound == pytest.approx(1960 * sigma, rel=0.15, abs=1)
+        seen.check()
