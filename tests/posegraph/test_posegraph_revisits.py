@@ -20,7 +20,7 @@ from tofuse.registration.base import Registration
 from tofuse.registration.pose_probability import ACCEPTED
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.registration.verification import Assessment
+from tofuse.registration.verification import FitQuality
 
 turn = revisited_path.turn  # the fixture
 
@@ -170,7 +170,9 @@ def test_searched_loops_are_accepted_or_agree(turn, monkeypatch, probable, wrong
     monkeypatch.setattr(revisits, "register_pair", scripted)
     # Nothing fits from the drifted pose, so that only the search can succeed.
     monkeypatch.setattr(
-        revisits.FitStatistics, "assess", lambda *_: Assessment(False, np.inf, "does not fit")
+        revisits.FitStatistics,
+        "assess",
+        lambda *_: FitQuality("conflicting", np.inf, "does not fit"),
     )
     found = pushed(options, frames, start)
     assert len(asked) >= 2

@@ -12,7 +12,7 @@ from tofuse.errors import InputError
 from tofuse.files.memory import give_back
 from tofuse.kernels.threads import serial_chunks, thread_count, threads
 from tofuse.odometry.base import Step
-from tofuse.odometry.motion import Moment
+from tofuse.odometry.motion import FrameTime
 from tofuse.parts import check_number
 from tofuse.pipeline.assembly import Assembly
 from tofuse.pipeline.background_queue import BackgroundQueue
@@ -139,7 +139,7 @@ class Mapper:
         with self.watch.timing("filters"):
             T_expected = None
             if self._log.entries and self._log.entries[-1].has_pose:
-                T_expected = self._tracker.predicted_pose(Moment(frame.index, frame.timestamp))
+                T_expected = self._tracker.predicted_pose(FrameTime(frame.index, frame.timestamp))
             return self._preparation.process(frame, T_expected, history, prepared)
 
     def _track(self, filtered: FilteredFrame, T_odometry: Float64 | None, repeated: bool) -> Step:
