@@ -32,7 +32,7 @@ import numpy as np
 
 from hours import there_and_back
 from scaling import LENGTH, made_frames
-from tofuse.files.memory import give_back
+from tofuse.files.memory import trim_memory
 from tofuse.files.spill import Spill, SpillFile
 from tofuse.lab.simulation.record import simulate
 from tofuse.live.device import DeviceError, Settings, Stream
@@ -80,7 +80,7 @@ class Usage:
     def measured(after: int) -> Usage:
         """Measure, after that many frames or runs."""
         gc.collect()
-        give_back()
+        trim_memory()
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         descriptors, threads = (len(os.listdir(f"/proc/self/{name}")) for name in ("fd", "task"))
         objects = gc.get_objects()  # compared by type: a weak proxy passes for what it refers to

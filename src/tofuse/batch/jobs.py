@@ -16,15 +16,13 @@ from typing import Any
 
 from tofuse.errors import InputError
 from tofuse.files.reading import name_order, parse_toml, read_head, read_text
-from tofuse.files.stamps import Stamp, stamp, stamps_in
+from tofuse.files.stamps import stamps_of
 
 RESERVED = ("batch.csv", "batch.html", "jobs")  # names in the output folder not for jobs
 # Other files are recordings if they are binary, or a reader recognises them.
 _LISTS = (".csv", ".toml", ".txt")
 _HEAD_BYTES = 4096
 _MAX_NAME_LENGTH = 100  # characters of a name
-# Files that readers use in the folder of a single file, whatever its name.
-_SIDECARS = ("camera.json", "rays.npy", "correction.npz")
 _UNITS = {"": 1, "k": 1000, "m": 1000**2, "g": 1000**3, "t": 1000**4}
 _BINARY = {"ki": 1 << 10, "mi": 1 << 20, "gi": 1 << 30, "ti": 1 << 40}
 
@@ -59,21 +57,9 @@ class Job:
         """
         values = [word.partition("=")[2] for word in self.arguments]
         paths = [Path(v) for v in (self.recording, *values) if v and Path(v).is_absolute()]
-        files = [s for path in paths for s in _stamps(path, out)]
+        files = [s for path in paths for s in stamps_of(path, out)]
         facts = {"recording": self.recording, "words": self.arguments, "files": files}
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
-
-
-def _stamps(path: Path, out: Path) -> list[Stamp]:
-    """Stamps of all files in a folder, or of a file and those that belong to it."""
-    if os.path.isdir(path):
-        return stamps_in(path, out)
-    if not os.path.isfile(path):
-        return []
-    stem = path.name.split(".")[0]
-    siblings = sorted(p for p in path.parent.iterdir() if p.name.split(".")[0] == stem)
-    siblings += [path.parent / name for name in _SIDECARS]
-    return [stamp(p) for p in siblings if p.is_file()]
 
 
 @dataclass(frozen=True)

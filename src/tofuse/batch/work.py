@@ -106,7 +106,7 @@ def _start_process(task: Task, folder: BatchFolder, lock: int) -> subprocess.Pop
                 stdout=subprocess.PIPE,
                 stderr=log,
                 env={k: v for k, v in os.environ.items() if k != _NOT_INHERITED},
-                start_new_session=True,  # Ctrl-C reaches only this process: checkpoints stay
+                start_new_session=True,  # Ctrl-C reaches only this process
                 pass_fds=() if sys.platform == "win32" else (lock,),
             )
     except OSError as error:

@@ -82,7 +82,7 @@ class LocalWorkers(Workers):
         return
 
     def close(self) -> None:
-        """See `Workers`. Checkpoints of killed processes stay for the next time."""
+        """See `Workers`."""
         self._closed = True
         for process in self._processes:
             process.kill()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _BROKEN_PIPE = 128 + 13  # as if terminated by SIGPIPE
 _UNCHANGED = "existing files are unchanged, or the new result is complete"
-_INTERRUPTED = f"interrupted; {_UNCHANGED}"
+_INTERRUPTED, _TERMINATED = f"interrupted; {_UNCHANGED}", f"terminated; {_UNCHANGED}"
 _MEMORY = "out of memory; use --every, --max-depth or a larger voxel_m"
 
 
@@ -165,6 +165,8 @@ def _run_unwrapped(command: Callable[[], int]) -> int:
         while isinstance(cause, SystemError):
             cause = cause.__cause__ or cause.__context__
         if isinstance(cause, KeyboardInterrupt | Ended):
+            for note in getattr(error, "__notes__", ()):
+                cause.add_note(note)
             raise cause from None
         raise
 
@@ -180,11 +182,11 @@ def run_command(command: Callable[[], int]) -> int:
         except TofuseError as error:
             _print_error(str(error))
             return 2
-        except KeyboardInterrupt:
-            _print_error(_INTERRUPTED)
+        except KeyboardInterrupt as error:
+            _print_error("; ".join([_INTERRUPTED, *getattr(error, "__notes__", ())]))
             return 130
         except Ended as error:
-            _print_error(f"terminated; {_UNCHANGED}")
+            _print_error("; ".join([_TERMINATED, *getattr(error, "__notes__", ())]))
             return 128 + error.number
         except OSError as error:
             # Not converted to a TofuseError where it occurred.

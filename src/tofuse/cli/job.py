@@ -3,7 +3,7 @@
     python -m tofuse.cli.job PICTURE INPUT --out DIR ...
 
 It is killed when its standard input closes: without its parent, another worker may be doing the
-same job, and can resume from its checkpoint. The last lines on standard output are JSON: the result
+same job, and can go on after its tracking. The last lines on standard output are JSON: the result
 as `tofuse run --json` prints it, and facts for the batch.
 """
 

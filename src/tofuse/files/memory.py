@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any
 
 
-def give_back() -> None:
+def trim_memory() -> None:
     """Return freed memory to the operating system, where the C library (glibc) retains it.
 
     The memory that a stage frees is fragmented, so that the next one would allocate more.

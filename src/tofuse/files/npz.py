@@ -1,15 +1,13 @@
-"""Reading and writing .npz files, safe against pickles and decompression bombs."""
+"""Reading .npz files, safe against pickles and decompression bombs."""
 
 from __future__ import annotations
 
 import math
 import zipfile
 import zlib
-from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
 
-import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
@@ -24,28 +22,11 @@ _MAX_COMPRESSION = 1100  # just above the largest ratio that deflate reaches
 _KINDS = "biufcSU"
 
 
-def write_npz(file: IO[bytes], arrays: Iterable[tuple[str, NDArray[Any]]]) -> None:
-    """Write arrays, by name, to an open file as they come, uncompressed.
-
-    The same arrays give the same bytes.
-
-    Raises
-    ------
-    ValueError
-        If an array contains Python objects.
-    """
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-        for name, array in arrays:
-            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
-                npy.write_array(member, np.asanyarray(array), allow_pickle=False)
-
-
 def read_npz(
     path: str | Path,
     *,
     limit: int = _MAX_BYTES,
     names: frozenset[str] | None = None,
-    exclude_prefix: str | None = None,
 ) -> Arrays:
     """Return the arrays of a file, by name.
 
@@ -55,8 +36,6 @@ def read_npz(
         Largest total size in bytes.
     names
         Names of the arrays to read; all unless given.
-    exclude_prefix
-        Prefix of the names of arrays to skip.
 
     Raises
     ------
@@ -69,7 +48,7 @@ def read_npz(
             path.stat() if isinstance(path, Path) else Path(path).stat()
             raise InputError("is not a regular file", where=path, remedy="pass a file")
         with zipfile.ZipFile(path) as archive:
-            return _read(archive, limit, names, exclude_prefix)
+            return _read(archive, limit, names)
     except OSError as error:
         raise input_error(error, path) from error
     except (
@@ -94,18 +73,11 @@ def read_npz(
         ) from error
 
 
-def _read(
-    archive: zipfile.ZipFile, limit: int, names: frozenset[str] | None, exclude_prefix: str | None
-) -> Arrays:
+def _read(archive: zipfile.ZipFile, limit: int, names: frozenset[str] | None) -> Arrays:
     members = archive.infolist()
     if len(members) > _MAX_MEMBERS:
         raise ValueError(f"it contains {len(members)} arrays")
-    selected = [
-        m
-        for m in members
-        if (names is None or m.filename.removesuffix(".npy") in names)
-        and (exclude_prefix is None or not m.filename.startswith(exclude_prefix))
-    ]
+    selected = [m for m in members if names is None or m.filename.removesuffix(".npy") in names]
     if sum(m.file_size for m in selected) > limit:
         raise ValueError(f"its arrays have more than {limit >> 20} MiB")
     arrays: Arrays = {}

@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 from tofuse.arrays import UInt8
 from tofuse.errors import OutputError
 from tofuse.files.atomic import output_error
-from tofuse.files.memory import give_back
+from tofuse.files.memory import trim_memory
 
-_PIECE_BYTES = 16 << 20  # bytes copied at a time
 _TRIM_BYTES = 128 << 20  # evicted between two returns of free memory to the system
 
 
@@ -86,13 +85,6 @@ class SpillFile:
         except OSError as error:
             raise _disk_error(error, self._where) from error
 
-    def pieces(self) -> list[Piece]:
-        """Return the content as pieces that are read when they are converted to arrays."""
-        return [
-            Piece(self, k, min(_PIECE_BYTES, self.size - k))
-            for k in range(0, self.size, _PIECE_BYTES)
-        ]
-
     def close(self) -> None:
         """Remove the file."""
         if self._file is not None:
@@ -102,34 +94,6 @@ class SpillFile:
     @property
     def _where(self) -> Path:
         return Path(self.folder or tempfile.gettempdir())
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the whole content; `pieces` is for contents that don't fit into memory."""
-        return {"folder": self.folder, "data": [piece.copy() for piece in self.pieces()]}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        SpillFile.__init__(self, state["folder"])
-        for data in state["data"]:
-            self.append(data)
-
-
-@dataclasses.dataclass(frozen=True)
-class Piece:
-    """A range of bytes of a temporary file, read when NumPy converts it to an array."""
-
-    file: SpillFile
-    offset: int
-    size: int
-
-    def copy(self) -> UInt8:
-        """Return the bytes."""
-        data = np.empty(self.size, np.uint8)
-        self.file.read(self.offset, data)
-        return data
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> UInt8:
-        """See `copy`."""
-        return self.copy()
 
 
 T = TypeVar("T")
@@ -286,7 +250,7 @@ class Spill(Generic[T]):
         if self._evicted_bytes > _TRIM_BYTES:
             # Free memory is fragmented: without this, more than the budget stays resident.
             self._evicted_bytes = 0
-            give_back()
+            trim_memory()
 
     def _write(self, number: int) -> None:
         entry, item = self._entries[number], self._resident[number]
@@ -305,25 +269,6 @@ class Spill(Generic[T]):
             self._file.read(offset, _bytes_of(arrays[name]))
             offset += arrays[name].nbytes
         return arrays
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the items in memory if none was spilled; else all of them as they are on disk."""
-        with self._lock:
-            resident = self._resident
-            if self._file.size:
-                for number in resident:
-                    self._write(number)
-                resident = OrderedDict()
-            return self.__dict__ | {
-                "_resident": resident,
-                "_resident_bytes": self._resident_bytes if resident else 0,
-                "_last": {},
-                "_empty": {},
-                "_lock": None,
-            }
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _lock=RLock())
 
 
 @dataclasses.dataclass(frozen=True)

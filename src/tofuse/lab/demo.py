@@ -16,11 +16,10 @@ from tofuse.files.atomic import UNFINISHED, sync_tree, write_text
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.passing import Passing
 from tofuse.lab.simulation.record import simulate
-from tofuse.pipeline.checkpoint import remove_states
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.run import run
 from tofuse.pipeline.run_options import Options, resolve
-from tofuse.results.folder import CHECKPOINT, RECORDING, OutputFolder
+from tofuse.results.folder import RECORDING, TRACKED, OutputFolder
 from tofuse.results.types import Reconstruction
 
 # Settings of the thesis per scene (section 4.1): points beyond the object are removed.
@@ -65,7 +64,7 @@ def demo(
         OutputFolder(out, overwrite=overwrite) as folder,
         _replacing_recording(out / RECORDING) as fresh,
     ):
-        remove_states(out / CHECKPOINT)  # of the replaced recording
+        (out / TRACKED).unlink(missing_ok=True)  # of the replaced recording
         expect_failure = scene == FAILURE
         simulate_to(
             scene,

@@ -11,7 +11,6 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.pipeline.backend import BackEnd
-from tofuse.pipeline.checkpoint import NoCheckpoints, Stages
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog, poses_in_world
 from tofuse.pipeline.observations import Observations
@@ -58,13 +57,13 @@ class Assembly:
     seed: int
     threads: int
 
-    def run(self, log: FrameLog, stages: Stages) -> Reconstruction:
+    def run(self, log: FrameLog) -> Reconstruction:
         """Join components, and reconstruct them: the main one last."""
         with threads(self.threads):
-            groups = self._join(log, stages)
+            groups = self._join(log)
             log, components = self._components(log, groups)
             poses = poses_in_world(log, groups[0].T_group_component)
-            result = self._back_end(log, poses, groups[0].joins).run(stages, components)
+            result = self._back_end(log, poses, groups[0].joins).run(components)
         return replace(result, seed=self.seed, threads=self.threads)
 
     def graph(self, log: FrameLog, component: int, loops: Sequence[ClosedLoop]) -> PoseGraph:
@@ -73,19 +72,13 @@ class Assembly:
         poses = poses_in_world(component_log, {component: np.eye(4)})
         return TrackedGraph(component_log.posed, poses, ()).build(loops)
 
-    def _join(self, log: FrameLog, stages: Stages) -> list[Group]:
+    def _join(self, log: FrameLog) -> list[Group]:
         """Decide from all views which components are connected, and how."""
-        saved = stages.load("joining")
-        if saved is not None:
-            self.watch.seconds.update(saved[1])
-            return list(saved[0])
         components = log.tracked_components(self.observations.views)
         if len(components) > 1:
             self.progress.stage("joining components")
         with self.watch.timing("joining"):
-            groups = self.config.joining.join(components, log.links, self.config.search)
-        stages.save("joining", (groups, dict(self.watch.seconds)))
-        return groups
+            return self.config.joining.join(components, log.links, self.config.search)
 
     def _components(
         self, log: FrameLog, groups: Sequence[Group]
@@ -107,9 +100,7 @@ class Assembly:
                 component_log = log.of(frames)  # in its own model it is the main component
                 poses = poses_in_world(component_log, part.group.T_group_component)
                 back_end = self._back_end(component_log, poses, part.group.joins)
-                result = replace(
-                    back_end.run(NoCheckpoints(), ()), seed=self.seed, threads=self.threads
-                )
+                result = replace(back_end.run(()), seed=self.seed, threads=self.threads)
             components.append(Component(ranges, part.T_main_component, part.connection, result))
         return numbered, tuple(components)
 

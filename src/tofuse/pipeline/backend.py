@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.files.memory import give_back
+from tofuse.files.memory import trim_memory
+from tofuse.fusion.cloud import Cloud
+from tofuse.fusion.model import Model
 from tofuse.pipeline.assessment import Assessment
-from tofuse.pipeline.checkpoint import Stages
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog
 from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.progress import Progress, Stopwatch
-from tofuse.pipeline.stage_results import Fused, Optimised, Refined, VisualEvidence
+from tofuse.pipeline.stage_results import Optimised, Refined, VisualEvidence
 from tofuse.pipeline.tracked_graph import TrackedGraph
 from tofuse.posegraph.covariances import MIN_WEIGHT, GraphCovariances, accepted_only
 from tofuse.posegraph.external_sensors import SensorPriors, measure_all, with_sensors
@@ -28,8 +28,6 @@ from tofuse.results.types import Component, Diagnostics, Reconstruction
 
 # Maximum number of repeated loop searches along a long trajectory.
 _MAX_SEARCHES = 2
-
-T = TypeVar("T")
 
 
 class BackEnd:
@@ -69,25 +67,16 @@ class BackEnd:
         posed = [e for e in log.posed if e.record.index in poses]
         self._tracked = TrackedGraph(posed, poses, joins)
 
-    def run(self, stages: Stages, components: tuple[Component, ...]) -> Reconstruction:
-        """Return the reconstruction; `stages` stores the result of each step."""
-        closed = self._run_stage(stages, "loops", self._close_loops)
-        refined = self._run_stage(stages, "refinement", lambda: self._refine(closed))
-        fused = self._run_stage(stages, "fusion", lambda: self._fuse(closed, refined))
-        return self._result(closed, refined, fused, components)
-
-    def _run_stage(self, stages: Stages, name: str, compute: Callable[[], T]) -> T:
-        """Return the result of a stage: loaded from an interrupted job, or computed."""
-        saved = stages.load(name)
-        if saved is not None:
-            result: T = saved[0]
-            self._watch.seconds.update(saved[1])
-            return result
-        result = compute()
-        with self._watch.timing("keeping"):
-            stages.save(name, (result, dict(self._watch.seconds)))
-        give_back()
-        return result
+    def run(self, components: tuple[Component, ...]) -> Reconstruction:
+        """Return the reconstruction."""
+        closed = self._close_loops()
+        trim_memory()
+        refined = self._refine(closed)
+        trim_memory()
+        model, cloud_before = self._fuse(closed, refined)
+        trim_memory()
+        result = self._result(closed, refined, model, components)
+        return replace(result, diagnostics=replace(result.diagnostics, cloud_before=cloud_before))
 
     def _close_loops(self) -> Optimised:
         self._progress.stage("closing loops")
@@ -186,7 +175,8 @@ class BackEnd:
                 graph = with_sensors(graph, closed.sensors)
         return Refined(graph, refinement)
 
-    def _fuse(self, closed: Optimised, refined: Refined) -> Fused:
+    def _fuse(self, closed: Optimised, refined: Refined) -> tuple[Model, Cloud | None]:
+        """Return the model, and a cloud at the poses before optimisation if that changed any."""
         graph, refinement, model = refined.graph, refined.refinement, self._observations.model
         poses_changed = bool(graph.loop.any()) or refinement.kept or bool(closed.sensors)
         self._progress.stage("fusing", model.views)
@@ -198,13 +188,13 @@ class BackEnd:
                 refinement.errors,
             )
             initial_poses = dict(zip(ids, closed.sequential, strict=True))
-            return Fused(fused, model.sketch(initial_poses) if poses_changed else None)
+            return fused, model.sketch(initial_poses) if poses_changed else None
 
     def _result(
         self,
         closed: Optimised,
         refined: Refined,
-        fused: Fused,
+        model: Model,
         components: tuple[Component, ...],
     ) -> Reconstruction:
         self._progress.stage("checking")
@@ -212,7 +202,7 @@ class BackEnd:
             assessment = Assessment(
                 self._config, self._log, self._tracked, self._observations, self._prior_loops
             )
-            assessed = assessment.run(closed, refined, fused.model, components)
+            assessed = assessment.run(closed, refined, model, components)
         model, entries = assessed.model, self._log.entries
         return Reconstruction(
             trajectory=self._scatter(refined.graph.poses),
@@ -229,7 +219,6 @@ class BackEnd:
                 objective=closed.optimisation.objective,
                 removed={},
                 seconds=dict(self._watch.seconds),
-                cloud_before=fused.cloud_before,
                 refinement=refined.refinement,
                 parts=closed.optimisation.parts,
                 priors=closed.sensors.records,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
 
 from tofuse.kernels.threads import job_pool, thread_count
 
@@ -46,8 +45,3 @@ class BackgroundQueue:
         if self._pool is not None:
             self._pool.shutdown()
         self._pool = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return an empty queue, after all jobs: they change objects of the same state."""
-        self.wait()
-        return {"_pool": None, "_jobs": deque()}

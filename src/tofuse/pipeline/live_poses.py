@@ -6,7 +6,6 @@ A loop takes effect a fixed number of frames after it was searched for.
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 
@@ -60,23 +59,6 @@ class LiveLoops:
                 self._job = self._pool.submit(job)
                 self._due = self._frames + DELAY
         return bool(new_loops)
-
-    def wait(self) -> None:
-        """Wait for the running search; its loops take effect when they are due."""
-        if self._job is not None:
-            self._job.result()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return everything but the thread, with the result of the running search."""
-        loops = None if self._job is None else self._job.result()
-        return {**self.__dict__, "_pool": None, "_job": loops}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        loops = state["_job"]
-        self.__dict__.update(state)
-        if loops is not None:
-            self._job = Future()
-            self._job.set_result(loops)
 
     def finish(self) -> None:
         """Wait for the running search, and end the thread."""
@@ -140,10 +122,6 @@ class LivePoses:
         assert b.T_component_camera is not None
         T_a_b = a.T_component_camera @ link.T_i_j @ se3.inverse(b.T_component_camera)
         T_world[b.component] = T_world[a.component] @ T_a_b
-
-    def wait(self) -> None:
-        """Wait for the running search."""
-        self._loops.wait()
 
     def finish(self) -> None:
         """Wait for the running search, and end the thread."""

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from tofuse.arrays import Float64
 from tofuse.bounds import Bounds
 from tofuse.errors import InputError
-from tofuse.files.memory import give_back
+from tofuse.files.memory import trim_memory
 from tofuse.kernels.threads import serial_chunks, thread_count, threads
-from tofuse.odometry.base import Step
+from tofuse.odometry.base import Step, Tracker
 from tofuse.odometry.motion import FrameTime
 from tofuse.parts import check_number
 from tofuse.pipeline.assembly import Assembly
 from tofuse.pipeline.background_queue import BackgroundQueue
-from tofuse.pipeline.checkpoint import NoCheckpoints, Stages
 from tofuse.pipeline.config import Config, check_views, from_method, kind_of
 from tofuse.pipeline.frame_log import FrameLog, record_of
 from tofuse.pipeline.intake import Intake
@@ -51,6 +49,8 @@ class Mapper:
         Given loops, in frame indices.
     progress
         Receives frames and stages.
+    tracker
+        Replaces that of the configuration's odometry.
     """
 
     def __init__(
@@ -61,6 +61,7 @@ class Mapper:
         threads: int | None = None,
         loops: Sequence[PriorLoop] = (),
         progress: Progress | None = None,
+        tracker: Tracker | None = None,
     ) -> None:
         check_number(seed, Bounds(0), "seed", whole=True)
         self.config = from_method(config) if isinstance(config, str) else config
@@ -74,11 +75,11 @@ class Mapper:
         self._log = FrameLog()
         self._queue = BackgroundQueue()
         self._ended = self._finished = False
-        self._start_method()
+        self._start_method(tracker)
 
-    def _start_method(self) -> None:
+    def _start_method(self, tracker: Tracker | None = None) -> None:
         self._preparation = Preparation(self.config)
-        self._tracker = self.config.odometry.start(self.seed, self.config.search)
+        self._tracker = tracker or self.config.odometry.start(self.seed, self.config.search)
         self._observations = Observations(self.config, self.seed, self._prior_loops)
         self._live_poses = LivePoses(self._observations.loops)
         self._component = 0
@@ -247,15 +248,10 @@ class Mapper:
             self._intake.end()
             self._ended = True
             del self._tracker  # its keyframes
-            give_back()
+            trim_memory()
 
-    def finish(self, stages: Stages | None = None) -> Reconstruction:
+    def finish(self) -> Reconstruction:
         """Join components, close loops, optimise, refine, fuse and judge.
-
-        Parameters
-        ----------
-        stages
-            Stores the result of each stage, and provides those of an interrupted job.
 
         Raises
         ------
@@ -270,7 +266,7 @@ class Mapper:
         with self.watch.timing("fusion"):
             self._queue.finish()
         self.end()
-        result = self._assembly().run(self._log, stages or NoCheckpoints())
+        result = self._assembly().run(self._log)
         diagnostics = replace(
             result.diagnostics,
             removed=self._preparation.counts.fractions,
@@ -310,19 +306,3 @@ class Mapper:
     def _check_open(self) -> None:
         if self._finished or self._ended:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return everything but the progress, so that a copy can be resumed elsewhere."""
-        self._live_poses.wait()  # background jobs change this state
-        self._queue.wait()
-        return {name: value for name, value in self.__dict__.items() if name != "_progress"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _progress=Silent())
-
-    def resume(self, threads: int | None, progress: Progress) -> None:
-        """Resume a copy with a number of threads (None: all cores) and a new progress."""
-        self.threads = threads if threads is not None else thread_count()
-        self._progress = progress
-        for entry in self._log.entries:
-            progress.advance(entry.record)

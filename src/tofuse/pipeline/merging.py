@@ -22,12 +22,11 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses, StatedPose, StatedPoses
 from tofuse.parts import check_number
-from tofuse.pipeline.checkpoint import NoCheckpoints
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.paint import paint
 from tofuse.pipeline.progress import Progress, Silent
-from tofuse.pipeline.reconstruct import TrackingState, push_frames, with_recording_facts
+from tofuse.pipeline.reconstruct import push_frames, with_recording_facts
 from tofuse.pipeline.run_options import ModelOptions
 from tofuse.pipeline.session_pairs import Model, session_changes, session_pairs
 from tofuse.pipeline.sessions import Session, read_sessions, sessions_of
@@ -156,9 +155,7 @@ def merge_sessions(
         for session, offset in zip(sessions, offsets, strict=True):
             mapper.interrupt(_config_of(session, offset))
             session_recording = replace(recording, indices=session.recording.indices + offset)
-            push_frames(
-                TrackingState(mapper), session_recording, session.config.window, NoCheckpoints()
-            )
+            push_frames(mapper, session_recording, session.config.window)
         result = mapper.finish()
         progress.stage("comparing sessions")
         with use_threads(mapper.threads):

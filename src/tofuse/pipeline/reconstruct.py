@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import accumulate
 from types import MappingProxyType
 from typing import Any
@@ -14,12 +14,11 @@ from threadpoolctl import threadpool_limits
 from tofuse.arrays import Float64
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.pipeline.adaptation import adapted
-from tofuse.pipeline.checkpoint import NoCheckpoints, Stages
 from tofuse.pipeline.config import Config, ViewKind, from_method, kind_of
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.self_calibration import self_calibrated
-from tofuse.pipeline.state_checks import check_tracked
+from tofuse.pipeline.tracked_file import TrackedFile
 from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.frames import Frame
@@ -28,7 +27,6 @@ from tofuse.recordings.recording import Recording
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.types import Reconstruction
 
-_TRACKING = "tracking"
 # Number of frames read and prepared in advance; each takes a multiple of its images' size.
 _PREFETCHED_FRAMES = 4
 
@@ -41,7 +39,7 @@ def reconstruct(
     threads: int | None = None,
     loops: Sequence[PriorLoop] = (),
     progress: Progress | None = None,
-    stages: Stages | None = None,
+    tracked_file: TrackedFile | None = None,
 ) -> Reconstruction:
     """Reconstruct a recording: trajectory, pose graph, fused cloud, diagnostics.
 
@@ -61,9 +59,9 @@ def reconstruct(
         Given loops, in frame indices.
     progress
         Receives stages, frames and notes.
-    stages
-        Stores the result of each stage, and provides those of an interrupted job with the same
-        recording, configuration and seed.
+    tracked_file
+        Stores the tracked frames, or provides those of an interrupted job with the same recording,
+        configuration and seed.
 
     Raises
     ------
@@ -75,19 +73,17 @@ def reconstruct(
     config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
     config = adapted(config, recording, threads, progress)
 
-    def reconstruct_with(config: Config, stages: Stages) -> Reconstruction:
+    def reconstruct_with(config: Config, tracked_file: TrackedFile | None) -> Reconstruction:
         # BLAS results depend on its number of threads; those of our kernels don't.
         with threadpool_limits(1):
-            mapper = _track(recording, config, seed, threads, loops, progress, stages)
-            result = mapper.finish(stages)
+            mapper = _track(recording, config, seed, threads, loops, progress, tracked_file)
+            result = mapper.finish()
         return _with_facts(result, recording, config)
 
-    result = reconstruct_with(config, stages or NoCheckpoints())
+    result = reconstruct_with(config, tracked_file)
     if not config.self_calibration:
         return result
-    return self_calibrated(
-        result, config, lambda config: reconstruct_with(config, NoCheckpoints()), progress
-    )
+    return self_calibrated(result, config, lambda config: reconstruct_with(config, None), progress)
 
 
 def reconstruct_with_views(
@@ -99,8 +95,8 @@ def reconstruct_with_views(
     """
     config = adapted(config, recording, threads, progress)
     with threadpool_limits(1):
-        mapper = _track(recording, config, 0, threads, (), progress, NoCheckpoints())
-        result = mapper.finish(NoCheckpoints())
+        mapper = _track(recording, config, 0, threads, (), progress)
+        result = mapper.finish()
     return _with_facts(result, recording, config), mapper.views
 
 
@@ -111,30 +107,27 @@ def _track(
     threads: int | None,
     loops: Sequence[PriorLoop],
     progress: Progress,
-    stages: Stages,
+    tracked_file: TrackedFile | None = None,
 ) -> Mapper:
-    """Push all frames to a new mapper, or the remaining ones to that of an interrupted job."""
+    """Push all frames to a new mapper."""
     progress.stage("tracking", len(recording))
-    tracked: TrackingState | None = stages.load(_TRACKING)
-    if tracked is None:
-        tracked = TrackingState(Mapper(config, seed=seed, threads=threads, loops=loops))
-    else:
-        check_tracked(tracked, recording)
-    if tracked.done:
-        progress.note(f"resumes after frame {tracked.done} of an interrupted run")
-    tracked.mapper.resume(threads, progress)
-    if tracked.done < len(recording):
-        push_frames(tracked, recording, config.window, stages)
-        tracked.mapper.end()
-        if stages.due():
-            _save(tracked, stages)
-    if len(tracked.unreadable) == len(recording):
+    tracker = config.odometry.start(seed, config.search)
+    if tracked_file is not None:
+        tracker = tracked_file.tracker(tracker)
+    mapper = Mapper(
+        config, seed=seed, threads=threads, loops=loops, progress=progress, tracker=tracker
+    )
+    unreadable = push_frames(mapper, recording, config.window)
+    mapper.end()
+    if len(unreadable) == len(recording):
         raise InputError(
-            f"none of the {len(recording)} frames can be read (first: {tracked.unreadable[0]})",
+            f"none of the {len(recording)} frames can be read (first: {unreadable[0]})",
             where=recording.path,
             remedy="check that the files are complete, or use --format",
         )
-    return tracked.mapper
+    if tracked_file is not None:
+        tracked_file.finish(mapper.log)
+    return mapper
 
 
 def _with_facts(result: Reconstruction, recording: Recording, config: Config) -> Reconstruction:
@@ -154,37 +147,24 @@ def with_recording_facts(result: Reconstruction, recording: dict[str, Any]) -> R
     return replace(result, recording=recording, components=components)
 
 
-@dataclass(eq=False)
-class TrackingState:
-    """State of tracking: the mapper, the number of frames done, and errors of unreadable ones."""
-
-    mapper: Mapper
-    done: int = 0
-    unreadable: list[str] = field(default_factory=list)
-
-
-def push_frames(tracked: TrackingState, recording: Recording, window: int, stages: Stages) -> None:
-    """Push the remaining frames of a recording to the mapper.
+def push_frames(mapper: Mapper, recording: Recording, window: int) -> list[str]:
+    """Push the frames of a recording to the mapper; returns the errors of unreadable ones.
 
     Parameters
     ----------
-    tracked
-        The state of tracking, which is updated.
-    recording
-        The recording.
+    mapper, recording
+        The mapper and the recording.
     window
         Number of frames that the filters use, the current one included.
-    stages
-        Stores the state whenever that is due.
     """
-    mapper, odometry, gravity = tracked.mapper, recording.odometry, recording.gravity
+    odometry, gravity = recording.odometry, recording.gravity
     recent: dict[int, Frame] = {}
-    first = tracked.done
+    unreadable = []
     if mapper.threads > 1:
-        frames = recording.read_with(mapper.prepare, _PREFETCHED_FRAMES, first=first)
+        frames = recording.read_with(mapper.prepare, _PREFETCHED_FRAMES)
     else:
-        frames = ((item, None) for item in recording.read_all(_PREFETCHED_FRAMES, first=first))
-    for k in range(first, len(recording)):
+        frames = ((item, None) for item in recording.read_all(_PREFETCHED_FRAMES))
+    for k in range(len(recording)):
         with mapper.watch.timing("reading"):
             item, prepared = next(frames)
         index, time = int(recording.indices[k]), float(recording.timestamps[k])
@@ -193,22 +173,15 @@ def push_frames(tracked: TrackingState, recording: Recording, window: int, stage
         ):
             mapper.interrupt()
         if isinstance(item, UnreadableFrameError):
-            tracked.unreadable.append(str(item))
+            unreadable.append(str(item))
             mapper.skip(index, time, str(item))
-        else:
-            T = None if odometry is None or not np.isfinite(odometry[k]).all() else odometry[k]
-            down = None if gravity is None or not np.isfinite(gravity[k]).all() else gravity[k]
-            past = past_frames(recording, index, window - 1, recent)
-            recent = {f.index: f for f in [*past, item]}
-            mapper.push(item, T_odometry=T, gravity=down, history=past, prepared=prepared)
-        tracked.done = k + 1
-        if tracked.done < len(recording) and stages.due():
-            _save(tracked, stages)
-
-
-def _save(tracked: TrackingState, stages: Stages) -> None:
-    with tracked.mapper.watch.timing("keeping"):
-        stages.save(_TRACKING, tracked)
+            continue
+        T = None if odometry is None or not np.isfinite(odometry[k]).all() else odometry[k]
+        down = None if gravity is None or not np.isfinite(gravity[k]).all() else gravity[k]
+        past = past_frames(recording, index, window - 1, recent)
+        recent = {f.index: f for f in [*past, item]}
+        mapper.push(item, T_odometry=T, gravity=down, history=past, prepared=prepared)
+    return unreadable
 
 
 def view_kind(recording: Recording) -> ViewKind:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -10,14 +12,15 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from tofuse._version import __version__
 from tofuse.corrections.unwrap import Unwrap
 from tofuse.errors import InputError
-from tofuse.files.memory import give_back
+from tofuse.files.memory import trim_memory
+from tofuse.files.stamps import stamps_of
 from tofuse.fusion.texture import Textured
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.inspect import inspect_recording
 from tofuse.pipeline.adaptation import adapted
-from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.judging import device_sentence
 from tofuse.pipeline.paint import paint
@@ -26,25 +29,16 @@ from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.pipeline.reconstruct import reconstruct, view_kind
 from tofuse.pipeline.report_files import write_report_files
 from tofuse.pipeline.run_options import Options, check_guess, check_unwrap, resolve, seed_of
+from tofuse.pipeline.tracked_file import TrackedFile
 from tofuse.posegraph.given_loops import read_loops
 from tofuse.posegraph.loops import PriorLoop
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
-from tofuse.results.folder import OutputFolder, check_output, is_result
+from tofuse.results.folder import TRACKED, OutputFolder, check_output
 from tofuse.results.output import write_result
 from tofuse.results.run_json import plain
 from tofuse.results.types import Reason, Reconstruction, in_main_model
 from tofuse.results.verdict import ranked, verdict_of
-
-# Errors that a modified checkpoint may cause.
-_STATE_ERRORS = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    LookupError,
-    TypeError,
-    ValueError,
-)
 
 
 def run(
@@ -66,12 +60,12 @@ def run(
     watch = Stopwatch()
     with watch.timing("opening"):
         job = _open(inputs, options, progress)
-    checkpoints = Checkpoints(options.out, _key(inputs, options, job), progress.note)
-    overwrite = options.overwrite or bool(checkpoints.fresh)
+    tracked_file = _tracked_file(inputs, options, job, progress)
     with (
-        OutputFolder(options.out, overwrite=overwrite) if folder is None else nullcontext(folder)
+        OutputFolder(options.out, overwrite=options.overwrite)
+        if folder is None
+        else nullcontext(folder)
     ) as out:
-        checkpoints.begin(not is_result(options.out))
         try:
             result = reconstruct(
                 job.recording,
@@ -80,14 +74,14 @@ def run(
                 threads=options.threads,
                 loops=job.loops,
                 progress=progress,
-                stages=checkpoints,
+                tracked_file=tracked_file,
             )
             texture = _texture(job, result, options, progress, watch)
             result = _with_job(result, job, options, watch)
             if device := device_sentence(job.recording, result):
                 progress.note(device)
             progress.stage("writing")
-            give_back()
+            trim_memory()
             # BLAS results depend on its number of threads, and idle threads busy-wait.
             with threadpool_limits(1):
                 write_result(
@@ -96,15 +90,10 @@ def run(
                     lambda r, f: write_report_files(job.recording, job.config, r, f),
                     texture,
                 )
-            checkpoints.finish()
-        except _STATE_ERRORS as error:
-            checkpoints.give_up(error)
-            if checkpoints.used:  # it was modified; otherwise the error is a bug
-                raise checkpoints.unusable(error) from error
-            raise
         except BaseException as error:
-            checkpoints.give_up(error)
+            tracked_file.keep_after(error)
             raise
+        tracked_file.remove()
     return result
 
 
@@ -179,19 +168,21 @@ def _preview(recording: Recording, progress: Progress) -> None:
         progress.placed(frame, np.eye(4))
 
 
-def _key(inputs: Sequence[str | Path], options: Options, job: _Job) -> str:
-    """Return a digest of everything that determines the result: input, options, program."""
+def _tracked_file(
+    inputs: Sequence[str | Path], options: Options, job: _Job, progress: Progress
+) -> TrackedFile:
+    """Return the file of the tracked frames for this input, these options and this version."""
+    out = options.out.absolute()
+    paths = [Path(path) for path in (*inputs, options.camera, options.loops) if path is not None]
     facts = {
+        "version": __version__,
+        "options": repr(replace(options, out=Path(), overwrite=False, threads=None)),
         "config": plain(job.config.to_dict()),
         "seed": job.seed,
-        "format": job.recording.format,
-        "topic": options.topic,
-        "frames": job.recording.indices.tolist(),
-        "average_still": options.average_still,
+        "files": [stamps_of(path.absolute(), out) for path in paths],
     }
-    option_files = (options.camera, options.loops)
-    files = [Path(path) for path in (*inputs, *option_files) if path is not None]
-    return digest(facts, files, excluded=options.out)
+    key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+    return TrackedFile(out / TRACKED, key, progress.note)
 
 
 def quick_findings(

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tofuse.arrays import Float64
-from tofuse.fusion.cloud import Cloud
-from tofuse.fusion.model import Model
 from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.graph import Optimisation, PoseGraph
 from tofuse.posegraph.loops import ClosedLoop
@@ -45,11 +43,3 @@ class Refined:
 
     graph: PoseGraph
     refinement: Refinement
-
-
-@dataclass(frozen=True, eq=False)
-class Fused:
-    """The model, and a cloud at the poses before optimisation; None if that changed no pose."""
-
-    model: Model
-    cloud_before: Cloud | None

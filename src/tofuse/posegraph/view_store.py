@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 from weakref import finalize
 
 import numpy as np
@@ -221,16 +221,12 @@ class Spilled(Generic[T]):
     """An item that may be on disk, until it is garbage collected."""
 
     def __init__(self, item: T, spill: Spill[T]) -> None:
-        self.__setstate__({"_spill": spill, "_number": spill.put(item)})
+        self._spill, self._number = spill, spill.put(item)
+        finalize(self, spill.drop, self._number).atexit = False
 
     def get(self) -> T:
         """Return the item."""
         return self._spill.get(self._number)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self._spill: Spill[T] = state["_spill"]
-        self._number: int = state["_number"]
-        finalize(self, self._spill.drop, self._number).atexit = False
 
 
 @dataclass(frozen=True, eq=False)

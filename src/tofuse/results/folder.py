@@ -35,7 +35,7 @@ from tofuse.files.staging import (
 
 STAGING = f"{UNFINISHED}unfinished"
 LOCK = f"{UNFINISHED}lock"
-CHECKPOINT = f"{UNFINISHED}checkpoint"  # state of an interrupted run
+TRACKED = f"{UNFINISHED}tracked.npz"  # tracked frames of an interrupted run
 RECORDING = "recording"  # written by `tofuse demo` next to its result
 
 # Files of a result, by `tofuse run` and `tofuse export`; all of them are removed with it.
@@ -211,8 +211,7 @@ def check_output(path: str | Path, *, overwrite: bool) -> None:
     Parameters
     ----------
     path, overwrite
-        As for `OutputFolder`. Checkpoints in the folder may be from an interruption of the same
-        run, which may then replace its content: that is left to `OutputFolder`.
+        As for `OutputFolder`.
 
     Raises
     ------
@@ -223,11 +222,10 @@ def check_output(path: str | Path, *, overwrite: bool) -> None:
     lock = path / LOCK
     if os.path.lexists(lock):
         Claim(lock, target=path).release()
-    if not (path / CHECKPOINT).exists():
-        try:
-            _check_content(path, RESULT, overwrite)
-        except OSError as error:
-            raise _output_error(path, error) from error
+    try:
+        _check_content(path, RESULT, overwrite)
+    except OSError as error:
+        raise _output_error(path, error) from error
 
 
 def _check_content(path: Path, contract: Contract, overwrite: bool) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.memory import give_back
+from tofuse.files.memory import trim_memory
 from tofuse.files.npz import read_npz
 from tofuse.report.extras import ReportExtras
 from tofuse.report.html import write_report
@@ -61,7 +61,7 @@ def write_report_and_view(result: Reconstruction, folder: Path, extras: ReportEx
         If a file can't be written.
     """
     pictures = draw(result.diagnostics.samples)
-    give_back()
+    trim_memory()
     write_report(result, folder / "report.html", replace(extras, pictures=pictures))
     write_view_file(result, pictures, folder / NAME)
 
