@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.arrays import Float32, Float64
+from tofuse.kernels import tukey
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import project_ray, project_rays
 
@@ -283,8 +284,8 @@ def compare_planes(
         inlier = has_plane & (e2 < one) & (s0 * m0 + s1 * m1 + s2 * m2 >= min_cosine32)
         # Nearer than the target's surface: in its free space.
         in_front = has_plane & (r < zero) & (e2 > np.float32(4))
-        weight = (one - e2) * (one - e2) if inlier else zero
-        sqrt_weight = (one - e2) * np.sqrt(information) if inlier else zero
+        weight = tukey.weight(e2) if inlier else zero
+        sqrt_weight = tukey.root_weight(e2) * np.sqrt(information) if inlier else zero
         block[SQRT_WEIGHT * LANES + k] = sqrt_weight
         block[IS_INLIER * LANES + k] = one if inlier else zero
         block[STAT * LANES + k] = one if inlier else zero
@@ -321,8 +322,8 @@ def compare_albedos(
         known = (block[IS_INLIER * LANES + k] > zero) & (r * r < np.float32(np.inf))
         e2 = r * r * inv_limit2
         inlier = known & (e2 < one)
-        weight = (one - e2) * (one - e2) if inlier else zero
-        sqrt_weight = (one - e2) * inv_scale_p if inlier else zero
+        weight = tukey.weight(e2) if inlier else zero
+        sqrt_weight = tukey.root_weight(e2) * inv_scale_p if inlier else zero
         r = r if inlier else zero
         tx, ty = tx if inlier else zero, ty if inlier else zero
         s0 = block[POINT_ALBEDO_SLOPE * LANES + k] if inlier else zero

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64, Int64
+from tofuse.kernels import tukey
 from tofuse.kernels.alignment import (
     ALBEDO,
     ALBEDO_SLOPE,
@@ -268,8 +269,8 @@ def _calibration_equations(
         s2 = np.float64(point[NORMAL + 2])
         if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
             continue
-        f = 1 - e2
-        out[SUPPORT] += f * f * f
+        weight = tukey.weight(e2)
+        out[SUPPORT] += tukey.support(weight)
         # Mean of both views' normals, which halves the effect of either's noise.
         m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
         jacobian_row(J, m0, m1, m2, px, py, pz)
@@ -285,7 +286,7 @@ def _calibration_equations(
             )
             if known[p]:
                 J[7 + p] = 0.0
-        _add_residual(A, g, J, r, f * f / variance, unknowns)
+        _add_residual(A, g, J, r, weight / variance, unknowns)
 
         tx = np.float64(pixel[ALBEDO_SLOPE])
         source_albedo = np.float64(point[POINT_ALBEDO])
@@ -298,10 +299,10 @@ def _calibration_equations(
         e2 = r2 / (scale_p * scale_p) / limit2
         if e2 >= 1:
             continue
-        f = 1 - e2
-        out[WEIGHT_P] += f * f
-        out[SQUARES_P] += f * f * r2
-        out[SUPPORT] += f * f * f
+        weight = tukey.weight(e2)
+        out[WEIGHT_P] += weight
+        out[SQUARES_P] += weight * r2
+        out[SUPPORT] += tukey.support(weight)
         # Gradient with respect to the transformed point, rotated back into the source frame.
         d0 = tx / (z * ray_scale)
         d1 = ty / (z * ray_scale)
@@ -328,7 +329,7 @@ def _calibration_equations(
             J[7 + CENTER_Y] -= d1 * z
         if estimated > DISTORTION and not known[DISTORTION]:
             J[7 + DISTORTION] -= rho2 * z * (d0 * xn + d1 * yn)
-        _add_residual(A, g, J, r, f * f / (scale_p * scale_p), unknowns)
+        _add_residual(A, g, J, r, weight / (scale_p * scale_p), unknowns)
     q = H
     for p in range(UNKNOWNS):
         out[G + p] = g[p]
@@ -518,11 +519,11 @@ def _add_patches(sums: Float64, block: Float32, patches: Int64) -> None:
 
 @kernel
 def _add_support(total: Float64, block: Float32, statistic: int) -> None:
-    """Add w^(3/2), which is 1 minus the robust cost, of the robust weights w in a statistic."""
+    """Add the support of the residuals whose robust weights are in a statistic."""
     index = STAT + statistic - INLIERS
     row = block[index * LANES : (index + 1) * LANES]
     for k in range(LANES):
-        total[k] += row[k] * np.sqrt(row[k])
+        total[k] += tukey.support(row[k])
 
 
 @kernel

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int32, Int64
+from tofuse.kernels import tukey
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import jacobian_row, project_ray
 from tofuse.kernels.rigid_motions import retract
@@ -411,7 +412,7 @@ def _add_equations(
         m2 = A[0, 2] * n0 + A[1, 2] * n1 + A[2, 2] * n2
         if m0 * normals[k, 0] + m1 * normals[k, 1] + m2 * normals[k, 2] < min_cosine:
             continue
-        w = (1 - e2) * (1 - e2)
+        w = tukey.weight(e2)
         if forward:
             jacobian_row(J, m0, m1, m2, px, py, pz)
         else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.bounds import Bounded, Bounds
 from tofuse.geometry import se3
-from tofuse.kernels.executors import executor
+from tofuse.kernels.threads import run_all
 from tofuse.parts import part
 from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.candidates import MAX_OVERLAP_BETWEEN, CandidateSelector, LoopView, Pair
@@ -258,29 +259,25 @@ class _RevisitLoops(Loops):
         """Register the later view with the earlier one in both directions, once for each pair."""
         pair = target.index, source.index
         if pair not in self._decisions:
-            self._decisions[pair] = self._decide(
-                pair, register_near(*self._registration_arguments(target, source))
-            )
+            self._decisions[pair] = self._decide(pair, self._register_near(target, source))
         return self._decisions[pair]
 
     def _confirm_all(self, pairs: Sequence[tuple[LoopView, LoopView]]) -> list[ClosedLoop]:
         """As `_confirm`, for many pairs (target, source)."""
         new = [(a, b) for a, b in pairs if (a.index, b.index) not in self._decisions]
-        registrations = executor().map(
-            register_near, len(new), lambda k: self._registration_arguments(*new[k])
+        registrations = run_all(
+            [partial(self._register_near, target, source) for target, source in new]
         )
         for (a, b), registration in zip(new, registrations, strict=True):
             pair = a.index, b.index
             self._decisions[pair] = self._decide(pair, registration)
         return [self._decisions[a.index, b.index] for a, b in pairs]
 
-    def _registration_arguments(
-        self, target: LoopView, source: LoopView
-    ) -> tuple[PreparedView, PreparedView, Float64, FitStatistics]:
-        """Arguments of `register_near`, with the initial guess of the trajectory."""
+    def _register_near(self, target: LoopView, source: LoopView) -> Registration | None:
+        """Register two views from the initial guess of the trajectory."""
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         # Without caches, or the data derived for the comparison would stay in memory.
-        return (
+        return register_near(
             source.view.without_caches(),
             target.view.without_caches(),
             guess,
@@ -309,17 +306,10 @@ class _RevisitLoops(Loops):
         """
         registrations, margins = {}, {}
         reasons = {p: "looks similar" if p in similar else closed[p].record.reason for p in pairs}
-        results = executor().map(
-            register_anywhere,
-            len(pairs),
-            lambda k: (
-                *(posed[n].view for n in reversed(pairs[k])),
-                self._fit_statistics,
-                self._search,
-            ),
-            large=True,
-        )
-        for (i, j), registration in zip(pairs, results, strict=True):
+        for i, j in pairs:
+            registration = register_anywhere(
+                posed[j].view, posed[i].view, self._fit_statistics, self._search
+            )
             if registration is None:
                 reasons[i, j] += "; there are too few surfaces for a search"
                 continue

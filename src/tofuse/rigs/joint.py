@@ -18,6 +18,7 @@ import numpy as np
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import rig_residuals as kernels
+from tofuse.kernels import tukey
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.pair_equations import Round
@@ -326,8 +327,7 @@ class _System:
             row[:, kernels.RESIDUAL_VARIANCE] * self.scale[target, source] ** 2 + inflation_m**2
         )
         e2 = row[:, kernels.RESIDUAL] ** 2 / (variance * self.options.robust**2)
-        f = np.maximum(1 - e2, 0)
-        return f * f / variance, f * (1 - 5 * e2) / variance
+        return tukey.weights(e2) / variance, tukey.slopes(e2) / variance
 
     def _prior(self) -> Float64:
         """Return the (7,) information of a camera's prior, in units."""
