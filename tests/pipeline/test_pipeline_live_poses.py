@@ -120,7 +120,7 @@ def test_error_in_job_is_raised():
 class _AlwaysClosing:
     """Loops of which every search finds one."""
 
-    points: ClassVar[bool] = False
+    needs_points: ClassVar[bool] = False
 
     def detection_job(self):
         record = LoopRecord(0, 1, True, "")

@@ -217,4 +217,4 @@ def test_loops_are_searched_again_after_views_moved(turn):
     again = accepted(start)
     assert again >= first
     assert any(i == 0 and j >= 11 for i, j in again)
-    assert not loops.repeat_worthwhile
+    assert not loops.is_long

@@ -364,4 +364,4 @@ def test_consistent_search_and_alignment_stand_alone(pair):
         (True, 0.4, False),
     ):
         made = replace(near, believed=False, confirmed=confirmed, probability=probability)
-        assert made.stands_alone == alone
+        assert made.is_decisive == alone

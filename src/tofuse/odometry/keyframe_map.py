@@ -202,7 +202,7 @@ class Relocalizer:
         registration = self._probable(view, keyframe)
         if registration is None:
             return None
-        certain = adjacent or registration.stands_alone
+        certain = adjacent or registration.is_decisive
         return Link(keyframe.view.index, view.index, registration, certain, registration.how)
 
     def confirms(self, view: PreparedView, keyframe: Keyframe, T: Float64) -> bool | None:

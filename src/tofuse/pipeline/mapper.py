@@ -14,10 +14,8 @@ from tofuse.odometry.base import Step, Tracker
 from tofuse.odometry.motion import FrameTime
 from tofuse.parts import check_number
 from tofuse.pipeline.assembly import Assembly
-from tofuse.pipeline.background_queue import BackgroundQueue
 from tofuse.pipeline.config import Config, check_views, from_method, kind_of
-from tofuse.pipeline.frame_log import FrameLog, record_of
-from tofuse.pipeline.intake import Intake
+from tofuse.pipeline.frame_log import FrameLog, FrameSequence, record_of
 from tofuse.pipeline.live_poses import LivePoses
 from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.preparation import FilteredFrame, Preparation, Prepared
@@ -71,9 +69,8 @@ class Mapper:
         self.watch = Stopwatch()
         self._prior_loops = tuple(loops)
         self._progress = progress or Silent()
-        self._intake = Intake()
+        self._sequence = FrameSequence()
         self._log = FrameLog()
-        self._queue = BackgroundQueue()
         self._ended = self._finished = False
         self._start_method(tracker)
 
@@ -122,7 +119,7 @@ class Mapper:
             does not support, or its index is not larger than those before.
         """
         self._check(frame)
-        repeated = self._intake.is_repeated(frame)
+        repeated = self._sequence.is_repeated(frame)
         if repeated:
             self._log.repeated.append(frame.index)
         # Chunks run serially while other threads prepare frames; else relocalization uses all.
@@ -163,8 +160,7 @@ class Mapper:
         T_odometry: Float64 | None,
         gravity: Float64 | None,
     ) -> None:
-        frame = filtered.corrected
-        self._log.add(record_of(frame, step), step, T_odometry, gravity)
+        self._log.add(record_of(filtered.corrected, step), step, T_odometry, gravity)
         lost = step.T_component_camera is None
         if step.moving is not None:
             filtered = replace(filtered, for_model=filtered.for_model.keep(~step.moving))
@@ -172,10 +168,8 @@ class Mapper:
             with self.watch.timing("loops"):
                 self._observations.add(filtered, step)
             with self.watch.timing("fusion"):
-                self._queue.submit(
-                    lambda: self._observations.add_to_model(frame, filtered.for_model, step)
-                )
-        self._queue.submit(lambda: self._observations.sample(filtered, lost=lost))
+                self._observations.add_to_model(filtered, step)
+        self._observations.sample(filtered, lost=lost)
 
     def _close_loops(self, step: Step) -> None:
         """Correct the current component by loops whose search started some frames ago."""
@@ -211,8 +205,8 @@ class Mapper:
             Why it could not be read.
         """
         self._check_open()
-        self._intake.check_order(index)
-        self._intake.accept(index)
+        self._sequence.check_order(index)
+        self._sequence.accept(index)
         self._log.add(FrameRecord(index, timestamp, "skipped", reason), None)
         self._progress.advance(self._log.entries[-1].record)
 
@@ -245,7 +239,7 @@ class Mapper:
     def end(self) -> None:
         """End tracking, and release the state that only further frames would need."""
         if not self._ended:
-            self._intake.end()
+            self._sequence.end()
             self._ended = True
             del self._tracker  # its keyframes
             trim_memory()
@@ -264,7 +258,7 @@ class Mapper:
         self._log.check_posed()
         self._live_poses.finish()
         with self.watch.timing("fusion"):
-            self._queue.finish()
+            self._observations.finish()
         self.end()
         result = self._assembly().run(self._log)
         diagnostics = replace(
@@ -294,14 +288,14 @@ class Mapper:
                 where="frame",
                 remedy="pass a RangeFrame or a CloudFrame",
             )
-        self._intake.check_order(frame.index)
+        self._sequence.check_order(frame.index)
         kind = kind_of(frame)
-        if self._intake.check_kind(frame):
+        if self._sequence.check_kind(frame):
             if self._method is not None and kind == "cloud":
                 self.config = from_method(self._method, kind)
                 self._start_method()
             check_views(self.config, kind)
-        self._intake.accept(frame.index, kind)
+        self._sequence.accept(frame.index, kind)
 
     def _check_open(self) -> None:
         if self._finished or self._ended:

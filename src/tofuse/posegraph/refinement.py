@@ -103,14 +103,14 @@ class Refiner(Protocol):
 
     Attributes
     ----------
-    points
+    needs_points
         Whether it needs the points of frames, not only prepared views.
     """
 
-    points: ClassVar[bool] = True
+    needs_points: ClassVar[bool] = True
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
-        """Add the next frame that has a pose, if `points` is set."""
+        """Add the next frame that has a pose, if `needs_points` is set."""
         ...
 
     def finish(
@@ -151,7 +151,7 @@ class NoRefinement(RefinementMethod):
 
 
 class _Idle(Refiner):
-    points: ClassVar[bool] = False
+    needs_points: ClassVar[bool] = False
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`: views are not needed."""
@@ -233,7 +233,7 @@ class Joint(Bounded, RefinementMethod):
 
 
 class _Joint(Refiner):
-    points: ClassVar[bool] = False
+    needs_points: ClassVar[bool] = False
 
     def __init__(self, options: Joint, views: ViewStore[PreparedView]) -> None:
         self._options = options

@@ -116,7 +116,7 @@ class Revisits(Bounded, LoopDetector):
 
 
 class _RevisitLoops(Loops):
-    points: ClassVar[bool] = False
+    needs_points: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -153,8 +153,8 @@ class _RevisitLoops(Loops):
             self._chosen.push_posed(newest)
 
     @property
-    def repeat_worthwhile(self) -> bool:
-        """See `Loops.repeat_worthwhile`."""
+    def is_long(self) -> bool:
+        """See `Loops.is_long`."""
         return len(self._chosen.views) > self._spacing.max_views
 
     def candidates_change(self, poses: Mapping[int, Float64]) -> bool:
@@ -331,7 +331,7 @@ class _RevisitLoops(Loops):
         for (i, j), registration in registrations.items():
             T_i_j = measured[i, j]
             isolated = not any(self._consistent(i, j, T_i_j, *p, T) for p, T in measured.items())
-            if isolated and not registration.stands_alone:
+            if isolated and not registration.is_decisive:
                 reasons[i, j] += f"; by a search {registration.reason}, and no other loop agrees"
                 continue
             reason = registration.how if isolated else f"{registration.how}; another loop agrees"
