@@ -33,7 +33,7 @@ _MIN_DEPTH = 0.02  # m; points nearer to the other camera are not compared
 _EDGE_SIGMAS = 4.0  # smallest difference between neighbouring depths at an edge
 
 
-class View(NamedTuple):
+class CellView(NamedTuple):
     """A view that is sampled at every `stride`-th pixel, its cells.
 
     Attributes
@@ -56,7 +56,7 @@ class View(NamedTuple):
     stride: int
 
 
-class Cells(NamedTuple):
+class MotionCells(NamedTuple):
     """State of the cells of a view: (rows, columns) each.
 
     Attributes
@@ -163,7 +163,7 @@ def in_image(u: float, v: float, node: int, rows: int, columns: int) -> bool:
 
 @kernel
 def residual_ratios(
-    view: View, moving: Bool, step: int, other: View, T: Float64, model_error: float
+    view: CellView, moving: Bool, step: int, other: CellView, T: Float64, model_error: float
 ) -> Float32:
     """Return absolute depth differences divided by their sigma, (N,), where both views have depth.
 
@@ -226,8 +226,8 @@ def residual_ratios(
 
 @kernel
 def compare(
-    view: View,
-    other: View,
+    view: CellView,
+    other: CellView,
     other_moving: Bool,
     T: Float64,
     scale: float,
@@ -333,9 +333,9 @@ def compare(
 
 @kernel
 def propagate(
-    view: View,
-    prev: View,
-    prev_cells: Cells,
+    view: CellView,
+    prev: CellView,
+    prev_cells: MotionCells,
     T: Float64,
     tolerance: float,
     prior: float,
@@ -410,9 +410,9 @@ def propagate(
 
 @kernel
 def predict(
-    view: View,
-    prev: View,
-    prev_cells: Cells,
+    view: CellView,
+    prev: CellView,
+    prev_cells: MotionCells,
     T: Float64,
     tolerance: float,
     radius: int,

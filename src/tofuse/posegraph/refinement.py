@@ -281,7 +281,7 @@ class _Joint(Refiner):
 
 
 @dataclass(frozen=True)
-class _Evidence:
+class _Checks:
     """Evidence of refined views: errors of the camera, and (m, rad) of the poses by halves."""
 
     calibration: Callable[[], CalibrationCheck]
@@ -294,14 +294,14 @@ def _refine_jointly(
     poses: Float64,
     measured: SensorPriors,
     _: ViewStore[PreparedView],
-) -> tuple[Refined, _Evidence]:
+) -> tuple[Refined, _Checks]:
     """Refine all views at once."""
     views = [_sampled(p, options) for p in posed]
     priors = _priors([p.index for p in posed], measured)
     error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
     refined = refine(views, poses, options.alignment, calibrate=error_indices, priors=priors)
     all_views = RefinedSubmap(views, np.arange(len(views)), refined, priors)
-    return refined, _Evidence(
+    return refined, _Checks(
         lambda: _calibration_check(all_views, options),
         lambda: _split_half_errors(all_views, options),
     )
@@ -313,7 +313,7 @@ def _refine_in_submaps(
     poses: Float64,
     measured: SensorPriors,
     store: ViewStore[PreparedView],
-) -> tuple[Refined, _Evidence]:
+) -> tuple[Refined, _Checks]:
     """Refine submap by submap."""
     ids = [p.index for p in posed]
     refined, parts = refine_submaps(
@@ -327,7 +327,7 @@ def _refine_in_submaps(
         [_ERROR_INDEX[name] for name in options.calibrate],
     )
     checks, splits = [check for check, _ in parts], [split for _, split in parts]
-    return refined, _Evidence(lambda: combine_checks(checks), lambda: _mean_errors(splits))
+    return refined, _Checks(lambda: combine_checks(checks), lambda: _mean_errors(splits))
 
 
 def _evaluate(

@@ -78,7 +78,7 @@ class JointOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class RigView:
     """A view of a rig's camera at an instant."""
 
     camera: int
@@ -116,7 +116,7 @@ class JointPoses:
 
 
 def refine_together(
-    views: Sequence[View], poses: Float64, options: JointOptions | None = None
+    views: Sequence[RigView], poses: Float64, options: JointOptions | None = None
 ) -> JointPoses:
     """Optimise the poses and depth offsets of all cameras jointly.
 
@@ -133,14 +133,14 @@ def refine_together(
 
 
 def refined_poses(
-    views: Sequence[View], poses: Float64, options: JointOptions | None = None
+    views: Sequence[RigView], poses: Float64, options: JointOptions | None = None
 ) -> Float64:
     """Return the poses (K, 4, 4) of `refine_together` alone, without covariances."""
     return _optimised(views, poses, options or JointOptions()).poses
 
 
 def disagreements(
-    views: Sequence[View], poses: Float64
+    views: Sequence[RigView], poses: Float64
 ) -> dict[tuple[int, int], tuple[float, int]]:
     """Return, by pair of cameras, the median distance between surfaces in m and the pixel count."""
     system = _System(views, poses, JointOptions())
@@ -188,7 +188,7 @@ def distances_between(
     return np.asarray(distance[valid], np.float64)
 
 
-def _optimised(views: Sequence[View], poses: Float64, options: JointOptions) -> _System:
+def _optimised(views: Sequence[RigView], poses: Float64, options: JointOptions) -> _System:
     system = _System(views, poses, options)
     for stage in options.rounds:
         for _ in range(stage.iterations):
@@ -200,7 +200,7 @@ def _optimised(views: Sequence[View], poses: Float64, options: JointOptions) -> 
 class _System:
     """The unknowns, and the compared pairs of views."""
 
-    def __init__(self, views: Sequence[View], poses: Float64, options: JointOptions) -> None:
+    def __init__(self, views: Sequence[RigView], poses: Float64, options: JointOptions) -> None:
         self.options = options
         self.views = views
         self.poses = np.array(poses, float)
