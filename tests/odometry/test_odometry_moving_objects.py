@@ -424,7 +424,7 @@ SCALE, MODEL_ERROR, JUMP, RADIUS, MOST, LEAST, WEIGHT, STRIDE = (
 def sampled(view):
     """The view and its cells in the form that the kernels take."""
     images = view.rays, view.z, view.sigma, view.planes, view.plane_variance
-    return kernels.CellView(*images, view.projection.lookup, view.projection.frame, STRIDE)
+    return kernels.View(*images, view.projection.lookup, view.projection.frame, STRIDE)
 
 
 def test_compare_matches_reference():
@@ -506,7 +506,7 @@ def test_propagate_and_predict_match_reference():
     odds = np.where(with_camera, odds_before[own_i, own_j], odds)
     out = [np.empty(before.shape, t) for t in (np.float32, np.float32, np.uint8, np.bool_)]
     views = sampled(view), sampled(other)
-    cells = kernels.MotionCells(before, odds_before, moved, tracked_before)
+    cells = kernels.Cells(before, odds_before, moved, tracked_before)
     for start, stop in ((0, 5), (5, 18)):
         kernels.propagate(*views, cells, T, tolerance, prior, *out, start, stop)
     np.testing.assert_allclose(out[0], depth, rtol=1e-6)

@@ -33,7 +33,7 @@ _MIN_DEPTH = 0.02  # m; points nearer to the other camera are not compared
 _EDGE_SIGMAS = 4.0  # smallest difference between neighbouring depths at an edge
 
 
-class CellView(NamedTuple):
+class View(NamedTuple):
     """A view that is sampled at every `stride`-th pixel, its cells.
 
     Attributes
@@ -56,7 +56,7 @@ class CellView(NamedTuple):
     stride: int
 
 
-class MotionCells(NamedTuple):
+class Cells(NamedTuple):
     """State of the cells of a view: (rows, columns) each.
 
     Attributes
@@ -163,7 +163,7 @@ def in_image(u: float, v: float, node: int, rows: int, columns: int) -> bool:
 
 @kernel
 def residual_ratios(
-    view: CellView, moving: Bool, step: int, other: CellView, T: Float64, model_error: float
+    view: View, moving: Bool, step: int, other: View, T: Float64, model_error: float
 ) -> Float32:
     """Return absolute depth differences divided by their sigma, (N,), where both views have depth.
 
@@ -226,8 +226,8 @@ def residual_ratios(
 
 @kernel
 def compare(
-    view: CellView,
-    other: CellView,
+    view: View,
+    other: View,
     other_moving: Bool,
     T: Float64,
     scale: float,
@@ -333,9 +333,9 @@ def compare(
 
 @kernel
 def propagate(
-    view: CellView,
-    prev: CellView,
-    prev_cells: MotionCells,
+    view: View,
+    prev: View,
+    prev_cells: Cells,
     T: Float64,
     tolerance: float,
     prior: float,
@@ -410,9 +410,9 @@ def propagate(
 
 @kernel
 def predict(
-    view: CellView,
-    prev: CellView,
-    prev_cells: MotionCells,
+    view: View,
+    prev: View,
+    prev_cells: Cells,
     T: Float64,
     tolerance: float,
     radius: int,

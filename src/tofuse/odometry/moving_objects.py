@@ -96,7 +96,7 @@ class _LastView:
 
     view: PreparedView
     T_world_camera: Float64
-    cells: kernels.MotionCells
+    cells: kernels.Cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ class PairUpdate:
 
     last: _LastView
     reference: int
-    cells: kernels.MotionCells
+    cells: kernels.Cells
     scale: float | None
 
 
@@ -223,7 +223,7 @@ class MovingObjects:
         self._max_references = max_references
         self.in_last_view = False
         self._last: _LastView | None = None
-        self._references: OrderedDict[int, kernels.MotionCells] = OrderedDict()
+        self._references: OrderedDict[int, kernels.Cells] = OrderedDict()
         self._scales: deque[float] = deque(maxlen=_SCALE_WINDOW)
 
     def reset(self) -> None:
@@ -352,7 +352,7 @@ class MovingObjects:
         if pair.scale is not None:
             self._scales.append(pair.scale)
 
-    def _reference(self, reference: PreparedView) -> kernels.MotionCells:
+    def _reference(self, reference: PreparedView) -> kernels.Cells:
         """Return the cells of a reference so far."""
         shape = _cell_shape(reference.z.shape, _stride(reference))
         cells = self._references.get(reference.index)
@@ -362,12 +362,10 @@ class MovingObjects:
             stride = _stride(reference)
             depth = np.ascontiguousarray(reference.z[::stride, ::stride])
             odds = np.full(shape, _PRIOR_ODDS, np.float32)
-            cells = kernels.MotionCells(
-                depth, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8)
-            )
+            cells = kernels.Cells(depth, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8))
         return cells
 
-    def _store(self, index: int, cells: kernels.MotionCells) -> None:
+    def _store(self, index: int, cells: kernels.Cells) -> None:
         self._references[index] = cells
         self._references.move_to_end(index)
         while len(self._references) > self._max_references:
@@ -375,7 +373,7 @@ class MovingObjects:
 
     def _propagated(
         self, view: PreparedView, T_world_camera: Float64
-    ) -> tuple[kernels.MotionCells, Bool]:
+    ) -> tuple[kernels.Cells, Bool]:
         """Propagate the cells of the last view to this one; and return which surfaces are new."""
         last, stride = self._last, _stride(view)
         shape = _cell_shape(view.z.shape, stride)
@@ -383,7 +381,7 @@ class MovingObjects:
         tracked, arrived = np.empty(shape, np.uint8), np.empty(shape, np.bool_)
         if last is None:
             T, previous = np.eye(4), view
-            cells = kernels.MotionCells(
+            cells = kernels.Cells(
                 np.zeros(shape, np.float32), odds, np.zeros(shape, np.bool_), tracked
             )
         else:
@@ -402,7 +400,7 @@ class MovingObjects:
             )  # fmt: skip
 
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
-        return kernels.MotionCells(depth, odds, odds > _DETECT, tracked), arrived
+        return kernels.Cells(depth, odds, odds > _DETECT, tracked), arrived
 
     def _scale(
         self, view: PreparedView, moving: Bool, reference: PreparedView, T: Float64
@@ -435,7 +433,7 @@ class MovingObjects:
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
         return outcome, llr
 
-    def _updated(self, cells: kernels.MotionCells, evidence: Float32) -> kernels.MotionCells:
+    def _updated(self, cells: kernels.Cells, evidence: Float32) -> kernels.Cells:
         """Add the evidence of a pair of views."""
         prior = np.float32(_PRIOR_ODDS)
         odds = prior + np.float32(_DECAY) * (cells.odds - prior) + evidence
@@ -443,8 +441,8 @@ class MovingObjects:
         return cells._replace(odds=np.clip(odds, 2 * prior, max_odds).astype(np.float32))
 
     def _segmented(
-        self, cells: kernels.MotionCells, evidence: Float32, detect: float
-    ) -> tuple[kernels.MotionCells, int]:
+        self, cells: kernels.Cells, evidence: Float32, detect: float
+    ) -> tuple[kernels.Cells, int]:
         """Segment cells with hysteresis, and count the segments.
 
         `evidence` is that of this frame: segments are not extended over cells that agree in it.
@@ -498,9 +496,9 @@ def _stride(view: PreparedView) -> int:
     return -(-view.z.shape[1] // _COLUMNS)
 
 
-def _sampled(view: PreparedView) -> kernels.CellView:
+def _sampled(view: PreparedView) -> kernels.View:
     grid = view.projection
-    return kernels.CellView(
+    return kernels.View(
         view.rays, view.z, view.sigma, view.planes, view.plane_variance,
         grid.lookup, grid.frame, _stride(view),
     )  # fmt: skip
