@@ -78,7 +78,7 @@ class Mapper:
         self._preparation = Preparation(self.config)
         self._tracker = tracker or self.config.odometry.start(self.seed, self.config.search)
         self._observations = Observations(self.config, self.seed, self._prior_loops)
-        self._live_poses = LivePoses(self._observations.loops)
+        self._live_poses = LivePoses(self._observations.loops, self.config.optimiser)
         self._component = 0
 
     def push(
@@ -128,7 +128,8 @@ class Mapper:
             filtered = self._prepare(frame, history, prepared)
             step = self._track(filtered, T_odometry, repeated)
             self._store(filtered, step, T_odometry, gravity)
-            self._close_loops(step)
+            with self.watch.timing("loops"):
+                self._live_poses.update(step, self._log)
             return self._report(filtered, step)
 
     def _prepare(
@@ -170,14 +171,6 @@ class Mapper:
             with self.watch.timing("fusion"):
                 self._observations.add_to_model(filtered, step)
         self._observations.sample(filtered, lost=lost)
-
-    def _close_loops(self, step: Step) -> None:
-        """Correct the current component by loops whose search started some frames ago."""
-        with self.watch.timing("loops"):
-            loops = self._live_poses.update(step, self._log)
-            if loops:
-                graph = self._assembly().graph(self._log, step.component, loops)
-                self._live_poses.apply_loops(graph, self.config.optimiser.optimise(graph).graph)
 
     def _report(self, filtered: FilteredFrame, step: Step) -> Float64 | None:
         self._progress.advance(self._log.entries[-1].record)
