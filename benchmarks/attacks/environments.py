@@ -104,7 +104,7 @@ STAGES = (
     ("writing", "tofuse.results.output:_write_files"),
     ("moving", "tofuse.results.folder:move_all"),
     ("moves", "tofuse.files.staging:_Plan.carry_out"),
-    ("the end", "tofuse.pipeline.checkpoint:Checkpoints.finish"),
+    ("the end", "tofuse.pipeline.tracked_file:TrackedFile.remove"),
 )
 _SIGNALS = ("SIGINT", "SIGTERM")
 

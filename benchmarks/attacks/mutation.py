@@ -228,25 +228,28 @@ def _possible(
 
 
 def _small() -> dict[str, Subject]:
-    """Single files: graphs, poses, cameras, configurations, meshes, checkpoints."""
+    """Single files: graphs, poses, cameras, configurations, meshes, tracked frames."""
     import made_cwipc
     from tofuse.batch.jobs import read_jobs
     from tofuse.calibration.lens_files import read_lens_file
     from tofuse.cli.batching import run_arguments
     from tofuse.files.geometry_record import GeometryRecord
     from tofuse.files.glb import read_glb, write_glb
-    from tofuse.files.npz import read_npz, write_npz
     from tofuse.files.pose import read_pose
     from tofuse.files.tables import read_columns
     from tofuse.files.trajectory_formats import read_poses
+    from tofuse.odometry.base import Step
+    from tofuse.pipeline import tracked_file
     from tofuse.pipeline.config import changed, from_method, read_changes
-    from tofuse.pipeline.states import StateError, decode, encode
+    from tofuse.pipeline.frame_log import FrameLog
+    from tofuse.pipeline.tracked_file import TrackedFile
     from tofuse.posegraph.g2o import read_g2o
     from tofuse.posegraph.given_loops import read_loops
     from tofuse.recordings.camera_file import read_camera_file
     from tofuse.recordings.cwipc import read_cameras
     from tofuse.recordings.open import read_reference
     from tofuse.recordings.rig import read_rig
+    from tofuse.results.types import FrameRecord
     from tofuse.sensor.noise import NoiseModel, RangeLaw
 
     pose = [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -273,16 +276,17 @@ def _small() -> dict[str, Subject]:
     def configure(path: Path) -> None:
         changed(from_method("default"), read_changes(path), where=str(path))
 
-    def state(path: Path) -> None:
-        with path.open("wb") as file:
-            write_npz(file, encode({"a": [np.arange(5.0), (1, 2.5, None)], "b": {3: "x"}}))
+    def replay(path: Path) -> TrackedFile:
+        file = TrackedFile(path, "key", lambda _note: None)
+        file.tracker(from_method("default").odometry.start(0))
+        return file
 
-    def resume(path: Path) -> None:
-        arrays = read_npz(path)
-        try:
-            decode(arrays)
-        except (StateError, ValueError, KeyError, RecursionError):
-            return  # as in `Checkpoints.load`
+    def track(path: Path) -> None:
+        file, log = replay(path), FrameLog()
+        for k in range(3):
+            log.add(FrameRecord(k, 0.1 * k, "tracked"), Step("tracked", "", np.eye(4)))
+        tracked_file._MIN_TRACKING_S = 0.0
+        file.finish(log)
 
     def mesh(path: Path) -> None:
         import wavy_surface
@@ -318,7 +322,7 @@ def _small() -> dict[str, Subject]:
         found[name] = _file(file, lambda path, text=text: path.write_text(text), read)
     return found | {
         "glb": _file("a.glb", mesh, read_glb),
-        "a state": _file("a.state", state, resume),
+        "tracked frames": _file("a.npz", track, replay),
     }
 
 

@@ -265,7 +265,7 @@ def test_object_is_segmented_from_background(tmp_path, capsys) -> None:
     effects = Effects.none(shot_noise=True, scatter=0.02)
     simulate("box", tmp_path / "rec", every=20, frames=6, effects=effects)
     run(tmp_path / "rec", "--out", tmp_path / "out", "--object")
-    assert "checkpoint" not in capsys.readouterr().err
+    assert "interrupted" not in capsys.readouterr().err
     made = run_json(tmp_path / "out")
     assert made["config"]["filters"][0] == {"part": "background", "sigmas": 4.0, "fraction": 0.02}
     *_, scattering, multipath = made["config"]["corrections"]

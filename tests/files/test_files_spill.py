@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import errno
 import os
-import pickle
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -115,17 +114,6 @@ def test_dropped_items_are_removed(tmp_path: Path) -> None:
             spill.get(k)
     assert same(spill.get(2), made(2))
     assert spill.put(made(5)) == 5
-
-
-@pytest.mark.parametrize("budget", [0, 3000, 10**9])
-def test_spill_survives_pickling(tmp_path: Path, budget: int) -> None:
-    spill: Spill[Item] = Spill(budget, tmp_path)
-    for k in range(10):
-        spill.put(made(k))
-    copy = pickle.loads(pickle.dumps(spill, 5))
-    copy.put(made(10))
-    spill.close()
-    assert all(same(copy.get(k), made(k)) for k in range(11))
 
 
 def test_concurrent_reads(tmp_path: Path) -> None:

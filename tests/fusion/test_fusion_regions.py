@@ -12,7 +12,6 @@ from made_rooms import at, seen
 from tofuse.files.spill import Spill
 from tofuse.fusion.frusta import Frusta
 from tofuse.fusion.layout import Layout
-from tofuse.fusion.model import ModelBuilder
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.range_view import RangeView
 from tofuse.fusion.stitching import Piece, stitch
@@ -20,7 +19,6 @@ from tofuse.fusion.tsdf import Volume, _free_space_limits, fuse_surface
 from tofuse.kernels import tsdf
 from tofuse.kernels.blocks import EDGE, block_key, block_of
 from tofuse.kernels.threads import threads
-from tofuse.pipeline.states import decode, encode
 from whole_volume import volume_around
 
 COLUMNS = ("vertices", "faces", "normals", "color", "sigma", "views")
@@ -201,17 +199,3 @@ def test_view_counts_saturate() -> None:
     volume.seen[near] = tsdf.MAX_VIEWS
     volume.add([view], EYE[None])
     assert (volume.seen[near] == tsdf.MAX_VIEWS).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("memory_mb", [1, 600])
-def test_spilled_views_are_restored_with_state(room, memory_mb) -> None:
-    _, poses = room
-    builder = ModelBuilder(Fusion(voxel_m=0.05, memory_mb=memory_mb))
-    for k, T in enumerate(poses):
-        builder.add(seen(T, k), None, 1000)
-    again = decode({name: np.asarray(array) for name, array in encode(builder)})
-    made = [each.fuse(dict(enumerate(poses))).mesh for each in (builder, again)]
-    same(*made)
-    again.add(seen(poses[0], len(poses)), None, 1000)
-    assert again.views == len(poses) + 1

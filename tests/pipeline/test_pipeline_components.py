@@ -7,14 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kept_stages import Kept
 from made_rooms import OTHER, at, seen
 from tofuse.fusion.options import Fusion
 from tofuse.geometry import se3
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
-from tofuse.pipeline.progress import Silent
-from tofuse.pipeline.states import decode, encode
 from tofuse.posegraph.joining import Joining
 from tofuse.registration.search import SearchOptions
 
@@ -125,44 +122,6 @@ def test_result_is_independent_of_threads(there_and_back, joined) -> None:
     for one, two in zip(live, also, strict=True):
         assert (one is None) == (two is None)
         assert one is None or one.tobytes() == two.tobytes()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("after", [6, 20])
-def test_restored_copy_gives_same_result(there_and_back, joined, after) -> None:
-    _, frames = there_and_back
-    result, _ = joined
-    mapper = Mapper(CONFIG, threads=1)
-    for frame in frames[:after]:
-        mapper.push(frame)
-    # As in checkpoints, which load types of the package only.
-    copy = decode(dict(encode(mapper)))
-    copy.resume(1, Silent())
-    for frame in frames[after:]:
-        copy.push(frame)
-    again = copy.finish()
-    assert again.trajectory.tobytes() == result.trajectory.tobytes()
-    assert [c.frames for c in again.components] == [c.frames for c in result.components]
-    assert again.cloud.points.tobytes() == result.cloud.points.tobytes()
-
-
-@pytest.mark.slow
-def test_finish_resumes_after_any_stage(there_and_back, joined) -> None:
-    """Decisions about components are stored with the other stages."""
-    result, _ = joined
-    mapper = Mapper(CONFIG, threads=1)
-    for frame in there_and_back[1]:
-        mapper.push(frame)
-    copy = decode({name: array.copy() for name, array in encode(mapper)})
-    copy.resume(1, Silent())
-    whole, part = Kept(0), Kept(0)
-    results = [mapper.finish(whole)]
-    # Joining and loops are stored, later stages are not.
-    part.states = {k: whole.states[k] for k in ("joining", "loops")}
-    results.append(copy.finish(part))
-    for again in results:
-        assert again.trajectory.tobytes() == result.trajectory.tobytes()
-        assert [c.frames for c in again.components] == [c.frames for c in result.components]
 
 
 @pytest.mark.slow

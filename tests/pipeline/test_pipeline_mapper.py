@@ -166,16 +166,6 @@ def test_preparation_out_of_order_gives_same_result(
     assert [s.index for s in a.diagnostics.samples] == [s.index for s in b.diagnostics.samples]
 
 
-def test_no_frames_after_end(frames) -> None:
-    mapper = Mapper(CONFIG)
-    mapper.push(frames[0])
-    mapper.end()
-    with pytest.raises(InputError, match="is finished"):
-        mapper.push(frames[1])
-    mapper.end()
-    assert mapper.finish().trajectory.shape == (1, 4, 4)
-
-
 def test_clouds_and_unsuitable_frames_are_not_prepared(frames) -> None:
     assert Mapper().prepare(CloudFrame.of(np.ones((5, 3)))) is None
     assert Mapper(from_method("default", "cloud")).prepare(frames[0]) is not None

@@ -19,7 +19,7 @@ from tofuse.lab.simulation.record import simulate
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.run import run
 from tofuse.pipeline.run_options import Options, resolve
-from tofuse.results.folder import RECORDING, TRACKED, OutputFolder
+from tofuse.results.folder import RECORDING, OutputFolder
 from tofuse.results.types import Reconstruction
 
 # Settings of the thesis per scene (section 4.1): points beyond the object are removed.
@@ -64,7 +64,6 @@ def demo(
         OutputFolder(out, overwrite=overwrite) as folder,
         _replacing_recording(out / RECORDING) as fresh,
     ):
-        (out / TRACKED).unlink(missing_ok=True)  # of the replaced recording
         expect_failure = scene == FAILURE
         simulate_to(
             scene,

@@ -75,8 +75,7 @@ class BackEnd:
         trim_memory()
         model, cloud_before = self._fuse(closed, refined)
         trim_memory()
-        result = self._result(closed, refined, model, components)
-        return replace(result, diagnostics=replace(result.diagnostics, cloud_before=cloud_before))
+        return self._result(closed, refined, model, cloud_before, components)
 
     def _close_loops(self) -> Optimised:
         self._progress.stage("closing loops")
@@ -195,6 +194,7 @@ class BackEnd:
         closed: Optimised,
         refined: Refined,
         model: Model,
+        cloud_before: Cloud | None,
         components: tuple[Component, ...],
     ) -> Reconstruction:
         self._progress.stage("checking")
@@ -219,6 +219,7 @@ class BackEnd:
                 objective=closed.optimisation.objective,
                 removed={},
                 seconds=dict(self._watch.seconds),
+                cloud_before=cloud_before,
                 refinement=refined.refinement,
                 parts=closed.optimisation.parts,
                 priors=closed.sensors.records,

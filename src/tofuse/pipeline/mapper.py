@@ -71,7 +71,7 @@ class Mapper:
         self._progress = progress or Silent()
         self._sequence = FrameSequence()
         self._log = FrameLog()
-        self._ended = self._finished = False
+        self._finished = False
         self._start_method(tracker)
 
     def _start_method(self, tracker: Tracker | None = None) -> None:
@@ -229,14 +229,6 @@ class Mapper:
         """Prepared views of frames with a pose, spaced by motion, in the order of their frames."""
         return self._observations.views.views
 
-    def end(self) -> None:
-        """End tracking, and release the state that only further frames would need."""
-        if not self._ended:
-            self._sequence.end()
-            self._ended = True
-            del self._tracker  # its keyframes
-            trim_memory()
-
     def finish(self) -> Reconstruction:
         """Join components, close loops, optimise, refine, fuse and judge.
 
@@ -245,14 +237,15 @@ class Mapper:
         InputError
             If no frame has a pose.
         """
-        if self._finished:
-            raise InputError("is finished", where="mapper", remedy="make a new Mapper")
+        self._check_open()
         self._finished = True
         self._log.check_posed()
         self._live_poses.finish()
         with self.watch.timing("fusion"):
             self._observations.finish()
-        self.end()
+        self._sequence.end()
+        del self._tracker  # its keyframes
+        trim_memory()
         result = self._assembly().run(self._log)
         diagnostics = replace(
             result.diagnostics,
@@ -291,5 +284,5 @@ class Mapper:
         self._sequence.accept(frame.index, kind)
 
     def _check_open(self) -> None:
-        if self._finished or self._ended:
+        if self._finished:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")

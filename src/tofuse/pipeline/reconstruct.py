@@ -118,7 +118,6 @@ def _track(
         config, seed=seed, threads=threads, loops=loops, progress=progress, tracker=tracker
     )
     unreadable = push_frames(mapper, recording, config.window)
-    mapper.end()
     if len(unreadable) == len(recording):
         raise InputError(
             f"none of the {len(recording)} frames can be read (first: {unreadable[0]})",

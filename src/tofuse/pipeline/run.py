@@ -47,7 +47,10 @@ def run(
     progress: Progress | None = None,
     folder: OutputFolder | None = None,
 ) -> Reconstruction:
-    """Reconstruct recordings and write the output folder, which may be claimed already.
+    """Reconstruct recordings and write the output folder.
+
+    The folder may be claimed already; the recording is then temporary, and an interrupted run can't
+    go on.
 
     Raises
     ------
@@ -60,7 +63,7 @@ def run(
     watch = Stopwatch()
     with watch.timing("opening"):
         job = _open(inputs, options, progress)
-    tracked_file = _tracked_file(inputs, options, job, progress)
+    tracked_file = _tracked_file(inputs, options, job, progress) if folder is None else None
     with (
         OutputFolder(options.out, overwrite=options.overwrite)
         if folder is None
@@ -91,9 +94,11 @@ def run(
                     texture,
                 )
         except BaseException as error:
-            tracked_file.keep_after(error)
+            if tracked_file is not None:
+                tracked_file.keep_after(error)
             raise
-        tracked_file.remove()
+        if tracked_file is not None:
+            tracked_file.remove()
     return result
 
 

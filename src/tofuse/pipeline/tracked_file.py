@@ -33,8 +33,10 @@ from tofuse.registration.prepared_view import PreparedView
 
 # Tracking that took less, in s, is repeated.
 _MIN_TRACKING_S = 10.0
-_ARRAYS = ("T_target_source", "information", "unobservable", "runner_up")  # of a registration
-_OTHERS = tuple(f.name for f in fields(Registration) if f.name not in (*_ARRAYS, "errors"))
+# Attributes of steps and of registrations that are plain data.
+_PLAIN_STEP = ("status", "reason", "reference", "component", "doubtful", "inflation")
+_ARRAYS = ("T_target_source", "information", "unobservable", "errors", "runner_up")
+_PLAIN_REGISTRATION = tuple(f.name for f in fields(Registration) if f.name not in _ARRAYS)
 _NOT_TRACKED = Step("lost", "not tracked before", None)
 
 
@@ -201,14 +203,8 @@ class ReplayingTracker(Tracker):
         self.indices = list(self._steps)
         poses = map(_matrix, arrays["predicted"])
         self._predicted = dict(zip(self.indices, poses, strict=True))
-        sizes, masks = arrays["moving_bytes"], arrays["moving"].tobytes()
-        ends = np.cumsum(sizes)
-        self._moving = {
-            index: masks[end - size : end]
-            for index, size, end in zip(
-                arrays["moving_index"].tolist(), sizes.tolist(), ends.tolist(), strict=True
-            )
-        }
+        masks = _split(arrays, "moving")
+        self._moving = dict(zip(arrays["moving_index"].tolist(), masks, strict=True))
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
@@ -243,83 +239,69 @@ def _packed(log: FrameLog, tracker: LoggingTracker) -> Arrays:
         if registration is not None
     ]
     unobservable = [r.unobservable for r in registrations]
+    masks = [np.frombuffer(bits, np.uint8) for bits in tracker.moving.values()]
     return {
         "steps": _text([_plain_step(index, step) for index, step in steps]),
         "poses": _matrices([step.T_component_camera for _, step in steps], 4),
         "predicted": _matrices([tracker.predicted.get(index) for index, _ in steps], 4),
-        "registrations": _text([[getattr(r, name) for name in _OTHERS] for r in registrations]),
+        "registrations": _text([_attributes(r, _PLAIN_REGISTRATION) for r in registrations]),
         "T_target_source": _matrices([r.T_target_source for r in registrations], 4),
         "information": _matrices([r.information for r in registrations], 6),
         "runner_up": _matrices([r.runner_up for r in registrations], 4),
         "unobservable": np.concatenate([np.zeros((0, 6)), *unobservable]),
         "n_unobservable": np.array([len(u) for u in unobservable], np.int64),
-        "moving": np.frombuffer(b"".join(tracker.moving.values()), np.uint8),
+        "moving": np.concatenate([np.zeros(0, np.uint8), *masks]),
+        "n_moving": np.array([len(mask) for mask in masks], np.int64),
         "moving_index": np.array(list(tracker.moving), np.int64),
-        "moving_bytes": np.array([len(bits) for bits in tracker.moving.values()], np.int64),
     }
 
 
 def _plain_step(index: int, step: Step) -> list[Any]:
-    """Return the plain attributes of a step and of its links."""
-    return [
-        index,
-        step.status,
-        step.reason,
-        step.reference,
-        step.component,
-        step.doubtful,
-        step.inflation,
-        step.registration is not None,
-        [[link.i, link.j, link.certain, link.how] for link in step.links],
-    ]
+    """Return a frame's index, links, and plain attributes, without matrices."""
+    links = [[link.i, link.j, link.certain, link.how] for link in step.links]
+    return [index, step.registration is not None, links, *_attributes(step, _PLAIN_STEP)]
 
 
 def _unpacked_steps(arrays: Arrays) -> Iterator[tuple[int, Step]]:
     """Yield the steps in arrays of `_packed`, by frame index."""
-    registrations = iter(_unpacked_registrations(arrays))
+    registrations = _unpacked_registrations(arrays)
     for plain, pose in zip(_parsed(arrays["steps"]), arrays["poses"], strict=True):
-        index, status, reason, reference, component, doubtful, inflation, registered, links = plain
-        yield (
-            index,
-            Step(
-                status,
-                reason,
-                _matrix(pose),
-                reference,
-                next(registrations) if registered else None,
-                component=component,
-                links=tuple(
-                    Link(i, j, next(registrations), certain, how) for i, j, certain, how in links
-                ),
-                doubtful=doubtful,
-                inflation=inflation,
+        index, is_registered, links, *others = plain
+        step = Step(
+            T_component_camera=_matrix(pose),
+            registration=next(registrations) if is_registered else None,
+            links=tuple(
+                Link(i, j, next(registrations), certain, how) for i, j, certain, how in links
             ),
+            **dict(zip(_PLAIN_STEP, others, strict=True)),
         )
+        yield index, step
 
 
-def _unpacked_registrations(arrays: Arrays) -> list[Registration]:
-    unobservable = np.split(arrays["unobservable"], np.cumsum(arrays["n_unobservable"]))[:-1]
+def _unpacked_registrations(arrays: Arrays) -> Iterator[Registration]:
+    names = ("T_target_source", "information", "runner_up")
+    matrices = zip(*(map(_matrix, arrays[name]) for name in names), strict=True)
     rows = zip(
-        _parsed(arrays["registrations"]),
-        arrays["T_target_source"],
-        arrays["information"],
-        unobservable,
-        arrays["runner_up"],
-        strict=True,
+        _parsed(arrays["registrations"]), matrices, _split(arrays, "unobservable"), strict=True
     )
-    return [
-        Registration(
-            T_target_source=T.copy(),
-            information=information.copy(),
-            unobservable=directions.copy(),
-            runner_up=_matrix(runner_up),
-            **dict(zip(_OTHERS, others, strict=True)),
+    for plain, given, unobservable in rows:
+        yield Registration(
+            unobservable=unobservable.copy(),
+            **dict(zip(names, given, strict=True)),
+            **dict(zip(_PLAIN_REGISTRATION, plain, strict=True)),
         )
-        for others, T, information, directions, runner_up in rows
-    ]
 
 
-def _unpacked_mask(bits: bytes, shape: tuple[int, ...]) -> Bool:
+def _attributes(item: Step | Registration, names: Sequence[str]) -> list[Any]:
+    return [getattr(item, name) for name in names]
+
+
+def _split(arrays: Arrays, name: str) -> list[NDArray[Any]]:
+    """Return the parts of an array whose lengths are in another one."""
+    return np.split(arrays[name], np.cumsum(arrays[f"n_{name}"]))[:-1]
+
+
+def _unpacked_mask(bits: NDArray[Any], shape: tuple[int, ...]) -> Bool:
     """Return a mask (H, W) from its compressed bits."""
     rows, columns = shape
     packed = np.frombuffer(zlib.decompress(bits), np.uint8)
