@@ -42,7 +42,7 @@ from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.open import open_recording
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_pair import follow_clouds, register_clouds
-from tofuse.registration.pose_probability import CLOUDS, Evidence
+from tofuse.registration.pose_probability import CLOUDS, PoseEvidence
 from tofuse.registration.viewpoint import viewpoint_of
 
 POINTS = 20_000
@@ -412,7 +412,7 @@ def samples(names: list[str], data: Path, max_pairs: int) -> tuple[list[Row], li
             assert found.support is not None
             assert found.contradiction is not None
             degenerate = len(found.unobservable)
-            evidence = Evidence(
+            evidence = PoseEvidence(
                 found.support, found.contradiction, found.margin, degenerate, CLOUDS
             )
             right, family = pair.is_right(found.T_target_source), families.index(KINDS[name].family)

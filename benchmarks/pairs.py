@@ -57,7 +57,7 @@ from tofuse.registration.pose_probability import (
     IMAGES,
     RIGHT_FRACTION,
     RIGHT_RAD,
-    Evidence,
+    PoseEvidence,
     logistic,
 )
 from tofuse.registration.prepared_view import PreparedView, prepare_view
@@ -449,10 +449,10 @@ def _add(
         pass
 
 
-def _evidence(found: Registration) -> Evidence:
+def _evidence(found: Registration) -> PoseEvidence:
     assert found.support is not None
     assert found.contradiction is not None
-    return Evidence(found.support, found.contradiction, found.margin, len(found.unobservable))
+    return PoseEvidence(found.support, found.contradiction, found.margin, len(found.unobservable))
 
 
 def stacked(rows: list[tuple[Float64, bool, int]]) -> Samples:

@@ -16,7 +16,7 @@ from types import ModuleType
 import pytest
 
 from paths import BENCHMARKS
-from tofuse.batch import client
+from tofuse.batch import cluster
 from tofuse.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
@@ -202,7 +202,7 @@ def test_unreachable_scheduler_is_reported(
     listed: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
-    monkeypatch.setattr(client, "TIMEOUT_S", 1.0)
+    monkeypatch.setattr(cluster, "_TIMEOUT_S", 1.0)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:99999"):
         words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", address]
         assert main(words) == 2

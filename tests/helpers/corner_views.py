@@ -49,6 +49,6 @@ def corner(T_world_camera: np.ndarray, *, offset: float = 0.0, waves: float = 1.
 def unpack(out):
     H = np.zeros((kernels.UNKNOWNS, kernels.UNKNOWNS))
     upper = np.triu_indices(kernels.UNKNOWNS)
-    H[upper] = out[kernels.H : kernels.G]
-    H.T[upper] = out[kernels.H : kernels.G]
-    return H, out[kernels.G : kernels.G + kernels.UNKNOWNS]
+    H[upper] = out[kernels.PRODUCTS : kernels.GRADIENT]
+    H.T[upper] = out[kernels.PRODUCTS : kernels.GRADIENT]
+    return H, out[kernels.GRADIENT : kernels.GRADIENT + kernels.UNKNOWNS]

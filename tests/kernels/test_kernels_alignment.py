@@ -285,8 +285,8 @@ def test_normal_equations_unpack_sums(photometric):
     if not photometric:
         J[:, 6] = 0
     total = np.zeros(kernels.SIZE)
-    total[kernels.H :][:36] = (J.T @ J)[np.triu_indices(8)]
-    total[kernels.D :][:21] = (D.T @ D)[UPPER6]
+    total[kernels.PRODUCTS :][:36] = (J.T @ J)[np.triu_indices(8)]
+    total[kernels.DIFFERENCES :][:21] = (D.T @ D)[UPPER6]
     H, g, C = kernels.normal_equations(total)
     wanted = (J.T @ J)[:7, :7]
     np.testing.assert_allclose(C, wanted - (D.T @ D)[:7, :7], atol=1e-12)
@@ -307,7 +307,7 @@ def test_step_solves_normal_equations(unheld):
     rng = np.random.default_rng(9)
     total = np.zeros(kernels.SIZE)
     J = rng.normal(size=(40, 8)) * ([1] * 7 + [0.01])
-    total[kernels.H :][:36] = (J.T @ J)[np.triu_indices(8)]
+    total[kernels.PRODUCTS :][:36] = (J.T @ J)[np.triu_indices(8)]
     units, prior = np.array([0.01] * 3 + [0.02] * 3), np.full(6, 0.3)
     T = se3.exp(rng.normal(size=6))
     predicted = T @ se3.exp([0.02, -0.01, 0.03, 0.02, 0.01, -0.02])

@@ -9,9 +9,8 @@ import pytest
 
 from made_rooms import OTHER, at, seen, surface
 from tofuse.geometry import se3
-from tofuse.odometry import keyframe_map, relocalization
-from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
-from tofuse.odometry.relocalization import Relocalizer
+from tofuse.odometry import keyframe_map
+from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap, Relocalizer
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.verification import FitStatistics
 
@@ -138,7 +137,7 @@ def counted(monkeypatch):
     def registered(view, target, **_):
         asked.append((view.index, target.index))
 
-    monkeypatch.setattr(relocalization, "register_pair", registered)
+    monkeypatch.setattr(keyframe_map, "register_pair", registered)
     return asked
 
 

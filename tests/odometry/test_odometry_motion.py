@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from tofuse.geometry import se3
-from tofuse.odometry.motion import Moment, MotionModel, find_jumps, is_small
+from tofuse.odometry.motion import FrameTime, MotionModel, find_jumps, is_small
 
 STEP = se3.exp(np.array([0.03, 0, 0.01, 0, 0.04, 0.01]))
 
 
 def counted(k):
     """A frame of unknown time."""
-    return Moment(k, float(k))
+    return FrameTime(k, float(k))
 
 
 def timed(rate):
-    return lambda k: Moment(k, 100.0 + k / rate)
+    return lambda k: FrameTime(k, 100.0 + k / rate)
 
 
 def walk(count, start=None, step=STEP):
@@ -62,7 +62,7 @@ def test_uneven_timestamps_stay_within_gate() -> None:
     motion, t = MotionModel(), 0.0
     for k in range(30):
         t += rng.uniform(0.03, 0.15)
-        T, now = se3.exp(t * twist), Moment(k, t)
+        T, now = se3.exp(t * twist), FrameTime(k, t)
         assert not motion.gate_violation(T, now)
         if k > 1:
             np.testing.assert_allclose(motion.predicted_pose(now), T, atol=1e-9)
@@ -196,20 +196,20 @@ def test_gate_widens_over_lost_frames() -> None:
 
 
 def test_frame_numbers_are_not_timestamps() -> None:
-    assert Moment(5, 0.5).seconds_since(Moment(3, 0.3)) == pytest.approx(0.2)
-    assert Moment(5, 5.0).seconds_since(Moment(3, 3.0)) is None
-    assert Moment(5, 5.0).since(Moment(3, 3.0)) == 2
-    assert Moment(5, 0.5).since(Moment(3, 0.3)) == pytest.approx(0.2)
+    assert FrameTime(5, 0.5).seconds_since(FrameTime(3, 0.3)) == pytest.approx(0.2)
+    assert FrameTime(5, 5.0).seconds_since(FrameTime(3, 3.0)) is None
+    assert FrameTime(5, 5.0).since(FrameTime(3, 3.0)) == 2
+    assert FrameTime(5, 0.5).since(FrameTime(3, 0.3)) == pytest.approx(0.2)
     # Constant timestamps carry no information.
-    assert Moment(5, 0.3).seconds_since(Moment(3, 0.3)) is None
-    assert Moment(5, 0.3).since(Moment(3, 0.3)) == 2
+    assert FrameTime(5, 0.3).seconds_since(FrameTime(3, 0.3)) is None
+    assert FrameTime(5, 0.3).since(FrameTime(3, 0.3)) == 2
 
 
 def test_jump_detection_uses_timestamps() -> None:
     poses = walk(20)
     broken = [*poses[:8], *(elsewhere(np.eye(4), 0.3) @ T for T in poses[8:])]
     for rate, found in ((30.0, [8]), (2.0, [])):
-        moments = [Moment(k, k / rate) for k in range(20)]
+        moments = [FrameTime(k, k / rate) for k in range(20)]
         assert [k for k, _ in find_jumps(broken, moments)] == found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +11,13 @@ import pytest
 from coarse_steps import without_multipath
 from made_rooms import CAMERA, at, seen
 from tofuse.geometry import se3
+from tofuse.odometry import selection
 from tofuse.odometry.keyframes import Keyframes
+from tofuse.odometry.motion import FrameTime, MotionModel
+from tofuse.odometry.selection import Selection
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
+from tofuse.registration.verification import FitQuality, FitStatistics
 
 SHARP = SurfaceOptions(radii=(2,))
 # A camera that translates and turns slowly.
@@ -45,6 +50,68 @@ def off(step, pose, first=WALK[0]):
     """Pose error of a step in component 0, in m and degrees."""
     error = se3.inverse(se3.inverse(first) @ pose) @ step.T_component_camera
     return np.linalg.norm(error[:3, 3]), np.degrees(se3.angle(error))
+
+
+class Alignments(list):
+    """Alignments of a view 1 m from the last pose, whose images agree by `view`."""
+
+    def __init__(self, fits, static=(), confirmed=None):
+        keyframe = SimpleNamespace(doubtful=False)
+        reference = SimpleNamespace(
+            keyframe=keyframe, target=SimpleNamespace(view=0, T_target_world=np.eye(4))
+        )
+        super().__init__(
+            SimpleNamespace(
+                fit=FitQuality(kind),
+                predicted=predicted,
+                view=agreement,
+                aligned=SimpleNamespace(converged=True, unobservable=()),
+                reference=reference,
+                keyframe=keyframe,
+                T_component_camera=at(1.0, 0.0, 0.0),
+                T_keyframe_camera=at(1.0, 0.0, 0.0),
+            )
+            for kind, predicted, agreement in fits
+        )
+        self.now, self.T_last, self.references = FrameTime(0, 0.0), np.eye(4), [reference]
+        self.static = lambda _: static
+        self.state = SimpleNamespace(
+            in_sequence=False,
+            motion=MotionModel(),
+            fit_statistics=FitStatistics(),
+            relocalizer=SimpleNamespace(confirms=lambda *_: confirmed),
+        )
+
+
+@pytest.mark.parametrize(
+    ("fit", "predicted", "agreement", "confirmed", "accepted"),
+    [
+        ("usual", True, 0.5, None, True),
+        ("usual", True, -0.1, None, False),  # the images disagree, of an unknown camera
+        ("usual", False, 0.5, True, True),
+        ("usual", False, 0.5, False, False),
+        ("usual", False, 0.5, None, False),
+        ("noisy", True, 0.5, None, True),
+        ("noisy", True, -0.1, None, False),
+        ("noisy", False, 0.5, True, False),
+        ("conflicting", True, 0.5, True, False),
+        ("conflicting", False, 0.5, True, False),
+    ],
+)
+def test_cases_of_fit_and_motion(monkeypatch, fit, predicted, agreement, confirmed, accepted):
+    monkeypatch.setattr(selection, "agreement", lambda view, *_: SimpleNamespace(score=view))
+    alignments = Alignments([(fit, predicted, agreement)], confirmed=confirmed)
+    assert Selection(alignments).best() is (alignments[0] if accepted else None)
+
+
+def test_conflict_is_explained_by_objects_or_rivals(monkeypatch) -> None:
+    monkeypatch.setattr(selection, "agreement", lambda view, *_: SimpleNamespace(score=view))
+    for rival, chosen in ((0.5, 1), (0.9, None)):
+        alignments = Alignments([("conflicting", True, rival), ("usual", True, 0.5)])
+        assert Selection(alignments).best() is (None if chosen is None else alignments[chosen])
+    static = Alignments([("noisy", True, 0.5), ("usual", True, 0.4)])
+    alignments = Alignments([("conflicting", True, 0.9), ("usual", True, 0.5)], static)
+    assert Selection(alignments).best() is static[1]
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from tofuse.pipeline.frame_log import FrameLog
 from tofuse.pipeline.live_poses import DELAY, LiveLoops, LivePoses
 from tofuse.pipeline.mapper import Mapper
 from tofuse.posegraph.graph import LoopRecord
+from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.loops import ClosedLoop
 from tofuse.posegraph.refinement import NoRefinement
 from tofuse.posegraph.revisits import Revisits
@@ -120,7 +121,7 @@ def test_error_in_job_is_raised():
 class _AlwaysClosing:
     """Loops of which every search finds one."""
 
-    points: ClassVar[bool] = False
+    needs_points: ClassVar[bool] = False
 
     def detection_job(self):
         record = LoopRecord(0, 1, True, "")
@@ -128,12 +129,12 @@ class _AlwaysClosing:
 
 
 def test_long_graphs_are_solved_less_often():
-    live, log = LivePoses(_AlwaysClosing()), FrameLog()
+    live, log = LivePoses(_AlwaysClosing(), LevenbergMarquardt()), FrameLog()
     solved = []
     for k in range(3000):
         step = Step("tracked", "", np.eye(4))
         log.add(FrameRecord(k, float(k), "tracked", ""), step)
-        if live.update(step, log):
+        if live.due_loops(step, log):
             solved.append(k)
     live.finish()
     gaps = np.diff(solved)

@@ -8,14 +8,19 @@ from made_rooms import at, seen
 from tofuse.odometry.base import Step
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.observations import Observations
+from tofuse.pipeline.preparation import FilteredFrame
+
+
+def add(observations, frame, T):
+    observations.add_to_model(FilteredFrame(frame, frame, frame, ()), Step("tracked", "", T))
 
 
 def test_images_of_a_camera_that_stays_are_thinned_in_the_model() -> None:
     observations = Observations(from_method("default"), 0, ())
     frame = seen(at(0, 0, 0), 0)
     for index in range(100):
-        here = replace(frame, index=index)
-        observations.add_to_model(here, here, Step("tracked", "", at(0, 0, 0)))
+        add(observations, replace(frame, index=index), at(0, 0, 0))
+    observations.finish()
     # The first 32, every second one of the next 64, and every fourth one of the other 4.
     assert observations.model.views == 65
 
@@ -24,7 +29,6 @@ def test_images_of_a_camera_that_moves_on_are_all_in_the_model() -> None:
     observations = Observations(from_method("default"), 0, ())
     frame = seen(at(0, 0, 0), 0)
     for index in range(100):
-        T = at(0, 0, 0.06 * index)
-        here = replace(frame, index=index)
-        observations.add_to_model(here, here, Step("tracked", "", T))
+        add(observations, replace(frame, index=index), at(0, 0, 0.06 * index))
+    observations.finish()
     assert observations.model.views == 100

@@ -12,6 +12,7 @@ from corner_views import corner
 from revisited_path import ALL, DRIFT, pushed
 from tofuse.geometry import se3
 from tofuse.posegraph import revisits
+from tofuse.posegraph.candidates import revisited
 from tofuse.posegraph.information_gain import InformationGain
 from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.revisits import Revisits
@@ -20,7 +21,7 @@ from tofuse.registration.base import Registration
 from tofuse.registration.pose_probability import ACCEPTED
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.registration.verification import Assessment
+from tofuse.registration.verification import FitQuality
 
 turn = revisited_path.turn  # the fixture
 
@@ -61,19 +62,20 @@ def test_loop_to_the_least_certain_view_is_tried_as_well():
     )
     options = SurfaceOptions(radii=(2,))
     views = [SampledView.of(prepare_view(corner(T), options), 600) for T in truth]
-    found = Revisits(per_view=1).candidates(views, poses, first=6)
+
+    def candidates(variance, per_view=1):
+        return revisited(views, poses, 0.4, per_view, InformationGain(variance), first=6)
+
+    found = candidates(np.zeros(8))
     assert list(found) == [(4, 6), (5, 7)]
     assert all(overlap > 0.9 for overlap in found.values())
     variance = np.array([0.0, 0.0, 0.3, 0.3, 1.0, 1.0, 1.1, 1.1])
-    found = Revisits(per_view=1).candidates(views, poses, first=6, gain=InformationGain(variance))
+    found = candidates(variance)
     assert list(found) == [(0, 6), (4, 6), (1, 7), (5, 7)]
     assert found[0, 6] < found[4, 6]
     # Differences within the accuracy of a loop don't count.
-    found = Revisits(per_view=1).candidates(
-        views, poses, first=6, gain=InformationGain(1e-5 * variance)
-    )
-    assert list(found) == [(4, 6), (5, 7)]
-    assert Revisits(per_view=0).candidates(views, poses) == {}
+    assert list(candidates(1e-5 * variance)) == [(4, 6), (5, 7)]
+    assert candidates(variance, per_view=0) == {}
 
 
 @pytest.mark.parametrize(("succeeding", "asked"), [(0, 2), (1, 3), (9, 4)])
@@ -170,7 +172,9 @@ def test_searched_loops_are_accepted_or_agree(turn, monkeypatch, probable, wrong
     monkeypatch.setattr(revisits, "register_pair", scripted)
     # Nothing fits from the drifted pose, so that only the search can succeed.
     monkeypatch.setattr(
-        revisits.FitStatistics, "assess", lambda *_: Assessment(False, np.inf, "does not fit")
+        revisits.FitStatistics,
+        "assess",
+        lambda *_: FitQuality("conflicting", np.inf, "does not fit"),
     )
     found = pushed(options, frames, start)
     assert len(asked) >= 2
@@ -213,4 +217,4 @@ def test_loops_are_searched_again_after_views_moved(turn):
     again = accepted(start)
     assert again >= first
     assert any(i == 0 and j >= 11 for i, j in again)
-    assert not loops.repeat_worthwhile
+    assert not loops.is_long

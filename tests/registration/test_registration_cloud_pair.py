@@ -25,7 +25,7 @@ from tofuse.registration import cloud_pair
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_agreement import CloudMap, cloud_agreement
 from tofuse.registration.cloud_pair import register_clouds
-from tofuse.registration.pose_probability import CLOUDS, Evidence
+from tofuse.registration.pose_probability import CLOUDS, PoseEvidence
 from tofuse.registration.reduce import averaged
 from tofuse.registration.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
 
@@ -248,7 +248,7 @@ def test_agreement_is_symmetric(scans):
 def test_evidence_without_free_space_depends_on_margin():
     """Images and clouds have their own models of evidence."""
     cases = [
-        Evidence(0.6, c, m, k, CLOUDS) for c, m, k in ((0, 0.6, 0), (0.03, 0.25, 0), (0, 0, 1))
+        PoseEvidence(0.6, c, m, k, CLOUDS) for c, m, k in ((0, 0.6, 0), (0.03, 0.25, 0), (0, 0, 1))
     ]
     right, other_room, slides = (case.probability for case in cases)
     assert right > 0.9 > 0.7 > other_room > slides

@@ -16,7 +16,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import PROBABLE
 from tofuse.registration.coarse_to_fine import CoarseToFine
-from tofuse.registration.pose_probability import ACCEPTED, Evidence
+from tofuse.registration.pose_probability import ACCEPTED, PoseEvidence
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.surface_options import SurfaceOptions
@@ -258,34 +258,34 @@ def agreement_of(support, contradiction, overlap=0.6):
 
 
 def test_probability_follows_evidence():
-    good = Evidence.of(agreement_of(0.5, 0.0), 0.3)
+    good = PoseEvidence.of(agreement_of(0.5, 0.0), 0.3)
     assert good.probability > 0.95
     for worse in (
-        Evidence.of(agreement_of(0.5, 0.2), 0.3),
-        Evidence.of(agreement_of(0.5, 0.0), 0.02),
+        PoseEvidence.of(agreement_of(0.5, 0.2), 0.3),
+        PoseEvidence.of(agreement_of(0.5, 0.0), 0.02),
     ):
         assert worse.probability < good.probability
     assert (
-        Evidence.of(agreement_of(0.5, 0.0), -0.1).probability
-        == Evidence.of(agreement_of(0.5, 0.0), 0.0).probability
+        PoseEvidence.of(agreement_of(0.5, 0.0), -0.1).probability
+        == PoseEvidence.of(agreement_of(0.5, 0.0), 0.0).probability
     )
     # Support is part of the margin; where no rival was evaluated, it counts by itself.
     assert (
-        Evidence.of(agreement_of(0.9, 0.0)).probability
+        PoseEvidence.of(agreement_of(0.9, 0.0)).probability
         > 0.98
-        > Evidence.of(agreement_of(0.3, 0.0)).probability
+        > PoseEvidence.of(agreement_of(0.3, 0.0)).probability
     )
     assert (
-        Evidence.of(agreement_of(0.9, 0.1)).probability
-        < Evidence.of(agreement_of(0.9, 0.0)).probability
+        PoseEvidence.of(agreement_of(0.9, 0.1)).probability
+        < PoseEvidence.of(agreement_of(0.9, 0.0)).probability
     )
 
 
 def test_reason_names_contrary_evidence():
-    words = Evidence.of(agreement_of(0.1, 0.2), 0.01, 2).rejection_reason()
+    words = PoseEvidence.of(agreement_of(0.1, 0.2), 0.01, 2).rejection_reason()
     for part in ("only 10% of the points", "another pose", "20% of the overlap", "2 directions"):
         assert part in words
-    assert Evidence.of(agreement_of(0.6, 0.0), 0.3).rejection_reason() == ""
+    assert PoseEvidence.of(agreement_of(0.6, 0.0), 0.3).rejection_reason() == ""
 
 
 def test_usual_fit_of_camera_decides_acceptance(pair):
@@ -317,9 +317,9 @@ def test_alignment_is_accepted_if_consistent_in_both_directions(pair):
 def test_large_margin_outweighs_degenerate_directions():
     """Otherwise poses along them would fit as well."""
     for margin in (0.02, 0.05):
-        supported, unsupported = (Evidence(0.6, 0.0, margin, k).probability for k in (0, 1))
+        supported, unsupported = (PoseEvidence(0.6, 0.0, margin, k).probability for k in (0, 1))
         assert unsupported < supported
-    assert Evidence(0.6, 0.0, 0.2, 1).probability == Evidence(0.6, 0.0, 0.2).probability
+    assert PoseEvidence(0.6, 0.0, 0.2, 1).probability == PoseEvidence(0.6, 0.0, 0.2).probability
 
 
 def test_empty_square_room_is_rejected():
@@ -364,4 +364,4 @@ def test_consistent_search_and_alignment_stand_alone(pair):
         (True, 0.4, False),
     ):
         made = replace(near, believed=False, confirmed=confirmed, probability=probability)
-        assert made.stands_alone == alone
+        assert made.is_decisive == alone

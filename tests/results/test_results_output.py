@@ -75,11 +75,7 @@ def test_large_model_is_compressed_and_has_an_overview(tmp_path, monkeypatch) ->
     assert 400_000 < (tmp_path / "out/mesh.glb").stat().st_size <= 600_000
     export(tmp_path / "out", ["pcd"])
     assert len(read_pcd(tmp_path / "out/cloud.pcd").cloud) == len(mesh.vertices)
-    # A small result replaces all of it, and what version 0.2 wrote.
-    (tmp_path / "out/view.npz").write_bytes(b"")
-    (tmp_path / "out/tiles").mkdir()
-    (tmp_path / "out/tiles/tileset.json").write_text("{}")
-    (tmp_path / "out/tiles/0-0-0-1.glb").write_text("")
+    # A small result replaces all of it.
     write_result(result(), OutputFolder(tmp_path / "out", overwrite=True))
     assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
 

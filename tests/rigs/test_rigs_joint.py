@@ -18,7 +18,7 @@ from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import prepare_view
 from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.rigs.joint import View, disagreements, refine_together
+from tofuse.rigs.joint import RigView, disagreements, refine_together
 
 
 def distorted(frame: RangeFrame, by: np.ndarray) -> RangeFrame:
@@ -31,7 +31,7 @@ def distorted(frame: RangeFrame, by: np.ndarray) -> RangeFrame:
 
 def rig(
     seed: int, offset: float = 0.0, distortion: np.ndarray | None = None
-) -> tuple[list[View], np.ndarray]:
+) -> tuple[list[RigView], np.ndarray]:
     rng = np.random.default_rng([seed, 3])
     T = camera_ring((0, 0, 0.2), 1.3, 1.3, 4)
     views = []
@@ -39,7 +39,7 @@ def rig(
         frame = looked_at(T[k], rng, offset if k == 2 else 0.0)
         if distortion is not None:
             frame = distorted(frame, distortion[k])
-        views.append(View(k, 0, SampledView.of(prepare_view(frame, SurfaceOptions()), 4000)))
+        views.append(RigView(k, 0, SampledView.of(prepare_view(frame, SurfaceOptions()), 4000)))
     return views, np.stack(relative(T))
 
 
@@ -117,7 +117,7 @@ def test_displaced_camera_increases_disagreement() -> None:
 def test_cameras_without_overlap_are_not_calibrated() -> None:
     views, truth = rig(3)
     apart = [v for v in views if v.camera in (0, 1)]
-    apart = [apart[0], View(1, 1, apart[1].sampled)]  # at another instant
+    apart = [apart[0], RigView(1, 1, apart[1].sampled)]  # at another instant
     placed = refine_together(apart, truth[:2])
     assert np.allclose(placed.poses, truth[:2])
     assert not placed.disagreement

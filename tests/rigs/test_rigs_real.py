@@ -9,7 +9,7 @@ from tofuse.geometry import se3
 from tofuse.posegraph.view_store import SampledView
 from tofuse.rigs.calibrate import calibrate_cameras
 from tofuse.rigs.inputs import open_cameras
-from tofuse.rigs.joint import View, disagreements
+from tofuse.rigs.joint import RigView, disagreements
 
 
 @pytest.mark.slow
@@ -28,7 +28,7 @@ def test_surfaces_agree_better_than_under_reference_poses(shared_data) -> None:
     assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.04
     assert np.degrees(se3.angle(off)).max() < 1.5
     views = [
-        View(k, 0, SampledView.of(camera.surface(camera.images(1)[0]), 4000))
+        RigView(k, 0, SampledView.of(camera.surface(camera.images(1)[0]), 4000))
         for k, camera in enumerate(cameras)
     ]
     under_reference = [median for median, _ in disagreements(views, T).values()]

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import os
 from concurrent.futures import Future
 from time import monotonic
 from typing import Any
 from uuid import uuid4
 
-from tofuse.batch.client import TIMEOUT_S, cannot_deserialize, connect, first_line
 from tofuse.batch.folder import Record
 from tofuse.batch.jobs import Job
 from tofuse.batch.work import Task, work
 from tofuse.batch.workers import Workers
 from tofuse.errors import InputError
+from tofuse.files.reading import read_text
 
+_TIMEOUT_S = 10.0  # of requests to a scheduler
 _POLL_S = 1.0  # interval at which the workers are counted
 
 
@@ -33,7 +36,7 @@ class DaskWorkers(Workers):
             If Dask is not installed, or no scheduler answers.
         """
         self._address = address
-        self._client: Any = connect(address, "use --workers to stay on this machine")
+        self._client: Any = _connect(address)
         self._running: set[Future[Record]] = set()
         self._worker_infos: list[dict[str, Any]] = []
         self._polled_at = -_POLL_S
@@ -88,7 +91,7 @@ class DaskWorkers(Workers):
 
     def close(self) -> None:
         """See `Workers`. Workers finish jobs that they have started, and write their records."""
-        self._client.close(timeout=TIMEOUT_S)
+        self._client.close(timeout=_TIMEOUT_S)
 
     def _workers(self) -> list[dict[str, Any]]:
         try:
@@ -113,10 +116,10 @@ class DaskWorkers(Workers):
             error = remote.exception()
             if isinstance(error, KilledWorker):
                 future.set_result(Record("", "killed", reason="its workers were killed"))
-            elif cannot_deserialize(error):
+            elif _cannot_deserialize(error):
                 future.set_exception(
                     InputError(
-                        f"can't load the jobs of this version ({first_line(error)})",
+                        f"can't load the jobs of this version ({_first_line(error)})",
                         where=self._address,
                         remedy="install this version of tofuse on its scheduler and its workers",
                     )
@@ -134,3 +137,58 @@ def _slots(worker: dict[str, Any], job: Job) -> int:
     if job.memory is None:
         return threads
     return min(threads, int(worker["resources"].get("memory", 0) // job.memory))
+
+
+def _connect(address: str) -> Any:
+    """Return a client of the scheduler at an address, or of the one that wrote a file."""
+    try:
+        import dask
+    except ImportError as error:
+        raise _not_installed() from error
+    # Dask would log errors that are reported here. It reads this when distributed is imported.
+    levels = {"distributed": "critical", "distributed.client": "critical"}
+    with dask.config.set({"logging": levels}):
+        try:
+            import distributed
+        except ImportError as error:
+            raise _not_installed() from error
+    client: Any = distributed.Client
+    target = _from_file(address) if os.path.isfile(address) else address
+    try:
+        return client(target, timeout=_TIMEOUT_S, set_as_default=False, name="tofuse")
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        raise InputError(
+            "no Dask scheduler answers",
+            where=address,
+            remedy="start one with `dask scheduler`, and pass the address that it prints",
+        ) from error
+
+
+def _cannot_deserialize(error: BaseException) -> bool:
+    """Whether a scheduler or worker could not load the objects of a task."""
+    return isinstance(error, ImportError | AttributeError) or "deserializ" in str(error)
+
+
+def _first_line(error: BaseException) -> str:
+    """Return the first line of an error's message, or its type."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def _from_file(path: str) -> str:
+    """The address in a file that a scheduler wrote."""
+    try:
+        return str(json.loads(read_text(path))["address"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            "is not a file of a Dask scheduler",
+            where=path,
+            remedy="pass the address that it prints",
+        ) from error
+
+
+def _not_installed() -> InputError:
+    return InputError(
+        "needs Dask distributed",
+        where="--scheduler",
+        remedy="pip install 'tofuse[dask]', or use --workers to stay on this machine",
+    )

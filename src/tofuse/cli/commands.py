@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     for is_set, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
         if is_set:
             raise InputError("requires --view", where=name, remedy="pass --view as well")
-    with _run_progress(arguments) as progress:
+    with progress_for(as_json=arguments.json) as progress:
         result = run_pipeline(arguments.inputs, options, progress)
     print_result(result, arguments.out, as_json=arguments.json)
     return exit_status(result)
@@ -93,25 +93,6 @@ def run_options(arguments: argparse.Namespace) -> Options:
     from tofuse.pipeline.run_options import Options
 
     return from_arguments(Options, arguments)
-
-
-@contextmanager
-def _run_progress(
-    arguments: argparse.Namespace,
-) -> Iterator[TerminalProgress | JsonProgress | QuietProgress]:
-    """Show the progress of a run; with --scheduler, distribute its work to the cluster."""
-    with progress_for(as_json=arguments.json) as progress:
-        if arguments.scheduler is None:
-            yield progress
-            return
-        from tofuse.batch.pieces import DaskExecutor
-        from tofuse.kernels.executors import using_executor
-
-        with (
-            closing(DaskExecutor(arguments.scheduler, progress.note)) as cluster,
-            using_executor(cluster),
-        ):
-            yield progress
 
 
 def _run_into(arguments: argparse.Namespace, options: Options) -> int:
@@ -129,7 +110,7 @@ def _run_into(arguments: argparse.Namespace, options: Options) -> int:
     if into.resolve() == options.out.resolve():
         raise InputError("is the same folder as --out", where="--into", remedy="use two folders")
     check_result(into)  # before hours of work
-    with _run_progress(arguments) as progress:
+    with progress_for(as_json=arguments.json) as progress:
         result = run_pipeline(arguments.inputs, options, progress)
     print_result(result, options.out, as_json=arguments.json)
     map_options = MergeOptions(
@@ -143,7 +124,7 @@ def _run_into(arguments: argparse.Namespace, options: Options) -> int:
         texture=options.texture,
         only_joined=True,
     )
-    with _run_progress(arguments) as progress:
+    with progress_for(as_json=arguments.json) as progress:
         merged = merge_files([into, options.out], map_options, progress)
     print_result(merged, into, as_json=arguments.json)
     return exit_status(merged)
@@ -169,7 +150,7 @@ def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
         if getattr(arguments, name):
             option = f"--{name.replace('_', '-')}"
             raise InputError("can't be used with a rig", where=option, remedy="leave it out")
-    with _run_progress(arguments) as progress:
+    with progress_for(as_json=arguments.json) as progress:
         rig_result = run_rig(arguments.rig, arguments.inputs, options, progress=progress)
     print_result(rig_result.result, arguments.out, as_json=arguments.json)
     return exit_status(rig_result.result)
@@ -187,7 +168,7 @@ def _run_live(arguments: argparse.Namespace, options: Options) -> int:
     try:
         _show(address(server), arguments)
         live = LiveView(server)
-        with _run_progress(arguments) as progress:
+        with progress_for(as_json=arguments.json) as progress:
             result = run_pipeline(arguments.inputs, options, CombinedProgress(progress, live))
         print_result(result, arguments.out, as_json=arguments.json)
         with _report_server(arguments.out) as report:

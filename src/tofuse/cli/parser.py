@@ -248,13 +248,6 @@ def _run(commands: Any) -> None:
         "a rig.json or cameraconfig.json; each INPUT is one of its cameras, in the same order",
     )
     _processing(p)
-    _value(
-        p,
-        "--scheduler ADDRESS",
-        str,
-        "spread loop search and refinement of a long recording over the workers of a Dask "
-        "scheduler: tcp://HOST:8786, or its scheduler file",
-    )
     g = p.add_argument_group("live view in the browser")
     _flag(g, "--view", "show the reconstruction live, and then the result")
     _page(g)

@@ -24,7 +24,6 @@ _EXCLUDED = {
     "port",
     "no-open",
     "threads",
-    "scheduler",
     "help",
 }
 _YES, _NO = {"true", "yes", "1", "x"}, {"false", "no", "0"}

@@ -100,7 +100,7 @@ T = TypeVar("T")
 
 
 @dataclasses.dataclass(eq=False)
-class _Entry:
+class _StoredItem:
     """The part of an item that always stays in memory.
 
     Attributes
@@ -145,7 +145,7 @@ class Spill(Generic[T]):
         if budget < 0:
             raise ValueError(f"budget is {budget}, not 0 or more")
         self.budget = budget
-        self._entries: dict[int, _Entry] = {}
+        self._entries: dict[int, _StoredItem] = {}
         self._resident: OrderedDict[int, T] = OrderedDict()  # least recently used first
         self._resident_bytes = 0
         self._next = 0
@@ -183,7 +183,7 @@ class Spill(Generic[T]):
                 shapes = self._shapes  # share one object between many items
             self._shapes = shapes
             nbytes = sum(a.nbytes for a in unshared.values())
-            self._entries[number] = _Entry(
+            self._entries[number] = _StoredItem(
                 _shell(type(item), fields | placeholders), shapes, nbytes
             )
             self._make_resident(number, item)
@@ -261,7 +261,7 @@ class Spill(Generic[T]):
             self._file.append(_bytes_of(getattr(item, name)))
         entry.offset = start
 
-    def _read(self, entry: _Entry) -> Mapping[str, NDArray[Any]]:
+    def _read(self, entry: _StoredItem) -> Mapping[str, NDArray[Any]]:
         assert entry.offset is not None
         offset, arrays = entry.offset, {}
         for name, shape in entry.shapes.items():

@@ -40,7 +40,7 @@ def with_pose_errors(
     cloud, mesh = model.cloud, model.mesh
     if cloud.sigma is None or not len(cloud) or not len(frames):
         return model
-    cells = _Cells.of(cloud)
+    cells = _SurfaceCells.of(cloud)
     pose_sigma = _cell_sigma(cells, frames, poses, covariances)
     if pose_sigma is None:
         return model
@@ -55,7 +55,7 @@ def with_pose_errors(
 
 
 @dataclass(frozen=True, eq=False)
-class _Cells:
+class _SurfaceCells:
     """Non-empty cubes: their edge, a point of each (M, 3), and the cell of every point (N,).
 
     Points are relative to `offset`.
@@ -67,7 +67,7 @@ class _Cells:
     of_point: Intp
 
     @classmethod
-    def of(cls, cloud: Cloud) -> _Cells:
+    def of(cls, cloud: Cloud) -> _SurfaceCells:
         size = max(_CELL_FRACTION * cloud.diagonal_m, 1e-6)
         cell = np.floor((cloud.points - cloud.points.min(0)) / np.float32(size)).astype(np.int64)
         count = cell.max(0) + 1
@@ -77,7 +77,7 @@ class _Cells:
 
 
 def _cell_sigma(
-    cells: _Cells, frames: Sequence[RangeFrame], poses: Float64, covariances: Float64
+    cells: _SurfaceCells, frames: Sequence[RangeFrame], poses: Float64, covariances: Float64
 ) -> Float64 | None:
     """Return sigma (M,) of each cell, the minimum over the views; None if no cell is visible."""
     world = cells.points + cells.offset

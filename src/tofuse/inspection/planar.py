@@ -32,6 +32,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
 from tofuse.arrays import Bool, Float64, Int64
+from tofuse.kernels import tukey
 from tofuse.normal import robust_sigma
 from tofuse.registration.prepared_view import PreparedView
 
@@ -277,7 +278,7 @@ def _residuals(
         plane = np.linalg.lstsq(B * root[:, None], observed * root, rcond=None)[0]
         e = observed - B @ plane
         cutoff = bound if np.isfinite(bound) else _CUTOFF_SIGMAS * _spread(e)
-        weight = base * np.maximum(1 - (e / cutoff) ** 2, 0) ** 2
+        weight = base * tukey.weights((e / cutoff) ** 2)
     slope = plane[0] * x + plane[1] * y
     if model != "range":
         by_first, by_stretch = observed * length, -slope

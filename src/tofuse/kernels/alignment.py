@@ -17,8 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.arrays import Float32, Float64
+from tofuse.kernels import tukey
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import project_ray, project_rays
+from tofuse.kernels.projection import MIN_DEPTH, nearest_pixel, project_rays
 
 # Columns of a source point: position in m, unit normal, sigma of z relative to z, log albedo
 # (NaN where unknown) and its gradient with respect to the position, 1/m.
@@ -40,8 +41,8 @@ ALBEDO_SLOPE = 6
 PIXEL_SIZE = 8
 
 # Layout of the sums that `accumulate` returns.
-H = 0  # 36: upper triangle of the 8x8 sum of w (J, r) (J, r)^T; J[6] is that of the exposure
-D = 36  # 21: upper triangle of the 6x6 sum of w D D^T
+PRODUCTS = 0  # 36: upper triangle of the 8x8 sum of w (J, r) (J, r)^T; J[6] is that of the exposure
+DIFFERENCES = 36  # 21: upper triangle of the 6x6 sum of w D D^T
 PROJECTED = 57  # points that project to a pixel of the target
 COMPARED = 58  # of those, points at which the target has a plane
 INLIERS = 59  # of those, points within the robust cut-off and with a compatible normal
@@ -64,7 +65,8 @@ SIZE = HISTOGRAM + BINS
 # (6), each multiplied by the square root of w; the statistics to be summed; chi2; and the square
 # root of the distance's w.
 LANES = 128
-MIN_DEPTH = 0.02  # m; points nearer to the target's camera are not compared
+# Points at more than twice the cut-off in front of a surface are in free space.
+FREE_SPACE = 4.0
 XN, YN, Z, _PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3
 HAS_PLANE = _PIXEL + PIXEL_SIZE
 IS_INLIER = HAS_PLANE + 1
@@ -281,10 +283,9 @@ def compare_planes(
         e2 = r2 * information * inv_limit2
         has_plane = block[HAS_PLANE * LANES + k] > zero
         inlier = has_plane & (e2 < one) & (s0 * m0 + s1 * m1 + s2 * m2 >= min_cosine32)
-        # Nearer than the target's surface: in its free space.
-        in_front = has_plane & (r < zero) & (e2 > np.float32(4))
-        weight = (one - e2) * (one - e2) if inlier else zero
-        sqrt_weight = (one - e2) * np.sqrt(information) if inlier else zero
+        in_front = has_plane & (r < zero) & (e2 > np.float32(FREE_SPACE))
+        weight = tukey.weight(e2) if inlier else zero
+        sqrt_weight = tukey.root_weight(e2) * np.sqrt(information) if inlier else zero
         block[SQRT_WEIGHT * LANES + k] = sqrt_weight
         block[IS_INLIER * LANES + k] = one if inlier else zero
         block[STAT * LANES + k] = one if inlier else zero
@@ -321,8 +322,8 @@ def compare_albedos(
         known = (block[IS_INLIER * LANES + k] > zero) & (r * r < np.float32(np.inf))
         e2 = r * r * inv_limit2
         inlier = known & (e2 < one)
-        weight = (one - e2) * (one - e2) if inlier else zero
-        sqrt_weight = (one - e2) * inv_scale_p if inlier else zero
+        weight = tukey.weight(e2) if inlier else zero
+        sqrt_weight = tukey.root_weight(e2) * inv_scale_p if inlier else zero
         r = r if inlier else zero
         tx, ty = tx if inlier else zero, ty if inlier else zero
         s0 = block[POINT_ALBEDO_SLOPE * LANES + k] if inlier else zero
@@ -413,7 +414,7 @@ def normal_equations(total: Float64) -> tuple[Float64, Float64, Float64]:
     A = np.zeros((7, 7))
     C = np.zeros((7, 7))
     g = np.zeros(7)
-    q = H
+    q = PRODUCTS
     for p in range(7):
         for o in range(p, 7):
             A[p, o] = total[q]
@@ -421,7 +422,7 @@ def normal_equations(total: Float64) -> tuple[Float64, Float64, Float64]:
             q += 1
         g[p] = total[q]
         q += 1
-    q = D
+    q = DIFFERENCES
     for p in range(6):
         for o in range(p, 6):
             C[p, o] -= total[q]
@@ -513,16 +514,14 @@ def exposure_differences(points: Float32, stride: int, target: TargetImage, T: F
     for k in range(0, points.shape[0], stride):
         px, py, pz = points[k, POINT], points[k, POINT + 1], points[k, POINT + 2]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        if z <= 0.02:
+        if z <= MIN_DEPTH:
             continue
         x = (T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) / z
         y = (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) / z
-        u, v, iu, _ = project_ray(x, y, lookup, lookup_frame)
-        if iu < 0 or not (
-            u > -0.5 and v > -0.5 and u < image.shape[1] - 0.5 and v < image.shape[0] - 0.5
-        ):
+        i, j = nearest_pixel(x, y, lookup, lookup_frame, image.shape[0], image.shape[1])
+        if i < 0:
             continue
-        pixel = image[int(v + 0.5), int(u + 0.5)]
+        pixel = image[i, j]
         if pixel[DISTANCE] == 0:
             continue
         expected = pixel[ALBEDO] + x * pixel[ALBEDO_SLOPE] + y * pixel[ALBEDO_SLOPE + 1]

@@ -18,7 +18,7 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64, UInt8
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import project_ray
+from tofuse.kernels.projection import MIN_DEPTH, in_image, project_ray
 
 # Outcomes of a comparison.
 NONE = 0  # no depth, or none in the other view at the projection
@@ -29,7 +29,6 @@ AMBIGUOUS = 4  # within the registration error of a depth edge of either view
 
 Rows = tuple[float, ...]
 
-_MIN_DEPTH = 0.02  # m; points nearer to the other camera are not compared
 _EDGE_SIGMAS = 4.0  # smallest difference between neighbouring depths at an edge
 
 
@@ -147,18 +146,12 @@ def transform_point(motion: Rows, x: float, y: float, depth: float) -> tuple[flo
     r00, r01, r02, t0, r10, r11, r12, t1, r20, r21, r22, t2 = motion
     px, py = x * depth, y * depth
     z = r20 * px + r21 * py + r22 * depth + t2
-    if not z > _MIN_DEPTH:
+    if not z > MIN_DEPTH:
         return 0.0, 0.0, 0.0
     inv_z = 1.0 / z
     u = (r00 * px + r01 * py + r02 * depth + t0) * inv_z
     v = (r10 * px + r11 * py + r12 * depth + t1) * inv_z
     return u, v, z
-
-
-@kernel
-def in_image(u: float, v: float, node: int, rows: int, columns: int) -> bool:
-    """Whether the result of `project_ray` lies in an image of `rows` x `columns`."""
-    return node >= 0 and u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5
 
 
 @kernel

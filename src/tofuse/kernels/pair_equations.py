@@ -13,19 +13,20 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64, Int64
+from tofuse.kernels import alignment as pose_sums
+from tofuse.kernels import tukey
 from tofuse.kernels.alignment import (
     ALBEDO,
     ALBEDO_SLOPE,
     BINS,
     CHI2,
-    COUNT_P,
     DISTANCE,
+    FREE_SPACE,
     HAS_PLANE,
     INLIERS,
     IS_INLIER,
     JACOBIAN,
     LANES,
-    MIN_DEPTH,
     NORMAL,
     PLANE,
     POINT,
@@ -34,10 +35,8 @@ from tofuse.kernels.alignment import (
     ROWS,
     SIGMA,
     SQRT_WEIGHT,
-    SQUARES_G,
     STAT,
     VARIANCE,
-    WEIGHT_G,
     WEIGHTED_RESIDUAL,
     XN,
     YN,
@@ -52,11 +51,8 @@ from tofuse.kernels.alignment import (
     project_block,
     transform_block,
 )
-from tofuse.kernels.alignment import IN_FRONT as FRONT
-from tofuse.kernels.alignment import SQUARES_P as ALBEDO_SQUARES
-from tofuse.kernels.alignment import WEIGHT_P as ALBEDO_WEIGHT
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import jacobian_row, project_ray
+from tofuse.kernels.projection import MIN_DEPTH, jacobian_row, nearest_pixel
 
 # Camera errors, in the order of the unknowns.
 OFFSET = 0  # to be added to the range, m
@@ -71,9 +67,9 @@ EXPOSURE = 6  # index of the exposure among the unknowns
 UNKNOWNS = 7 + ERRORS
 
 # Layout of the row of a pair.
-H = 0  # upper triangle over the unknowns
-G = UNKNOWNS * (UNKNOWNS + 1) // 2
-COMPARED = G + UNKNOWNS  # points that project to a target pixel with a plane
+PRODUCTS = 0  # upper triangle over the unknowns
+GRADIENT = UNKNOWNS * (UNKNOWNS + 1) // 2
+COMPARED = GRADIENT + UNKNOWNS  # points that project to a target pixel with a plane
 IN_FRONT = COMPARED + 1  # points in free space of the target
 WEIGHT_P = IN_FRONT + 1  # sums of robust weights and weighted squares of log albedo residuals
 SQUARES_P = WEIGHT_P + 1
@@ -221,7 +217,7 @@ def _calibration_equations(
             py += errors[p] * Bp[p, 1]
             pz += errors[p] * Bp[p, 2]
         z = r20 * px + r21 * py + r22 * pz + t2
-        if z <= 0.02:
+        if z <= MIN_DEPTH:
             continue
         x = r00 * px + r01 * py + r02 * pz + t0
         y = r10 * px + r11 * py + r12 * pz + t1
@@ -230,12 +226,10 @@ def _calibration_equations(
         rho2 = xn * xn + yn * yn
         ray_scale = 1.0 + errors[FOCAL] + errors[DISTORTION] * rho2
         xn, yn = xn / ray_scale, yn / ray_scale
-        u, v, iu, _ = project_ray(xn, yn, lookup, lookup_frame)
-        if iu < 0:
+        i, j = nearest_pixel(xn, yn, lookup, lookup_frame, rows, columns)
+        if i < 0:
             continue
-        if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
-            continue
-        pixel = image[int(v + 0.5), int(u + 0.5)]
+        pixel = image[i, j]
         distance = np.float64(pixel[DISTANCE])
         if distance == 0:
             continue
@@ -256,8 +250,7 @@ def _calibration_equations(
         out[HISTOGRAM + histogram_bin(r2 / raw_variance)] += 1
         e2 = r2 / variance / limit2
         if e2 >= 1:
-            # Nearer than the target's surface: in its free space.
-            if r < 0 and e2 > 4:
+            if r < 0 and e2 > FREE_SPACE:
                 out[IN_FRONT] += 1
             continue
         m0 = r00 * n0 + r10 * n1 + r20 * n2
@@ -268,8 +261,8 @@ def _calibration_equations(
         s2 = np.float64(point[NORMAL + 2])
         if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
             continue
-        f = 1 - e2
-        out[SUPPORT] += f * f * f
+        weight = tukey.weight(e2)
+        out[SUPPORT] += tukey.support(weight)
         # Mean of both views' normals, which halves the effect of either's noise.
         m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
         jacobian_row(J, m0, m1, m2, px, py, pz)
@@ -285,7 +278,7 @@ def _calibration_equations(
             )
             if known[p]:
                 J[7 + p] = 0.0
-        _add_residual(A, g, J, r, f * f / variance, unknowns)
+        _add_residual(A, g, J, r, weight / variance, unknowns)
 
         tx = np.float64(pixel[ALBEDO_SLOPE])
         source_albedo = np.float64(point[POINT_ALBEDO])
@@ -298,10 +291,10 @@ def _calibration_equations(
         e2 = r2 / (scale_p * scale_p) / limit2
         if e2 >= 1:
             continue
-        f = 1 - e2
-        out[WEIGHT_P] += f * f
-        out[SQUARES_P] += f * f * r2
-        out[SUPPORT] += f * f * f
+        weight = tukey.weight(e2)
+        out[WEIGHT_P] += weight
+        out[SQUARES_P] += weight * r2
+        out[SUPPORT] += tukey.support(weight)
         # Gradient with respect to the transformed point, rotated back into the source frame.
         d0 = tx / (z * ray_scale)
         d1 = ty / (z * ray_scale)
@@ -328,10 +321,10 @@ def _calibration_equations(
             J[7 + CENTER_Y] -= d1 * z
         if estimated > DISTORTION and not known[DISTORTION]:
             J[7 + DISTORTION] -= rho2 * z * (d0 * xn + d1 * yn)
-        _add_residual(A, g, J, r, f * f / (scale_p * scale_p), unknowns)
-    q = H
+        _add_residual(A, g, J, r, weight / (scale_p * scale_p), unknowns)
+    q = PRODUCTS
     for p in range(UNKNOWNS):
-        out[G + p] = g[p]
+        out[GRADIENT + p] = g[p]
         for o in range(p, UNKNOWNS):
             out[q] = A[p, o]
             q += 1
@@ -404,8 +397,8 @@ def _pose_equations(
     image, lookup, lookup_frame = target
     block = np.zeros(ROWS * LANES, np.float32)
     # Products of the rows of J and r, followed by counts and sums over columns.
-    products, support = 36, 36 + SQUARES_G - INLIERS
-    total = np.zeros((36 + COUNT_P + 1 - INLIERS, LANES))
+    products, support = 36, 36 + pose_sums.SQUARES_G - INLIERS
+    total = np.zeros((36 + pose_sums.COUNT_P + 1 - INLIERS, LANES))
     for first in range(0, len(points), LANES):
         count = min(LANES, len(points) - first)
         load_block(block, points[first : first + count])
@@ -423,12 +416,17 @@ def _pose_equations(
         if len(sums) > 0:
             _add_patches(sums, block, patches[first : first + count])
         add_products(total, block, 8)
-        _add_support(total[support], block, WEIGHT_G)
+        _add_support(total[support], block, pose_sums.WEIGHT_G)
         if scale_p > 0:
             compare_albedos(block, T, exposure, scale_p, robust)
             add_products(total, block, 8)
-            _add_support(total[support], block, ALBEDO_WEIGHT)
-        for statistic in (FRONT, ALBEDO_WEIGHT, ALBEDO_SQUARES, COUNT_P):
+            _add_support(total[support], block, pose_sums.WEIGHT_P)
+        for statistic in (
+            pose_sums.IN_FRONT,
+            pose_sums.WEIGHT_P,
+            pose_sums.SQUARES_P,
+            pose_sums.COUNT_P,
+        ):
             index = statistic - INLIERS
             column = total[products + index]
             row = block[(STAT + index) * LANES : (STAT + index + 1) * LANES]
@@ -441,20 +439,20 @@ def _pose_equations(
             low, high = total[q, :width], total[q, width:]
             for k in range(width):
                 low[k] += high[k]
-    q, index = 0, H
+    q, index = 0, PRODUCTS
     for p in range(8):
         for o in range(p, 8):
             if p < 7 and o < 7:
                 out[index] = total[q, 0]
                 index += 1
             elif p < 7:
-                out[G + p] = total[q, 0]
+                out[GRADIENT + p] = total[q, 0]
             q += 1
         index += ERRORS  # products with the camera errors remain 0
-    out[IN_FRONT] = total[products + FRONT - INLIERS, 0]
-    out[WEIGHT_P] = total[products + ALBEDO_WEIGHT - INLIERS, 0]
-    out[SQUARES_P] = total[products + ALBEDO_SQUARES - INLIERS, 0]
-    out[TERMS] = out[COMPARED] + total[products + COUNT_P - INLIERS, 0]
+    out[IN_FRONT] = total[products + pose_sums.IN_FRONT - INLIERS, 0]
+    out[WEIGHT_P] = total[products + pose_sums.WEIGHT_P - INLIERS, 0]
+    out[SQUARES_P] = total[products + pose_sums.SQUARES_P - INLIERS, 0]
+    out[TERMS] = out[COMPARED] + total[products + pose_sums.COUNT_P - INLIERS, 0]
     out[SUPPORT] = total[support, 0]
 
 
@@ -518,11 +516,11 @@ def _add_patches(sums: Float64, block: Float32, patches: Int64) -> None:
 
 @kernel
 def _add_support(total: Float64, block: Float32, statistic: int) -> None:
-    """Add w^(3/2), which is 1 minus the robust cost, of the robust weights w in a statistic."""
+    """Add the support of the residuals whose robust weights are in a statistic."""
     index = STAT + statistic - INLIERS
     row = block[index * LANES : (index + 1) * LANES]
     for k in range(LANES):
-        total[k] += row[k] * np.sqrt(row[k])
+        total[k] += tukey.support(row[k])
 
 
 @kernel
@@ -587,16 +585,14 @@ def overlaps(
                 break
             px, py, pz = points[k, POINT], points[k, POINT + 1], points[k, POINT + 2]
             z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-            if z <= 0.02:
+            if z <= MIN_DEPTH:
                 continue
             x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
             y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            u, v, iu, _ = project_ray(x / z, y / z, lookup, lookup_frame)
-            if iu < 0:
+            i, j = nearest_pixel(x / z, y / z, lookup, lookup_frame, rows, columns)
+            if i < 0:
                 continue
-            if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
-                continue
-            pixel = image[int(v + 0.5), int(u + 0.5)]
+            pixel = image[i, j]
             n0, n1, n2, distance = pixel[PLANE], pixel[PLANE + 1], pixel[PLANE + 2], pixel[DISTANCE]
             if distance == 0 or abs(n0 * x + n1 * y + n2 * z - distance) > tolerance * z:
                 continue

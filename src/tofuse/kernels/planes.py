@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.arrays import Float64, Int64
+from tofuse.kernels import tukey
 from tofuse.kernels.cloud_shape import symmetric_eigen
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import jacobian_row
@@ -138,7 +139,7 @@ def plane_equations(
             e2 = r * r / (variance[s] * robust * robust)
             if e2 >= 1:
                 continue
-            w = (1 - e2) * (1 - e2) / variance[s]
+            w = tukey.weight(e2) / variance[s]
             R = rotations[i]
             jacobian_row(
                 J,
@@ -231,4 +232,4 @@ def plane_support(
                 r += axes[s, 0, c] * (x[k, c] - mean[s, c])
             e2 = r * r / (limit * limit)
             if e2 < 1:
-                support[view[k]] += (1 - e2) ** 3
+                support[view[k]] += tukey.support(tukey.weight(e2))

@@ -7,6 +7,8 @@ import numpy as np
 from tofuse.arrays import Float32, Float64
 from tofuse.kernels.jit import kernel
 
+MIN_DEPTH = 0.02  # m; points nearer to a camera are not projected
+
 
 @kernel
 def project_ray(
@@ -42,6 +44,23 @@ def project_ray(
         (1 - au) * lookup[j + 1, i, 1] + au * lookup[j + 1, i + 1, 1]
     )
     return u, v, i, j
+
+
+@kernel
+def in_image(u: float, v: float, cell: int, rows: int, columns: int) -> bool:
+    """Whether the result of `project_ray` lies in an image of `rows` x `columns`."""
+    return cell >= 0 and u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5
+
+
+@kernel
+def nearest_pixel(
+    x: float, y: float, lookup: Float32, lookup_frame: Float64, rows: int, columns: int
+) -> tuple[int, int]:
+    """Return row and column of the pixel that a ray is nearest to; -1 outside the image."""
+    u, v, cell, _ = project_ray(x, y, lookup, lookup_frame)
+    if not in_image(u, v, cell, rows, columns):
+        return -1, -1
+    return int(v + 0.5), int(u + 0.5)
 
 
 @kernel

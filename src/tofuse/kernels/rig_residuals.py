@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.arrays import Float32, Float64
 from tofuse.kernels.alignment import DISTANCE, NORMAL, PLANE, POINT, SIGMA, VARIANCE, TargetImage
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import project_ray
+from tofuse.kernels.projection import MIN_DEPTH, nearest_pixel
 
 # Columns of a row: signed distance from the target's plane in m and its variance (0: no
 # correspondence), the target's normal in the source's frame, the source's own normal, the corrected
@@ -61,12 +61,12 @@ def residuals(
         q0 = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
         q1 = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
         q2 = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-        if q2 <= 0.02:
+        if q2 <= MIN_DEPTH:
             continue
-        u, v, iu, _ = project_ray(q0 / q2, q1 / q2, lookup, lookup_frame)
-        if iu < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
+        i, j = nearest_pixel(q0 / q2, q1 / q2, lookup, lookup_frame, rows, columns)
+        if i < 0:
             continue
-        pixel = image[int(v + 0.5), int(u + 0.5)]
+        pixel = image[i, j]
         distance = np.float64(pixel[DISTANCE])
         if distance == 0:
             continue

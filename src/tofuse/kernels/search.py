@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int32, Int64
+from tofuse.kernels import tukey
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import jacobian_row, project_ray
+from tofuse.kernels.projection import jacobian_row, nearest_pixel
 from tofuse.kernels.rigid_motions import retract
 
 # m; points nearer to the camera are not projected.
@@ -411,7 +412,7 @@ def _add_equations(
         m2 = A[0, 2] * n0 + A[1, 2] * n1 + A[2, 2] * n2
         if m0 * normals[k, 0] + m1 * normals[k, 1] + m2 * normals[k, 2] < min_cosine:
             continue
-        w = (1 - e2) * (1 - e2)
+        w = tukey.weight(e2)
         if forward:
             jacobian_row(J, m0, m1, m2, px, py, pz)
         else:
@@ -573,14 +574,10 @@ def measure_agreement(
             continue
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        u, v, iu, _ = project_ray(x / z, y / z, lookup, lookup_frame)
-        if iu < 0:
-            continue
-        if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
+        i, j = nearest_pixel(x / z, y / z, lookup, lookup_frame, rows, columns)
+        if i < 0:
             continue
         out[PROJECTED] += 1
-        i = int(v + 0.5)
-        j = int(u + 0.5)
         if planes[i, j, 3] <= 0:
             limit = sigmas * np.float64(sigma[k]) + floor_m + floor_fraction * z
             if nearest[i, j] > 0 and z < nearest[i, j] - 2 * limit:

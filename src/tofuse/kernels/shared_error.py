@@ -12,7 +12,13 @@ import numpy as np
 
 from tofuse.arrays import Float64, Int64
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.pair_equations import PATCH_RESIDUAL, PATCH_WEIGHT, UNKNOWNS, G, H
+from tofuse.kernels.pair_equations import (
+    GRADIENT,
+    PATCH_RESIDUAL,
+    PATCH_WEIGHT,
+    PRODUCTS,
+    UNKNOWNS,
+)
 
 
 @kernel
@@ -67,8 +73,8 @@ def _marginalise(sums: Float64, correlation: Float64, variance: float, row: Floa
             Z[i, p] = total / L[i, i]
     for p in range(6):
         for k in range(count):
-            row[G + p] -= R[k, 0] * R[k, 1 + p] - Z[k, 0] * Z[k, 1 + p]
-        index = H + p * UNKNOWNS - p * (p - 1) // 2
+            row[GRADIENT + p] -= R[k, 0] * R[k, 1 + p] - Z[k, 0] * Z[k, 1 + p]
+        index = PRODUCTS + p * UNKNOWNS - p * (p - 1) // 2
         for o in range(p, 6):
             for k in range(count):
                 row[index + o - p] -= R[k, 1 + p] * R[k, 1 + o] - Z[k, 1 + p] * Z[k, 1 + o]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int64
+from tofuse.kernels import tukey
 from tofuse.kernels.alignment import (
     DIFFERENCE,
     INLIERS,
@@ -124,19 +125,11 @@ def _add_to_tiles(tiles: Float64, tile_index: Int64, block: Float32, count: int)
 
 @kernel
 def _add_products(sums: Float64, block: Float32, kind: int, statistic: int) -> None:
-    """Add the products of the rows of J to those of a `kind`, and to the weighted and cross sums.
-
-    Tukey's influence function is r f^2 with f = 1 - (r / limit)^2, and its derivative is
-    f^2 (5 - 4 / f).
-    """
-    influence_ratio = np.empty(LANES, np.float32)
+    """Add the products of the rows of J to those of a kind, and to the weighted and cross sums."""
+    slope = np.empty(LANES, np.float32)
     weights = block[(STAT + statistic - INLIERS) * LANES : (STAT + statistic - INLIERS + 1) * LANES]
     for k in range(LANES):
-        influence_ratio[k] = (
-            np.float32(5) - np.float32(4) / np.sqrt(weights[k])
-            if weights[k] > np.float32(0)
-            else np.float32(0)
-        )
+        slope[k] = tukey.relative_slope(weights[k])
     q = 0
     for p in range(7):
         a = block[(JACOBIAN + p) * LANES : (JACOBIAN + p + 1) * LANES]
@@ -152,9 +145,9 @@ def _add_products(sums: Float64, block: Float32, kind: int, statistic: int) -> N
                 for k in range(LANES):
                     symmetrised = a[k] * b[k] - c[k] * d[k]
                     weighted[k] += symmetrised
-                    cross[k] += influence_ratio[k] * symmetrised
+                    cross[k] += slope[k] * symmetrised
             else:  # the exposure has the same derivative in both Jacobians
                 for k in range(LANES):
                     weighted[k] += a[k] * b[k]
-                    cross[k] += influence_ratio[k] * a[k] * b[k]
+                    cross[k] += slope[k] * a[k] * b[k]
             q += 1

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, Protocol
 
 from tofuse.arrays import Bool, Float64
-from tofuse.odometry.motion import Moment
+from tofuse.odometry.motion import FrameTime
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.prepared_view import PreparedView
@@ -86,7 +86,7 @@ class Tracker(Protocol):
         """
         return None
 
-    def predicted_pose(self, now: Moment) -> Float64 | None:
+    def predicted_pose(self, now: FrameTime) -> Float64 | None:
         """Return the predicted pose (4, 4) in the present component's frame, if known."""
         return None
 

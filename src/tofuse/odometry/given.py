@@ -14,8 +14,7 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.odometry.base import Odometry, Status, Step, Tracker
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
-from tofuse.odometry.motion_segmentation import MIN_MOVING_FRACTION
-from tofuse.odometry.moving_objects import MovingObjects, at_size
+from tofuse.odometry.moving_objects import MIN_MOVING_FRACTION, MovingObjects, at_size
 from tofuse.odometry.view_options import ViewOptions
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame

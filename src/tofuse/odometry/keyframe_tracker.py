@@ -8,20 +8,19 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.odometry.base import Status, Step, Tracker
 from tofuse.odometry.hypotheses import Hypotheses, Hypothesis
-from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
+from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap, Relocalizer
 from tofuse.odometry.keyframes import Keyframes
-from tofuse.odometry.motion import Moment, MotionModel
-from tofuse.odometry.motion_segmentation import MIN_MOVING_FRACTION, MotionSegmentation
-from tofuse.odometry.moving_objects import at_size
-from tofuse.odometry.relocalization import Relocalizer
-from tofuse.odometry.selection import HypothesisSelector
+from tofuse.odometry.motion import FrameTime
+from tofuse.odometry.moving_objects import MIN_MOVING_FRACTION, at_size
+from tofuse.odometry.selection import Selection
+from tofuse.odometry.tracker_state import TrackerState
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projective import registration_of
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.uncertainty import covariance
-from tofuse.registration.verification import FitStatistics, comparable
+from tofuse.registration.verification import FitStatistics
 
 
 class KeyframeTracker(Tracker):
@@ -29,18 +28,12 @@ class KeyframeTracker(Tracker):
 
     def __init__(self, options: Keyframes, search: SearchOptions) -> None:
         self._options = options
-        self._keyframes = KeyframeMap(options.keyframe_angle, options.keyframe_distance)
-        self._fit_statistics = FitStatistics()
-        self._relocalizer = Relocalizer(search if options.searches else None, self._fit_statistics)
-        self._motion = MotionModel()
-        self._segmentation = MotionSegmentation(self._relocalizer)
-        self._selector = HypothesisSelector(
-            self._fit_statistics, self._motion, self._segmentation, self._relocalizer
+        fit_statistics = FitStatistics()
+        self._state = TrackerState(
+            KeyframeMap(options.keyframe_angle, options.keyframe_distance),
+            Relocalizer(search if options.searches else None, fit_statistics),
+            fit_statistics,
         )
-        self._component = -1
-        self._connected = True  # whether a certain link joins the component to an earlier one
-        self._last: Keyframe | None = None  # the last frame of the component
-        self._in_sequence = False  # whether the frame just before has a pose in the component
 
     def prepare(self, frame: Frame) -> PreparedView | None:
         """See `Tracker.prepare`."""
@@ -54,44 +47,45 @@ class KeyframeTracker(Tracker):
         """See `Tracker.push`."""
         if not isinstance(frame, RangeFrame):
             raise InputError("is a cloud; this tracker needs images", where=f"frame {frame.index}")
-        self._relocalizer.count_frame()
-        problem = self._problem_of(frame) if surface is None else ""
-        if problem:
-            return self._lose(problem)
-        view = prepare_view(frame, self._options.views.surface) if surface is None else surface
+        state = self._state
+        state.relocalizer.count_frame()
+        view = self.prepare(frame) if surface is None else surface
+        if view is None:
+            return self._lose(self._problem_of(frame))
         if np.count_nonzero(view.planes[..., 3] > 0) < self._options.minimum_points:
             return self._lose("too few pixels have a surface")
-        now = Moment(frame.index, frame.timestamp)
-        self._motion.set_odometry(T_odometry)
-        hypotheses = self._hypotheses(view, now)
-        selected = self._selector.best(hypotheses, now, in_sequence=self._in_sequence)
+        now = FrameTime(frame.index, frame.timestamp)
+        state.motion.set_odometry(T_odometry)
+        hypotheses = Hypotheses(view, now, state, self._options)
+        selected = Selection(hypotheses).best()
+        state.degenerate = 0 if selected is None else len(selected.aligned.unobservable)
         if selected is None:
-            step = self._begin_component(view, hypotheses)
+            step = self._begin_component(hypotheses)
         else:
             step = self._continue_component(frame, selected, hypotheses)
         self._update(view, step, now)
         return step
 
     def _lose(self, reason: str) -> Step:
-        self._in_sequence = False
+        self._state.in_sequence = False
         return Step("lost", reason, None)
 
-    def _update(self, view: PreparedView, step: Step, now: Moment) -> None:
+    def _update(self, view: PreparedView, step: Step, now: FrameTime) -> None:
         T = step.T_component_camera
         assert T is not None
-        self._last = Keyframe(view, T, self._component, step.doubtful)
+        self._state.last = Keyframe(view, T, step.component, step.doubtful)
         degenerate = step.registration is not None and len(step.registration.unobservable) > 0
-        self._motion.update(T, now, degenerate=degenerate)
-        self._in_sequence = True
+        self._state.motion.update(T, now, degenerate=degenerate)
+        self._state.in_sequence = True
 
-    def predicted_pose(self, now: Moment) -> Float64 | None:
+    def predicted_pose(self, now: FrameTime) -> Float64 | None:
         """See `Tracker.predicted_pose`."""
-        return self._motion.predicted_pose(now)
+        return self._state.motion.predicted_pose(now)
 
     def interrupt(self) -> None:
         """See `Tracker.interrupt`."""
-        self._motion.interrupt()
-        self._last, self._in_sequence = None, False
+        self._state.motion.interrupt()
+        self._state.last, self._state.in_sequence = None, False
 
     def _problem_of(self, frame: RangeFrame) -> str:
         """Return why a frame can't be tracked; empty if it can."""
@@ -105,72 +99,36 @@ class KeyframeTracker(Tracker):
                 return ""
         return f"every depth is {first_depth:.3g} m"
 
-    def _hypotheses(self, view: PreparedView, now: Moment) -> Hypotheses:
-        """Return alignments with the last keyframe and the last frame, from the predicted pose."""
-        last, guess = self._last, self._options.guess
-        T_last = np.eye(4) if last is None else last.T_component_camera
-        references = []
-        if last is not None:
-            keyframes = [self._keyframes.newest]
-            if last.view.index != keyframes[0].view.index:
-                keyframes.append(last)
-            references = [
-                self._segmentation.reference(k)
-                for k in keyframes
-                if comparable(view.depth, k.depth)
-            ]
-        T_predicted = T_smoothed = None
-        if guess == "previous":
-            T_predicted, T_smoothed = (
-                self._motion.predicted_pose(now),
-                self._motion.smoothed_pose(now),
-            )
-        elif guess == "odometry":
-            T_predicted = self._motion.odometry_pose()
-        static = self._segmentation.static_part(
-            view, T_last if T_predicted is None else T_predicted
-        )
-        return Hypotheses(
-            view,
-            static,
-            references,
-            T_predicted,
-            T_smoothed,
-            T_last,
-            self._options.views.alignment,
-            self._fit_statistics,
-        )
-
-    def _begin_component(self, view: PreparedView, hypotheses: Hypotheses) -> Step:
+    def _begin_component(self, hypotheses: Hypotheses) -> Step:
         """Begin a component with an unconnected view, and search for links to the others."""
-        self._component += 1
-        last = None if self._last is None else self._last.view.index
-        adjacent = last if self._in_sequence else None
-        links = self._relocalizer.links(view, self._keyframes, self._component, adjacent)
-        self._connected = any(link.certain for link in links)
-        self._keyframes.add(Keyframe(view, np.eye(4), self._component))
-        if self._in_sequence:  # the camera still moves at the same velocity
-            self._motion.change_frame()
+        state, view = self._state, hypotheses.view
+        state.component += 1
+        adjacent = state.last.view.index if state.last is not None and state.in_sequence else None
+        links = state.relocalizer.links(view, state.keyframes, state.component, adjacent)
+        state.connected = any(link.certain for link in links)
+        state.keyframes.add(Keyframe(view, np.eye(4), state.component))
+        if state.in_sequence:  # the camera still moves at the same velocity
+            state.motion.change_frame()
         else:
-            self._motion.interrupt()
-        self._segmentation.reset()
+            state.motion.interrupt()
+        state.objects.reset()
         reason = ""
-        if self._component:
+        if state.component:
             rejection = hypotheses.first_rejection or "nothing comparable was seen before"
-            reason = f"begins component {self._component}: {rejection}"
+            reason = f"begins component {state.component}: {rejection}"
             if links:
                 reason += f"; {links[-1].how} in frame {links[-1].i}"
         return Step(
-            "tracked", reason, np.eye(4), surface=view, component=self._component, links=links
+            "tracked", reason, np.eye(4), surface=view, component=state.component, links=links
         )
 
     def _continue_component(
         self, frame: RangeFrame, selected: Hypothesis, hypotheses: Hypotheses
     ) -> Step:
         """Refine the selected hypothesis without moving objects, and take its pose."""
-        view = hypotheses.full_view
-        accepted, moving = self._segmentation.segment(hypotheses.converged(selected), hypotheses)
-        self._fit_statistics.learn(accepted.aligned, view.depth)
+        view = hypotheses.view
+        accepted, moving = hypotheses.segment(hypotheses.converged(selected))
+        self._state.fit_statistics.learn(accepted.aligned, view.depth)
         links = self._insert_keyframe(view, accepted)
         status, reason = _status_of(accepted, frame)
         mask = None
@@ -184,9 +142,9 @@ class KeyframeTracker(Tracker):
             accepted.keyframe.view.index,
             self._registration(accepted),
             view,
-            self._component,
+            self._state.component,
             links,
-            doubtful=not accepted.assessment.is_usual,
+            doubtful=not accepted.fit.is_usual,
             inflation=_inflation(accepted),
             moving=mask,
         )
@@ -197,16 +155,16 @@ class KeyframeTracker(Tracker):
         It is due far from the last keyframe, or where it fits the last frame only; unless the view
         itself is doubtful.
         """
-        T, keyframe = accepted.T_component_camera, accepted.keyframe
-        doubtful = not accepted.assessment.is_usual
-        replaces = keyframe is self._last and not doubtful
-        if not (replaces or self._keyframes.is_far(T, keyframe)):
+        state, T, keyframe = self._state, accepted.T_component_camera, accepted.keyframe
+        doubtful = not accepted.fit.is_usual
+        replaces = keyframe is state.last and not doubtful
+        if not (replaces or state.keyframes.is_far(T, keyframe)):
             return ()
         links: tuple[Link, ...] = ()
-        if not self._connected:
-            links = self._relocalizer.links(view, self._keyframes, self._component)
-            self._connected = any(link.certain for link in links)
-        self._keyframes.add(Keyframe(view, T, self._component, doubtful))
+        if not state.connected:
+            links = state.relocalizer.links(view, state.keyframes, state.component)
+            state.connected = any(link.certain for link in links)
+        state.keyframes.add(Keyframe(view, T, state.component, doubtful))
         return links
 
     def _registration(self, accepted: Hypothesis) -> Registration:
@@ -217,12 +175,12 @@ class KeyframeTracker(Tracker):
 
 def _inflation(accepted: Hypothesis) -> float:
     """Factor of the standard deviations: odds twice as high as usual double them."""
-    return float(np.exp(min(accepted.assessment.excess, 5.0)))
+    return float(np.exp(min(accepted.fit.excess, 5.0)))
 
 
 def _status_of(accepted: Hypothesis, frame: RangeFrame) -> tuple[Status, str]:
     """Return the status of a frame with a pose, and anything unusual in tracking it."""
-    notes = [accepted.note, accepted.assessment.reason]
+    notes = [accepted.note, accepted.fit.reason]
     if frame.amplitude_image is not None and not accepted.aligned.photometric:
         notes.append("the albedo took no part")
     status: Status = "tracked"

@@ -38,7 +38,7 @@ _MAX_UNTIMED_GAP = 3
 
 
 @dataclass(frozen=True)
-class Moment:
+class FrameTime:
     """When a frame was taken: its index, and its time in s, which is the index if unknown."""
 
     index: int
@@ -49,12 +49,12 @@ class Moment:
         """Whether the timestamp is a time, not the index."""
         return self.timestamp != self.index
 
-    def since(self, earlier: Moment) -> float:
+    def since(self, earlier: FrameTime) -> float:
         """Time since another frame, in s, or in frames where only these were counted; above 0."""
         seconds = self.seconds_since(earlier)
         return float(max(self.index - earlier.index, 1)) if seconds is None else seconds
 
-    def seconds_since(self, earlier: Moment) -> float | None:
+    def seconds_since(self, earlier: FrameTime) -> float | None:
         """Time since another frame in s; None where only frames were counted."""
         timed = (self.is_timed or earlier.is_timed) and self.timestamp > earlier.timestamp
         return self.timestamp - earlier.timestamp if timed else None
@@ -73,7 +73,7 @@ class MotionModel:
     def __init__(self) -> None:
         self.velocity_is_inherited = False
         self._T_last: Float64 | None = None  # of the last frame with a pose
-        self._last_time: Moment | None = None
+        self._last_time: FrameTime | None = None
         self._velocity: Float64 | None = None  # (6,) twist per unit of time, while it is known
         self._mean_velocity: Float64 | None = None  # (6,) its exponential moving average
         self._interval = 1.0  # between the last two frames with a pose
@@ -88,7 +88,7 @@ class MotionModel:
         """Set the pose (4, 4) of the coming frame by external odometry, in any fixed frame."""
         self._T_odometry_now = T_odometry
 
-    def predicted_pose(self, now: Moment) -> Float64 | None:
+    def predicted_pose(self, now: FrameTime) -> Float64 | None:
         """Return the pose at constant velocity; None while the velocity is unknown.
 
         Position and rotation are those of external odometry, each unless it has predicted recent
@@ -103,7 +103,7 @@ class MotionModel:
             return None
         return np.asarray(T @ se3.inverse(before) @ now, np.float64)
 
-    def smoothed_pose(self, now: Moment) -> Float64 | None:
+    def smoothed_pose(self, now: FrameTime) -> Float64 | None:
         """Return the pose at the mean velocity of recent frames; None while it is unknown.
 
         Where a direction is degenerate for many frames, only the prediction moves the camera
@@ -112,7 +112,7 @@ class MotionModel:
         """
         return self._with_odometry(self._extrapolated(self._mean_velocity, now), now)
 
-    def gate(self, now: Moment) -> Float64:
+    def gate(self, now: FrameTime) -> Float64:
         """Return by how much a pose may deviate from the predicted one, (2,), m and rad.
 
         Infinite without a prediction.
@@ -136,7 +136,7 @@ class MotionModel:
             minimum + _DEVIATION_FACTOR * typical_deviation * max(elapsed, 1.0), np.float64
         )
 
-    def gate_violation(self, T: Float64, now: Moment) -> str:
+    def gate_violation(self, T: Float64, now: FrameTime) -> str:
         """Describe by how much a pose outside of the gate deviates; empty for one inside."""
         T_predicted = self.predicted_pose(now)
         if T_predicted is None:
@@ -149,7 +149,7 @@ class MotionModel:
             "pose"
         )
 
-    def is_feasible(self, T: Float64, now: Moment) -> bool:
+    def is_feasible(self, T: Float64, now: FrameTime) -> bool:
         """Whether a handheld camera can have moved to a pose since the last frame."""
         if self._T_last is None or self._last_time is None:
             return True
@@ -157,7 +157,7 @@ class MotionModel:
         limit = GATE + HANDHELD * (1.0 if seconds is None else seconds)
         return bool((_distance_and_angle(self._T_last, T) <= limit).all())
 
-    def normalised_deviation(self, T: Float64, now: Moment) -> float:
+    def normalised_deviation(self, T: Float64, now: FrameTime) -> float:
         """Return the deviation from the predicted pose as a multiple of the largest recent one.
 
         0 without a prediction.
@@ -168,7 +168,7 @@ class MotionModel:
         scale = np.maximum(np.max(self._deviations, axis=0), _TRACKING_NOISE)
         return float(np.max(_distance_and_angle(T_predicted, T) / scale))
 
-    def _with_odometry(self, T: Float64 | None, now: Moment) -> Float64 | None:
+    def _with_odometry(self, T: Float64 | None, now: FrameTime) -> Float64 | None:
         """Replace the parts of a pose (4, 4) that external odometry has not predicted worse."""
         T_odometry = self.odometry_pose()
         if T_odometry is None:
@@ -184,7 +184,7 @@ class MotionModel:
             fused[:3, :3] = T_odometry[:3, :3]
         return fused
 
-    def _compare_odometry(self, T: Float64, now: Moment) -> None:
+    def _compare_odometry(self, T: Float64, now: FrameTime) -> None:
         """Record how well odometry and velocity predicted a pose (4, 4)."""
         T_odometry, T_velocity = self.odometry_pose(), self._extrapolated(self._velocity, now)
         if T_odometry is not None and T_velocity is not None:
@@ -192,7 +192,7 @@ class MotionModel:
                 (_distance_and_angle(T_odometry, T), _distance_and_angle(T_velocity, T))
             )
 
-    def update(self, T: Float64, now: Moment, *, degenerate: bool = False) -> None:
+    def update(self, T: Float64, now: FrameTime, *, degenerate: bool = False) -> None:
         """Update the velocity with the pose of the next frame.
 
         Parameters
@@ -209,7 +209,7 @@ class MotionModel:
         self._update_velocity(T, now)
         self._T_odometry_before, self._T_odometry_now = self._T_odometry_now, None
 
-    def _update_velocity(self, T: Float64, now: Moment) -> None:
+    def _update_velocity(self, T: Float64, now: FrameTime) -> None:
         if self._T_last is None or self._last_time is None:
             self._T_last, self._last_time = T, now
             return
@@ -230,7 +230,7 @@ class MotionModel:
         self._velocity, self._interval = velocity, elapsed
         self._T_last, self._last_time, self.velocity_is_inherited = T, now, False
 
-    def restart_at(self, T: Float64, now: Moment) -> None:
+    def restart_at(self, T: Float64, now: FrameTime) -> None:
         """Continue from the pose of the next frame at the same velocity: the motion was a jump."""
         self._T_last, self._last_time = T, now
         self._T_odometry_before, self._T_odometry_now = self._T_odometry_now, None
@@ -252,7 +252,7 @@ class MotionModel:
         self.velocity_is_inherited = False
         self._deviations.clear()
 
-    def _extrapolated(self, velocity: Float64 | None, now: Moment) -> Float64 | None:
+    def _extrapolated(self, velocity: Float64 | None, now: FrameTime) -> Float64 | None:
         if self._T_last is None or self._last_time is None or velocity is None:
             return None
         return retract(self._T_last, velocity * now.since(self._last_time))
@@ -265,7 +265,7 @@ def is_small(T: Float64) -> bool:
 
 def find_jumps(
     poses: Sequence[Float64 | None],
-    moments: Sequence[Moment],
+    moments: Sequence[FrameTime],
     interruptions: Collection[int] = (),
 ) -> list[tuple[int, str]]:
     """Return the positions of poses outside of the gate, and descriptions of their deviations.

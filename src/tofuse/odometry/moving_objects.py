@@ -63,6 +63,8 @@ _DILATION = 3
 # Minimum fraction of the comparisons outside of the mask that agree, for a pair of views to be
 # evidence of motion. Below, a wrong pose is as likely.
 _MIN_AGREEMENT = 0.5
+# Moving fraction of a view above which the static rest is realigned, and the mask reported.
+MIN_MOVING_FRACTION = 0.01
 # Number of reference views whose log-odds are kept.
 _MAX_REFERENCES = 40
 # Rows of cells of a chunk; fixed, so that the result does not depend on the number of threads.
@@ -89,27 +91,12 @@ _LIMITS = kernels.Limits(
 
 
 @dataclass(frozen=True, eq=False)
-class _Cells:
-    """State of the cells of a view, see `kernels.moving_objects.Cells`."""
-
-    depth: Float32
-    odds: Float32
-    moving: Bool
-    tracked: UInt8
-
-    @property
-    def arrays(self) -> kernels.Cells:
-        """The same for kernels."""
-        return kernels.Cells(self.depth, self.odds, self.moving, self.tracked)
-
-
-@dataclass(frozen=True, eq=False)
 class _LastView:
     """The previous view, its pose, and its cells."""
 
     view: PreparedView
     T_world_camera: Float64
-    cells: _Cells
+    cells: kernels.Cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +105,7 @@ class PairUpdate:
 
     last: _LastView
     reference: int
-    cells: _Cells
+    cells: kernels.Cells
     scale: float | None
 
 
@@ -225,17 +212,23 @@ class MovingObjects:
     ----------
     max_references
         Number of reference views whose log-odds are kept.
+
+    Attributes
+    ----------
+    in_last_view
+        Whether objects moved in the last view.
     """
 
     def __init__(self, max_references: int = _MAX_REFERENCES) -> None:
         self._max_references = max_references
+        self.in_last_view = False
         self._last: _LastView | None = None
-        self._references: OrderedDict[int, _Cells] = OrderedDict()
+        self._references: OrderedDict[int, kernels.Cells] = OrderedDict()
         self._scales: deque[float] = deque(maxlen=_SCALE_WINDOW)
 
     def reset(self) -> None:
         """Forget the last view, as the camera was lost after it; references are kept."""
-        self._last = None
+        self._last, self.in_last_view = None, False
 
     def predicted_mask(self, T_world_camera_predicted: Float64, view: PreparedView) -> Bool:
         """Return the (H, W) pixels of an unaligned view that belong to the last view's mask.
@@ -260,7 +253,7 @@ class MovingObjects:
         kernels.predict(
             _sampled(view),
             _sampled(last.view),
-            last.cells.arrays,
+            last.cells,
             T,
             2 * _MAX_MOTION,
             _DILATION,
@@ -329,7 +322,7 @@ class MovingObjects:
         else:
             evidence, reference_evidence = cells.odds, reference_cells.odds
         detect = 0.0 if suspected else _DETECT
-        cells, segments = self._segmented(replace(cells, tracked=tracked), evidence, detect)
+        cells, segments = self._segmented(cells._replace(tracked=tracked), evidence, detect)
         reference_cells, _ = self._segmented(reference_cells, reference_evidence, detect)
         counts = _counts(outcome, cells.moving) + _counts(reference_outcome, reference_cells.moving)
         mask = _pixels(cells.moving, view.z.shape, _stride(view))
@@ -354,12 +347,12 @@ class MovingObjects:
     def update(self, moving: Moving) -> None:
         """Update the state with the result of `compare` for the accepted pose."""
         pair = moving.pair_update
-        self._last = pair.last
+        self._last, self.in_last_view = pair.last, moving.fraction > 0
         self._store(pair.reference, pair.cells)
         if pair.scale is not None:
             self._scales.append(pair.scale)
 
-    def _reference(self, reference: PreparedView) -> _Cells:
+    def _reference(self, reference: PreparedView) -> kernels.Cells:
         """Return the cells of a reference so far."""
         shape = _cell_shape(reference.z.shape, _stride(reference))
         cells = self._references.get(reference.index)
@@ -369,16 +362,18 @@ class MovingObjects:
             stride = _stride(reference)
             depth = np.ascontiguousarray(reference.z[::stride, ::stride])
             odds = np.full(shape, _PRIOR_ODDS, np.float32)
-            cells = _Cells(depth, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8))
+            cells = kernels.Cells(depth, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8))
         return cells
 
-    def _store(self, index: int, cells: _Cells) -> None:
+    def _store(self, index: int, cells: kernels.Cells) -> None:
         self._references[index] = cells
         self._references.move_to_end(index)
         while len(self._references) > self._max_references:
             self._references.popitem(last=False)
 
-    def _propagated(self, view: PreparedView, T_world_camera: Float64) -> tuple[_Cells, Bool]:
+    def _propagated(
+        self, view: PreparedView, T_world_camera: Float64
+    ) -> tuple[kernels.Cells, Bool]:
         """Propagate the cells of the last view to this one; and return which surfaces are new."""
         last, stride = self._last, _stride(view)
         shape = _cell_shape(view.z.shape, stride)
@@ -386,14 +381,16 @@ class MovingObjects:
         tracked, arrived = np.empty(shape, np.uint8), np.empty(shape, np.bool_)
         if last is None:
             T, previous = np.eye(4), view
-            cells = _Cells(np.zeros(shape, np.float32), odds, np.zeros(shape, np.bool_), tracked)
+            cells = kernels.Cells(
+                np.zeros(shape, np.float32), odds, np.zeros(shape, np.bool_), tracked
+            )
         else:
             T, previous = se3.inverse(last.T_world_camera) @ T_world_camera, last.view
             cells = last.cells
         T = np.ascontiguousarray(T)
         # At the rim of the tracked region a cell may belong to an adjacent surface.
         inner = np.asarray(cv2.erode(cells.tracked, _NEIGHBOURS), np.uint8)
-        last_cells = replace(cells, tracked=inner).arrays
+        last_cells = cells._replace(tracked=inner)
         sampled, sampled_previous = _sampled(view), _sampled(previous)
 
         def work(a: int, b: int) -> None:
@@ -403,7 +400,7 @@ class MovingObjects:
             )  # fmt: skip
 
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
-        return _Cells(depth, odds, odds > _DETECT, tracked), arrived
+        return kernels.Cells(depth, odds, odds > _DETECT, tracked), arrived
 
     def _scale(
         self, view: PreparedView, moving: Bool, reference: PreparedView, T: Float64
@@ -436,21 +433,23 @@ class MovingObjects:
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
         return outcome, llr
 
-    def _updated(self, cells: _Cells, evidence: Float32) -> _Cells:
+    def _updated(self, cells: kernels.Cells, evidence: Float32) -> kernels.Cells:
         """Add the evidence of a pair of views."""
         prior = np.float32(_PRIOR_ODDS)
         odds = prior + np.float32(_DECAY) * (cells.odds - prior) + evidence
         max_odds = _DETECT + 2 * _MAX_EVIDENCE
-        return replace(cells, odds=np.clip(odds, 2 * prior, max_odds).astype(np.float32))
+        return cells._replace(odds=np.clip(odds, 2 * prior, max_odds).astype(np.float32))
 
-    def _segmented(self, cells: _Cells, evidence: Float32, detect: float) -> tuple[_Cells, int]:
+    def _segmented(
+        self, cells: kernels.Cells, evidence: Float32, detect: float
+    ) -> tuple[kernels.Cells, int]:
         """Segment cells with hysteresis, and count the segments.
 
         `evidence` is that of this frame: segments are not extended over cells that agree in it.
         """
         odds, depth = cells.odds, cells.depth
         certain = odds > detect
-        unsegmented = replace(cells, moving=np.zeros(odds.shape, np.bool_))
+        unsegmented = cells._replace(moving=np.zeros(odds.shape, np.bool_))
         if not certain.any():
             return unsegmented, 0
         likely = (odds > _EXTEND).view(np.uint8)
@@ -474,7 +473,7 @@ class MovingObjects:
             np.abs(near_depth - depth) <= np.float32(_MAX_MOTION) * near_depth
         )
         moving = moving | (dilated & (evidence >= 0) & (odds >= _PRIOR_ODDS))
-        return replace(cells, odds=odds, moving=moving), int(kept.sum())
+        return cells._replace(odds=odds, moving=moving), int(kept.sum())
 
     def _completed(self, moving: Bool, depth: Float32) -> Bool:
         """Complete the mask on surfaces of which more than half moves.

@@ -13,7 +13,7 @@ from tofuse.bounds import Bounded, Bounds
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.odometry.base import Odometry, Step, Tracker
-from tofuse.odometry.motion import Moment, MotionModel
+from tofuse.odometry.motion import FrameTime, MotionModel
 from tofuse.odometry.sequential import SEED_STAGE
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
@@ -194,8 +194,8 @@ class _PairwiseTracker(Tracker):
         return (registered.link(frame),) if registered is not None and registered.accepted else ()
 
 
-def _moment(frame: Frame) -> Moment:
-    return Moment(frame.index, frame.timestamp)
+def _moment(frame: Frame) -> FrameTime:
+    return FrameTime(frame.index, frame.timestamp)
 
 
 @dataclass(frozen=True, eq=False)

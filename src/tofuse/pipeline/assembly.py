@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
@@ -15,10 +13,8 @@ from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog, poses_in_world
 from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.progress import Progress, Stopwatch
-from tofuse.pipeline.tracked_graph import TrackedGraph
-from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.joining import Group
-from tofuse.posegraph.loops import ClosedLoop, PriorLoop
+from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.merged_components import Join, JoinKind
 from tofuse.results.ranges import runs
 from tofuse.results.types import Component, Reconstruction
@@ -65,12 +61,6 @@ class Assembly:
             poses = poses_in_world(log, groups[0].T_group_component)
             result = self._back_end(log, poses, groups[0].joins).run(components)
         return replace(result, seed=self.seed, threads=self.threads)
-
-    def graph(self, log: FrameLog, component: int, loops: Sequence[ClosedLoop]) -> PoseGraph:
-        """Return the pose graph of a component as tracked, with loops."""
-        component_log = log.of_component(component)
-        poses = poses_in_world(component_log, {component: np.eye(4)})
-        return TrackedGraph(component_log.posed, poses, ()).build(loops)
 
     def _join(self, log: FrameLog) -> list[Group]:
         """Decide from all views which components are connected, and how."""

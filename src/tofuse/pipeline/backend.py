@@ -150,7 +150,7 @@ class BackEnd:
         Along a long trajectory the drift exceeds the search range of loops; the poses in its middle
         are corrected only after its ends are joined.
         """
-        for _ in range(_MAX_SEARCHES if self._observations.loops.repeat_worthwhile else 0):
+        for _ in range(_MAX_SEARCHES if self._observations.loops.is_long else 0):
             graph = self._tracked.build(loops)
             if not graph.loop.any():
                 break

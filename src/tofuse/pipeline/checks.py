@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.evaluation.cross_view import CrossViewConsistency
 from tofuse.geometry import se3
-from tofuse.odometry.motion import Moment, find_jumps
+from tofuse.odometry.motion import FrameTime, find_jumps
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.calibration_check import proposal
 from tofuse.posegraph.covariances import loop_errors
@@ -249,7 +249,7 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     posed = iter(e.sequential)
     has_pose = e.in_main
     poses = [next(posed) if has else None for has in has_pose]
-    moments = [Moment(r.index, r.timestamp) for r in e.records]
+    moments = [FrameTime(r.index, r.timestamp) for r in e.records]
     unmeasured = {k + 1 for k, record in enumerate(e.records) if len(record.unobservable)}
     unexpected = {*e.interruptions, *_component_changes(e.records, has_pose), *unmeasured}
     pose_jumps = find_jumps(poses, moments, unexpected)

@@ -113,7 +113,7 @@ def estimate_falloff(
     law
         Law of the falloff of amplitude, or else of colour.
     """
-    views = _Views(recording, prepare, options)
+    views = _FalloffViews(recording, prepare, options)
     slopes: list[_Slope] = []
     for start in np.unique(np.linspace(0, len(recording) - 1, _PAIRS + 1)[:-1].astype(int)):
         # The initial exponent is the median so far: nearly compensated amplitude hardly biases.
@@ -139,7 +139,7 @@ class _Slope:
     motion: float
 
 
-class _Views:
+class _FalloffViews:
     """Views of a recording, with uncompensated amplitude."""
 
     def __init__(self, recording: Recording, prepare: Prepare, options: SurfaceOptions) -> None:
@@ -155,7 +155,7 @@ class _Views:
         return view if view.has_albedo else None
 
 
-def _slope_from(views: _Views, start: int, initial: float, law: Law) -> _Slope | None:
+def _slope_from(views: _FalloffViews, start: int, initial: float, law: Law) -> _Slope | None:
     """Return the slope of a view and a later one with enough motion in between, if any."""
     target = views.get(start)
     if target is None:

@@ -34,7 +34,7 @@ from tofuse.files.trajectory_formats import TimedPoses, read_poses
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses
-from tofuse.odometry.motion import Moment, find_jumps
+from tofuse.odometry.motion import FrameTime, find_jumps
 from tofuse.parts import check_number
 from tofuse.pipeline.checks import accuracy_reasons, cross_view_reasons, tolerance_of
 from tofuse.pipeline.config import Config, check_views, from_method
@@ -484,7 +484,7 @@ def _reasons(
         if not contradictions or r.code != "uncertain_poses"
     )
     # The camera itself may have moved abruptly; then the refined poses jump as well.
-    moments = [Moment(f.index, f.timestamp) for f in frames]
+    moments = [FrameTime(f.index, f.timestamp) for f in frames]
     actual_jumps = {k for k, _ in find_jumps(_or_none(refined.trajectory), moments)}
     jumped = {
         k: words for k, words in find_jumps(_or_none(poses), moments) if k not in actual_jumps

@@ -13,8 +13,9 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import job_pool
 from tofuse.odometry.base import Step
-from tofuse.pipeline.frame_log import FrameLog
-from tofuse.posegraph.graph import PoseGraph
+from tofuse.pipeline.frame_log import FrameLog, poses_in_world
+from tofuse.pipeline.tracked_graph import TrackedGraph
+from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.loops import ClosedLoop, Loops
 from tofuse.registration.base import Link
 
@@ -73,8 +74,8 @@ class LivePoses:
     At the end of the recording components are joined and loops are closed again.
     """
 
-    def __init__(self, loops: Loops) -> None:
-        self._loops = LiveLoops(loops)
+    def __init__(self, loops: Loops, optimiser: Optimiser) -> None:
+        self._loops, self._optimiser = LiveLoops(loops), optimiser
         self._component = 0
         self._pending = False  # whether there are closed loops that were not yet optimised
         self._n_new = 0  # frames of this component since the last optimisation
@@ -84,7 +85,18 @@ class LivePoses:
         self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
         self._T_closed_tracked = np.eye(4)
 
-    def update(self, step: Step, log: FrameLog) -> list[ClosedLoop]:
+    def update(self, step: Step, log: FrameLog) -> None:
+        """Add the next frame; correct this and the following poses if loops have closed."""
+        loops = self.due_loops(step, log)
+        if not loops:
+            return
+        component_log = log.of_component(step.component)
+        poses = poses_in_world(component_log, {step.component: np.eye(4)})
+        tracked = TrackedGraph(component_log.posed, poses, ()).build(loops)
+        optimised = self._optimiser.optimise(tracked).graph
+        self._T_closed_tracked = optimised.poses[-1] @ se3.inverse(tracked.poses[-1])
+
+    def due_loops(self, step: Step, log: FrameLog) -> list[ClosedLoop]:
         """Add the next frame; return the loops of its component if optimisation is due, else []."""
         if step.component != self._component:
             self._component, self._T_closed_tracked = step.component, np.eye(4)
@@ -100,10 +112,6 @@ class LivePoses:
         self._pending, self._n_new = False, 0
         component_frames = {e.record.index for e in log.of_component(step.component).posed}
         return [c for c in self._loops.closed if {c.record.i, c.record.j} <= component_frames]
-
-    def apply_loops(self, tracked: PoseGraph, optimised: PoseGraph) -> None:
-        """Apply the correction of a graph's last pose by loops to all following poses."""
-        self._T_closed_tracked = optimised.poses[-1] @ se3.inverse(tracked.poses[-1])
 
     def pose(self, step: Step) -> Float64 | None:
         """Return T_world_camera (4, 4); None if lost, or not connected to the first component."""

@@ -11,13 +11,11 @@ from tofuse.errors import InputError
 from tofuse.files.memory import trim_memory
 from tofuse.kernels.threads import serial_chunks, thread_count, threads
 from tofuse.odometry.base import Step, Tracker
-from tofuse.odometry.motion import Moment
+from tofuse.odometry.motion import FrameTime
 from tofuse.parts import check_number
 from tofuse.pipeline.assembly import Assembly
-from tofuse.pipeline.background_queue import BackgroundQueue
 from tofuse.pipeline.config import Config, check_views, from_method, kind_of
-from tofuse.pipeline.frame_log import FrameLog, record_of
-from tofuse.pipeline.intake import Intake
+from tofuse.pipeline.frame_log import FrameLog, FrameSequence, record_of
 from tofuse.pipeline.live_poses import LivePoses
 from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.preparation import FilteredFrame, Preparation, Prepared
@@ -71,9 +69,8 @@ class Mapper:
         self.watch = Stopwatch()
         self._prior_loops = tuple(loops)
         self._progress = progress or Silent()
-        self._intake = Intake()
+        self._sequence = FrameSequence()
         self._log = FrameLog()
-        self._queue = BackgroundQueue()
         self._finished = False
         self._start_method(tracker)
 
@@ -81,7 +78,7 @@ class Mapper:
         self._preparation = Preparation(self.config)
         self._tracker = tracker or self.config.odometry.start(self.seed, self.config.search)
         self._observations = Observations(self.config, self.seed, self._prior_loops)
-        self._live_poses = LivePoses(self._observations.loops)
+        self._live_poses = LivePoses(self._observations.loops, self.config.optimiser)
         self._component = 0
 
     def push(
@@ -122,7 +119,7 @@ class Mapper:
             does not support, or its index is not larger than those before.
         """
         self._check(frame)
-        repeated = self._intake.is_repeated(frame)
+        repeated = self._sequence.is_repeated(frame)
         if repeated:
             self._log.repeated.append(frame.index)
         # Chunks run serially while other threads prepare frames; else relocalization uses all.
@@ -131,7 +128,8 @@ class Mapper:
             filtered = self._prepare(frame, history, prepared)
             step = self._track(filtered, T_odometry, repeated)
             self._store(filtered, step, T_odometry, gravity)
-            self._close_loops(step)
+            with self.watch.timing("loops"):
+                self._live_poses.update(step, self._log)
             return self._report(filtered, step)
 
     def _prepare(
@@ -140,7 +138,7 @@ class Mapper:
         with self.watch.timing("filters"):
             T_expected = None
             if self._log.entries and self._log.entries[-1].has_pose:
-                T_expected = self._tracker.predicted_pose(Moment(frame.index, frame.timestamp))
+                T_expected = self._tracker.predicted_pose(FrameTime(frame.index, frame.timestamp))
             return self._preparation.process(frame, T_expected, history, prepared)
 
     def _track(self, filtered: FilteredFrame, T_odometry: Float64 | None, repeated: bool) -> Step:
@@ -163,8 +161,7 @@ class Mapper:
         T_odometry: Float64 | None,
         gravity: Float64 | None,
     ) -> None:
-        frame = filtered.corrected
-        self._log.add(record_of(frame, step), step, T_odometry, gravity)
+        self._log.add(record_of(filtered.corrected, step), step, T_odometry, gravity)
         lost = step.T_component_camera is None
         if step.moving is not None:
             filtered = replace(filtered, for_model=filtered.for_model.keep(~step.moving))
@@ -172,18 +169,8 @@ class Mapper:
             with self.watch.timing("loops"):
                 self._observations.add(filtered, step)
             with self.watch.timing("fusion"):
-                self._queue.submit(
-                    lambda: self._observations.add_to_model(frame, filtered.for_model, step)
-                )
-        self._queue.submit(lambda: self._observations.sample(filtered, lost=lost))
-
-    def _close_loops(self, step: Step) -> None:
-        """Correct the current component by loops whose search started some frames ago."""
-        with self.watch.timing("loops"):
-            loops = self._live_poses.update(step, self._log)
-            if loops:
-                graph = self._assembly().graph(self._log, step.component, loops)
-                self._live_poses.apply_loops(graph, self.config.optimiser.optimise(graph).graph)
+                self._observations.add_to_model(filtered, step)
+        self._observations.sample(filtered, lost=lost)
 
     def _report(self, filtered: FilteredFrame, step: Step) -> Float64 | None:
         self._progress.advance(self._log.entries[-1].record)
@@ -211,8 +198,8 @@ class Mapper:
             Why it could not be read.
         """
         self._check_open()
-        self._intake.check_order(index)
-        self._intake.accept(index)
+        self._sequence.check_order(index)
+        self._sequence.accept(index)
         self._log.add(FrameRecord(index, timestamp, "skipped", reason), None)
         self._progress.advance(self._log.entries[-1].record)
 
@@ -255,8 +242,8 @@ class Mapper:
         self._log.check_posed()
         self._live_poses.finish()
         with self.watch.timing("fusion"):
-            self._queue.finish()
-        self._intake.end()
+            self._observations.finish()
+        self._sequence.end()
         del self._tracker  # its keyframes
         trim_memory()
         result = self._assembly().run(self._log)
@@ -287,14 +274,14 @@ class Mapper:
                 where="frame",
                 remedy="pass a RangeFrame or a CloudFrame",
             )
-        self._intake.check_order(frame.index)
+        self._sequence.check_order(frame.index)
         kind = kind_of(frame)
-        if self._intake.check_kind(frame):
+        if self._sequence.check_kind(frame):
             if self._method is not None and kind == "cloud":
                 self.config = from_method(self._method, kind)
                 self._start_method()
             check_views(self.config, kind)
-        self._intake.accept(frame.index, kind)
+        self._sequence.accept(frame.index, kind)
 
     def _check_open(self) -> None:
         if self._finished:

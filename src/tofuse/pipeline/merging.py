@@ -24,11 +24,11 @@ from tofuse.odometry.given import GivenPoses, StatedPose, StatedPoses
 from tofuse.parts import check_number
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
-from tofuse.pipeline.paint import paint
+from tofuse.pipeline.paint import make_texture
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import push_frames, with_recording_facts
 from tofuse.pipeline.run_options import ModelOptions
-from tofuse.pipeline.session_pairs import Model, session_changes, session_pairs
+from tofuse.pipeline.session_pairs import SessionModel, session_changes, session_pairs
 from tofuse.pipeline.sessions import Session, read_sessions, sessions_of
 from tofuse.posegraph.loops import PriorLoop
 from tofuse.posegraph.view_store import PosedView
@@ -212,7 +212,7 @@ def _with_sessions(
     recording: Recording,
 ) -> Reconstruction:
     """Return the result with its sessions, their overlaps and changes."""
-    merged_poses = Model.of(result).poses
+    merged_poses = SessionModel.of(result).poses
     records = tuple(
         SessionRecord(
             session.name,
@@ -325,7 +325,7 @@ def _merge_into(
     texture = None
     if config.fusion.texture:
         recording, _ = joined_recording(sessions)
-        texture = paint(recording, result, config.fusion.texture, options.threads, progress)
+        texture = make_texture(recording, result, config.fusion.texture, options.threads, progress)
     progress.stage("writing")
     with threadpool_limits(1):
         write_result(result, folder, _report, texture)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -12,6 +14,7 @@ from tofuse.files.spill import Scratch, Spill
 from tofuse.fusion.cloud import as_cloud
 from tofuse.fusion.model import ModelBuilder
 from tofuse.geometry.cameras import ray_lengths
+from tofuse.kernels.threads import job_pool, thread_count
 from tofuse.odometry.base import Step
 from tofuse.pipeline.budget import checked_bytes, views_bytes
 from tofuse.pipeline.config import Config
@@ -29,6 +32,8 @@ _COLUMNS = 200
 # Number of images of a place that are all fused into the model; of further ones a decreasing
 # fraction, as their noise is then averaged.
 _VIEWS_PER_PLACE = 32
+# Bounds memory, as waiting jobs reference frames.
+_MAX_WAITING = 4
 
 
 class Observations:
@@ -48,8 +53,6 @@ class Observations:
         Typical radial range of each posed frame, m, by index.
     ambiguity_m
         Ambiguity range of the camera, if known.
-    has_covariances
-        Whether covariances of registrations are realistic; those of ICP are too small.
     samples
         Some frames for the report.
     """
@@ -68,27 +71,48 @@ class Observations:
         self._checks = _EvenSample(_CHECKED_IMAGES, Spill(checked_bytes(config.memory_mb)))
         self.depths: dict[int, float] = {}
         self.ambiguity_m: float | None = None
-        self.has_covariances = False
+        self._needs_points = self.loops.needs_points or self.refiner.needs_points
+        self._queue = _BackgroundQueue()
+
+    @property
+    def has_covariances(self) -> bool:
+        """Whether covariances of registrations are realistic.
+
+        Those between prepared views are; those of ICP, whose trackers prepare none, are too small.
+        """
+        return len(self.views.views) > 0
 
     def add(self, filtered: FilteredFrame, step: Step) -> None:
         """Store the data of a frame with a pose for joining, loops and refinement."""
-        T, surface = step.T_component_camera, step.surface
+        T = step.T_component_camera
         assert T is not None
         if isinstance(filtered.corrected, RangeFrame):
             self.ambiguity_m = filtered.corrected.ambiguity_m
-        if surface is not None:
-            # Covariances of trackers with prepared views are realistic; those of ICP are too small.
-            self.has_covariances = True
-            self.views.push(surface, T, step.component, _reduced)
-        view: Frame = filtered.for_model
-        # Methods on prepared views need no points, which take long to compute.
-        if surface is None or self.loops.points or self.refiner.points:
-            view = as_cloud(filtered.for_model, _MAX_POINTS)
+        if step.surface is not None:
+            self.views.push(step.surface, T, step.component, _reduced)
+        view = filtered.for_model
+        if self._needs_points:
+            view = as_cloud(view, _MAX_POINTS)
         self.loops.push(view, T)
         self.refiner.push(view, T)
 
-    def add_to_model(self, frame: Frame, clean: Frame, step: Step) -> None:
-        """Store the data of a frame with a pose for the model and the verdict."""
+    def add_to_model(self, filtered: FilteredFrame, step: Step) -> None:
+        """Store the data of a frame with a pose for the model and the verdict, in the background.
+
+        Waits while too many frames are waiting.
+        """
+        self._queue.submit(partial(self._add_to_model, filtered, step))
+
+    def sample(self, filtered: FilteredFrame, *, lost: bool) -> None:
+        """Store small images of some frames for the report, in the background."""
+        self._queue.submit(partial(self._sample, filtered, lost=lost))
+
+    def finish(self) -> None:
+        """Wait until everything is stored."""
+        self._queue.finish()
+
+    def _add_to_model(self, filtered: FilteredFrame, step: Step) -> None:
+        frame, clean = filtered.corrected, filtered.for_model
         depth = _typical_range(frame)
         if isinstance(frame, RangeFrame):
             self.depths[frame.index] = depth
@@ -98,8 +122,7 @@ class Observations:
         if self._places.keeps(depth, step.T_component_camera, step.component):
             self.model.add(clean, step.surface, _MAX_POINTS)
 
-    def sample(self, filtered: FilteredFrame, *, lost: bool) -> None:
-        """Store small images of some frames for the report."""
+    def _sample(self, filtered: FilteredFrame, *, lost: bool) -> None:
         frame, tracked, modelled = filtered.corrected, filtered.for_tracking, filtered.for_model
         if (
             isinstance(frame, RangeFrame)
@@ -145,3 +168,38 @@ class _EvenSample:
                 self.images = self.images[::2]
                 self._step *= 2
         self._count += 1
+
+
+class _BackgroundQueue:
+    """Runs jobs in order on a background thread; with a single thread, immediately.
+
+    An error of a job is raised by one of the next calls.
+    """
+
+    def __init__(self) -> None:
+        self._pool: ThreadPoolExecutor | None = None
+        self._jobs: deque[Future[None]] = deque()
+
+    def submit(self, job: Callable[[], None]) -> None:
+        """Queue a job; waits while the queue is full."""
+        if thread_count() == 1:
+            self.wait()
+            job()
+            return
+        if self._pool is None:
+            self._pool = job_pool(1, "tofuse-behind")
+        self._jobs.append(self._pool.submit(job))
+        while len(self._jobs) > _MAX_WAITING:
+            self._jobs.popleft().result()
+
+    def wait(self) -> None:
+        """Wait for all jobs."""
+        while self._jobs:
+            self._jobs.popleft().result()
+
+    def finish(self) -> None:
+        """Wait for all jobs, and end the thread."""
+        self.wait()
+        if self._pool is not None:
+            self._pool.shutdown()
+        self._pool = None

@@ -22,7 +22,7 @@ _METRES_PER_RADIAN = 1.0
 TEXTURE = 2048  # default size in texels
 
 
-def paint(
+def make_texture(
     recording: Recording,
     result: Reconstruction,
     size: int,

@@ -24,7 +24,7 @@ from tofuse.inspection.inspect import inspect_recording
 from tofuse.pipeline.adaptation import adapted
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.judging import device_sentence
-from tofuse.pipeline.paint import paint
+from tofuse.pipeline.paint import make_texture
 from tofuse.pipeline.priors import with_prior
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.pipeline.reconstruct import reconstruct, view_kind
@@ -144,7 +144,7 @@ def _texture(
     if not size:
         return None
     with watch.timing("texture"):
-        texture = paint(job.recording, result, size, options.threads, progress)
+        texture = make_texture(job.recording, result, size, options.threads, progress)
     if texture is None:
         progress.note("no texture: there is no surface, or neither colour nor amplitude")
     return texture

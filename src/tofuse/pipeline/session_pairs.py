@@ -24,7 +24,7 @@ _COMPARED = 60
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class SessionModel:
     """One of the models of a result: the main one, or that of a separate component.
 
     Attributes
@@ -37,7 +37,7 @@ class Model:
     poses: dict[int, Float64]
 
     @classmethod
-    def of(cls, result: Reconstruction) -> Model:
+    def of(cls, result: Reconstruction) -> SessionModel:
         """The main model of a result."""
         frames = zip(result.diagnostics.frames, result.trajectory, strict=True)
         return cls(result, {f.index: T for f, T in frames if np.isfinite(T).all()})
@@ -94,7 +94,7 @@ def session_pairs(
         Prepared views of frames with a pose.
     """
     separate = [c.result for c in result.components if c.result is not None and not c.connected]
-    models = [Model.of(each) for each in (result, *separate)]
+    models = [SessionModel.of(each) for each in (result, *separate)]
     pairs = []
     for a, b in combinations(range(len(records)), 2):
         first, second = records[a], records[b]
@@ -116,7 +116,7 @@ def _pair(
     b: int,
     first: SessionRecord,
     second: SessionRecord,
-    model: Model,
+    model: SessionModel,
     first_views: Sequence[View],
     second_views: Sequence[View],
     *,
@@ -148,7 +148,7 @@ def session_changes(
     views
         Prepared views of frames with a pose.
     """
-    model = Model.of(result)
+    model = SessionModel.of(result)
     views_of = [model.views(record, views) for record in records]
     detected = []
     for a, b in combinations(range(len(records)), 2):

@@ -24,7 +24,7 @@ from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import replacing
 from tofuse.files.npz import Arrays, read_npz
 from tofuse.odometry.base import Step, Tracker
-from tofuse.odometry.motion import Moment
+from tofuse.odometry.motion import FrameTime
 from tofuse.odometry.moving_objects import at_size, without_pixels
 from tofuse.pipeline.frame_log import FrameLog
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -169,7 +169,7 @@ class LoggingTracker(Tracker):
         """See `Tracker.prepare`."""
         return self._tracker.prepare(frame)
 
-    def predicted_pose(self, now: Moment) -> Float64 | None:
+    def predicted_pose(self, now: FrameTime) -> Float64 | None:
         """See `Tracker.predicted_pose`."""
         T = self._tracker.predicted_pose(now)
         if T is not None:
@@ -224,7 +224,7 @@ class ReplayingTracker(Tracker):
         """See `Tracker.prepare`."""
         return self._prepare(frame)
 
-    def predicted_pose(self, now: Moment) -> Float64 | None:
+    def predicted_pose(self, now: FrameTime) -> Float64 | None:
         """See `Tracker.predicted_pose`."""
         return self._predicted.get(now.index)
 

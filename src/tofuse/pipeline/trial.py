@@ -163,14 +163,14 @@ def trial(recording: Recording, uncorrected: Prepare, corrected: Prepare) -> Tri
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class _TrialView:
     """A view without the correction, and the relative change of its z (H, W) by the correction."""
 
     surface: PreparedView
     change: Float32
 
     @classmethod
-    def of(cls, uncorrected: RangeFrame, corrected: RangeFrame) -> _View:
+    def of(cls, uncorrected: RangeFrame, corrected: RangeFrame) -> _TrialView:
         surface = prepare_view(uncorrected, _VIEW)
         valid = uncorrected.valid & corrected.valid
         change = np.where(valid, corrected.z / np.where(valid, uncorrected.z, 1) - 1, np.nan)
@@ -185,22 +185,22 @@ class _AlignedViews:
     def __init__(self, recording: Recording, uncorrected: Prepare, corrected: Prepare) -> None:
         self._recording = recording
         self._uncorrected, self._corrected = uncorrected, corrected
-        self._views: dict[int, _View | None] = {}
+        self._views: dict[int, _TrialView | None] = {}
         self._steps: dict[tuple[int, int], Aligned | None] = {}
 
-    def _view(self, k: int) -> _View | None:
+    def _view(self, k: int) -> _TrialView | None:
         if k not in self._views:
             self._views[k] = self._prepared(k)
         return self._views[k]
 
-    def _prepared(self, k: int) -> _View | None:
+    def _prepared(self, k: int) -> _TrialView | None:
         frame = self._recording.image(k) if k < len(self._recording) else None
         if frame is None:
             return None
         uncorrected, corrected = self._uncorrected(frame), self._corrected(frame)
         if not (isinstance(uncorrected, RangeFrame) and isinstance(corrected, RangeFrame)):
             return None
-        return _View.of(uncorrected, corrected) if len(uncorrected) else None
+        return _TrialView.of(uncorrected, corrected) if len(uncorrected) else None
 
     def _step(self, i: int, j: int) -> Aligned | None:
         """Align view j to view i; None if they do not fit."""
@@ -237,7 +237,7 @@ class _AlignedViews:
         distance = float(np.linalg.norm(T[:3, 3]))
         return max(float(se3.angle(T)) / _DESIRED_ANGLE, distance / (_DESIRED_DISTANCE * depth))
 
-    def run(self, start: int, stride: int) -> tuple[list[_View], Float64]:
+    def run(self, start: int, stride: int) -> tuple[list[_TrialView], Float64]:
         """Return aligned views from `start` on, and their poses (N, 4, 4) relative to the first."""
         first = self._view(start)
         if first is None:
@@ -252,7 +252,7 @@ class _AlignedViews:
         return views, np.array(poses)
 
 
-def _regressed(views: Sequence[_View], poses: Float64) -> tuple[float, float] | None:
+def _regressed(views: Sequence[_TrialView], poses: Float64) -> tuple[float, float] | None:
     """Regress the disagreement of a run jointly with its poses: see `Trial`."""
     n = len(views)
     if n < 3:  # the relative pose of a pair absorbs nearly all of it
@@ -280,7 +280,9 @@ def _regressed(views: Sequence[_View], poses: Float64) -> tuple[float, float] | 
     return (float(explained), float(predicted)) if predicted > 0 else None
 
 
-def _compared(target: _View, source: _View, T: Float64) -> tuple[Float64, Float64, Float64] | None:
+def _compared(
+    target: _TrialView, source: _TrialView, T: Float64
+) -> tuple[Float64, Float64, Float64] | None:
     """Return the distances of a view's points from another's planes, with derivatives.
 
     Parameters

@@ -21,7 +21,7 @@ _LEVELS = 8
 _CONSTRAINED = 1e-12
 
 
-class Level(NamedTuple):
+class TreeLevel(NamedTuple):
     """Vertices at the ends of the branches once those of the levels before are removed.
 
     Attributes
@@ -69,7 +69,7 @@ class Branches:
         rigid = ~graph.loop & (eigenvalues[:, 0] > _CONSTRAINED * eigenvalues[:, -1])
         self.vertices = np.zeros(len(graph.ids), np.bool_)
         self.edges = np.zeros(len(graph.edges), np.bool_)
-        self._levels: list[Level] = []
+        self._levels: list[TreeLevel] = []
         degree = np.bincount(graph.edges.ravel(), minlength=len(graph.ids))
         for _ in range(_LEVELS):
             is_leaf = (degree == 1) & ~kept
@@ -79,7 +79,7 @@ class Branches:
             i, j = graph.edges[leaf_edges].T
             # Of two ends that only join each other, the later one is removed.
             is_leaf_j = is_leaf[j]
-            level = Level(leaf_edges, np.where(is_leaf_j, j, i), np.where(is_leaf_j, i, j))
+            level = TreeLevel(leaf_edges, np.where(is_leaf_j, j, i), np.where(is_leaf_j, i, j))
             self._levels.append(level)
             self.edges[leaf_edges], self.vertices[level.vertices] = True, True
             degree -= np.bincount(graph.edges[leaf_edges].ravel(), minlength=len(degree))

@@ -143,7 +143,7 @@ class _Points:
 
 
 @dataclass(frozen=True, eq=False)
-class _Cells:
+class _PlaneCells:
     """Points sorted into cells, and the plane of each."""
 
     order: Intp
@@ -253,7 +253,7 @@ def _level(
     iterations: int,
     options: PlaneOptions,
     divisions: int = 1,
-) -> tuple[Float64, list[_Cells]]:
+) -> tuple[Float64, list[_PlaneCells]]:
     """Iterate with cells of one size; returns the poses and their cells.
 
     If the support of the views falls, these are the initial ones.
@@ -279,7 +279,7 @@ def _level(
     return (refined, cells) if after >= before - SUPPORT_NOISE else (poses, initial_cells)
 
 
-def _divided(points: _Points, poses: Float64, size: float, divisions: int) -> list[_Cells]:
+def _divided(points: _Points, poses: Float64, size: float, divisions: int) -> list[_PlaneCells]:
     """Divide all points into cells in several shifted ways."""
     shifts = np.arange(divisions) / divisions
     return [_cells(points, poses, _centres(points, poses, size, shift)) for shift in shifts]
@@ -314,7 +314,7 @@ def _means(x: Float64, cell: Int64) -> Float64:
     return sums[count > 0] / count[count > 0, None]
 
 
-def _cells(points: _Points, poses: Float64, centres: Float64) -> _Cells:
+def _cells(points: _Points, poses: Float64, centres: Float64) -> _PlaneCells:
     """Assign each point to the nearest centre, and fit the planes.
 
     The two sides of a wall may be closer to each other than a cell is wide, so cells observed from
@@ -332,7 +332,7 @@ def _cells(points: _Points, poses: Float64, centres: Float64) -> _Cells:
     return _fit(points, x, cell, int(cell.max()) + 1)
 
 
-def _fit(points: _Points, x: Float64, cell: Int64, size: int) -> _Cells:
+def _fit(points: _Points, x: Float64, cell: Int64, size: int) -> _PlaneCells:
     """Sort points (M, 3) of the world into cells (M,), and fit the planes."""
     # Points are ordered by their views already.
     order = np.argsort(cell, kind="stable")
@@ -345,10 +345,10 @@ def _fit(points: _Points, x: Float64, cell: Int64, size: int) -> _Cells:
         kernels.fit_cells(x, view, start[a : b + 1], mean[a:b], axes[a:b], spread[a:b], views[a:b])
 
     run_chunks(work, size)
-    return _Cells(order, start, points.p[order], x, view, mean, axes, spread, views)
+    return _PlaneCells(order, start, points.p[order], x, view, mean, axes, spread, views)
 
 
-def _back_sides(cells: _Cells, poses: Float64) -> Bool:
+def _back_sides(cells: _PlaneCells, poses: Float64) -> Bool:
     """(M,) mask of the points, ordered by cell, on the back of a cell with two separate sides."""
     size = len(cells.mean)
     cell = np.repeat(np.arange(size), np.diff(cells.start))
@@ -371,7 +371,7 @@ def _back_sides(cells: _Cells, poses: Float64) -> Bool:
 
 
 def _system(
-    points: _Points, poses: Float64, divisions: Sequence[_Cells], options: PlaneOptions
+    points: _Points, poses: Float64, divisions: Sequence[_PlaneCells], options: PlaneOptions
 ) -> tuple[Factor | None, PairSystem]:
     """Normal equations of all poses without the planes, averaged over several divisions."""
     n = points.count
@@ -385,7 +385,7 @@ def _system(
     for cells, variance in zip(divisions, variances, strict=True):
 
         def work(
-            a: int, b: int, cells: _Cells = cells, variance: Float64 = variance
+            a: int, b: int, cells: _PlaneCells = cells, variance: Float64 = variance
         ) -> tuple[Float64, Float64, Float64]:
             out = np.zeros_like(diagonal), np.zeros_like(gradient), np.zeros_like(off_diagonal)
             kernels.plane_equations(
@@ -412,7 +412,7 @@ def _system(
     return system.factor(matrix, rhs, _DAMPING), system
 
 
-def _variance(cells: _Cells, min_points: int) -> Float64:
+def _variance(cells: _PlaneCells, min_points: int) -> Float64:
     """(S,) variance of the residuals of each cell, 0 if it has too few points or only one view."""
     valid = cells.shared & (np.diff(cells.start) >= min_points)
     variance = np.where(valid, cells.spread[:, 0], 0.0)
@@ -422,7 +422,7 @@ def _variance(cells: _Cells, min_points: int) -> Float64:
     return variance
 
 
-def _pairs(divisions: Sequence[_Cells], variances: Sequence[Float64], n: int) -> Intp:
+def _pairs(divisions: Sequence[_PlaneCells], variances: Sequence[Float64], n: int) -> Intp:
     """Pairs of views i < j that observe the same cell."""
     shared_cells = np.zeros((n, n))
     for cells, variance in zip(divisions, variances, strict=True):
@@ -434,7 +434,7 @@ def _pairs(divisions: Sequence[_Cells], variances: Sequence[Float64], n: int) ->
     return np.argwhere(np.triu(shared_cells, 1) > 0).astype(np.intp)
 
 
-def _support(points: _Points, cells: _Cells, limit: float) -> Float64:
+def _support(points: _Points, cells: _PlaneCells, limit: float) -> Float64:
     out = np.zeros(points.count)
     kernels.plane_support(
         cells.x, cells.view, cells.start, cells.mean, cells.axes, cells.views, limit, out

@@ -236,9 +236,7 @@ def link_of(first: View, second: View, registration: Registration | None) -> Lin
     """Return a registration of two views as a link, None if it is not probable."""
     if registration is None or not registration.is_probable:
         return None
-    return Link(
-        first.index, second.index, registration, registration.stands_alone, registration.how
-    )
+    return Link(first.index, second.index, registration, registration.is_decisive, registration.how)
 
 
 def _tracking_failures(components: Sequence[TrackedComponent]) -> int:

@@ -93,19 +93,19 @@ class Loops(Protocol):
 
     Attributes
     ----------
-    points
+    needs_points
         Whether it requires the points of frames, not only prepared views.
     """
 
-    points: ClassVar[bool] = True
+    needs_points: ClassVar[bool] = True
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """Add the next frame that has a pose."""
         ...
 
     @property
-    def repeat_worthwhile(self) -> bool:
-        """Whether there are enough views for a second detection to be worthwhile."""
+    def is_long(self) -> bool:
+        """Whether the trajectory is so long that a second detection is worthwhile."""
         return False
 
     def candidates_change(self, poses: Mapping[int, Float64]) -> bool:

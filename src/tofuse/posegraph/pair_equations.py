@@ -289,9 +289,9 @@ def without_exposure(state: DirectedPairs) -> tuple[Float64, Float64]:
     """
     m, e = len(state.target), kernels.EXPOSURE
     H = np.zeros((m, kernels.UNKNOWNS, kernels.UNKNOWNS))
-    H[:, _UPPER[0], _UPPER[1]] = state.rows[:, kernels.H : kernels.G]
-    H[:, _UPPER[1], _UPPER[0]] = state.rows[:, kernels.H : kernels.G]
-    g = state.rows[:, kernels.G : kernels.G + kernels.UNKNOWNS]
+    H[:, _UPPER[0], _UPPER[1]] = state.rows[:, kernels.PRODUCTS : kernels.GRADIENT]
+    H[:, _UPPER[1], _UPPER[0]] = state.rows[:, kernels.PRODUCTS : kernels.GRADIENT]
+    g = state.rows[:, kernels.GRADIENT : kernels.GRADIENT + kernels.UNKNOWNS]
     pivot = np.maximum(H[:, e, e], 1e-9)
     state.exposure -= np.clip(g[:, e] / pivot, -0.3, 0.3)
     kept = np.delete(np.arange(kernels.UNKNOWNS), e)

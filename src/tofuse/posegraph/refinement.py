@@ -103,14 +103,14 @@ class Refiner(Protocol):
 
     Attributes
     ----------
-    points
+    needs_points
         Whether it needs the points of frames, not only prepared views.
     """
 
-    points: ClassVar[bool] = True
+    needs_points: ClassVar[bool] = True
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
-        """Add the next frame that has a pose, if `points` is set."""
+        """Add the next frame that has a pose, if `needs_points` is set."""
         ...
 
     def finish(
@@ -151,7 +151,7 @@ class NoRefinement(RefinementMethod):
 
 
 class _Idle(Refiner):
-    points: ClassVar[bool] = False
+    needs_points: ClassVar[bool] = False
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`: views are not needed."""
@@ -233,7 +233,7 @@ class Joint(Bounded, RefinementMethod):
 
 
 class _Joint(Refiner):
-    points: ClassVar[bool] = False
+    needs_points: ClassVar[bool] = False
 
     def __init__(self, options: Joint, views: ViewStore[PreparedView]) -> None:
         self._options = options
@@ -281,7 +281,7 @@ class _Joint(Refiner):
 
 
 @dataclass(frozen=True)
-class _Evidence:
+class _Checks:
     """Evidence of refined views: errors of the camera, and (m, rad) of the poses by halves."""
 
     calibration: Callable[[], CalibrationCheck]
@@ -294,14 +294,14 @@ def _refine_jointly(
     poses: Float64,
     measured: SensorPriors,
     _: ViewStore[PreparedView],
-) -> tuple[Refined, _Evidence]:
+) -> tuple[Refined, _Checks]:
     """Refine all views at once."""
     views = [_sampled(p, options) for p in posed]
     priors = _priors([p.index for p in posed], measured)
     error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
     refined = refine(views, poses, options.alignment, calibrate=error_indices, priors=priors)
     all_views = RefinedSubmap(views, np.arange(len(views)), refined, priors)
-    return refined, _Evidence(
+    return refined, _Checks(
         lambda: _calibration_check(all_views, options),
         lambda: _split_half_errors(all_views, options),
     )
@@ -313,7 +313,7 @@ def _refine_in_submaps(
     poses: Float64,
     measured: SensorPriors,
     store: ViewStore[PreparedView],
-) -> tuple[Refined, _Evidence]:
+) -> tuple[Refined, _Checks]:
     """Refine submap by submap."""
     ids = [p.index for p in posed]
     refined, parts = refine_submaps(
@@ -327,7 +327,7 @@ def _refine_in_submaps(
         [_ERROR_INDEX[name] for name in options.calibrate],
     )
     checks, splits = [check for check, _ in parts], [split for _, split in parts]
-    return refined, _Evidence(lambda: combine_checks(checks), lambda: _mean_errors(splits))
+    return refined, _Checks(lambda: combine_checks(checks), lambda: _mean_errors(splits))
 
 
 def _evaluate(

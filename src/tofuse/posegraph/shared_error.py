@@ -99,8 +99,8 @@ def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagree
     per_weight = 1 / np.maximum(weight, 1e-12)
     valid = weight > _MIN_WEIGHT * np.median(weight, axis=1, keepdims=True)
     A = np.zeros((count, kernels.UNKNOWNS, kernels.UNKNOWNS))
-    A[:, _UPPER[0], _UPPER[1]] = rows[:, kernels.H : kernels.G]
-    A[:, _UPPER[1], _UPPER[0]] = rows[:, kernels.H : kernels.G]
+    A[:, _UPPER[0], _UPPER[1]] = rows[:, kernels.PRODUCTS : kernels.GRADIENT]
+    A[:, _UPPER[1], _UPPER[0]] = rows[:, kernels.PRODUCTS : kernels.GRADIENT]
     normal = A[:, :7, :7] * np.outer(_UNITS, _UNITS) + np.eye(7) / _PRIOR_SIGMA**2
     J = np.zeros((count, PATCHES, 7))
     J[..., :6] = sums[..., kernels.PATCH_RESPONSE :]

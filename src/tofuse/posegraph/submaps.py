@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import pair_equations as kernels
-from tofuse.kernels.executors import executor
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.joint_alignment import Refined, Support, refine, spread_evenly, support_of
 from tofuse.posegraph.levenberg import LevenbergMarquardt
@@ -136,17 +135,16 @@ def refine_submaps(
     priors
         Returns the priors on views by their positions, None for all.
     evaluate
-        Called with each refined submap, possibly in another process.
+        Called with each refined submap.
     calibrate
         Errors of the camera to estimate: separately in each submap; the result is their median.
     """
     pairs = spread_evenly(overlaps(coarse, poses, options.overlap)[0], options.neighbours)
     parts = [s for s in submaps(world_centroids(coarse, poses), pairs, max_size) if len(s.pairs)]
 
-    def arguments(k: int) -> tuple[Any, ...]:
+    results = [
         # Only one submap's views are in memory at a time.
-        part = parts[k]
-        return (
+        _refine_submap(
             load(part.views),
             part,
             poses[part.views],
@@ -155,8 +153,8 @@ def refine_submaps(
             priors(part.views),
             evaluate,
         )
-
-    results = executor().map(_refine_submap, len(parts), arguments, large=True)
+        for part in parts
+    ]
     refined_submaps = [(part, refined) for part, (refined, _) in zip(parts, results, strict=True)]
     if not refined_submaps:
         empty = np.zeros(0)

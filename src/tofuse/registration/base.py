@@ -108,7 +108,7 @@ class Registration:
         return self.probability is not None and self.probability >= PROBABLE
 
     @property
-    def stands_alone(self) -> bool:
+    def is_decisive(self) -> bool:
         """Whether it needs no confirmation by another measurement.
 
         It is accepted, or a search and an alignment agree on a probable pose.

@@ -25,7 +25,7 @@ from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
 from tofuse.registration.consensus import are_distinct
 from tofuse.registration.fpfh import candidates
 from tofuse.registration.icp import Icp
-from tofuse.registration.pose_probability import CERTAIN, CLOUDS, Evidence
+from tofuse.registration.pose_probability import CERTAIN, CLOUDS, PoseEvidence
 from tofuse.registration.reduce import extent
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.remapping import Remapping
@@ -66,7 +66,7 @@ _NO_RIVAL = _Pose(np.eye(4), Agreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
-class _Views:
+class _CloudViews:
     """Two clouds averaged to the same resolution."""
 
     source: Frame
@@ -76,7 +76,7 @@ class _Views:
     rng: np.random.Generator
 
     @classmethod
-    def of(cls, source: Frame, target: Frame, rng: np.random.Generator) -> _Views:
+    def of(cls, source: Frame, target: Frame, rng: np.random.Generator) -> _CloudViews:
         size = max(_finest(source), _finest(target))
         size, data, model = CoarseToFine(points=_POINTS).finest(source, target, size)
         maps = CloudMap.of(data, size, source), CloudMap.of(model, size, target)
@@ -107,8 +107,8 @@ class _Views:
         aligned = self.evaluated(T)
         return aligned if aligned.agreement.score >= initial.agreement.score else initial
 
-    def evidence(self, pose: _Pose, lead: float | None = None, degenerate: int = 0) -> Evidence:
-        return Evidence.of(pose.agreement, lead, degenerate, CLOUDS)
+    def evidence(self, pose: _Pose, lead: float | None = None, degenerate: int = 0) -> PoseEvidence:
+        return PoseEvidence.of(pose.agreement, lead, degenerate, CLOUDS)
 
     def with_information(self, registration: Registration) -> Registration:
         """Return a registration with its information matrix."""
@@ -195,7 +195,7 @@ def _registered(
     *,
     always_search: bool = False,
 ) -> Registration:
-    views = _Views.of(source, target, rng)
+    views = _CloudViews.of(source, target, rng)
     start = np.eye(4) if guess is None else guess
     local = replace(views.refined(start), guess=start)
     if views.evidence(local).probability >= CERTAIN and not always_search:
@@ -255,7 +255,7 @@ def with_cloud_information(
 
     Images of clouds have holes, and their noise is unknown.
     """
-    views = _Views.of(source, target, rng)
+    views = _CloudViews.of(source, target, rng)
     unobservable = cloud_unobservable(
         views.source_map, views.target_map, registration.T_target_source
     )
@@ -266,7 +266,7 @@ def follow_clouds(
     source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
 ) -> Registration:
     """Register two clouds from a guess (4, 4) without a search; see `register_clouds`."""
-    views = _Views.of(source, target, rng)
+    views = _CloudViews.of(source, target, rng)
     local = replace(views.refined(guess), guess=guess)
     if views.evidence(local).probability < CERTAIN:
         coarse = CoarseToFine().register(source, target, guess, rng)
@@ -275,7 +275,7 @@ def follow_clouds(
     return views.with_information(_registration(views, local))
 
 
-def _proposed(views: _Views, start: Float64) -> list[_Pose]:
+def _proposed(views: _CloudViews, start: Float64) -> list[_Pose]:
     """Return the poses of feature matching, and of coarse-to-fine ICP if they lack support.
 
     Raises
@@ -319,7 +319,7 @@ def _refinement_stages(size: float) -> tuple[Icp, ...]:
     return wide, replace(wide, rejectors=(MaxDistance(2.0),), stopping=SmallStep(1e-3, 8))
 
 
-def _rival(views: _Views, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _Pose:
+def _rival(views: _CloudViews, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _Pose:
     """Return the first pose distinct from the best one, whose alignment is T (4, 4).
 
     With large noise, subsets of the points may converge to different poses, but all points to the
@@ -339,7 +339,9 @@ def _rival(views: _Views, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _P
     return _NO_RIVAL
 
 
-def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = None) -> Registration:
+def _registration(
+    views: _CloudViews, best: _Pose, poses: Sequence[_Pose] | None = None
+) -> Registration:
     """Align all points from the best pose and evaluate its evidence.
 
     The rival is one of `poses`, the best first; None if the pose is not compared with others.

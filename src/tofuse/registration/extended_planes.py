@@ -13,8 +13,14 @@ from tofuse.kernels.plane_extension import extend_planes
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.registration.view_noise import inverse, scale_at, shared_sigma, with_shared_error
-from tofuse.registration.view_planes import edge_pixels_by_noise, fitted_planes
+from tofuse.registration.view_planes import (
+    edge_pixels_by_noise,
+    fitted_planes,
+    inverse,
+    scale_at,
+    shared_sigma,
+    with_shared_error,
+)
 
 # Pixels whose noise exceeds the typical one by this ratio get planes of their own, if they are at
 # least this fraction of a view.

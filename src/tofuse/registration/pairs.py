@@ -14,6 +14,7 @@ import numpy as np
 from tofuse.arrays import Bool, Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
+from tofuse.kernels import tukey
 from tofuse.kernels.cloud_sums import direction_products, plane_sums
 from tofuse.kernels.icp import transform_points
 from tofuse.normal import robust_sigma
@@ -182,7 +183,7 @@ def loss_weights(loss: Loss, residual: Float64, resolution: float) -> Float64:
         return np.minimum(1.0, _HUBER / np.maximum(x, _HUBER))
     if loss == "cauchy":
         return 1 / (1 + (x / _CAUCHY) ** 2)
-    return np.where(x < _TUKEY, (1 - (x / _TUKEY) ** 2) ** 2, 0.0)
+    return tukey.weights((x / _TUKEY) ** 2)
 
 
 def variance_of(square: float, weight: Float64, resolution: float) -> float:

@@ -29,8 +29,8 @@ _MIN_SUPPORT, _MIN_LEAD, CONTRADICTION = 0.25, 0.1, 0.08
 
 
 @dataclass(frozen=True)
-class Model:
-    """Coefficients of `Evidence.search_regressors` and `Evidence.local_regressors`."""
+class ProbabilityModel:
+    """Coefficients of `PoseEvidence.search_regressors` and `PoseEvidence.local_regressors`."""
 
     search: tuple[float, ...]
     local: tuple[float, ...]
@@ -38,15 +38,15 @@ class Model:
 
 # Fitted to images: 351 searched poses, 370 poses aligned from a guess. On held-out scenes the area
 # under the ROC curve is 0.99 and 0.91.
-IMAGES = Model(search=(0.34, 6.17, -6.40, -4.21), local=(0.55, 7.01, -6.02))
+IMAGES = ProbabilityModel(search=(0.34, 6.17, -6.40, -4.21), local=(0.55, 7.01, -6.02))
 # Fitted to clouds: 146 searched poses. On 226 held-out pairs, some without overlap, the area is
 # 0.98; of 90 accepted poses 2 were wrong, one by 0.13 m, one in a room of the same size without a
 # known viewpoint.
-CLOUDS = Model(search=(-1.82, 6.08, -4.78, -0.69), local=(-2.29, 9.96, -5.5))
+CLOUDS = ProbabilityModel(search=(-1.82, 6.08, -4.78, -0.69), local=(-2.29, 9.96, -5.5))
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PoseEvidence:
     """Evidence for and against a pose.
 
     Attributes
@@ -65,7 +65,7 @@ class Evidence:
     contradiction: float
     margin: float | None = None
     degenerate: int = 0
-    model: Model = IMAGES
+    model: ProbabilityModel = IMAGES
 
     @classmethod
     def of(
@@ -73,8 +73,8 @@ class Evidence:
         agreement: Agreement,
         margin: float | None = None,
         degenerate: int = 0,
-        model: Model = IMAGES,
-    ) -> Evidence:
+        model: ProbabilityModel = IMAGES,
+    ) -> PoseEvidence:
         """Return the evidence from the agreement of both views."""
         return cls(agreement.support, agreement.contradiction, margin, degenerate, model)
 

@@ -16,21 +16,19 @@ from tofuse.kernels.view_planes import albedo_image, halve, smooth_and_slope
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.registration.projection import Projection, projection_of
 from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.registration.view_noise import (
+from tofuse.registration.view_planes import (
+    edge_pixels,
+    fitted_planes,
     inverse,
     noise_law,
     noise_scale,
+    pixels_with_plane,
+    row_chunks,
     scale_at,
     shared_sigma,
     stated_sigma,
     typical_noise,
     with_shared_error,
-)
-from tofuse.registration.view_planes import (
-    edge_pixels,
-    fitted_planes,
-    pixels_with_plane,
-    row_chunks,
 )
 
 # Sparse images are not halved below this width and height.

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -49,26 +50,32 @@ PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 6, 0.0, 0
 COARSE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
 
 
+FitKind = Literal["usual", "noisy", "conflicting"]
+
+
 @dataclass(frozen=True, eq=False)
-class Assessment:
+class FitQuality:
     """Comparison of an alignment with those of this camera.
 
     Attributes
     ----------
-    is_usual
-        Whether all statistics are within the usual range.
+    kind
+        "usual" if all statistics are within the usual range; "noisy" if only the noise exceeds it;
+        "conflicting" if the views conflict.
     excess
         Sum of the logarithms by which statistics exceed their usual value; 0 for a usual fit.
     reason
         Statistic that is out of range, with its usual value; empty for a usual fit.
-    conflict
-        Whether the views conflict, rather than only being noisier.
     """
 
-    is_usual: bool
-    excess: float
-    reason: str
-    conflict: bool = False
+    kind: FitKind
+    excess: float = 0.0
+    reason: str = ""
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether all statistics are within the usual range."""
+        return self.kind == "usual"
 
 
 class FitStatistics:
@@ -133,20 +140,20 @@ class FitStatistics:
                 sigma[k] = np.hypot(np.sqrt(weight) * spread, np.sqrt(1 - weight) * sigma[k])
         self._mean, self._sigma = mean, np.maximum(sigma, _MIN_SIGMA)
 
-    def assess(self, aligned: Aligned) -> Assessment:
+    def assess(self, aligned: Aligned) -> FitQuality:
         """Compare an alignment with the distribution."""
         if aligned.inliers < _MIN_INLIERS:
             reason = f"{aligned.inliers} inliers are too few to determine a pose"
-            return Assessment(False, np.inf, reason, True)
+            return FitQuality("conflicting", np.inf, reason)
         statistics = _statistics(aligned)
         deviation = np.where(np.isfinite(statistics), statistics - self._mean, 0.0)
         worst = int(np.argmax(deviation / self._sigma))
         if deviation[worst] <= self._sigmas * self._sigma[worst]:
-            return Assessment(True, 0.0, "")
+            return FitQuality("usual")
         excess = float(np.maximum(deviation, 0).sum())
         reason = _describe(worst, float(statistics[worst]), float(self._mean[worst]))
         conflict = np.delete(deviation > self._sigmas * self._sigma, _NOISE).any()
-        return Assessment(False, excess, reason, bool(conflict))
+        return FitQuality("conflicting" if conflict else "noisy", excess, reason)
 
 
 def _statistics(aligned: Aligned) -> Float64:

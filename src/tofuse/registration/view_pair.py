@@ -17,7 +17,7 @@ from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.registration.agreement import Agreement, AgreementOptions, agreement
 from tofuse.registration.base import Registration
-from tofuse.registration.pose_probability import CERTAIN, CONTRADICTION, Evidence
+from tofuse.registration.pose_probability import CERTAIN, CONTRADICTION, PoseEvidence
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import (
     UNITS,
@@ -79,9 +79,9 @@ class _Pose:
         return len(self.aligned.unobservable)
 
     @property
-    def evidence(self) -> Evidence:
+    def evidence(self) -> PoseEvidence:
         """Evidence without a comparison with rivals."""
-        return Evidence.of(self.agreement, degenerate=self.degenerate)
+        return PoseEvidence.of(self.agreement, degenerate=self.degenerate)
 
     @property
     def is_certain(self) -> bool:
@@ -272,7 +272,7 @@ class _Pair:
             best = self.preferred(local, best, search)
         rival = self.rival(best, match)
         lead = best.agreement.score - (max(rival.score, 0.0) if rival else 0.0)
-        evidence = Evidence.of(best.agreement, lead, best.degenerate)
+        evidence = PoseEvidence.of(best.agreement, lead, best.degenerate)
         return replace(self.registration(best, evidence, rival), confirmed=confirmed)
 
     def refined(self, match: Match, search: Search) -> _Pose:
@@ -315,7 +315,7 @@ class _Pair:
         return next(rivals, None)
 
     def registration(
-        self, pose: _Pose, evidence: Evidence, rival: Candidate | None
+        self, pose: _Pose, evidence: PoseEvidence, rival: Candidate | None
     ) -> Registration:
         """Return a pose as a registration."""
         registration = registration_of(pose.aligned, pose.T_target_source, self._covariance(pose))

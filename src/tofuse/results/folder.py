@@ -46,7 +46,6 @@ FILES = (
     "mesh.gltf",
     "trajectory.kitti.txt",
     "trajectory.log",
-    "view.npz",  # of version 0.2
 )
 # The model of a separate component is in its own folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
@@ -260,10 +259,9 @@ def component_number(folder: Path) -> int | None:
 
 
 _FILE = "|".join(map(re.escape, FILES))
-_TILE = rf"{TILES}/({re.escape(TILESET)}|\d{{1,4}}(-\d{{1,9}}){{3}}\.glb)"
 _EXPORTED = rf"nerfstudio/(transforms\.json|points\.ply|{_IMAGES})|colmap/{_IMAGES}"
 RESULT = Contract(
-    re.compile(rf"({_COMPONENT.pattern}/)?({_FILE}|{_TILE})|{_EXPORTED}", re.ASCII),
+    re.compile(rf"({_COMPONENT.pattern}/)?({_FILE})|{_EXPORTED}", re.ASCII),
     "run.json",
     is_result,
 )

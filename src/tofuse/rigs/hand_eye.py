@@ -17,6 +17,7 @@ from scipy import stats
 from tofuse.arrays import Bool, Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
+from tofuse.kernels import tukey
 from tofuse.normal import MEDIAN_OF_NORMAL
 from tofuse.registration.projective import UNITS
 from tofuse.rigs.clocks import Lag, lag_between
@@ -261,7 +262,7 @@ def _sigma(e: Float64) -> Float64:
 def _weights(e: Float64, sigma: Float64) -> Float64:
     """Return Tukey's biweights (N, 6) of the residual of each pose."""
     ratio = ((e / sigma) ** 2).mean(1) / _TUKEY**2
-    return np.repeat((np.maximum(1 - ratio, 0) ** 2)[:, None], 6, axis=1)
+    return np.repeat(tukey.weights(ratio)[:, None], 6, axis=1)
 
 
 def _covariance(J: Float64, e: Float64, times: Float64, sigma: Float64) -> Float64:

@@ -18,6 +18,7 @@ import numpy as np
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import rig_residuals as kernels
+from tofuse.kernels import tukey
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.pair_equations import Round
@@ -77,7 +78,7 @@ class JointOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class RigView:
     """A view of a rig's camera at an instant."""
 
     camera: int
@@ -115,7 +116,7 @@ class JointPoses:
 
 
 def refine_together(
-    views: Sequence[View], poses: Float64, options: JointOptions | None = None
+    views: Sequence[RigView], poses: Float64, options: JointOptions | None = None
 ) -> JointPoses:
     """Optimise the poses and depth offsets of all cameras jointly.
 
@@ -132,14 +133,14 @@ def refine_together(
 
 
 def refined_poses(
-    views: Sequence[View], poses: Float64, options: JointOptions | None = None
+    views: Sequence[RigView], poses: Float64, options: JointOptions | None = None
 ) -> Float64:
     """Return the poses (K, 4, 4) of `refine_together` alone, without covariances."""
     return _optimised(views, poses, options or JointOptions()).poses
 
 
 def disagreements(
-    views: Sequence[View], poses: Float64
+    views: Sequence[RigView], poses: Float64
 ) -> dict[tuple[int, int], tuple[float, int]]:
     """Return, by pair of cameras, the median distance between surfaces in m and the pixel count."""
     system = _System(views, poses, JointOptions())
@@ -187,7 +188,7 @@ def distances_between(
     return np.asarray(distance[valid], np.float64)
 
 
-def _optimised(views: Sequence[View], poses: Float64, options: JointOptions) -> _System:
+def _optimised(views: Sequence[RigView], poses: Float64, options: JointOptions) -> _System:
     system = _System(views, poses, options)
     for stage in options.rounds:
         for _ in range(stage.iterations):
@@ -199,7 +200,7 @@ def _optimised(views: Sequence[View], poses: Float64, options: JointOptions) -> 
 class _System:
     """The unknowns, and the compared pairs of views."""
 
-    def __init__(self, views: Sequence[View], poses: Float64, options: JointOptions) -> None:
+    def __init__(self, views: Sequence[RigView], poses: Float64, options: JointOptions) -> None:
         self.options = options
         self.views = views
         self.poses = np.array(poses, float)
@@ -326,8 +327,7 @@ class _System:
             row[:, kernels.RESIDUAL_VARIANCE] * self.scale[target, source] ** 2 + inflation_m**2
         )
         e2 = row[:, kernels.RESIDUAL] ** 2 / (variance * self.options.robust**2)
-        f = np.maximum(1 - e2, 0)
-        return f * f / variance, f * (1 - 5 * e2) / variance
+        return tukey.weights(e2) / variance, tukey.slopes(e2) / variance
 
     def _prior(self) -> Float64:
         """Return the (7,) information of a camera's prior, in units."""

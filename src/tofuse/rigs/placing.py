@@ -25,12 +25,12 @@ from tofuse.posegraph.view_store import SampledView
 from tofuse.recordings.recording import evenly_spaced
 from tofuse.registration.agreement import AgreementOptions, Comparison
 from tofuse.registration.base import PROBABLE
-from tofuse.registration.pose_probability import ACCEPTED, Evidence
+from tofuse.registration.pose_probability import ACCEPTED, PoseEvidence
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.search import DISTINCT_M, Search, SearchOptions, are_distinct_poses
 from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import register_pair
-from tofuse.rigs.joint import JointOptions, View, refined_poses
+from tofuse.rigs.joint import JointOptions, RigView, refined_poses
 
 V = TypeVar("V")
 
@@ -116,12 +116,12 @@ class _Placer:
         for a, b in itertools.combinations(sorted(self._depth), 2):
             self._search(a, b)
 
-    def _views_to_refine(self) -> list[View]:
+    def _views_to_refine(self) -> list[RigView]:
         instants = range(max(map(len, self._views), default=0))
         full = [m for m in instants if all(self._views[c][m] is not None for c in self._depth)]
         selected = _evenly(full or list(instants), _REFINED)
         return [
-            View(c, m, SampledView.of(view, _POINTS))
+            RigView(c, m, SampledView.of(view, _POINTS))
             for m in selected
             for c, views in enumerate(self._views)
             if (view := views[m]) is not None
@@ -321,7 +321,7 @@ class _Placer:
         rival_scores = self._rivals({**others, camera: pose}, camera, candidates)
         rival = next(rival_scores, 0.0)
         overlap = max(sum(s.overlap for s in agreements), 1e-9)
-        evidence = Evidence(
+        evidence = PoseEvidence(
             support=min(sum(s.support for s in agreements), 1.0),
             contradiction=sum(s.contradiction for s in agreements) / overlap,
             margin=score - rival,

@@ -35,7 +35,7 @@ from tofuse.results.verdict import ranked, verdict_of
 from tofuse.rigs.calibrate import Motion, cameras_of, moves
 from tofuse.rigs.check import CameraMotion, compare
 from tofuse.rigs.inputs import Camera
-from tofuse.rigs.joint import View, disagreements, refine_together
+from tofuse.rigs.joint import RigView, disagreements, refine_together
 from tofuse.rigs.rig_trajectory import track_rig
 
 # No loops are searched: poses of the rig are final.
@@ -282,7 +282,7 @@ def _check_calibration(
         frame = source.read(int(index))
         if isinstance(frame, RangeFrame):
             c = int(source.camera[index])
-            views.append(View(c, 0, SampledView.of(cameras[c].surface(frame), _POINTS)))
+            views.append(RigView(c, 0, SampledView.of(cameras[c].surface(frame), _POINTS)))
     calibrated = np.stack([camera.T_rig_camera for camera in rig.cameras])
     refined = refine_together(views, calibrated)
     recalibrated = tuple(

@@ -26,7 +26,7 @@ from tofuse.recordings.still import average_of, change_between
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.rigs.clocks import lag_between
 from tofuse.rigs.inputs import Camera
-from tofuse.rigs.joint import JointPoses, View, distances_between, refine_together, refined_poses
+from tofuse.rigs.joint import JointPoses, RigView, distances_between, refine_together, refined_poses
 from tofuse.rigs.placing import Placement, place
 
 # A camera is static if this fraction of its pixels measure the same surface in this fraction of the
@@ -148,12 +148,14 @@ def _with_clock_uncertainty(
     )
 
 
-def _views(instants: Sequence[Sequence[PreparedView | None]], order: Sequence[int]) -> list[View]:
+def _views(
+    instants: Sequence[Sequence[PreparedView | None]], order: Sequence[int]
+) -> list[RigView]:
     """Return the views of the placed cameras, numbered in their order."""
     count = max((len(row) for row in instants), default=1)
     points = int(np.clip(_TOTAL_POINTS / count, _MIN_POINTS, _POINTS))
     return [
-        View(k, m, SampledView.of(view, points))
+        RigView(k, m, SampledView.of(view, points))
         for k, c in enumerate(order)
         for m, view in enumerate(instants[c])
         if view is not None

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
 from tofuse.arrays import Float64, Int64
-from tofuse.kernels.kdtree import KdTree, checked_points, run_queries
-from tofuse.lab.kernels.cloud_search import ball_moments, kdtree_nearest_featured
+from tofuse.kernels.kdtree import KdTree, checked_points
 
 
 class FeaturedKdTree(KdTree):
@@ -31,28 +31,28 @@ class FeaturedKdTree(KdTree):
         space (M,) in m^2, infinity there.
         """
         array = checked_points(queries, "queries")
-        index = np.empty(len(array), np.int64)
-        distance2 = np.empty(len(array))
-        limit = max_distance * max_distance if max_distance >= 0 else -1.0
-        point_rows, query_rows = (
-            np.ascontiguousarray(f, np.float64) for f in (features, query_features)
+        index = np.full(len(array), -1, np.int64)
+        distance2 = np.full(len(array), np.inf)
+        usable = np.flatnonzero(np.isfinite(features).all(1))
+        tree = cKDTree(_joined(self._points[usable], features[usable], weight))
+        joined = _joined(array, query_features, weight)
+        open_queries = np.flatnonzero(
+            (self.nearest(array, max_distance)[0] >= 0) & np.isfinite(joined).all(1)
         )
-
-        def search(a: int, b: int) -> None:
-            kdtree_nearest_featured(
-                *self._tree,
-                self._depth,
-                point_rows,
-                array[a:b],
-                query_rows[a:b],
-                tolerance,
-                weight,
-                limit,
-                index[a:b],
-                distance2[a:b],
-            )
-
-        run_queries(search, len(array))
+        k = 0
+        while len(open_queries) and k < len(usable):
+            # Several times as many candidates for queries without a permitted one.
+            k = min(max(4 * k, 4), len(usable))
+            candidates = usable[tree.query(joined[open_queries], range(1, k + 1))[1]]
+            difference = array[open_queries, None] - self._points[candidates]
+            squared = (difference**2).sum(2)
+            gap = np.abs(query_features[open_queries, None] - features[candidates])
+            permitted = (squared <= max_distance**2) & (gap <= tolerance).all(2)
+            first, found = permitted.argmax(1), permitted.any(1)
+            rows = np.flatnonzero(found)
+            index[open_queries[found]] = candidates[rows, first[rows]]
+            distance2[open_queries[found]] = squared[rows, first[rows]]
+            open_queries = open_queries[~found]
         return index, distance2
 
     def moments(self, centres: ArrayLike, radius: float) -> Float64:
@@ -62,11 +62,15 @@ class FeaturedKdTree(KdTree):
         m^2; zero where there are none.
         """
         array = checked_points(centres, "centres")
-        out = np.empty((len(array), 3))
-        _, arranged, axes, cuts = self._tree
+        balls = self._tree.query_ball_point(array, radius, return_sorted=True)
+        matrices = np.zeros((len(array), 3, 3))
+        for k, members in enumerate(balls):
+            if members:
+                x = self._points[members] - array[k]
+                matrices[k] = x.T @ x / len(members)
+        return np.linalg.eigvalsh(matrices)
 
-        def compute(a: int, b: int) -> None:
-            out[a:b] = ball_moments(arranged, axes, cuts, self._depth, array[a:b], radius)
 
-        run_queries(compute, len(array))
-        return out
+def _joined(points: Float64, features: Float64, weight: float) -> Float64:
+    """Coordinates (N, 3 + K) of points and features, whose distance is to be minimised."""
+    return np.hstack([points, np.sqrt(weight) * features])

@@ -116,7 +116,7 @@ class RelaxationMethod(Bounded, RefinementMethod):
 
 
 class _Relaxation(Refiner):
-    points: ClassVar[bool] = True
+    needs_points: ClassVar[bool] = True
 
     def __init__(self, method: RelaxationMethod) -> None:
         self._method = method
