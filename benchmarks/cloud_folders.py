@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.arrays import Float32, Float64
+from tofuse.engine.arrays import Float32, Float64
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -27,8 +27,8 @@ import pairs
 import scoring
 import tofuse
 from sequences import DATA
-from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.ply import write_ply
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.ply import write_ply
 
 # Pose (4, 4) in a common frame and points (n, 3) of each view.
 Views = Iterator[tuple[Float64, Float32]]

@@ -6,7 +6,7 @@ how many are accepted and wrong; also for Open3D's RANSAC over FPFH with point-t
 KISS-Matcher, if installed, with voxels of 1/100 of the target's extent. Clouds have at most 20,000
 points. "moved" clouds were transformed into another frame, so that their viewpoint is unknown; in
 "sparse" pairs the source has a tenth of the target's points. `fit` fits the logistic models of
-`tofuse.registration.pose_probability` to simulated pairs. `viewpoints` counts the clouds whose
+`tofuse.engine.search.pose_probability` to simulated pairs. `viewpoints` counts the clouds whose
 origin is taken for the viewpoint.
 
     python benchmarks/cloud_pairs.py table [--data ../shared/data] [--kinds scans]
@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.arrays import Float32, Float64
+from tofuse.engine.arrays import Float32, Float64
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -35,15 +35,15 @@ import pairs
 import tofuse
 from peers import kiss_global, o3d_global
 from sequences import DATA
-from tofuse.errors import RegistrationError
-from tofuse.geometry import se3
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.geometry import se3
 from tofuse.lab.simulation import scene as scenes
-from tofuse.recordings.frames import CloudFrame, Frame
-from tofuse.recordings.open import open_recording
-from tofuse.registration.base import Registration
-from tofuse.registration.cloud_pair import follow_clouds, register_clouds
-from tofuse.registration.pose_probability import CLOUDS, PoseEvidence
-from tofuse.registration.viewpoint import viewpoint_of
+from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.alignment.base import Registration
+from tofuse.engine.clouds.cloud_pair import follow_clouds, register_clouds
+from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
+from tofuse.engine.clouds.viewpoint import viewpoint_of
 
 POINTS = 20_000
 RIGHT_M, RIGHT_FRACTION, RIGHT_DEG = 0.1, 0.05, 4.0

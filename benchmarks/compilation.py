@@ -4,7 +4,7 @@
     python benchmarks/compilation.py --list RECORDING [RECORDING ...]
 
 Each row is a `tofuse run` in its own process: with all kernels cached, with an empty cache, and
-with an empty cache and the second process (`tofuse.kernels.ahead`). `--list` writes the list of
+with an empty cache and the second process (`tofuse.engine.compute.ahead`). `--list` writes the list of
 kernels that this process compiles, from those that runs of the recordings call.
 """
 
@@ -21,15 +21,15 @@ from typing import Any
 
 import numba
 
-from tofuse.kernels.ahead import DTYPES
+from tofuse.engine.compute.ahead import DTYPES
 
 ROOT = Path(__file__).resolve().parents[1]
 LIST = ROOT / "src" / "tofuse" / "kernels" / "signatures.txt"
 ALONE = (
-    "import sys; from tofuse.kernels import ahead; ahead.usable_cores = lambda: 1; "
-    "from tofuse.cli import main; sys.exit(main())"
+    "import sys; from tofuse.engine.compute import ahead; ahead.usable_cores = lambda: 1; "
+    "from tofuse.apps.cli import main; sys.exit(main())"
 )
-BOTH = "import sys; from tofuse.cli import main; sys.exit(main())"
+BOTH = "import sys; from tofuse.apps.cli import main; sys.exit(main())"
 _NAMES = {name: short for short, name in DTYPES.items()} | {"bool": "b1"}
 
 
@@ -92,7 +92,7 @@ def called(recordings: list[Path]) -> list[str]:
             def on_start(self, event: Any) -> None:
                 nonlocal depth
                 kernel = event.data["dispatcher"].py_func
-                if depth == 0 and kernel.__module__.startswith("tofuse.kernels."):
+                if depth == 0 and kernel.__module__.startswith("tofuse.engine.compute."):
                     name = f"{kernel.__module__.rsplit('.', 1)[1]}.{kernel.__name__}"
                     lines.setdefault(signature_line(name, event.data["args"]))
                 depth += 1
@@ -102,7 +102,7 @@ def called(recordings: list[Path]) -> list[str]:
                 depth -= 1
 
         with event.install_listener("numba:compile", Listener()):
-            from tofuse.cli import main
+            from tofuse.apps.cli.program import main
 
             for recording in recordings:
                 main(

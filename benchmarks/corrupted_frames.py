@@ -19,12 +19,12 @@ from pathlib import Path
 import numpy as np
 
 import sequences
-from tofuse.arrays import Bool, Float64
-from tofuse.geometry import se3
-from tofuse.pipeline.config import from_method
-from tofuse.pipeline.mapper import Mapper
-from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.results.types import Reconstruction
+from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.quality.types import Reconstruction
 
 Corruption = Callable[[RangeFrame], RangeFrame]
 

@@ -85,8 +85,8 @@ def peer_run(source: Path, chosen: Sequence[str], threads: int) -> Usage:
 def peer(source: str, out: Path, start: int, end: int | None, every: int, threads: int) -> None:
     """Entry point of that process."""
     from peers.o3d import DenseSlam
-    from tofuse.recordings.frames import RangeFrame
-    from tofuse.recordings.open import open_recording
+    from tofuse.engine.frames.frames import RangeFrame
+    from tofuse.formats.recordings.open import open_recording
 
     recording = open_recording(source).select(start, end, every)
     session, frames = None, 0

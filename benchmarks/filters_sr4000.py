@@ -16,17 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.filters.angle import NeighbourhoodAngle
-from tofuse.filters.base import Filter, apply_filters
-from tofuse.filters.confidence import Confidence
-from tofuse.filters.distance import Distance
-from tofuse.filters.neighbours import NeighbourFraction
+from tofuse.engine.filters.angle import NeighbourhoodAngle
+from tofuse.engine.filters.base import Filter, apply_filters
+from tofuse.engine.filters.confidence import Confidence
+from tofuse.engine.filters.distance import Distance
+from tofuse.engine.filters.neighbours import NeighbourFraction
 from tofuse.lab.methods.filters_amplitude import Amplitude
 from tofuse.lab.methods.filters_median import Median
 from tofuse.lab.methods.filters_neighbour_distance import NeighbourDistance
 from tofuse.lab.methods.filters_temporal import TemporalDeviation, z_deviation
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.open import open_recording
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.open import open_recording
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "sr4000_corridor"
 

@@ -36,28 +36,28 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.arrays import Bool, Float64
-from tofuse.corrections.multipath import Multipath
-from tofuse.files.spill import Spill
-from tofuse.filters.base import apply_filters
-from tofuse.fusion.layout import Layout
-from tofuse.fusion.mesh import Mesh
-from tofuse.fusion.model import ModelBuilder
-from tofuse.fusion.options import Fusion
-from tofuse.fusion.range_view import RangeView
-from tofuse.fusion.stored_views import StoredViews
-from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
-from tofuse.geometry import se3
-from tofuse.kernels.threads import threads
+from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.sensor.multipath_correction import Multipath
+from tofuse.engine.compute.spill import Spill
+from tofuse.engine.filters.base import apply_filters
+from tofuse.engine.fusion.layout import Layout
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.model import ModelBuilder
+from tofuse.engine.fusion.options import Fusion
+from tofuse.engine.fusion.range_view import RangeView
+from tofuse.engine.fusion.stored_views import StoredViews
+from tofuse.engine.fusion.tsdf import Volume, fitting_voxel, fuse_surface
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import threads
 from tofuse.lab.experiments.surface_error import Surface, compare_surfaces, distances
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import RecordingPlan, plan
-from tofuse.pipeline.config import Config, from_method
-from tofuse.pipeline.mapper import Mapper
-from tofuse.recordings.correction_file import corrected_depth
-from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.prepared_view import prepare_view
-from tofuse.registration.surface_options import SurfaceOptions
+from tofuse.engine.mapping.config import Config, from_method
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.formats.recordings.correction_file import corrected_depth
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 
 _NOISE = Effects.none(shot_noise=True, ambient=1.0, saturation=True, mixed_pixels=True, wrap=True)
 _NOISE_FRACTION = 0.01  # of the range

@@ -26,25 +26,25 @@ from functools import cached_property
 import numpy as np
 
 import sequences
-from tofuse.arrays import Bool, Float64
-from tofuse.evaluation.trajectory import align
-from tofuse.fusion.mesh import Mesh
-from tofuse.fusion.range_view import RangeView
-from tofuse.fusion.tsdf import fuse_surface
-from tofuse.geometry import se3
-from tofuse.kernels.threads import threads
+from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.quality.trajectory import align
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.range_view import RangeView
+from tofuse.engine.fusion.tsdf import fuse_surface
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import threads
 from tofuse.lab.experiments.surface_error import Surface, distances
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import RecordingPlan, plan, write
-from tofuse.pipeline.adaptation import adapted
-from tofuse.pipeline.config import from_method
-from tofuse.pipeline.preparation import Preparation
-from tofuse.pipeline.reconstruct import reconstruct
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.open import open_recording
-from tofuse.recordings.recording import Recording
-from tofuse.registration.prepared_view import prepare_view
-from tofuse.registration.surface_options import SurfaceOptions
+from tofuse.engine.mapping.adaptation import adapted
+from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.preparation import Preparation
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 
 OUT = sequences.OUT / "recordings" / "ghosts"
 WALKS = (

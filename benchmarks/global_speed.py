@@ -27,18 +27,18 @@ from pathlib import Path
 import numpy as np
 
 import sequences
-from tofuse.fusion.options import Fusion
-from tofuse.kernels.threads import run_chunks, threads
-from tofuse.odometry.keyframes import Keyframes
-from tofuse.pipeline.config import from_method
-from tofuse.pipeline.mapper import Mapper
-from tofuse.pipeline.progress import Stopwatch
-from tofuse.posegraph.revisits import Revisits
-from tofuse.posegraph.view_store import SampledView, Spacing, ViewStore, overlaps
-from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.prepared_view import PreparedView, prepare_view
-from tofuse.registration.search import Search
-from tofuse.results.types import Reconstruction
+from tofuse.engine.fusion.options import Fusion
+from tofuse.engine.compute.thread_pool import run_chunks, threads
+from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.progress import Stopwatch
+from tofuse.engine.loops.revisits import Revisits
+from tofuse.engine.stored_views.view_store import SampledView, Spacing, ViewStore, overlaps
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.views.prepared_view import PreparedView, prepare_view
+from tofuse.engine.search.search import Search
+from tofuse.engine.quality.types import Reconstruction
 
 
 def there_and_back(frames: list[RangeFrame], count: int) -> Iterator[RangeFrame]:

@@ -20,14 +20,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.filters.base import apply_filters
-from tofuse.geometry import se3
-from tofuse.kernels.threads import threads
-from tofuse.pipeline.methods import thesis
-from tofuse.recordings.frames import Frame
-from tofuse.registration.icp import algorithm_1
-from tofuse.registration.selectors import Random
+from tofuse.engine.arrays import Float64
+from tofuse.engine.filters.base import apply_filters
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.mapping.methods import thesis
+from tofuse.engine.frames.frames import Frame
+from tofuse.engine.clouds.icp import algorithm_1
+from tofuse.engine.clouds.selectors import Random
 
 POINTS = 1000
 RESOLUTION_M = 0.01
@@ -111,7 +111,7 @@ def filtered_views(path: str | None, frames: int) -> tuple[list[Frame], Float64 
 
         recording = simulate_recording("room", frames=frames)
     else:
-        from tofuse.recordings.open import open_recording
+        from tofuse.formats.recordings.open import open_recording
 
         recording = open_recording(path).select(end=frames)
     views = [apply_filters(thesis("range").filters, frame)[0] for frame in recording]

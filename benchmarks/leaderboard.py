@@ -34,8 +34,8 @@ from boards.sequences_board import Sequences
 from boards.statements import statements
 from boards.two_views import TwoViews
 from sequences import DATA, OUT
-from tofuse.files.atomic import write_text
-from tofuse.kernels.threads import threads
+from tofuse.formats.files.atomic import write_text
+from tofuse.engine.compute.thread_pool import threads
 
 BOARDS: dict[str, Board] = {board.name: board for board in (TwoViews(), Graphs(), Sequences())}
 KEPT = OUT / "leaderboard"

@@ -20,9 +20,9 @@ from scipy.spatial import cKDTree
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from sequences import DATA, KINDS
-from tofuse.arrays import Float64
-from tofuse.kernels.kdtree import KdTree
-from tofuse.kernels.threads import threads
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.compute.thread_pool import threads
 
 _REPEATS, _K = 7, 12
 

@@ -17,18 +17,18 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.calibration.noise_estimation import NoiseFit, estimate_noise
-from tofuse.files.images import read_image
-from tofuse.geometry.cameras import Pinhole
+from tofuse.apps.calibration.noise_estimation import NoiseFit, estimate_noise
+from tofuse.formats.files.images import read_image
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CAMERAS, camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.noise import noise_model_for
-from tofuse.recordings.open import open_recording
-from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.recordings.still import average_still
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.noise.choice import noise_model_for
+from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.formats.recordings.still import average_still
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 ZENSE = Pinhole(640, 480, 456.636, 456.226, 342.983, 233.82)
@@ -74,7 +74,7 @@ def show(title: str, recording: Recording) -> None:
 
 def family_sigma(prior: object, fit: NoiseFit, k: int) -> float:
     """Sigma of the family's model at the centre of a bin."""
-    from tofuse.sensor.noise import NoiseModel
+    from tofuse.engine.noise.model import NoiseModel
 
     assert isinstance(prior, NoiseModel)
     centre = float(np.sqrt(fit.bins[k].low * fit.bins[k].high))

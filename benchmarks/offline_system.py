@@ -35,8 +35,8 @@ def ate(times: Sequence[float], poses: object, recording: object) -> str:
     """Errors of a trajectory as text."""
     import numpy as np
 
-    from tofuse.evaluation.trajectory import evaluate_trajectory
-    from tofuse.recordings.recording import Recording
+    from tofuse.engine.quality.trajectory import evaluate_trajectory
+    from tofuse.engine.frames.recording import Recording
 
     assert isinstance(recording, Recording)
     if recording.reference is None:
@@ -83,8 +83,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not options.no_first:
             ours(source, chosen, options.threads, out)
         seconds, peak = ours(source, chosen, options.threads, out)
-        from tofuse.files.trajectory import read_tum
-        from tofuse.recordings.open import open_recording
+        from tofuse.formats.files.trajectory import read_tum
+        from tofuse.formats.recordings.open import open_recording
 
         recording = open_recording(source).select(options.start, options.end, options.every)
         times, poses = read_tum(out / "trajectory.txt")

@@ -16,8 +16,8 @@ import unusual
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.paths import Path
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
 from unusual import Unusual
 
 VIEWS = 14

@@ -3,7 +3,7 @@
 `table` prints, by the gap in frames, how many poses are right (within 0.1 m and 4 degrees), how
 many of those are accepted, and how many are accepted and wrong; also for Open3D's RANSAC over FPFH
 with point-to-plane ICP, if installed. `fit` fits the logistic models of
-`tofuse.registration.pose_probability` to simulated pairs, some of them without overlap, and prints
+`tofuse.engine.search.pose_probability` to simulated pairs, some of them without overlap, and prints
 their coefficients, with area under the ROC curve and calibration on held-out scenes. For these
 models a pose is right within 5 % of the depth and 4 degrees. `cameras` tests the models on the
 other cameras and scenes of `pair_views`, compared with models fitted on all of these except the
@@ -34,7 +34,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.arrays import Bool, Float64, Intp
+from tofuse.engine.arrays import Bool, Float64, Intp
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -42,27 +42,20 @@ import tofuse
 from pair_views import TAKEN, recorded
 from peers import o3d_global
 from sequences import DATA, OUT, kinect_loop
-from tofuse.errors import RegistrationError
-from tofuse.geometry import se3
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.geometry import se3
 from tofuse.lab.simulation.record import simulate
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.open import open_recording
-from tofuse.recordings.recording import Recording
-from tofuse.registration.agreement import agreement
-from tofuse.registration.any_pair import AnyPair
-from tofuse.registration.base import Registration
-from tofuse.registration.cloud_pair import register_clouds
-from tofuse.registration.pose_probability import (
-    ACCEPTED,
-    IMAGES,
-    RIGHT_FRACTION,
-    RIGHT_RAD,
-    PoseEvidence,
-    logistic,
-)
-from tofuse.registration.prepared_view import PreparedView, prepare_view
-from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.registration.view_pair import follow, register_pair
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.search.pair_agreement import agreement
+from tofuse.engine.clouds.any_pair import AnyPair
+from tofuse.engine.alignment.base import Registration
+from tofuse.engine.clouds.cloud_pair import register_clouds
+from tofuse.engine.search.pose_probability import ACCEPTED, IMAGES, RIGHT_FRACTION, RIGHT_RAD, PoseEvidence, logistic
+from tofuse.engine.views.prepared_view import PreparedView, prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.search.view_pair import follow, register_pair
 
 RIGHT_M, RIGHT_DEG = 0.1, 4.0
 # Ridge penalty: keeps coefficients finite where few pairs are perfectly separable.

@@ -30,15 +30,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import Float64, Intp
-from tofuse.geometry import se3
-from tofuse.geometry.cameras import Pinhole, scaled
-from tofuse.kernels.threads import run_chunks
-from tofuse.kernels.threads import threads as using_threads
-from tofuse.odometry.keyframes import Keyframes
-from tofuse.pipeline.mapper import Mapper
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.open import open_recording
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import Pinhole, scaled
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute.thread_pool import threads as using_threads
+from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.open import open_recording
 
 LENGTH = 60  # frames of the sequence that is played forwards and backwards
 BANDWIDTH_BYTES = 1 << 28

@@ -27,7 +27,7 @@ from tofuse.lab.experiments.statements import STATEMENTS, Results, judge_all
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.scenes import room
 from tofuse.lab.simulation.texture import Material
-from tofuse.pipeline.progress import Silent
+from tofuse.engine.mapping.progress import Silent
 
 _PEAKS_SEEDS = 5
 

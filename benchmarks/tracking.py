@@ -27,21 +27,21 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.arrays import Float64
+from tofuse.engine.arrays import Float64
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import peers
 import sequences
-from tofuse.errors import InputError
-from tofuse.evaluation.consistency import map_consistency
-from tofuse.evaluation.trajectory import evaluate_trajectory
-from tofuse.files.atomic import write_text
-from tofuse.geometry import se3
-from tofuse.kernels.threads import threads as using_threads
-from tofuse.odometry.keyframes import Keyframes
-from tofuse.pipeline.methods import default
-from tofuse.recordings.frames import RangeFrame
+from tofuse.engine.errors import InputError
+from tofuse.engine.quality.consistency import map_consistency
+from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.formats.files.atomic import write_text
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import threads as using_threads
+from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.mapping.methods import default
+from tofuse.engine.frames.frames import RangeFrame
 
 WARM_UP = 5
 CONSISTENCY_FRAMES = 60

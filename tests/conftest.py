@@ -16,7 +16,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Compile kernels once where several processes share the tests; each would compile its own."""
     several = getattr(config.option, "numprocesses", None)
     if several and not hasattr(config, "workerinput") and not config.option.collectonly:
-        from tofuse.kernels import ahead
+        from tofuse.engine.compute import ahead
 
         if not ahead.compiled_marker().exists():
             with ahead.compiling_in_background():

@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from tofuse.arrays import Float64, UInt8
-from tofuse.files.geometry_record import GeometryRecord
-from tofuse.geometry import se3
-from tofuse.lab.kernels import bvh
+from tofuse.engine.arrays import Float64, UInt8
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.engine.geometry import se3
+from tofuse.lab.simulation import bvh_kernels as bvh
 
 SIZE = (720, 480)  # pixels
 TILT, TURN = np.radians(48.0), np.radians(62.0)

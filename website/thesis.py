@@ -15,8 +15,8 @@ import sys
 import tomllib
 from pathlib import Path
 
-from tofuse import parts
-from tofuse.pipeline.config import PACKAGES
+from tofuse.engine import parts
+from tofuse.engine.mapping.config import PACKAGES
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "thesis.md"

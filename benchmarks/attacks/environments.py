@@ -21,7 +21,7 @@ _BEGIN = """
 import os, sys
 sys.argv[0] = "tofuse"
 {setup}
-from tofuse.cli import console
+from tofuse.apps.cli import console
 sys.exit(console())
 """
 
@@ -98,13 +98,13 @@ time.time = lambda: 2e9 - 1000.0 * next(passed)
 time.time_ns = lambda: int(1e9 * time.time())
 """
 STAGES = (
-    ("opening", "tofuse.pipeline.run:adapted"),
-    ("tracking", "tofuse.pipeline.reconstruct:push_frames"),
-    ("a model", "tofuse.pipeline.backend:BackEnd.run"),
-    ("writing", "tofuse.results.output:_write_files"),
-    ("moving", "tofuse.files.staging:replace_folder"),
-    ("moves", "tofuse.files.staging:_move_into_place"),
-    ("the end", "tofuse.pipeline.tracked_file:TrackedFile.remove"),
+    ("opening", "tofuse.apps.jobs.running:adapted"),
+    ("tracking", "tofuse.engine.mapping.reconstruction:push_frames"),
+    ("a model", "tofuse.engine.mapping.backend:BackEnd.run"),
+    ("writing", "tofuse.apps.results.output:_write_files"),
+    ("moving", "tofuse.formats.files.staging:replace_folder"),
+    ("moves", "tofuse.formats.files.staging:_move_into_place"),
+    ("the end", "tofuse.apps.jobs.tracked_file:TrackedFile.remove"),
 )
 _SIGNALS = ("SIGINT", "SIGTERM")
 

@@ -103,7 +103,7 @@ def _with_camera(make: Callable[[Path], Any], inside: str, format_: str) -> Subj
 
 
 def _depth_png(path: Path) -> None:
-    from tofuse.files.images import png_bytes
+    from tofuse.formats.files.images import png_bytes
 
     path.write_bytes(png_bytes(np.full((24, 32), 2000, np.uint16)))
 
@@ -111,8 +111,8 @@ def _depth_png(path: Path) -> None:
 def _recording(
     inside: str, format_: str | None, camera: str | None = None
 ) -> Callable[[Path], str]:
-    from tofuse.errors import TofuseError
-    from tofuse.recordings.open import open_recording
+    from tofuse.engine.errors import TofuseError
+    from tofuse.formats.recordings.open import open_recording
 
     def read(folder: Path) -> str:
         about = None if camera is None else folder / camera
@@ -128,9 +128,9 @@ def _recording(
 
 
 def _scans() -> dict[str, Subject]:
-    from tofuse.files.e57 import write_e57
-    from tofuse.files.geometry_record import GeometryRecord
-    from tofuse.files.las import write_las
+    from tofuse.formats.files.e57 import write_e57
+    from tofuse.formats.files.geometry_record import GeometryRecord
+    from tofuse.formats.files.las import write_las
 
     points = np.random.default_rng(5).normal(size=(60, 3))
 
@@ -222,24 +222,24 @@ def _possible(
 
 def _small() -> dict[str, Subject]:
     """Single files: graphs, poses, cameras, configurations, meshes, tracked frames."""
-    from tofuse.batch.jobs import read_jobs
-    from tofuse.calibration.lens_files import read_lens_file
-    from tofuse.cli.batching import run_arguments
-    from tofuse.files.pose import read_pose
-    from tofuse.files.tables import read_columns
-    from tofuse.files.trajectory_formats import read_poses
-    from tofuse.odometry.base import Step
-    from tofuse.pipeline import tracked_file
-    from tofuse.pipeline.config import changed, from_method, read_changes
-    from tofuse.pipeline.frame_log import FrameLog
-    from tofuse.pipeline.tracked_file import TrackedFile
-    from tofuse.posegraph.g2o import read_g2o
-    from tofuse.posegraph.given_loops import read_loops
-    from tofuse.recordings.camera_file import read_camera_file
-    from tofuse.recordings.open import read_reference
-    from tofuse.recordings.rig import read_rig
-    from tofuse.results.types import FrameRecord
-    from tofuse.sensor.noise import NoiseModel, RangeLaw
+    from tofuse.apps.batch.jobs import read_jobs
+    from tofuse.apps.calibration.lens_files import read_lens_file
+    from tofuse.apps.cli.batching import run_arguments
+    from tofuse.formats.files.pose import read_pose
+    from tofuse.formats.files.tables import read_columns
+    from tofuse.formats.files.trajectory_formats import read_poses
+    from tofuse.engine.tracking.base import Step
+    from tofuse.apps.jobs import tracked_file
+    from tofuse.engine.mapping.config import changed, from_method, read_changes
+    from tofuse.engine.mapping.frame_log import FrameLog
+    from tofuse.apps.jobs.tracked_file import TrackedFile
+    from tofuse.formats.files.g2o import read_g2o
+    from tofuse.formats.files.given_loops import read_loops
+    from tofuse.formats.recordings.camera_file import read_camera_file
+    from tofuse.formats.recordings.open import read_reference
+    from tofuse.formats.recordings.rig import read_rig
+    from tofuse.engine.quality.types import FrameRecord
+    from tofuse.engine.noise.model import NoiseModel, RangeLaw
 
     pose = [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     still = np.eye(4).tolist()
@@ -324,14 +324,14 @@ def _results() -> dict[str, Subject]:
 
 def _result(out: Path) -> None:
     import made_results
-    from tofuse.results.folder import OutputFolder
-    from tofuse.results.output import write_result
+    from tofuse.apps.results.folder import OutputFolder
+    from tofuse.apps.results.output import write_result
 
     write_result(made_results.torn(), OutputFolder(out))
 
 
 def _load(out: Path) -> None:
-    from tofuse.results.loading import load_result
+    from tofuse.apps.results.loading import load_result
 
     load_result(out)
 
@@ -345,7 +345,7 @@ def _with_images(folder: Path) -> None:
 
 
 def _export(folder: Path) -> None:
-    from tofuse.results.export import export
+    from tofuse.apps.export.exporting import export
 
     export(folder / "result", ["log", "nerfstudio"], folder / "exported", overwrite=True)
 
@@ -357,9 +357,9 @@ def _session(out: Path) -> None:
 
 
 def _load_session(out: Path) -> None:
-    from tofuse.errors import InputError
-    from tofuse.pipeline.progress import Silent
-    from tofuse.pipeline.sessions import read_sessions
+    from tofuse.engine.errors import InputError
+    from tofuse.engine.mapping.progress import Silent
+    from tofuse.apps.jobs.sessions import read_sessions
 
     try:
         read_sessions([out], 1, Silent())
@@ -477,7 +477,7 @@ class _TooLong(BaseException):
 
 def attack(name: str, subject: Subject, seed: int, folder: Path) -> str:
     """Read one damaged copy, and return "read", "rejected", or the fault."""
-    from tofuse.errors import TofuseError
+    from tofuse.engine.errors import TofuseError
 
     rng = np.random.default_rng([seed, *name.encode()])
     for _ in range(1 + int(rng.integers(2))):

@@ -7,8 +7,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
-from tofuse import parts
-from tofuse.pipeline.config import PACKAGES
+from tofuse.engine import parts
+from tofuse.engine.mapping.config import PACKAGES
 
 Score = Mapping[str, float]
 

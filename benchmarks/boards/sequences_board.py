@@ -16,12 +16,12 @@ import peers
 import sequences
 import tracking
 from boards import Board, Score, default_made
-from tofuse.arrays import Float64
-from tofuse.errors import TofuseError
-from tofuse.evaluation.trajectory import evaluate_trajectory
-from tofuse.parts import name_of
-from tofuse.pipeline.config import changed, from_method
-from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import TofuseError
+from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.engine.parts import name_of
+from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.mapping.reconstruction import reconstruct
 
 # Title, and which images are used: every n-th.
 SCENES = {

@@ -8,9 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import Bool, Float64, Intp
-from tofuse.geometry.cameras import Camera, Pinhole
-from tofuse.recordings.frames import RangeFrame
+from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.cameras.cameras import Camera, Pinhole
+from tofuse.engine.frames.frames import RangeFrame
 
 MAX_DEPTH_M = 12.0
 

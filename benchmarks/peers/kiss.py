@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from peers import MAX_DEPTH_M, Method, Session
-from tofuse.arrays import Float64
-from tofuse.recordings.frames import RangeFrame
+from tofuse.engine.arrays import Float64
+from tofuse.engine.frames.frames import RangeFrame
 
 _VOXELS_M = (0.05, 0.1)
 _THRESHOLDS_M = (0.1, 0.5)

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.errors import RegistrationError
-from tofuse.recordings.frames import Frame
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import Frame
 
 
 def method(voxel_m: float) -> Callable[[Frame, Frame], Float64] | None:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from peers import MAX_DEPTH_M, Method, PinholeImages, Session, grid
-from tofuse.arrays import Float64, Int64, UInt8
-from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.arrays import Float64, Int64, UInt8
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 
 # Counts per metre: 0.2 mm, so that rounding is far below the noise of any camera.
 _SCALE = 5000.0

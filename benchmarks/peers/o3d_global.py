@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.errors import RegistrationError
-from tofuse.recordings.frames import Frame
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import Frame
 
 # As in the tutorial: 5 cm for a room. Radii and distances are multiples of it.
 VOXEL_M = 0.05

@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 
 from peers import PinholeImages
-from tofuse.arrays import Float64, UInt8, UInt16
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.open import open_recording
+from tofuse.engine.arrays import Float64, UInt8, UInt16
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.open import open_recording
 
 _SCALE = 5000.0  # counts per metre
 _LEAST_WEIGHT = 1.0  # extract surfaces seen by a single frame

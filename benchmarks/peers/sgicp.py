@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from peers import MAX_DEPTH_M, Method, Session
-from tofuse.arrays import Float64
-from tofuse.recordings.frames import RangeFrame
+from tofuse.engine.arrays import Float64
+from tofuse.engine.frames.frames import RangeFrame
 
 # Each peer is tried with every pair of these; the best on the first frames is used.
 _VOXELS_M = (0.02, 0.04, 0.08)

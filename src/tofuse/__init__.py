@@ -18,80 +18,71 @@ from typing import TYPE_CHECKING, Any
 from tofuse._version import __version__
 
 if TYPE_CHECKING:
-    from tofuse.api.result import Result, load, merge, reconstruct
-    from tofuse.errors import InputError, OutputError, RegistrationError, TofuseError
-    from tofuse.evaluation.changes import Change
-    from tofuse.fusion.cloud import Cloud
-    from tofuse.fusion.mesh import Mesh
-    from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, Rational, RayTable
-    from tofuse.inspection.inspect import inspect_recording as inspect
-    from tofuse.live.player import Player
-    from tofuse.pipeline.config import Config
-    from tofuse.pipeline.evaluating import Evaluation, evaluate
-    from tofuse.pipeline.judging import Judgement, judge
-    from tofuse.pipeline.mapper import Mapper
-    from tofuse.posegraph.accuracy import Accuracy
-    from tofuse.posegraph.graph import LoopRecord, PoseGraph
-    from tofuse.recordings.frames import CloudFrame, RangeFrame
-    from tofuse.recordings.from_arrays import from_arrays
-    from tofuse.recordings.open import open_recording as open  # noqa: A004
-    from tofuse.recordings.recording import Recording
-    from tofuse.registration.base import Registration
-    from tofuse.registration.register import register
-    from tofuse.results.types import (
-        Component,
-        Diagnostics,
-        FrameRecord,
-        Reason,
-        Reconstruction,
-        SessionChange,
-        SessionPair,
-        SessionRecord,
-    )
+    from tofuse.apps.api.result import Result, load, merge, reconstruct
+    from tofuse.engine.errors import InputError, OutputError, RegistrationError, TofuseError
+    from tofuse.engine.quality.change_detection import Change
+    from tofuse.engine.fusion.cloud import Cloud
+    from tofuse.engine.fusion.mesh import Mesh
+    from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, Rational, RayTable
+    from tofuse.apps.inspection.inspect import inspect_recording as inspect
+    from tofuse.apps.live.player import Player
+    from tofuse.engine.mapping.config import Config
+    from tofuse.apps.jobs.evaluating import Evaluation, evaluate
+    from tofuse.apps.jobs.judging import Judgement, judge
+    from tofuse.engine.mapping.mapper import Mapper
+    from tofuse.engine.quality.accuracy import Accuracy
+    from tofuse.engine.graph.graph import LoopRecord, PoseGraph
+    from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+    from tofuse.engine.frames.from_arrays import from_arrays
+    from tofuse.formats.recordings.open import open_recording as open  # noqa: A004
+    from tofuse.engine.frames.recording import Recording
+    from tofuse.engine.alignment.base import Registration
+    from tofuse.engine.clouds.pair import register
+    from tofuse.engine.quality.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction, SessionChange, SessionPair, SessionRecord
 
 _HOMES = {
-    "Accuracy": "tofuse.posegraph.accuracy",
-    "BrownConrady": "tofuse.geometry.cameras",
-    "Change": "tofuse.evaluation.changes",
-    "Cloud": "tofuse.fusion.cloud",
-    "CloudFrame": "tofuse.recordings.frames",
-    "Component": "tofuse.results.types",
-    "Config": "tofuse.pipeline.config",
-    "Diagnostics": "tofuse.results.types",
-    "Evaluation": "tofuse.pipeline.evaluating",
-    "Fisheye": "tofuse.geometry.cameras",
-    "FrameRecord": "tofuse.results.types",
-    "InputError": "tofuse.errors",
-    "Judgement": "tofuse.pipeline.judging",
-    "LoopRecord": "tofuse.posegraph.graph",
-    "Mapper": "tofuse.pipeline.mapper",
-    "Mesh": "tofuse.fusion.mesh",
-    "OutputError": "tofuse.errors",
-    "Pinhole": "tofuse.geometry.cameras",
-    "Player": "tofuse.live.player",
-    "PoseGraph": "tofuse.posegraph.graph",
-    "RangeFrame": "tofuse.recordings.frames",
-    "Rational": "tofuse.geometry.cameras",
-    "RayTable": "tofuse.geometry.cameras",
-    "Reason": "tofuse.results.types",
-    "Reconstruction": "tofuse.results.types",
-    "Recording": "tofuse.recordings.recording",
-    "Registration": "tofuse.registration.base",
-    "RegistrationError": "tofuse.errors",
-    "Result": "tofuse.api.result",
-    "SessionChange": "tofuse.results.types",
-    "SessionPair": "tofuse.results.types",
-    "SessionRecord": "tofuse.results.types",
-    "TofuseError": "tofuse.errors",
-    "evaluate": "tofuse.pipeline.evaluating",
-    "from_arrays": "tofuse.recordings.from_arrays",
-    "inspect": "tofuse.inspection.inspect",
-    "judge": "tofuse.pipeline.judging",
-    "load": "tofuse.api.result",
-    "merge": "tofuse.api.result",
-    "open": "tofuse.recordings.open",
-    "reconstruct": "tofuse.api.result",
-    "register": "tofuse.registration.register",
+    "Accuracy": "tofuse.engine.quality.accuracy",
+    "BrownConrady": "tofuse.engine.cameras.cameras",
+    "Change": "tofuse.engine.quality.change_detection",
+    "Cloud": "tofuse.engine.fusion.cloud",
+    "CloudFrame": "tofuse.engine.frames.frames",
+    "Component": "tofuse.engine.quality.types",
+    "Config": "tofuse.engine.mapping.config",
+    "Diagnostics": "tofuse.engine.quality.types",
+    "Evaluation": "tofuse.apps.jobs.evaluating",
+    "Fisheye": "tofuse.engine.cameras.cameras",
+    "FrameRecord": "tofuse.engine.quality.types",
+    "InputError": "tofuse.engine.errors",
+    "Judgement": "tofuse.apps.jobs.judging",
+    "LoopRecord": "tofuse.engine.graph.graph",
+    "Mapper": "tofuse.engine.mapping.mapper",
+    "Mesh": "tofuse.engine.fusion.mesh",
+    "OutputError": "tofuse.engine.errors",
+    "Pinhole": "tofuse.engine.cameras.cameras",
+    "Player": "tofuse.apps.live.player",
+    "PoseGraph": "tofuse.engine.graph.graph",
+    "RangeFrame": "tofuse.engine.frames.frames",
+    "Rational": "tofuse.engine.cameras.cameras",
+    "RayTable": "tofuse.engine.cameras.cameras",
+    "Reason": "tofuse.engine.quality.types",
+    "Reconstruction": "tofuse.engine.quality.types",
+    "Recording": "tofuse.engine.frames.recording",
+    "Registration": "tofuse.engine.alignment.base",
+    "RegistrationError": "tofuse.engine.errors",
+    "Result": "tofuse.apps.api.result",
+    "SessionChange": "tofuse.engine.quality.types",
+    "SessionPair": "tofuse.engine.quality.types",
+    "SessionRecord": "tofuse.engine.quality.types",
+    "TofuseError": "tofuse.engine.errors",
+    "evaluate": "tofuse.apps.jobs.evaluating",
+    "from_arrays": "tofuse.engine.frames.from_arrays",
+    "inspect": "tofuse.apps.inspection.inspect",
+    "judge": "tofuse.apps.jobs.judging",
+    "load": "tofuse.apps.api.result",
+    "merge": "tofuse.apps.api.result",
+    "open": "tofuse.formats.recordings.open",
+    "reconstruct": "tofuse.apps.api.result",
+    "register": "tofuse.engine.clouds.pair",
 }
 
 __all__ = [

@@ -2,6 +2,6 @@
 
 import sys
 
-from tofuse.cli import console
+from tofuse.apps.cli.program import console
 
 sys.exit(console())

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.cli.progress import TerminalProgress
-from tofuse.errors import InputError
-from tofuse.geometry import se3
+from tofuse.apps.cli.progress import TerminalProgress
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
-from tofuse.recordings.convert import convert
-from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.icp import Icp
+from tofuse.formats.export.conversion import convert
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.clouds.icp import Icp
 
 
 @pytest.fixture(scope="module")
 def arrays():
     """Depth images (N, H, W) in a corner with a box, K and the poses (N, 4, 4)."""
-    from tofuse.geometry.cameras import Pinhole
+    from tofuse.engine.cameras.cameras import Pinhole
 
     camera = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
     rays = np.concatenate([camera.rays().astype(float), np.ones((60, 80, 1))], -1)

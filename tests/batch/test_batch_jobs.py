@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tofuse.batch.jobs import Job, parse_bytes, read_jobs
-from tofuse.cli.run_arguments import run_arguments
-from tofuse.errors import InputError
+from tofuse.apps.batch.jobs import Job, parse_bytes, read_jobs
+from tofuse.apps.cli.run_arguments import run_arguments
+from tofuse.engine.errors import InputError
 
 
 def jobs_of(folder: Path, text: str, name: str = "list.txt") -> tuple[Job, ...]:

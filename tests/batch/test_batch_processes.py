@@ -16,8 +16,8 @@ from types import ModuleType
 import pytest
 
 from paths import BENCHMARKS
-from tofuse.batch import cluster
-from tofuse.cli import main
+from tofuse.apps.batch import cluster
+from tofuse.apps.cli.program import main
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 JOBS = [f"seed-{k}" for k in range(2)]
@@ -234,7 +234,7 @@ def test_workers_without_tofuse_are_reported(
 
 def test_job_ends_with_its_parent(room_recording: Path, tmp_path: Path) -> None:
     words = [str(tmp_path / "a.jpg"), str(room_recording), "--out", str(tmp_path / "out")]
-    job = subprocess.Popen([sys.executable, "-m", "tofuse.cli.job", *words], stdin=subprocess.PIPE)
+    job = subprocess.Popen([sys.executable, "-m", "tofuse.apps.cli.job", *words], stdin=subprocess.PIPE)
     assert job.stdin is not None
     job.stdin.close()
     assert job.wait(60) == -signal.SIGKILL

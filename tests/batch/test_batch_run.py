@@ -15,16 +15,16 @@ from pathlib import Path
 
 import pytest
 
-from tofuse.batch import batch as loop
-from tofuse.batch.batch import pending, run_batch, status_of
-from tofuse.batch.cluster import DaskWorkers
-from tofuse.batch.folder import BatchFolder, Record
-from tofuse.batch.jobs import Job
-from tofuse.batch.table import COLUMNS, duration, write_table
-from tofuse.batch.work import Task, work
-from tofuse.batch.workers import LocalWorkers, Workers
-from tofuse.cli import main
-from tofuse.errors import InputError, OutputError
+from tofuse.apps.batch import batch as loop
+from tofuse.apps.batch.batch import pending, run_batch, status_of
+from tofuse.apps.batch.cluster import DaskWorkers
+from tofuse.apps.batch.folder import BatchFolder, Record
+from tofuse.apps.batch.jobs import Job
+from tofuse.apps.batch.table import COLUMNS, duration, write_table
+from tofuse.apps.batch.work import Task, work
+from tofuse.apps.batch.workers import LocalWorkers, Workers
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError, OutputError
 
 Outcome = Callable[[Task], Record]
 JOBS = tuple(Job(name, f"/{name}") for name in ("a", "b", "c"))
@@ -269,7 +269,7 @@ def test_full_disk_is_reported(folder: BatchFolder, monkeypatch) -> None:
     def full(*_args: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("tofuse.files.atomic.os.replace", full)
+    monkeypatch.setattr("tofuse.formats.files.atomic.os.replace", full)
     with pytest.raises(OutputError, match="no space left on device"):
         run(folder, Scripted())
 
@@ -281,8 +281,8 @@ def test_memory_limits_concurrent_jobs(monkeypatch) -> None:
         go_on.wait(60)
         return failed(task)
 
-    monkeypatch.setattr("tofuse.batch.workers.machine_memory", lambda: 100)
-    monkeypatch.setattr("tofuse.batch.workers.work", wait)
+    monkeypatch.setattr("tofuse.apps.batch.workers.machine_memory", lambda: 100)
+    monkeypatch.setattr("tofuse.apps.batch.workers.work", wait)
     half = Task(replace(JOBS[0], memory=50), "/out", 1)
     unstated = Task(JOBS[0], "/out", 1)
     workers = LocalWorkers(4)

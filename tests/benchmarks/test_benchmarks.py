@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from paths import BENCHMARKS
-from tofuse.evaluation.consistency import map_consistency
-from tofuse.geometry import se3
-from tofuse.geometry.cameras import BrownConrady
-from tofuse.kernels import steps
+from tofuse.engine.quality.consistency import map_consistency
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import BrownConrady
+from tofuse.engine.alignment import step_kernels as steps
 from tofuse.lab.experiments.peaks import chain
-from tofuse.posegraph.build import Measured
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.native import RecordingWriter
+from tofuse.engine.graph.build import Measured
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.native import RecordingWriter
 
 
 @pytest.fixture

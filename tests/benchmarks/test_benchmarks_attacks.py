@@ -15,7 +15,7 @@ import pytest
 
 import tofuse
 from paths import BENCHMARKS
-from tofuse.recordings.open import readers
+from tofuse.formats.recordings.open import readers
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs alarms and FIFOs")
 

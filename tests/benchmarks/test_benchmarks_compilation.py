@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from paths import BENCHMARKS
-from tofuse.kernels import ahead
-from tofuse.kernels.moving_objects import Cells, Limits
+from tofuse.engine.compute import ahead
+from tofuse.engine.tracking.moving_object_kernels import Cells, Limits
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from paths import BENCHMARKS
-from tofuse import parts
-from tofuse.geometry import se3
-from tofuse.registration.base import Registrar, Registration
+from tofuse.engine import parts
+from tofuse.engine.geometry import se3
+from tofuse.engine.alignment.base import Registrar, Registration
 
 
 class Inline:

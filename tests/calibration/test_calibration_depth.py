@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 
 from boxes_in_room import views_in_room
-from tofuse.calibration.board import Board
-from tofuse.calibration.depth import DepthFit, calibrate_depth, compose
-from tofuse.calibration.plane_views import PlaneView, board_planes, scene_planes
-from tofuse.cli import main
-from tofuse.errors import InputError
-from tofuse.geometry import se3
-from tofuse.geometry.cameras import Pinhole
+from tofuse.apps.calibration.board import Board
+from tofuse.apps.calibration.depth import DepthFit, calibrate_depth, compose
+from tofuse.apps.calibration.plane_views import PlaneView, board_planes, scene_planes
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
 from tofuse.lab.simulation.sensor import factory_correction
-from tofuse.recordings.native import RecordingWriter
-from tofuse.recordings.open import open_recording
-from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.depth_correction import DepthCorrection
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.sensor.depth_correction import DepthCorrection
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 CAMERA = Pinhole(48, 36, 45.0, 45.0, 23.5, 17.5)

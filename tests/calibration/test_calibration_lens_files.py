@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from tofuse.calibration.lens_files import read_lens_file
-from tofuse.cli import main
-from tofuse.errors import InputError
-from tofuse.geometry.cameras import BrownConrady, Fisheye, Rational
-from tofuse.recordings.camera_file import load_camera
+from tofuse.apps.calibration.lens_files import read_lens_file
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError
+from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Rational
+from tofuse.formats.recordings.camera_file import load_camera
 
 ROS = """image_width: 800
 image_height: 600

@@ -11,21 +11,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.calibration.noise_estimation import estimate_noise
-from tofuse.cli import main
-from tofuse.errors import InputError
-from tofuse.geometry.cameras import Pinhole
+from tofuse.apps.calibration.noise_estimation import estimate_noise
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
-from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.recordings.native import RecordingWriter
-from tofuse.recordings.noise import noise_model_for
-from tofuse.recordings.open import open_recording
-from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.noise import NOISE, NoiseModel
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.engine.noise.choice import noise_model_for
+from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.noise.model import NOISE, NoiseModel
 
 CAMERA = Pinhole(80, 60, 60.0, 60.0, 39.5, 29.5)
 

@@ -14,11 +14,11 @@ import pytest
 
 import made_exports
 from paths import BENCHMARKS
-from tofuse import cli
-from tofuse.cli import main, run_command
-from tofuse.cli.streams import SafeStream, safe_streams
-from tofuse.errors import Ended
-from tofuse.kernels import cores, jit
+from tofuse.apps.cli import program as cli
+from tofuse.apps.cli.program import main, run_command
+from tofuse.apps.cli.streams import SafeStream, safe_streams
+from tofuse.engine.errors import Ended
+from tofuse.engine.compute import cores, jit
 from tofuse.lab.simulation.record import simulate
 
 sys.path.insert(0, str(BENCHMARKS))
@@ -299,7 +299,7 @@ def test_container_quotas_limit_cores(name, tmp_path, monkeypatch) -> None:
 
 
 def test_second_run_into_same_folder_is_rejected(clouds: Path, tmp_path: Path, capfd) -> None:
-    from tofuse.results.folder import OutputFolder
+    from tofuse.apps.results.folder import OutputFolder
 
     with OutputFolder(tmp_path / "out"):
         assert main(["run", "no such recording", "--out", str(tmp_path / "out")]) == 2

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from cli_calls import listing, refuses
-from tofuse.cli import main
-from tofuse.files import reading
-from tofuse.files.images import read_image, write_png
+from tofuse.apps.cli.program import main
+from tofuse.formats.files import reading
+from tofuse.formats.files.images import read_image, write_png
 
 
 @pytest.fixture
@@ -423,11 +423,11 @@ def test_unexpected_errors_are_one_line(capfd, monkeypatch) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO), "some/file")
 
     monkeypatch.setattr(reading, "read_text", fail)
-    monkeypatch.setattr("tofuse.pipeline.evaluating.read_poses", fail)
+    monkeypatch.setattr("tofuse.apps.jobs.evaluating.read_poses", fail)
     refuses(capfd, "evaluate", "a", "b", says=("some/file", os.strerror(errno.EIO)))
 
     def too_much(*_args: object, **_options: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("tofuse.pipeline.evaluating.read_poses", too_much)
+    monkeypatch.setattr("tofuse.apps.jobs.evaluating.read_poses", too_much)
     refuses(capfd, "evaluate", "a", "b", says=("out of memory", "--every"))

@@ -12,16 +12,9 @@ import time
 
 import pytest
 
-from tofuse.cli import progress as module
-from tofuse.cli.progress import (
-    Health,
-    JsonProgress,
-    Pace,
-    QuietProgress,
-    TerminalProgress,
-    progress_for,
-)
-from tofuse.results.types import FrameRecord
+from tofuse.apps.cli import progress as module
+from tofuse.apps.cli.progress import Health, JsonProgress, Pace, QuietProgress, TerminalProgress, progress_for
+from tofuse.engine.quality.types import FrameRecord
 
 
 class Clock:
@@ -118,8 +111,8 @@ def test_json_progress_reports_events(capsys) -> None:
 
 _SHOW = """
 import time
-from tofuse.cli.progress import progress_for
-from tofuse.results.types import FrameRecord
+from tofuse.apps.cli.progress import progress_for
+from tofuse.engine.quality.types import FrameRecord
 with progress_for(as_json=False) as progress:
     progress.stage("tracking", 40)
     progress.note("read [this]")

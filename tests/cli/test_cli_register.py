@@ -13,15 +13,15 @@ import pytest
 from browser import changed, chromium, watched
 from cli_calls import call, listing, refuses
 from registration_scenes import bumpy_ball, stone, turn
-from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.las import write_las
-from tofuse.files.ply import read_ply, write_ply
-from tofuse.files.pose import read_pose
-from tofuse.files.trajectory import read_tum, tum_text, write_tum
-from tofuse.geometry import se3
-from tofuse.pipeline import pair as pair_module
-from tofuse.recordings.open import open_recording
-from tofuse.registration.base import Registration
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.las import write_las
+from tofuse.formats.files.ply import read_ply, write_ply
+from tofuse.formats.files.pose import read_pose
+from tofuse.formats.files.trajectory import read_tum, tum_text, write_tum
+from tofuse.engine.geometry import se3
+from tofuse.apps.jobs import pair as pair_module
+from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.alignment.base import Registration
 
 FILES = {"registration.json", "transform.txt", "aligned.ply", "report.html"}
 MAP = np.array([512_345.25, 4_012_345.5, 310.0])
@@ -33,7 +33,7 @@ T_SMALL = turn([0.1, 1, 0.2], 4) @ se3.exp([0.02, -0.01, 0.03, 0, 0, 0])
 def light_page(monkeypatch) -> None:
     """Skip the page if the test does not use it."""
     monkeypatch.setattr(
-        "tofuse.report.pair.write_pair_report", lambda _, path: path.write_text("<html>")
+        "tofuse.apps.report.pair.write_pair_report", lambda _, path: path.write_text("<html>")
     )
 
 
@@ -459,7 +459,7 @@ def test_write_failure_keeps_earlier_result(
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("tofuse.report.pair.write_pair_report", full)
+    monkeypatch.setattr("tofuse.apps.report.pair.write_pair_report", full)
     refuses(
         capfd, "register", clouds[1], clouds[1], "--out", out, "--overwrite",
         says=(str(out), "No space left"),

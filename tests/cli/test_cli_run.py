@@ -16,26 +16,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.cli import main
-from tofuse.cli.parser import DEMO_SCENES, make_parser
-from tofuse.errors import TofuseError
-from tofuse.files.images import read_image, write_png
-from tofuse.files.ply import read_ply
-from tofuse.files.trajectory import read_tum
+from tofuse.apps.cli.program import main
+from tofuse.apps.cli.parser import DEMO_SCENES, make_parser
+from tofuse.engine.errors import TofuseError
+from tofuse.formats.files.images import read_image, write_png
+from tofuse.formats.files.ply import read_ply
+from tofuse.formats.files.trajectory import read_tum
 from tofuse.lab import demo as demo_module
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
-from tofuse.parts import name_of
-from tofuse.pipeline import run as run_module
-from tofuse.pipeline.config import from_method
-from tofuse.pipeline.reconstruct import reconstruct
-from tofuse.posegraph.g2o import read_g2o
-from tofuse.recordings.convert import convert
-from tofuse.recordings.open import open_recording
-from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.results.run_json import main_poses
-from tofuse.results.types import Component, Reason, Reconstruction
-from tofuse.results.verdict import ADVICE, REASONS
+from tofuse.engine.parts import name_of
+from tofuse.apps.jobs import running as run_module
+from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.formats.files.g2o import read_g2o
+from tofuse.formats.export.conversion import convert
+from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.apps.results.run_json import main_poses
+from tofuse.engine.quality.types import Component, Reason, Reconstruction
+from tofuse.engine.quality.verdict import ADVICE, REASONS
 from wrapped_depth import wrapping
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
@@ -534,7 +534,7 @@ def test_interrupted_run_changes_nothing(
             raise error("now")
 
     with monkeypatch.context() as patch:
-        patch.setattr("tofuse.cli.progress.QuietProgress.stage", interrupt)
+        patch.setattr("tofuse.apps.cli.progress.QuietProgress.stage", interrupt)
         words += ["--overwrite", "--seed", "1"]
         if error is RuntimeError:
             with pytest.raises(RuntimeError):
@@ -553,8 +553,8 @@ def test_interrupted_run_changes_nothing(
 # Prints a line in the middle of tracking, and waits there.
 _SLOW = """
 import sys, time
-from tofuse.cli import main
-from tofuse.cli.progress import QuietProgress
+from tofuse.apps.cli import main
+from tofuse.apps.cli.progress import QuietProgress
 def advance(self, record=None):
     if record is not None and record.index == 2:
         print("middle", flush=True)
@@ -676,7 +676,7 @@ def test_interrupted_simulation_leaves_nothing(tmp_path, monkeypatch) -> None:
     def interrupt(_self, _record=None) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tofuse.cli.progress.QuietProgress.advance", interrupt)
+    monkeypatch.setattr("tofuse.apps.cli.progress.QuietProgress.advance", interrupt)
     words = ["simulate", "box", "--out", str(tmp_path / "rec"), "--frames", "2"]
     assert main([*words, "--without", "all"]) == 130
     assert list(tmp_path.iterdir()) == []
@@ -724,7 +724,7 @@ def test_peaks_demo(tmp_path, capsys, monkeypatch) -> None:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("tofuse.cli.progress.QuietProgress.stage", interrupt)
+        patch.setattr("tofuse.apps.cli.progress.QuietProgress.stage", interrupt)
         words = ["demo", "--scene", "peaks", "--method", "thesis", "--seed", "1"]
         assert main([*words, "--out", str(out), "--overwrite"]) == 130
         after = contents(tmp_path)

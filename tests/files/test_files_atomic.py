@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tofuse.errors import OutputError
-from tofuse.files.atomic import make_folder, replacing, write_text
+from tofuse.engine.errors import OutputError
+from tofuse.formats.files.atomic import make_folder, replacing, write_text
 
 
 def test_file_is_replaced_atomically(tmp_path: Path) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.errors import InputError
-from tofuse.files.e57 import write_e57
-from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.glb import write_glb, write_gltf
-from tofuse.files.las import write_las, write_laz
-from tofuse.files.obj import write_obj
-from tofuse.files.pcd import write_pcd
-from tofuse.files.ply import write_ply
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.e57 import write_e57
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.glb import write_glb, write_gltf
+from tofuse.formats.files.las import write_las, write_laz
+from tofuse.formats.files.obj import write_obj
+from tofuse.formats.files.pcd import write_pcd
+from tofuse.formats.files.ply import write_ply
 
 POINTS = np.zeros((3, 3), np.float32)
 FACE = np.array([[0, 1, 2]], np.int32)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from parsed_glb import parse
-from tofuse.errors import InputError
-from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.glb import write_glb
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.glb import write_glb
 
 
 def test_mesh_round_trips(tmp_path) -> None:

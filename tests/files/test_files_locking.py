@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from tofuse.errors import OutputError
-from tofuse.files.locking import locked
-from tofuse.files.stamps import stamp, stamps_in
+from tofuse.engine.errors import OutputError
+from tofuse.formats.files.locking import locked
+from tofuse.formats.files.stamps import stamp, stamps_in
 
 
 def test_lock_is_exclusive(tmp_path: Path) -> None:
@@ -35,7 +35,7 @@ def test_lock_is_exclusive(tmp_path: Path) -> None:
 
 HOLD = """
 import subprocess, sys
-from tofuse.files.locking import locked
+from tofuse.formats.files.locking import locked
 with locked(sys.argv[1]) as handle:
     command = [sys.executable, "-c", "input()"]
     subprocess.Popen(command, pass_fds=(handle,), stdout=subprocess.DEVNULL)

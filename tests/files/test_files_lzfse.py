@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from made_phones import lzfse_raw
-from tofuse.errors import InputError
-from tofuse.files.lzfse import lzfse_decompress
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.lzfse import lzfse_decompress
 
 # `CONTENT` compressed by Apple's reference encoder.
 STREAM = base64.b64decode(

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.errors import InputError
-from tofuse.files.pcd import read_pcd
-from tofuse.kernels.lzf import lzf_decompress
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.pcd import read_pcd
+from tofuse.formats.files.lzf_kernels import lzf_decompress
 
 
 def lzf_twin(source: bytes) -> bytes:

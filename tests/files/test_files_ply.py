@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.errors import InputError
-from tofuse.files import ply as plys
-from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.ply import read_ply, write_ply
+from tofuse.engine.errors import InputError
+from tofuse.formats.files import ply as plys
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.ply import read_ply, write_ply
 
 CUBE = """ply
 format ascii 1.0

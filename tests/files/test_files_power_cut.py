@@ -14,14 +14,14 @@ import pytest
 
 from made_results import contents, result, torn
 from paths import BENCHMARKS
-from tofuse.batch.folder import BatchFolder, Record
-from tofuse.batch.jobs import Job
-from tofuse.batch.table import write_table
-from tofuse.files.atomic import write_text
-from tofuse.files.staging import finish_replacing, is_interrupted, new_folder
-from tofuse.recordings.rig import Rig, RigCamera, write_rig
-from tofuse.results.folder import OutputFolder, finish_interrupted, is_result
-from tofuse.results.output import write_result
+from tofuse.apps.batch.folder import BatchFolder, Record
+from tofuse.apps.batch.jobs import Job
+from tofuse.apps.batch.table import write_table
+from tofuse.formats.files.atomic import write_text
+from tofuse.formats.files.staging import finish_replacing, is_interrupted, new_folder
+from tofuse.formats.recordings.rig import Rig, RigCamera, write_rig
+from tofuse.apps.results.folder import OutputFolder, finish_interrupted, is_result
+from tofuse.apps.results.output import write_result
 
 
 @pytest.fixture

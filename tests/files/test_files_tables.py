@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.errors import InputError
-from tofuse.files.reading import files_with, list_folder, read_text
-from tofuse.files.tables import read_columns, read_numbers, write_columns
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.reading import files_with, list_folder, read_text
+from tofuse.formats.files.tables import read_columns, read_numbers, write_columns
 
 
 def test_numbers_are_read_with_any_separator(tmp_path: Path) -> None:

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.errors import InputError
-from tofuse.files.trajectory import associate, associated_poses, read_tum, tum_text, write_tum
-from tofuse.geometry.se3 import exp
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.trajectory import associate, associated_poses, read_tum, tum_text, write_tum
+from tofuse.engine.geometry.se3 import exp
 
 
 def _poses(n: int = 20) -> np.ndarray:

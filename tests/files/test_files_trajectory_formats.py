@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.cli import main
-from tofuse.errors import InputError
-from tofuse.evaluation.trajectory import evaluate_trajectory
-from tofuse.files.trajectory import write_kitti, write_log, write_tum
-from tofuse.files.trajectory_formats import TimedPoses, read_poses
-from tofuse.geometry import se3
-from tofuse.geometry.quaternion import from_matrix
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError
+from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.formats.files.trajectory import write_kitti, write_log, write_tum
+from tofuse.formats.files.trajectory_formats import TimedPoses, read_poses
+from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.quaternion import from_matrix
 
 RNG = np.random.default_rng(3)
 POSES = np.stack(
@@ -231,7 +231,7 @@ def test_evaluate_needs_frame_timestamps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], room_recording: Path
 ) -> None:
     reference = room_recording / "groundtruth.txt"
-    from tofuse.recordings.open import open_recording
+    from tofuse.formats.recordings.open import open_recording
 
     recording = open_recording(room_recording)
     assert recording.reference is not None

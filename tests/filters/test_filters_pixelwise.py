@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tofuse import parts
-from tofuse.errors import InputError
-from tofuse.filters.base import Filter, Removal, apply_filters
-from tofuse.filters.confidence import Confidence
-from tofuse.filters.distance import Distance
-from tofuse.filters.foreground import Foreground, otsu
-from tofuse.geometry.cameras import Pinhole
-from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.engine import parts
+from tofuse.engine.errors import InputError
+from tofuse.engine.filters.base import Filter, Removal, apply_filters
+from tofuse.engine.filters.confidence import Confidence
+from tofuse.engine.filters.distance import Distance
+from tofuse.engine.filters.foreground import Foreground, otsu
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 
 NAN = float("nan")
 
@@ -125,7 +125,7 @@ def test_invalid_options_are_rejected(cls: type, options: dict[str, Any]) -> Non
 
 
 def test_option_errors_name_field() -> None:
-    parts.discover("tofuse.filters")
+    parts.discover("tofuse.engine.filters")
     data = {"part": "distance", "minimum": 2, "maximum": 1}
     with pytest.raises(InputError, match=r"my.toml: filters\[0\].*maximum must be above 2"):
         parts.from_dict(Filter, data, where="my.toml: filters[0]")

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.filters.base import Filter, apply_filters
-from tofuse.filters.confidence import Confidence
+from tofuse.engine.filters.base import Filter, apply_filters
+from tofuse.engine.filters.confidence import Confidence
 from tofuse.lab.methods.filters_temporal import TemporalDeviation, z_deviation
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.open import open_recording
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.open import open_recording
 
 
 def noise(frames: list[RangeFrame], filters: list[Filter]) -> tuple[float, float]:

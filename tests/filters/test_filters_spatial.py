@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tofuse import parts
-from tofuse.filters.angle import NeighbourhoodAngle
-from tofuse.filters.base import Filter, apply_filters
-from tofuse.filters.neighbours import NeighbourFraction, mean_neighbour_distance
-from tofuse.geometry import se3
-from tofuse.geometry.cameras import Pinhole
-from tofuse.kernels.threads import threads
+from tofuse.engine import parts
+from tofuse.engine.filters.angle import NeighbourhoodAngle
+from tofuse.engine.filters.base import Filter, apply_filters
+from tofuse.engine.filters.neighbours import NeighbourFraction, mean_neighbour_distance
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.compute.thread_pool import threads
 from tofuse.lab.methods.filters_box import Box
-from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 
 NAN = float("nan")
 
@@ -173,7 +173,7 @@ def test_neighbour_distance_is_invariant_to_order_and_frame(seed: int, n: int, k
 
 
 def every_filter() -> list[Filter]:
-    for package in ("tofuse.filters", "tofuse.lab.methods"):
+    for package in ("tofuse.engine.filters", "tofuse.lab.methods"):
         parts.discover(package)
     box = Box((-1.0, -1.0, 0.5), (1.0, 1.0, 3.0))
     known = parts.registered("filter")

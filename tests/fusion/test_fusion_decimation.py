@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.fusion import mesh as mesh_module
-from tofuse.fusion.edge_collapse import collapse_edges
-from tofuse.fusion.mesh import Mesh
-from tofuse.kernels.kdtree import KdTree
+from tofuse.engine.fusion import mesh as mesh_module
+from tofuse.engine.fusion.edge_collapse import collapse_edges
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.geometry.kdtree import KdTree
 from tofuse.lab.experiments.surface_error import Surface, distances
 
 

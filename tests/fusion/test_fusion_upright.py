@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.fusion.mesh import Mesh
-from tofuse.fusion.upright import likely_up, upright
-from tofuse.geometry import se3
-from tofuse.recordings.open import open_recording
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.upright import likely_up, upright
+from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.open import open_recording
 
 RNG = np.random.default_rng(3)
 UP = np.array([0.0, -1.0, 0.0])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.geometry import se3
-from tofuse.geometry.places import PlaceCounts
+from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.places import PlaceCounts
 
 
 def turned(rad: float, x: float = 0.0) -> np.ndarray:

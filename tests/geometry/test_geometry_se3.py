@@ -10,8 +10,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from tofuse.errors import InputError
-from tofuse.geometry import quaternion, se3
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import quaternion, se3
 
 finite = st.floats(-3, 3)
 small = st.floats(-1.7, 1.7)  # keeps the rotation vector shorter than pi

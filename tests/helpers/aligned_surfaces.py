@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from corner_views import SHARP, corner
-from tofuse.geometry import se3
-from tofuse.posegraph.pair_equations import RefineOptions
-from tofuse.registration.prepared_view import prepare_view
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views.pair_equations import RefineOptions
+from tofuse.engine.views.prepared_view import prepare_view
 
 OPTIONS = RefineOptions()
 

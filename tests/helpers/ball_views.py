@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.geometry.cameras import BrownConrady
-from tofuse.recordings.frames import RangeFrame
+from tofuse.engine.cameras.cameras import BrownConrady
+from tofuse.engine.frames.frames import RangeFrame
 
 EYE = np.eye(4)
 

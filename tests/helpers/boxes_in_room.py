@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.geometry.cameras import Pinhole
-from tofuse.recordings.frames import RangeFrame
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
 
 ROOM = np.array([[-2.5, -1.3, -2.0], [2.5, 1.1, 3.0]])
 BOXES = np.array(

@@ -19,9 +19,9 @@ import made_recordings
 import made_sens
 import made_tof
 import ros_bags
-from tofuse.errors import TofuseError
-from tofuse.recordings.frames import Frame
-from tofuse.recordings.open import open_recording
+from tofuse.engine.errors import TofuseError
+from tofuse.engine.frames.frames import Frame
+from tofuse.formats.recordings.open import open_recording
 
 # Function that writes a recording, name of its file (None: a folder), and its format.
 MAKERS: dict[str, tuple[Callable[[Path], object], str | None, str]] = {

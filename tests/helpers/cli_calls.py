@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tofuse.cli import main
+from tofuse.apps.cli.program import main
 
 
 def call(*words: object) -> int:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
-from tofuse.recordings.open import open_recording
-from tofuse.recordings.recording import Recording
+from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.frames.recording import Recording
 
 
 def without_multipath(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.geometry.cameras import Pinhole
-from tofuse.kernels import pair_equations as kernels
-from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.surface_options import FineScale, SurfaceOptions
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.views.surface_options import FineScale, SurfaceOptions
 
 CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)
 

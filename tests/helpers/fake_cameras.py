@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from made_ifm import head_info
-from tofuse.arrays import UInt16
+from tofuse.engine.arrays import UInt16
 
 WIDTH, HEIGHT = 32, 24
 

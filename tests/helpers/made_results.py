@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.fusion.cloud import empty_cloud
-from tofuse.posegraph.graph import PoseGraph
-from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
+from tofuse.engine.fusion.cloud import empty_cloud
+from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.quality.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 
 
 def result(seed=0) -> Reconstruction:

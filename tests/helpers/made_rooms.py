@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.geometry import se3
-from tofuse.geometry.cameras import Pinhole
-from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.prepared_view import PreparedView, prepare_view
-from tofuse.registration.surface_options import SurfaceOptions
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.views.prepared_view import PreparedView, prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float], float]
 

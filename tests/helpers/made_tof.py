@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from made_phones import DEPTH, HEIGHT, WIDTH
-from tofuse.geometry.cameras import Rational
+from tofuse.engine.cameras.cameras import Rational
 
 
 def make_arducam(folder: Path) -> None:

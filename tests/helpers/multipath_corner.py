@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.geometry.cameras import Pinhole, ray_lengths
-from tofuse.recordings.frames import RangeFrame
-from tofuse.sensor.multipath import ToFImage
+from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.sensor.multipath import ToFImage
 
 CAMERA = Pinhole(60, 48, 54.0, 54.0, 29.5, 23.5)
 

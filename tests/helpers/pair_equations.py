@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.kernels import pair_equations as kernels
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
 KNOWN = np.ones(kernels.ERRORS, np.int64)
 

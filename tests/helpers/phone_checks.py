@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 import made_phones as made
-from tofuse.geometry.cameras import Pinhole
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.recording import Recording
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import Recording
 
 
 def check_frames(recording: Recording, *, turned: bool = False, exact: float = 6e-4) -> None:

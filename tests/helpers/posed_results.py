@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.ply import write_ply
-from tofuse.files.trajectory import write_tum
-from tofuse.geometry import se3
-from tofuse.geometry.cameras import BrownConrady, Camera
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.native import RecordingWriter
-from tofuse.recordings.open import Opening
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.ply import write_ply
+from tofuse.formats.files.trajectory import write_tum
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import BrownConrady, Camera
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import Opening
 
 SIZE = (48, 36)
 

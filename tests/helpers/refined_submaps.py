@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from tofuse.files.spill import Scratch
-from tofuse.posegraph.view_store import Spacing, ViewStore
+from tofuse.engine.compute.spill import Scratch
+from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 
 
 def refined(part, views, poses, scratch=Scratch()):  # noqa: B008 - immutable

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.fusion.cloud import Cloud, CloudBuilder
-from tofuse.fusion.options import Fusion
-from tofuse.geometry import se3
-from tofuse.geometry.cameras import Pinhole
-from tofuse.posegraph.graph import LoopRecord, PoseGraph
-from tofuse.recordings.frames import RangeFrame
-from tofuse.report.extras import ReportExtras
-from tofuse.results.samples import FrameSample
-from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
+from tofuse.engine.fusion.cloud import Cloud, CloudBuilder
+from tofuse.engine.fusion.options import Fusion
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.graph.graph import LoopRecord, PoseGraph
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.apps.report.extras import ReportExtras
+from tofuse.engine.quality.samples import FrameSample
+from tofuse.engine.quality.types import Diagnostics, FrameRecord, Reason, Reconstruction
 
 # A room of 6.0 x 2.5 x 3.2 m around the first camera, and two blocks in it.
 ROOM = np.array([[-3.4, -1.4, -1.5], [2.6, 1.1, 1.7]])

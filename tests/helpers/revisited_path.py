@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from corner_views import corner
-from tofuse.geometry import se3
-from tofuse.odometry.base import Step, Tracker
-from tofuse.posegraph.view_store import Spacing, ViewStore
-from tofuse.registration.base import Registration
-from tofuse.registration.prepared_view import prepare_view
-from tofuse.registration.surface_options import FineScale, SurfaceOptions
+from tofuse.engine.geometry import se3
+from tofuse.engine.tracking.base import Step, Tracker
+from tofuse.engine.stored_views.view_store import Spacing, ViewStore
+from tofuse.engine.alignment.base import Registration
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import FineScale, SurfaceOptions
 
 ALL = Spacing(angle=0, distance=0)
 OPTIONS = SurfaceOptions(radii=(4,), fine_scale=FineScale(noise=0))

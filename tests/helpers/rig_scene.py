@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from tofuse.geometry.cameras import Pinhole
-from tofuse.recordings.frames import RangeFrame
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
 
 CAMERA = Pinhole(96, 72, 67.5, 67.5, 47.5, 35.5)
 

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tofuse.geometry import quaternion
-from tofuse.geometry.cameras import Pinhole
-from tofuse.geometry.se3 import exp
-from tofuse.recordings.readers import ros
+from tofuse.engine.geometry import quaternion
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.geometry.se3 import exp
+from tofuse.formats.readers import ros
 
 RNG = np.random.default_rng(100)
 

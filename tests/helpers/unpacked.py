@@ -1,4 +1,4 @@
-"""The inverse of `tofuse.report.packing.pack`."""
+"""The inverse of `tofuse.apps.report.packing.pack`."""
 
 from __future__ import annotations
 

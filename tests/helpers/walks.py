@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.geometry import se3
-from tofuse.posegraph.build import Measured, build_graph
-from tofuse.posegraph.graph import PoseGraph
+from tofuse.engine.geometry import se3
+from tofuse.engine.graph.build import Measured, build_graph
+from tofuse.engine.graph.graph import PoseGraph
 
 SIGMA = np.array([0.004, 0.002, 0.003, 0.001, 0.004, 0.002])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.fusion.mesh import Mesh
+from tofuse.engine.fusion.mesh import Mesh
 
 N = 180
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from tofuse.arrays import Float64
-from tofuse.fusion.layout import Layout
-from tofuse.fusion.stored_views import Views
-from tofuse.fusion.tsdf import Volume
+from tofuse.engine.arrays import Float64
+from tofuse.engine.fusion.layout import Layout
+from tofuse.engine.fusion.stored_views import Views
+from tofuse.engine.fusion.tsdf import Volume
 
 
 def volume_around(views: Views, poses: Float64, voxel_m: float) -> Volume:

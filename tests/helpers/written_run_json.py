@@ -6,8 +6,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from tofuse.results.run_json import read_run_json, write_run_json
-from tofuse.results.types import Reconstruction
+from tofuse.apps.results.run_json import read_run_json, write_run_json
+from tofuse.engine.quality.types import Reconstruction
 
 
 def run_json(result: Reconstruction) -> dict[str, Any]:

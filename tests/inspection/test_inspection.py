@@ -14,23 +14,23 @@ import pytest
 import made_rooms
 import tofuse
 from coarse_steps import without_multipath
-from tofuse.cli import main
-from tofuse.errors import InputError, OutputError
-from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.images import read_image
-from tofuse.files.ply import write_ply
-from tofuse.geometry import se3
-from tofuse.geometry.cameras import BrownConrady, Pinhole
-from tofuse.inspection import channels
-from tofuse.inspection.finding import CODES, Finding
-from tofuse.inspection.inspect import inspect_recording
-from tofuse.inspection.planar import Distortion
-from tofuse.inspection.sample import Sample
-from tofuse.pipeline.run import with_findings
-from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.recordings.native import RecordingWriter
-from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.results.types import SelfCalibration
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError, OutputError
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.images import read_image
+from tofuse.formats.files.ply import write_ply
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
+from tofuse.apps.inspection import channels
+from tofuse.apps.inspection.finding import CODES, Finding
+from tofuse.apps.inspection.inspect import inspect_recording
+from tofuse.apps.inspection.planar import Distortion
+from tofuse.apps.inspection.sample import Sample
+from tofuse.apps.jobs.running import with_findings
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.quality.types import SelfCalibration
 from wrapped_depth import wrapping
 
 CAMERA = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)
@@ -188,7 +188,7 @@ def test_long_recording_is_sampled() -> None:
 def test_recording_without_readable_frames_is_rejected() -> None:
     class Broken(ArraySource):
         def read(self, index):
-            raise tofuse.errors.UnreadableFrameError("is broken", where=f"file {index}")
+            raise tofuse.engine.errors.UnreadableFrameError("is broken", where=f"file {index}")
 
     recording = Recording.of(Broken([image(2.0)]), "somewhere", "frames")
     with pytest.raises(InputError, match="somewhere: no frame can be read; file 0: is broken"):

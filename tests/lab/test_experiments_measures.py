@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from tofuse.geometry import se3
+from tofuse.engine.geometry import se3
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.recorded import record_scene, sample_surface
 from tofuse.lab.simulation.record import simulate_recording

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.errors import InputError, OutputError
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.lab.experiments.page import run_experiments
 from tofuse.lab.experiments.peaks import PeaksSweep
 from tofuse.lab.experiments.statements import STATEMENTS, Results, graded, judge_all

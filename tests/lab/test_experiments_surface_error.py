@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.errors import InputError
+from tofuse.engine.errors import InputError
 from tofuse.lab.experiments.surface_error import Surface, compare_surfaces, distances
 
 SQUARE = Surface(

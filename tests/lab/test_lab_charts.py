@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.geometry import se3
+from tofuse.engine.geometry import se3
 from tofuse.lab.methods.charts import Chart, Cosines, Quaternion, descend
-from tofuse.posegraph.graph import Gravity
-from tofuse.posegraph.levenberg import minimise
-from tofuse.posegraph.robust import Settings
+from tofuse.engine.graph.graph import Gravity
+from tofuse.engine.graph.levenberg import minimise
+from tofuse.engine.graph.robust import Settings
 from walked_graph import walk
 
 CHARTS = [Quaternion(), Cosines()]

@@ -8,8 +8,8 @@ import pytest
 import tofuse
 from registration_scenes import rng, stone, turn
 from searched_pair import TRUE, A, B, seen
-from tofuse.errors import RegistrationError
-from tofuse.geometry import se3
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.geometry import se3
 from tofuse.lab.methods.fpfh import Fpfh
 
 

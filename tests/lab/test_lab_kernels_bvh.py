@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.kernels.threads import chunk_bounds
-from tofuse.lab.kernels import bvh
+from tofuse.engine.compute.thread_pool import chunk_bounds
+from tofuse.lab.simulation import bvh_kernels as bvh
 
 
 def brute_force_cast(triangles, origins, directions):

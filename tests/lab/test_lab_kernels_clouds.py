@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tofuse.errors import InputError
-from tofuse.geometry import se3
-from tofuse.kernels.threads import threads
-from tofuse.lab.kernels.cloud_search import grid_search
-from tofuse.lab.kernels.symmetric import symmetric_sums
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.lab.methods.cloud_search_kernels import grid_search
+from tofuse.lab.methods.symmetric_kernels import symmetric_sums
 from tofuse.lab.methods.featured_tree import FeaturedKdTree
 
 seeds = st.integers(0, 2**32 - 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.lab.kernels import shading as kernels
+from tofuse.lab.simulation import shading_kernels as kernels
 from tofuse.lab.simulation.texture import Material, noise_tables, parameter_rows
 
 

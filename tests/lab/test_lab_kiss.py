@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from registration_scenes import box_walls, rng
-from tofuse.geometry import se3
-from tofuse.kernels.icp import transform_points
+from tofuse.engine.geometry import se3
+from tofuse.engine.clouds.icp_kernels import transform_points
 from tofuse.lab.methods.kiss import AdaptiveThreshold, Kiss, first_of_voxels
-from tofuse.recordings.frames import CloudFrame
+from tofuse.engine.frames.frames import CloudFrame
 
 
 def room(n, seed):

@@ -7,13 +7,13 @@ import pytest
 
 import tofuse
 from searched_pair import TRUE, A, B, error, seen
-from tofuse.errors import RegistrationError
-from tofuse.geometry import se3
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.geometry import se3
 from tofuse.lab.methods.plane_sets import PlaneSets
-from tofuse.recordings.frames import CloudFrame
-from tofuse.registration.plane_detection import detect_planes
-from tofuse.registration.prepared_view import prepare_view
-from tofuse.registration.surface_options import SurfaceOptions
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.search.plane_detection import detect_planes
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 
 WORLD = [((0, 1, 0), 1.0), ((0.1, 0, 1), 3.8), ((1, 0, -0.2), 1.7)]
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.arrays import Float64
-from tofuse.geometry import se3
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
 from tofuse.lab.experiments.peaks import chain
 from tofuse.lab.methods.elch import Elch
 from tofuse.lab.methods.lu_milios import LuMilios, solve_linear
-from tofuse.posegraph.build import Measured, build_graph
-from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.levenberg import minimise
-from tofuse.posegraph.robust import Settings
-from tofuse.posegraph.sparse import PairSystem
+from tofuse.engine.graph.build import Measured, build_graph
+from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph.levenberg import minimise
+from tofuse.engine.graph.robust import Settings
+from tofuse.engine.graph.sparse import PairSystem
 
 
 def ring(n: int, noise: float, seed: int = 0, loops: int = 1) -> tuple[PoseGraph, Float64]:

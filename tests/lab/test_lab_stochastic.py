@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.errors import InputError
-from tofuse.geometry import se3
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
 from tofuse.lab.methods.stochastic import Stochastic
-from tofuse.posegraph.build import Measured, build_graph
-from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.engine.graph.build import Measured, build_graph
+from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph.levenberg import LevenbergMarquardt
 
 
 def grid(side: int, noise: float, seed: int) -> PoseGraph:

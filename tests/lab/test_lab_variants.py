@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from registration_scenes import bumpy_ball, error, relief, rng, stone, turn, view
-from tofuse import parts
-from tofuse.errors import InputError, RegistrationError
-from tofuse.geometry import se3
+from tofuse.engine import parts
+from tofuse.engine.errors import InputError, RegistrationError
+from tofuse.engine.geometry import se3
 from tofuse.lab.methods.compatibility import AmplitudeCompatibility
 from tofuse.lab.methods.correspondence import ClosestInvariant
 from tofuse.lab.methods.variants import (
@@ -22,12 +22,12 @@ from tofuse.lab.methods.variants import (
     SymmetricIcp,
     Tricp,
 )
-from tofuse.pipeline.config import PACKAGES
-from tofuse.registration.base import Registrar
-from tofuse.registration.icp import Icp
-from tofuse.registration.rejectors import MaxDistance
-from tofuse.registration.selectors import All, Random
-from tofuse.registration.stopping import SmallStep
+from tofuse.engine.mapping.config import PACKAGES
+from tofuse.engine.alignment.base import Registrar
+from tofuse.engine.clouds.icp import Icp
+from tofuse.engine.clouds.rejectors import MaxDistance
+from tofuse.engine.clouds.selectors import All, Random
+from tofuse.engine.clouds.stopping import SmallStep
 
 
 def vanilla(resolution, points, steps=100):

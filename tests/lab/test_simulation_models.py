@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from tofuse.lab.simulation.models import CAMERAS, noise_of
-from tofuse.sensor.noise import NOISE
+from tofuse.engine.noise.model import NOISE
 
 
 @pytest.mark.parametrize("name", CAMERAS)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.geometry import se3
+from tofuse.engine.geometry import se3
 from tofuse.lab.experiments.peaks import PoseErrors, chain, run_peaks, sweep_peaks
 from tofuse.lab.simulation.peaks import peaks, peaks_cameras, peaks_points, peaks_views
-from tofuse.posegraph.build import Measured
+from tofuse.engine.graph.build import Measured
 
 
 def test_peaks_matches_matlab():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.geometry import se3
+from tofuse.engine.geometry import se3
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation.scene import Scene
 from tofuse.lab.simulation.scenes import blends, torso

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.lab.kernels import phasor
+from tofuse.lab.simulation import phasor_kernels as phasor
 
 RNG = np.random.default_rng(7)
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.errors import InputError, OutputError
-from tofuse.files.images import read_image
-from tofuse.files.ply import read_ply
-from tofuse.files.trajectory import read_tum
-from tofuse.geometry import se3
+from tofuse.engine.errors import InputError, OutputError
+from tofuse.formats.files.images import read_image
+from tofuse.formats.files.ply import read_ply
+from tofuse.formats.files.trajectory import read_tum
+from tofuse.engine.geometry import se3
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan, simulate, simulate_recording
 from tofuse.lab.simulation.scene import build
-from tofuse.recordings.readers.native import NativeSource
+from tofuse.formats.readers.native import NativeSource
 
 
 @pytest.fixture(scope="module")

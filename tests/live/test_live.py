@@ -24,15 +24,15 @@ from fake_cameras import (
     fake_ifm3d,
     infrared_counts,
 )
-from tofuse.cli import main
-from tofuse.errors import InputError, OutputError
-from tofuse.geometry.cameras import BrownConrady, Pinhole, Rational
-from tofuse.live.device import DeviceError, Stream, device, devices, is_installed
-from tofuse.live.player import Player
-from tofuse.live.recorder import QUEUE_FRAMES, record
-from tofuse.pipeline.mapper import Mapper
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, Rational
+from tofuse.apps.live.device import DeviceError, Stream, device, devices, is_installed
+from tofuse.apps.live.player import Player
+from tofuse.apps.live.recorder import QUEUE_FRAMES, record
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
 
 Install = Callable[..., None]
 
@@ -44,7 +44,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Install:
             module.__spec__ = ModuleSpec(module.__name__, None)
             monkeypatch.setitem(sys.modules, module.__name__, module)
 
-    monkeypatch.setattr("tofuse.live.devices.orbbec.TIMEOUT_S", 0.05)
+    monkeypatch.setattr("tofuse.apps.live.devices.orbbec.TIMEOUT_S", 0.05)
     return put
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 import tofuse
-from tofuse.posegraph.view_store import PosedView
-from tofuse.registration.prepared_view import prepare_view
-from tofuse.registration.surface_options import SurfaceOptions
+from tofuse.engine.stored_views.view_store import PosedView
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 
 
 @pytest.fixture(scope="module")

@@ -21,23 +21,23 @@ import pytest
 
 import tofuse
 from paths import ROOT
-from tofuse import parts
-from tofuse.cli.parser import DEMO_SCENES, make_parser
-from tofuse.files.trajectory import read_tum
-from tofuse.geometry import se3
+from tofuse.engine import parts
+from tofuse.apps.cli.parser import DEMO_SCENES, make_parser
+from tofuse.formats.files.trajectory import read_tum
+from tofuse.engine.geometry import se3
 from tofuse.lab import demo
 from tofuse.lab.simulation.models import CAMERAS
-from tofuse.pipeline.config import PACKAGES, Config, ViewKind, changed, from_method, methods
-from tofuse.pipeline.pair import register_files
-from tofuse.posegraph.graph import LoopRecord
-from tofuse.recordings.convert import convert
-from tofuse.registration.projective import ProjectiveOptions
-from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.registration.uncertainty import UncertaintyOptions
-from tofuse.results.pair import FILES as PAIR_FILES
-from tofuse.results.pair import pair_json
-from tofuse.results.types import Component
-from tofuse.results.verdict import REASONS
+from tofuse.engine.mapping.config import PACKAGES, Config, ViewKind, changed, from_method, methods
+from tofuse.apps.jobs.pair import register_files
+from tofuse.engine.graph.graph import LoopRecord
+from tofuse.formats.export.conversion import convert
+from tofuse.engine.alignment.projective import ProjectiveOptions
+from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.alignment.uncertainty import UncertaintyOptions
+from tofuse.apps.results.pair import FILES as PAIR_FILES
+from tofuse.apps.results.pair import pair_json
+from tofuse.engine.quality.types import Component
+from tofuse.engine.quality.verdict import REASONS
 from written_run_json import run_json
 
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
@@ -55,7 +55,7 @@ CITED = (
     *("Fischler and Bolles 1981", "Lowe 1999, 2004", "Wheeler and Ikeuchi 1995"),
     *("Söderkvist and Wedin 1994", "Moore 1991", "Hartley and Zisserman 2003"),
 )
-PART_PACKAGES = (*PACKAGES, "tofuse.recordings.readers", "tofuse.live.devices")
+PART_PACKAGES = (*PACKAGES, "tofuse.formats.readers", "tofuse.apps.live.devices")
 
 
 @cache

@@ -35,7 +35,7 @@ def test_import_loads_no_heavy_packages() -> None:
 def test_help_loads_no_heavy_packages(words) -> None:
     done = _python(
         "import json, sys\n"
-        "from tofuse.cli import main\n"
+        "from tofuse.apps.cli import main\n"
         "try:\n"
         f"    main({words!r})\n"
         "except SystemExit:\n"

@@ -9,10 +9,10 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import pytest
 
-from tofuse import parts
-from tofuse.bounds import Bounded, Bounds, NotEmpty
-from tofuse.errors import InputError
-from tofuse.pipeline.config import Config, changed, from_method, methods
+from tofuse.engine import parts
+from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
+from tofuse.engine.errors import InputError
+from tofuse.engine.mapping.config import Config, changed, from_method, methods
 
 
 class Shape(Protocol):

@@ -20,9 +20,9 @@ import made_tof
 from damaged_files import make_native, make_pcd, make_ply, make_slam6d, make_xyz
 from made_recordings import make_7scenes, make_redwood, make_sr4000, make_tum
 from ros_bags import COUNTS, TOPIC, Bag, orbbec, real_sense
-from tofuse.errors import InputError
-from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
-from tofuse.recordings.open import open_recording, readers
+from tofuse.engine.errors import InputError
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
+from tofuse.formats.recordings.open import open_recording, readers
 
 
 def inside(make: Callable[[Path], object], name: str = "a") -> Callable[[Path], Path]:

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.arrays import Float32, Intp
-from tofuse.errors import UnreadableFrameError
-from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.ply import write_ply
-from tofuse.geometry.cameras import BrownConrady, Camera, Pinhole, Rational
-from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.recordings.open import open_recording
-from tofuse.recordings.organised import find_deprojection
+from tofuse.engine.arrays import Float32, Intp
+from tofuse.engine.errors import UnreadableFrameError
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.ply import write_ply
+from tofuse.engine.cameras.cameras import BrownConrady, Camera, Pinhole, Rational
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.formats.recordings.open import open_recording
+from tofuse.formats.recordings.organised import find_deprojection
 
 PINHOLE = Pinhole(160, 120, 140.0, 141.0, 82.3, 57.9)
 LENSES: dict[str, Camera] = {

@@ -10,7 +10,7 @@ import pytest
 
 from camera_files import MAKERS, OTHERS, read_frames, read_through
 from damaged_files import damage
-from tofuse.recordings.open import open_recording
+from tofuse.formats.recordings.open import open_recording
 
 # `benchmarks/attack.py` runs any number.
 ROUNDS, CUTS = 12, 6

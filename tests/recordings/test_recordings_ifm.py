@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import made_ifm as made
-from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.recordings.open import open_recording
+from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.formats.recordings.open import open_recording
 
 
 def unit_vector(model: int, numbers: tuple[float, ...], u: int, v: int) -> np.ndarray:

@@ -9,8 +9,8 @@ import pytest
 
 import made_ifm as made
 from camera_files import read_through
-from tofuse.errors import InputError
-from tofuse.recordings.open import open_recording
+from tofuse.engine.errors import InputError
+from tofuse.formats.recordings.open import open_recording
 
 h5py = pytest.importorskip("h5py", reason="the package h5py is not installed")
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.geometry import se3
-from tofuse.geometry.cameras import Pinhole
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.imu import gravity_at
-from tofuse.recordings.native import RecordingWriter
-from tofuse.recordings.open import open_recording
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.imu import gravity_at
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import open_recording
 
 UP = np.array([0.1, -0.9, 0.3]) / np.linalg.norm([0.1, -0.9, 0.3])
 

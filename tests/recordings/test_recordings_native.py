@@ -10,23 +10,15 @@ import numpy as np
 import pytest
 
 from paths import DOCS
-from tofuse.errors import InputError, OutputError, UnreadableFrameError
-from tofuse.files.images import write_png
-from tofuse.files.trajectory import write_tum
-from tofuse.geometry.cameras import (
-    BrownConrady,
-    Camera,
-    Fisheye,
-    Pinhole,
-    Rational,
-    RayTable,
-    points_from_z,
-)
-from tofuse.geometry.se3 import exp
-from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.recordings.native import RecordingWriter
-from tofuse.recordings.readers.native import NativeSource
-from tofuse.sensor.depth_correction import DepthCorrection
+from tofuse.engine.errors import InputError, OutputError, UnreadableFrameError
+from tofuse.formats.files.images import write_png
+from tofuse.formats.files.trajectory import write_tum
+from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable, points_from_z
+from tofuse.engine.geometry.se3 import exp
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.readers.native import NativeSource
+from tofuse.engine.sensor.depth_correction import DepthCorrection
 
 PINHOLE = Pinhole(40, 30, 35.0, 36.0, 19.5, 14.5)
 CAMERAS: list[Camera] = [

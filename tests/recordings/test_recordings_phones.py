@@ -12,11 +12,11 @@ import pytest
 
 import made_phones as made
 from phone_checks import check_frames, check_lens
-from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.evaluation.consistency import map_consistency
-from tofuse.geometry.cameras import Pinhole
-from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.open import open_recording
+from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.quality.consistency import map_consistency
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.open import open_recording
 
 
 def test_scanner_app(tmp_path: Path) -> None:

@@ -20,16 +20,16 @@ from made_recordings import (
     pcd_bytes,
     pcd_points,
 )
-from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.files.geometry_record import GeometryRecord
-from tofuse.files.images import write_png
-from tofuse.files.ply import write_ply
-from tofuse.files.trajectory import write_tum
-from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
-from tofuse.geometry.se3 import exp
-from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.recordings.noise import family_of
-from tofuse.recordings.open import open_recording
+from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.images import write_png
+from tofuse.formats.files.ply import write_ply
+from tofuse.formats.files.trajectory import write_tum
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
+from tofuse.engine.geometry.se3 import exp
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.noise.choice import family_of
+from tofuse.formats.recordings.open import open_recording
 
 
 def test_sr4000_points_equal_stored_vectors(tmp_path: Path) -> None:

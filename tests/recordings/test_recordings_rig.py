@@ -7,17 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.errors import InputError
-from tofuse.geometry import se3
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
 from tofuse.lab.simulation.paths import rotation
-from tofuse.recordings.rig import (
-    Disagreement,
-    Rig,
-    RigCamera,
-    read_rig,
-    with_range_added,
-    write_rig,
-)
+from tofuse.formats.recordings.rig import Disagreement, Rig, RigCamera, read_rig, with_range_added, write_rig
 
 
 def made() -> Rig:
@@ -66,8 +59,8 @@ def test_invalid_files_are_refused(tmp_path: Path, change, message: str) -> None
 
 
 def test_depth_offset_is_along_ray() -> None:
-    from tofuse.geometry.cameras import Pinhole
-    from tofuse.recordings.frames import RangeFrame
+    from tofuse.engine.cameras.cameras import Pinhole
+    from tofuse.engine.frames.frames import RangeFrame
 
     camera = Pinhole(64, 48, 60.0, 60.0, 31.5, 23.5)
     frame = RangeFrame(0, 0.0, camera, np.full((48, 64), 2.0, np.float32), "z", None)

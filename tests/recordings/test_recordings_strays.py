@@ -15,15 +15,15 @@ import pytest
 
 import tofuse
 from made_recordings import make_sr4000
-from tofuse.cli import main
-from tofuse.errors import InputError
-from tofuse.files.npz import read_npz
-from tofuse.files.pose import read_pose
-from tofuse.files.stamps import stamp, stamps_in
-from tofuse.files.trajectory_formats import read_poses
-from tofuse.posegraph.g2o import read_g2o
-from tofuse.posegraph.given_loops import read_loops
-from tofuse.recordings.rig import read_rig
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.npz import read_npz
+from tofuse.formats.files.pose import read_pose
+from tofuse.formats.files.stamps import stamp, stamps_in
+from tofuse.formats.files.trajectory_formats import read_poses
+from tofuse.formats.files.g2o import read_g2o
+from tofuse.formats.files.given_loops import read_loops
+from tofuse.formats.recordings.rig import read_rig
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="links and queues of other systems")
 

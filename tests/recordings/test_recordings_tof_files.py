@@ -12,9 +12,9 @@ import pytest
 import made_tof
 from made_phones import DEPTH, HEIGHT, WIDTH
 from made_tof import ADI_LENS, adi_frame
-from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.geometry.cameras import Rational
-from tofuse.recordings.open import open_recording
+from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.cameras.cameras import Rational
+from tofuse.formats.recordings.open import open_recording
 
 
 def test_arducam(tmp_path: Path) -> None:

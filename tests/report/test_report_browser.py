@@ -10,8 +10,8 @@ import pytest
 
 from browser import changed, chromium, watched
 from report_results import make_room
-from tofuse.report.html import write_report
-from tofuse.report.thumbnails import viridis
+from tofuse.apps.report.html import write_report
+from tofuse.apps.report.thumbnails import viridis
 
 pytestmark = pytest.mark.nightly
 

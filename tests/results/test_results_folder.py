@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from made_results import contents, result, torn
-from tofuse.errors import InputError, OutputError
-from tofuse.files.staging import beside
+from tofuse.engine.errors import InputError, OutputError
+from tofuse.formats.files.staging import beside
 from tofuse.lab.demo import _check_simulated
-from tofuse.results.folder import OutputFolder, check_output, finish_interrupted, is_result
-from tofuse.results.output import write_result
-from tofuse.results.run_json import read_run_json
+from tofuse.apps.results.folder import OutputFolder, check_output, finish_interrupted, is_result
+from tofuse.apps.results.output import write_result
+from tofuse.apps.results.run_json import read_run_json
 
 
 @pytest.mark.parametrize("what", ["new", "old", "lock", "component", "file"])
@@ -41,7 +41,7 @@ def test_links_are_never_followed(tmp_path, what) -> None:
 
 HOLD = """
 import sys
-from tofuse.results.folder import OutputFolder
+from tofuse.apps.results.folder import OutputFolder
 with OutputFolder(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()

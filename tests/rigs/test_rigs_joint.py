@@ -12,13 +12,13 @@ import pytest
 from scipy.stats import chi2
 
 from rig_scene import looked_at
-from tofuse.geometry import se3
+from tofuse.engine.geometry import se3
 from tofuse.lab.simulation.rig import camera_ring, relative
-from tofuse.posegraph.view_store import SampledView
-from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.prepared_view import prepare_view
-from tofuse.registration.surface_options import SurfaceOptions
-from tofuse.rigs.joint import RigView, disagreements, refine_together
+from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.apps.rigs.joint import RigView, disagreements, refine_together
 
 
 def distorted(frame: RangeFrame, by: np.ndarray) -> RangeFrame:

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from tofuse.geometry import se3
-from tofuse.posegraph.view_store import SampledView
-from tofuse.rigs.calibrate import calibrate_cameras
-from tofuse.rigs.inputs import open_cameras
-from tofuse.rigs.joint import RigView, disagreements
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.apps.rigs.calibrating import calibrate_cameras
+from tofuse.apps.rigs.inputs import open_cameras
+from tofuse.apps.rigs.joint import RigView, disagreements
 
 
 @pytest.mark.slow

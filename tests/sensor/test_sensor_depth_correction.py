@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.errors import InputError
-from tofuse.sensor.depth_correction import DepthCorrection
+from tofuse.engine.errors import InputError
+from tofuse.engine.sensor.depth_correction import DepthCorrection
 
 
 def test_curve_is_linear_between_knots_and_constant_outside() -> None:

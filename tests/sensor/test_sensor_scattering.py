@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.sensor.scattering import Scattering, blur, estimate_fractions
+from tofuse.engine.sensor.scattering import Scattering, blur, estimate_fractions
 
 ROWS, COLUMNS = 60, 88
 V, U = np.mgrid[:ROWS, :COLUMNS]

@@ -11,13 +11,13 @@ import pytest
 from light_report import write_light_report
 
 from browser import changed, chromium, watched
-from tofuse.pipeline import run as run_module
-from tofuse.pipeline.progress import Silent
-from tofuse.pipeline.run import run
-from tofuse.pipeline.run_options import Options
-from tofuse.recordings.frames import CloudFrame
-from tofuse.viewer.coverage import Coverage
-from tofuse.viewer.server import serve, stop
+from tofuse.apps.jobs import running as run_module
+from tofuse.engine.mapping.progress import Silent
+from tofuse.apps.jobs.running import run
+from tofuse.apps.jobs.run_options import Options
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.apps.viewer.coverage import Coverage
+from tofuse.apps.viewer.server import serve, stop
 
 needs_viser = pytest.mark.skipif(
     importlib.util.find_spec("viser") is None, reason="viser is not installed"
@@ -57,9 +57,9 @@ class Recorder(Silent):
 @pytest.mark.slow
 @needs_viser
 def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser, monkeypatch):
-    from tofuse.pipeline.progress import CombinedProgress
-    from tofuse.viewer.live_view import LiveView
-    from tofuse.viewer.server import address
+    from tofuse.engine.mapping.progress import CombinedProgress
+    from tofuse.apps.viewer.live_view import LiveView
+    from tofuse.apps.viewer.server import address
 
     same = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply")
     quick = {"end": 4, "method": "thesis"}
@@ -114,7 +114,7 @@ def test_accuracy_improves_with_proximity_and_number_of_views():
 
 @needs_viser
 def test_views_of_long_run_are_thinned():
-    from tofuse.viewer import live_view as live_module
+    from tofuse.apps.viewer import live_view as live_module
 
     server = serve()
     try:

@@ -7,8 +7,8 @@ import socket
 
 import pytest
 
-from tofuse.report.policy import script_hashes, secured
-from tofuse.viewer.server import HOST, is_same_origin, page_headers
+from tofuse.apps.report.policy import script_hashes, secured
+from tofuse.apps.viewer.server import HOST, is_same_origin, page_headers
 
 HOSTS: dict[str, tuple[list[str], list[str], bool]] = {
     "our own page": (["127.0.0.1:8080"], ["http://127.0.0.1:8080"], True),
@@ -38,7 +38,7 @@ def test_hosts_and_origins_that_are_answered(name: str) -> None:
 @pytest.fixture(scope="module")
 def port():
     pytest.importorskip("viser")
-    from tofuse.viewer.server import serve, stop
+    from tofuse.apps.viewer.server import serve, stop
 
     server = serve()
     yield server.get_port()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.arrays import Bool, Float64
-from tofuse.geometry import se3
+from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.geometry import se3
 
 _DRAWS = 20_000
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tofuse.arrays import Float64
+from tofuse.engine.arrays import Float64
 from tofuse.lab.experiments.peaks import AXES, PeaksRun, PeaksSweep
-from tofuse.report import plots
-from tofuse.report.plots import AFTER, BAD, BEFORE, GRID, INK, MUTED, REFERENCE, make_figure, svg
+from tofuse.apps.report import plots
+from tofuse.apps.report.plots import AFTER, BAD, BEFORE, GRID, INK, MUTED, REFERENCE, make_figure, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

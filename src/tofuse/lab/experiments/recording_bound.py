@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from tofuse.arrays import Bool, Float64, Int64
-from tofuse.geometry import se3
+from tofuse.engine.arrays import Bool, Float64, Int64
+from tofuse.engine.geometry import se3
 from tofuse.lab.simulation import optics
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.geometry import se3
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
 from tofuse.lab.experiments import figures
 from tofuse.lab.experiments.cases import GUESSES, METHODS, CaseResult, Model, Run
 from tofuse.lab.experiments.peaks import PeaksSweep
 from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.lab.simulation.scenes import box, room
-from tofuse.report import thumbnails
+from tofuse.apps.report import thumbnails
 
 _EXAMPLE_SIGMA = 0.09
 

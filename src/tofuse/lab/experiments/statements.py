@@ -12,8 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from tofuse.arrays import Bool, Float64
-from tofuse.geometry import se3
+from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.geometry import se3
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.cases import CaseResult, Run
 from tofuse.lab.experiments.peaks import PeaksRun, PeaksSweep

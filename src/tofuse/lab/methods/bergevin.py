@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.geometry import se3
-from tofuse.kernels.icp import transform_points
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
+from tofuse.engine.clouds.icp_kernels import transform_points
 from tofuse.lab.methods.multiview import Cloud, Pairs, RelaxationMethod
-from tofuse.parts import part
+from tofuse.engine.parts import part
 
 # Relative size below which eigenvalues are rounding errors.
 _RANK = 1e-10

@@ -11,11 +11,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.geometry import quaternion, se3
-from tofuse.posegraph.descent import Descent, Problem
-from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.sparse import PairSystem, first_of_parts
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.graph.descent import Descent, Problem
+from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph.sparse import PairSystem, first_of_parts
 
 
 class Chart(Protocol):

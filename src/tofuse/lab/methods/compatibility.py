@@ -8,10 +8,10 @@ from typing import Annotated
 
 import numpy as np
 
-from tofuse.bounds import Bounded, Bounds
-from tofuse.kernels.icp import transform_points
-from tofuse.parts import part
-from tofuse.registration.interfaces import Alignment, Matches, Rejector
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.clouds.icp_kernels import transform_points
+from tofuse.engine.parts import part
+from tofuse.engine.clouds.interfaces import Alignment, Matches, Rejector
 
 
 @part("rejector", "normal", label="validated")

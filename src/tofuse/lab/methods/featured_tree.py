@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from tofuse.arrays import Float64, Int64
-from tofuse.kernels.kdtree import KdTree, checked_points
+from tofuse.engine.arrays import Float64, Int64
+from tofuse.engine.geometry.kdtree import KdTree, checked_points
 
 
 class FeaturedKdTree(KdTree):

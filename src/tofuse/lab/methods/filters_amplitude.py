@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from tofuse.arrays import Bool
-from tofuse.filters.base import Filter, Interval
-from tofuse.parts import part
-from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.engine.arrays import Bool
+from tofuse.engine.filters.base import Filter, Interval
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 
 
 @part("filter", "amplitude")

@@ -8,11 +8,11 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from tofuse.arrays import Bool
-from tofuse.bounds import Bounded, Bounds
-from tofuse.filters.base import Filter
-from tofuse.parts import part
-from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.engine.arrays import Bool
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.filters.base import Filter
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import Frame, RangeFrame
 
 
 @part("filter", "box")

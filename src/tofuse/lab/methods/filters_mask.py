@@ -11,12 +11,12 @@ from typing import Annotated, ClassVar
 import cv2
 import numpy as np
 
-from tofuse.arrays import Bool
-from tofuse.bounds import Bounded, NotEmpty
-from tofuse.errors import InputError
-from tofuse.filters.base import Filter
-from tofuse.parts import part
-from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.engine.arrays import Bool
+from tofuse.engine.bounds import Bounded, NotEmpty
+from tofuse.engine.errors import InputError
+from tofuse.engine.filters.base import Filter
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import Frame, RangeFrame
 
 
 @part("filter", "mask")

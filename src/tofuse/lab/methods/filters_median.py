@@ -8,13 +8,13 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.arrays import Bool, Float32
-from tofuse.bounds import Bounded, Bounds
-from tofuse.filters.base import Filter
-from tofuse.kernels.threads import run_chunks
-from tofuse.lab.kernels.window_median import window_median
-from tofuse.parts import part
-from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.engine.arrays import Bool, Float32
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.filters.base import Filter
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.lab.methods.window_median_kernels import window_median
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import Frame, RangeFrame
 
 
 @part("filter", "median")

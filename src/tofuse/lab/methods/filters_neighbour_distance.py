@@ -8,12 +8,12 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.arrays import Bool
-from tofuse.bounds import Bounded, Bounds
-from tofuse.filters.base import Filter
-from tofuse.filters.neighbours import MAX_NEIGHBOURS, mean_neighbour_distance
-from tofuse.parts import part
-from tofuse.recordings.frames import Frame
+from tofuse.engine.arrays import Bool
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.filters.base import Filter
+from tofuse.engine.filters.neighbours import MAX_NEIGHBOURS, mean_neighbour_distance
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import Frame
 
 
 @part("filter", "neighbour_distance")

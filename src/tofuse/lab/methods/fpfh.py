@@ -7,14 +7,14 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.bounds import Bounded, Bounds
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.lab.methods.sample_consensus import Method, SampleOptions, registration_of
-from tofuse.parts import part
-from tofuse.recordings.frames import Frame
-from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.coarse_to_fine import CoarseToFine
-from tofuse.registration.fpfh import NEIGHBOURS, POINTS, REACH, candidates
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import Frame
+from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
+from tofuse.engine.clouds.fpfh import NEIGHBOURS, POINTS, REACH, candidates
 
 
 @part("registration", "fpfh")

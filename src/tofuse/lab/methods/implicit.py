@@ -7,14 +7,14 @@ from typing import Annotated
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.bounds import Bounded, Bounds
-from tofuse.kernels.cloud_sums import plane_sums
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.clouds.cloud_sum_kernels import plane_sums
 from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
-from tofuse.parts import part
-from tofuse.registration.interfaces import Alignment, Matches
-from tofuse.registration.pairs import SurfacePairs, solve, surface_pairs
-from tofuse.registration.surface_metrics import PointToPlane, SurfaceMetric
+from tofuse.engine.parts import part
+from tofuse.engine.clouds.interfaces import Alignment, Matches
+from tofuse.engine.clouds.pairs import SurfacePairs, solve, surface_pairs
+from tofuse.engine.clouds.surface_metrics import PointToPlane, SurfaceMetric
 
 # Cutoff of the weights in widths (exp(-9)).
 _CUTOFF = 3.0

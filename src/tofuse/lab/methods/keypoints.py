@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.arrays import Bool, Float32, Float64, Int64, UInt8
-from tofuse.errors import RegistrationError
-from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.registration.prepared_view import PreparedView
+from tofuse.engine.arrays import Bool, Float32, Float64, Int64, UInt8
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.views.prepared_view import PreparedView
 
 Detector = Literal["sift", "orb", "fast"]
 Channel = Literal["auto", "albedo", "color"]

@@ -13,18 +13,18 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.arrays import Bool, Float64
-from tofuse.bounds import Bounded, Bounds
-from tofuse.geometry import se3
-from tofuse.kernels.icp import transform_points
-from tofuse.kernels.kdtree import KdTree
-from tofuse.posegraph.external_sensors import SensorPriors
-from tofuse.posegraph.plane_refinement import SampledPoints
-from tofuse.posegraph.refinement import Refinement, RefinementMethod, Refiner, accepted_with
-from tofuse.posegraph.view_store import Spacing, ViewStore
-from tofuse.recordings.frames import CloudFrame, Frame
-from tofuse.registration.prepared_view import PreparedView
-from tofuse.registration.shape import shape_at
+from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.geometry import se3
+from tofuse.engine.clouds.icp_kernels import transform_points
+from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.graph.external_sensors import SensorPriors
+from tofuse.engine.refinement.plane_refinement import SampledPoints
+from tofuse.engine.refinement.refinement import Refinement, RefinementMethod, Refiner, accepted_with
+from tofuse.engine.stored_views.view_store import Spacing, ViewStore
+from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.clouds.shape import shape_at
 
 # Min fraction and number of points with a partner in an overlapping view.
 _MIN_OVERLAP, _MIN_POINTS = 0.1, 30

@@ -9,17 +9,17 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.bounds import Bounded, Bounds
-from tofuse.errors import RegistrationError
-from tofuse.geometry import se3
-from tofuse.parts import part
-from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.registration.agreement import agreement
-from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.plane_detection import Plane, detect_planes
-from tofuse.registration.prepared_view import PreparedView, prepare_view
-from tofuse.registration.surface_options import SurfaceOptions
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.geometry import se3
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.search.pair_agreement import agreement
+from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.search.plane_detection import Plane, detect_planes
+from tofuse.engine.views.prepared_view import PreparedView, prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 
 # Min sine of the angle between two normals that determine a rotation, and min volume spanned by
 # three that determine a translation.

@@ -8,14 +8,14 @@ from typing import Annotated
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.bounds import Bounded, Bounds
-from tofuse.kernels.icp import transform_points
-from tofuse.parts import part
-from tofuse.registration.interfaces import Alignment, Matches, Metric
-from tofuse.registration.metrics import PointToPoint
-from tofuse.registration.pairs import in_scales
-from tofuse.registration.surface_metrics import TangentPlanes
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.clouds.icp_kernels import transform_points
+from tofuse.engine.parts import part
+from tofuse.engine.clouds.interfaces import Alignment, Matches, Metric
+from tofuse.engine.clouds.metrics import PointToPoint
+from tofuse.engine.clouds.pairs import in_scales
+from tofuse.engine.clouds.surface_metrics import TangentPlanes
 
 # Factor of mu per round (Yang et al. 2020, remark 5).
 _MU_FACTOR = 1.4

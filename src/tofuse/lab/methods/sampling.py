@@ -7,14 +7,14 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.arrays import Float64, Int64
-from tofuse.bounds import Bounded, Bounds
-from tofuse.errors import RegistrationError
-from tofuse.parts import part
-from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.registration.interfaces import Selector
-from tofuse.registration.selectors import Random
-from tofuse.registration.shape import NEIGHBOURS, normals_at
+from tofuse.engine.arrays import Float64, Int64
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.clouds.interfaces import Selector
+from tofuse.engine.clouds.selectors import Random
+from tofuse.engine.clouds.shape import NEIGHBOURS, normals_at
 
 
 @part("selector", "random-each-iteration", label="validated")

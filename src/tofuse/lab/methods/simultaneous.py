@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from tofuse.arrays import Float64
-from tofuse.geometry import se3
-from tofuse.kernels.icp import transform_points
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
+from tofuse.engine.clouds.icp_kernels import transform_points
 from tofuse.lab.methods.multiview import Cloud, Pairs, RelaxationMethod, optimal_rotation
-from tofuse.parts import part
+from tofuse.engine.parts import part
 
 # Weight of the fixed first view relative to all pairs.
 _GAUGE_WEIGHT = 1e6

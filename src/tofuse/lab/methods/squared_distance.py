@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.kernels.cloud_sums import matrix_sums
+from tofuse.engine.arrays import Float64
+from tofuse.engine.clouds.cloud_sum_kernels import matrix_sums
 from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
-from tofuse.parts import part
-from tofuse.registration.interfaces import Alignment, Matches
-from tofuse.registration.pairs import SurfacePairs, solve, surface_pairs
-from tofuse.registration.surface_metrics import PointToPlane, SurfaceMetric
+from tofuse.engine.parts import part
+from tofuse.engine.clouds.interfaces import Alignment, Matches
+from tofuse.engine.clouds.pairs import SurfacePairs, solve, surface_pairs
+from tofuse.engine.clouds.surface_metrics import PointToPlane, SurfaceMetric
 
 
 @part("metric", "squared-distance", label="validated")

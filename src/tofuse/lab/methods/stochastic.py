@@ -7,13 +7,13 @@ from typing import Annotated
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.bounds import Bounded, Bounds
-from tofuse.geometry import se3
-from tofuse.parts import part
-from tofuse.posegraph.castellani import free_vertices
-from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
-from tofuse.posegraph.levenberg import check_graph
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.geometry import se3
+from tofuse.engine.parts import part
+from tofuse.engine.graph.castellani import free_vertices
+from tofuse.engine.graph.graph import Optimisation, Optimiser, PoseGraph
+from tofuse.engine.graph.levenberg import check_graph
 
 
 @part("optimiser", "stochastic", label="validated")

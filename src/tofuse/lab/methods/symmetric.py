@@ -7,21 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.geometry import se3
-from tofuse.kernels.cloud_sums import plane_sums
-from tofuse.lab.kernels.symmetric import symmetric_sums
-from tofuse.parts import part
-from tofuse.registration.interfaces import Alignment, Matches
-from tofuse.registration.pairs import (
-    Loss,
-    SurfacePairs,
-    loss_weights,
-    solve,
-    surface_pairs,
-    variance_of,
-)
-from tofuse.registration.surface_metrics import SurfaceMetric
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
+from tofuse.engine.clouds.cloud_sum_kernels import plane_sums
+from tofuse.lab.methods.symmetric_kernels import symmetric_sums
+from tofuse.engine.parts import part
+from tofuse.engine.clouds.interfaces import Alignment, Matches
+from tofuse.engine.clouds.pairs import Loss, SurfacePairs, loss_weights, solve, surface_pairs, variance_of
+from tofuse.engine.clouds.surface_metrics import SurfaceMetric
 
 
 @part("metric", "symmetric", label="validated")

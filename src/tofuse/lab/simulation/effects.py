@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from enum import IntFlag
 from typing import Any, Literal, Self
 
-from tofuse.errors import InputError
+from tofuse.engine.errors import InputError
 
 NoiseLaw = Literal["poisson", "other"]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.geometry import se3
-from tofuse.posegraph.graph import PoseGraph
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
+from tofuse.engine.graph.graph import PoseGraph
 
 
 def drifting_laps(count: int, per_lap: int, degrees: float) -> tuple[PoseGraph, Float64]:

@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofuse.arrays import Float64, Int64
-from tofuse.geometry import se3
+from tofuse.engine.arrays import Float64, Int64
+from tofuse.engine.geometry import se3
 
 # Crease angle: edges below it are smoothed.
 CREASE_RAD = np.deg2rad(48.0)

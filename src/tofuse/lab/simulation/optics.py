@@ -8,13 +8,13 @@ from functools import cache
 import numpy as np
 from scipy import ndimage
 
-from tofuse.arrays import Bool, Float64, Int32
-from tofuse.geometry.cameras import Pinhole
-from tofuse.kernels.threads import run_chunks
-from tofuse.lab.kernels import phasor
+from tofuse.engine.arrays import Bool, Float64, Int32
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.lab.simulation import phasor_kernels as phasor
 from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.simulation.scene import Scene
-from tofuse.sensor.frequencies import SPEED_OF_LIGHT
+from tofuse.engine.sensor.frequencies import SPEED_OF_LIGHT
 
 # Offset of secondary rays from their surface, against self-intersection.
 _RAY_OFFSET_M = 1e-4

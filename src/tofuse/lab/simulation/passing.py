@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.errors import InputError
-from tofuse.geometry import se3
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.mesh import Mesh

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofuse.arrays import Float64
-from tofuse.geometry import se3
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
 
 Path = Callable[[float], Float64]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofuse.arrays import Float64, Intp
-from tofuse.geometry import se3
-from tofuse.recordings.frames import CloudFrame
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.geometry import se3
+from tofuse.engine.frames.frames import CloudFrame
 
 CAMERAS = 20
 RADIUS_M = 10.0

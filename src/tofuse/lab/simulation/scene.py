@@ -15,12 +15,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofuse.arrays import Float32, Float64, Int32, Int64
-from tofuse.errors import InputError
-from tofuse.geometry import se3
-from tofuse.kernels.threads import run_chunks
-from tofuse.lab.kernels import bvh
-from tofuse.lab.kernels.shading import Rays, Shading, Textures, Triangles, shade_hits
+from tofuse.engine.arrays import Float32, Float64, Int32, Int64
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.lab.simulation import bvh_kernels as bvh
+from tofuse.lab.simulation.shading_kernels import Rays, Shading, Textures, Triangles, shade_hits
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import texture
 from tofuse.lab.simulation.mesh import Mesh

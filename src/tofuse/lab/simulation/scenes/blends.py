@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofuse.arrays import Bool, Float64, Int64
+from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.lab.simulation.mesh import Mesh
 
 Shape = Callable[[Float64], Float64]

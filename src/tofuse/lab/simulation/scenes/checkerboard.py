@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.arrays import Float64
-from tofuse.geometry import se3
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.paths import Path

@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from tofuse.arrays import Float64
-from tofuse.geometry import se3
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.scene import SceneOptions, ScenePlan

@@ -1,0 +1,356 @@
+"""`tofuse.reconstruct`, `tofuse.merge` and `tofuse.load`, and the result that they return."""
+
+from __future__ import annotations
+
+import html
+import sys
+import tempfile
+import webbrowser
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
+
+from tofuse.apps.cli.progress import TerminalProgress
+from tofuse.engine.errors import InputError
+from tofuse.engine.filters.foreground import Foreground
+from tofuse.engine.mapping.adaptation import adapted
+from tofuse.engine.mapping.config import Config, changed, from_method
+from tofuse.apps.jobs.evaluating import Evaluation, evaluate
+from tofuse.apps.jobs.merging import merge as merge_results
+from tofuse.engine.mapping.progress import Progress
+from tofuse.engine.mapping.reconstruction import reconstruct as reconstruct_recording
+from tofuse.engine.mapping.reconstruction import view_kind
+from tofuse.apps.jobs.report_files import write_report_files
+from tofuse.apps.jobs.running import quick_findings, with_findings
+from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.quality.accuracy_card import SEPARATOR, card
+from tofuse.apps.results.folder import OutputFolder
+from tofuse.apps.results.loading import load_result
+from tofuse.apps.results.output import write_result
+from tofuse.engine.quality.types import Reconstruction
+
+if TYPE_CHECKING:
+    from tofuse.apps.viewer.report_server import ReportServer
+
+
+_THUMBNAIL = (420, 262)  # pixels
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(Reconstruction):
+    """A reconstruction: see `Reconstruction` for its fields.
+
+    Attributes
+    ----------
+    source
+        The recording; None for a result that was loaded.
+    fitted
+        The configuration after its parts were fitted to the recording, if known.
+    """
+
+    source: Recording | None = None
+    fitted: Config | None = None
+
+    @classmethod
+    def of(
+        cls,
+        reconstruction: Reconstruction,
+        source: Recording | None = None,
+        fitted: Config | None = None,
+    ) -> Self:
+        """Make a result of a reconstruction, for example that of `Mapper.finish`.
+
+        Parameters
+        ----------
+        reconstruction
+            The reconstruction.
+        source
+            The recording, if known.
+        fitted
+            The configuration after its parts were fitted to the recording, if known.
+        """
+        values = {f.name: getattr(reconstruction, f.name) for f in fields(Reconstruction)}
+        return cls(**values, source=source, fitted=fitted)
+
+    @property
+    def accuracy(self) -> str:
+        """The accuracy card, in one line."""
+        return SEPARATOR.join(card(self))
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the files of ``tofuse run``, and return the folder.
+
+        The report of a loaded result contains no images of its recording.
+
+        Parameters
+        ----------
+        folder
+            A new or empty folder, or one with an earlier result.
+        overwrite
+            Whether to replace an earlier result.
+
+        Raises
+        ------
+        OutputError
+            If the folder contains anything but a result, or a result and `overwrite` is not set.
+        """
+        # BLAS results depend on its number of threads.
+        with OutputFolder(folder, overwrite=overwrite) as out, threadpool_limits(1):
+            write_result(self, out, self._write_report)
+        return Path(folder)
+
+    def _write_report(self, result: Reconstruction, folder: Path) -> None:
+        from tofuse.apps.report.extras import ReportExtras
+        from tofuse.apps.report.html import write_report
+
+        if self.source is not None:
+            config = self.fitted or adapted(_configuration(self.config, self.source), self.source)
+            write_report_files(self.source, config, result, folder)
+            return
+        title = Path(str(result.recording["path"])).name
+        write_report(result, folder / "report.html", ReportExtras(title))
+
+    def evaluate(
+        self,
+        reference: str | Path | ArrayLike | None = None,
+        *,
+        reference_error_m: float | None = None,
+    ) -> Evaluation:
+        """Compare the trajectory with a reference.
+
+        Parameters
+        ----------
+        reference
+            A file, or (N, 4, 4) T_world_camera of the same frames, NaN where there is none. None:
+            the reference poses of the recording.
+        reference_error_m
+            Rms error of the reference itself, m.
+
+        Raises
+        ------
+        InputError
+            If there is no reference, or it does not match the frames.
+        """
+        poses = reference
+        if poses is None:
+            poses = None if self.source is None else self.source.reference
+        if poses is None:
+            raise InputError(
+                "has no reference poses",
+                where="the recording" if self.source else "the loaded result",
+                remedy="pass a reference",
+            )
+        poses_or_path = poses if isinstance(poses, str | Path) else np.asarray(poses, float)
+        return evaluate(
+            self.trajectory,
+            poses_or_path,
+            recording=self.source,
+            reference_error_m=reference_error_m,
+            config=self.config,
+        )
+
+    def view(self, *, port: int | None = None, open_browser: bool = True) -> ReportServer:
+        """Show the report in the browser, as ``tofuse view`` does, and return the server.
+
+        The page is served by threads of this process, until the server is stopped or the process
+        ends; in a ``with`` statement, until its end.
+
+        Parameters
+        ----------
+        port
+            Port of the server; None: 8080, or the next free one.
+        open_browser
+            Whether to open the page in the browser.
+        """
+        from tofuse.apps.viewer.report_server import FrameImages, ReportServer, report_pages
+
+        images = None if self.source is None else FrameImages([(0, self.source)])
+        with tempfile.TemporaryDirectory(prefix="tofuse-") as temporary:
+            folder = self.save(Path(temporary) / "result")
+            pages = report_pages(folder)
+            if images is None:
+                with suppress(InputError):  # the recording of a loaded result is gone
+                    images = FrameImages.of(folder)
+        server = ReportServer(pages, images, port)
+        if open_browser:
+            webbrowser.open(server.address)
+        return server
+
+    def plot(self) -> Plot:
+        """Draw the model and the camera trajectory from above and from the side."""
+        from tofuse.apps.report import plots
+
+        points = self.cloud.points.astype(float) + self.cloud.offset
+        points = points[np.isfinite(points).all(1)]
+        path = self.trajectory[self.has_pose][:, :3, 3]
+        if not len(points):
+            raise InputError("has no points to draw", where="the model")
+        return Plot(
+            tuple(
+                plots.model(points, path, None, view, measured=None, label=f"Model, from {name}")
+                for view, name in (("above", "above"), ("side", "the side"))
+            )
+        )
+
+    def _repr_html_(self) -> str:
+        from tofuse.apps.report import thumbnails
+        from tofuse.apps.report.scene import make_scene, render
+
+        rows = {f.index: k for k, f in enumerate(self.diagnostics.frames)}
+        scene = make_scene(self, rows)
+        accuracy = html.escape(self.accuracy)
+        verdict = html.escape(self.diagnostics.verdict.capitalize())
+        picture = ""
+        if len(scene.points):
+            source = thumbnails.data_uri(render(scene, _THUMBNAIL))
+            picture = f'<img src="{source}" alt="The model" style="border-radius:8px"><br>'
+        return f"<div>{picture}<b>{verdict}</b>: {accuracy}</div>"
+
+
+@dataclass(frozen=True, repr=False)
+class Plot:
+    """Drawings that a notebook shows side by side.
+
+    Attributes
+    ----------
+    drawings
+        SVG elements.
+    """
+
+    drawings: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return f"Plot of {len(self.drawings)} drawings: save it, or show it in a notebook"
+
+    def _repr_html_(self) -> str:
+        style = "--ink:#1a1d21;--muted:#5c6470;--grid:#dfe3e8;--after:#0b67b8;--bad:#c01f3c"
+        boxes = "".join(f'<div style="width:440px">{svg}</div>' for svg in self.drawings)
+        return f'<div style="display:flex;flex-wrap:wrap;gap:16px;{style}">{boxes}</div>'
+
+    def save(self, path: str | Path) -> None:
+        """Write an HTML page with the drawings to a path."""
+        from tofuse.formats.files.atomic import write_text
+
+        write_text(path, f'<!doctype html><meta charset="utf-8">{self._repr_html_()}\n')
+
+
+def reconstruct(
+    recording: Recording,
+    config: Config | str | Mapping[str, Any] = "default",
+    *,
+    seed: int = 0,
+    threads: int | None = None,
+    loops: Sequence[PriorLoop] = (),
+    progress: Progress | bool | None = None,
+) -> Result:
+    """Reconstruct a recording: trajectory, pose graph, fused cloud and surface, diagnostics.
+
+    Frames that can't be read are skipped and counted. As at the start of `tofuse run`, a quick
+    inspection of the recording precedes: its severe findings rule out the verdict "good".
+
+    Parameters
+    ----------
+    recording
+        A recording of `tofuse.open` or `tofuse.from_arrays`.
+    config
+        The name of a configuration ("default", "thesis"); or options that differ from the default,
+        as in a TOML file of ``--config``: ``{"fusion": {"voxel_m": 0.01}}``; or a configuration.
+    seed
+        Random seed.
+    threads
+        Number of threads; None: all cores. The result does not depend on it.
+    loops
+        Known loop closures, in frame indices.
+    progress
+        True: progress bars on the terminal.
+
+    Raises
+    ------
+    InputError
+        If `recording` is not a recording or an option does not exist; if no frame can be read, or
+        none has enough valid points for a pose; or if a filter can't estimate its parameters from
+        the recording.
+    """
+    if not isinstance(recording, Recording):
+        raise InputError(
+            f"is a {type(recording).__name__}, not a recording",
+            where="recording",
+            remedy="pass tofuse.open(path), or tofuse.from_arrays(depth, K)",
+        )
+    with _with_terminal(progress) as display:
+        fitted = adapted(_configuration(config, recording), recording, threads, display)
+        turning = any(isinstance(part, Foreground) for part in fitted.filters)
+        findings = quick_findings(recording, fitted, turning=turning)
+        reconstruction = reconstruct_recording(
+            recording, fitted, seed=seed, threads=threads, loops=loops, progress=display
+        )
+    return Result.of(with_findings(reconstruction, findings, turning=turning), recording, fitted)
+
+
+def _configuration(config: Config | str | Mapping[str, Any], recording: Recording) -> Config:
+    kind = view_kind(recording)
+    if isinstance(config, str):
+        return from_method(config, kind)
+    if isinstance(config, Mapping):
+        options = {name: value for name, value in config.items() if name != "method"}
+        return changed(from_method(config.get("method", "default"), kind), options, where="config")
+    return config
+
+
+def merge(
+    results: Sequence[str | Path],
+    *,
+    tolerance_m: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | bool | None = None,
+) -> Result:
+    """Merge the results of several runs into one map, in the world frame of the first.
+
+    Parameters
+    ----------
+    results
+        Output folders of ``tofuse run`` or ``tofuse merge``; at least two sessions. Their
+        recordings must still be at their paths.
+    tolerance_m
+        Accuracy required of a good map, m; by default that of the first result.
+    seed, threads, progress
+        As for `reconstruct`.
+
+    Returns
+    -------
+    A result as of a run, with `sessions` and `session_pairs`. Sessions that can't be joined to the
+    first one are components with their own models.
+
+    Raises
+    ------
+    InputError
+        If a folder is not a result, or its recording is missing or has changed.
+    """
+    with _with_terminal(progress) as display:
+        merged = merge_results(
+            results, tolerance_m=tolerance_m, seed=seed, threads=threads, progress=display
+        )
+    return Result.of(merged)
+
+
+def _with_terminal(progress: Progress | bool | None) -> AbstractContextManager[Progress | None]:
+    return TerminalProgress(sys.stderr) if progress is True else nullcontext(progress or None)
+
+
+def load(folder: str | Path) -> Result:
+    """Read a result of ``tofuse run`` or `Result.save` from its folder.
+
+    Raises
+    ------
+    InputError
+        If it is not an output folder, or its files are damaged or of different runs.
+    """
+    return Result.of(load_result(folder))

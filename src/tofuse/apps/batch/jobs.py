@@ -1,0 +1,289 @@
+"""The jobs of a batch: recordings, and lists of them with options."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from glob import escape, glob, has_magic
+from pathlib import Path
+from typing import Any
+
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.reading import name_order, parse_toml, read_head, read_text
+from tofuse.formats.files.stamps import stamps_of
+
+RESERVED = ("batch.csv", "batch.html", "jobs")  # names in the output folder not for jobs
+# Other files are recordings if they are binary, or a reader recognises them.
+_LISTS = (".csv", ".toml", ".txt")
+_HEAD_BYTES = 4096
+_MAX_NAME_LENGTH = 100  # characters of a name
+_UNITS = {"": 1, "k": 1000, "m": 1000**2, "g": 1000**3, "t": 1000**4}
+_BINARY = {"ki": 1 << 10, "mi": 1 << 20, "gi": 1 << 30, "ti": 1 << 40}
+
+RunArguments = Callable[[Mapping[str, str], Path, str], tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording, and the options of its run.
+
+    Attributes
+    ----------
+    name
+        Name of its folder: unique, and valid on every system.
+    recording
+        Absolute path.
+    arguments
+        Options of `tofuse run`, each ``--name`` or ``--name=value``.
+    memory
+        Stated memory requirement in bytes; None without one.
+    """
+
+    name: str
+    recording: str
+    arguments: tuple[str, ...] = ()
+    memory: int | None = None
+
+    def key(self, out: Path) -> str:
+        """Return a digest of the inputs of the result: the recording's files and the options.
+
+        Files are identified by path, size and modification time; those in `out` are ignored.
+        """
+        values = [word.partition("=")[2] for word in self.arguments]
+        paths = [Path(v) for v in (self.recording, *values) if v and Path(v).is_absolute()]
+        files = [s for path in paths for s in stamps_of(path, out)]
+        facts = {"recording": self.recording, "words": self.arguments, "files": files}
+        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A line or row of a list, or an argument: its pattern, and its options."""
+
+    where: str
+    pattern: str
+    options: Mapping[str, str] = field(default_factory=dict)
+
+
+def read_jobs(paths: Sequence[Path], run_arguments: RunArguments) -> tuple[Job, ...]:
+    """Return the jobs of recordings, globs of recordings, and lists.
+
+    A list is a table (.csv, .toml), or text with one path or glob per line; relative ones refer to
+    its folder. Folders, binary files and files that a reader recognises are recordings. Duplicates
+    of a recording with the same options are ignored.
+
+    Parameters
+    ----------
+    paths
+        Paths of lists and of recordings, and globs of recordings.
+    run_arguments
+        Converts the options of a row to arguments of `tofuse run`; it also gets the folder that
+        relative paths refer to, and the row for error messages.
+
+    Raises
+    ------
+    InputError
+        If a list can't be read, there is no recording, or a row can't be a job.
+    """
+    jobs: dict[str, Job] = {}  # by the name in lower case, as some systems ignore case
+    seen: set[tuple[object, ...]] = set()
+    for base, row in (each for path in paths for each in _rows(path)):
+        options = dict(row.options)
+        name, memory = options.pop("name", ""), options.pop("memory", "")
+        memory_bytes = _bytes_of(memory, row.where) if memory else None
+        arguments = run_arguments(options, base, row.where)
+        matches = _matches(row, base)
+        if name and len(matches) > 1:
+            raise InputError(
+                f"{row.pattern} matches {len(matches)} recordings, but there is one name, {name}",
+                where=row.where,
+                remedy="leave out the name, or list the recordings one by one",
+            )
+        for recording in matches:
+            identity = os.path.realpath(recording), arguments, name
+            if identity in seen:
+                continue
+            job_name = _check_name(name, jobs, row.where) if name else _unique_name(recording, jobs)
+            seen.add(identity)
+            jobs[job_name.lower()] = Job(job_name, recording, arguments, memory_bytes)
+    if not jobs:
+        names = ", ".join(map(str, paths))
+        raise InputError("lists no recording", where=names, remedy="add a path or glob per line")
+    return tuple(jobs.values())
+
+
+def _rows(path: Path) -> Iterator[tuple[Path, _Row]]:
+    """Yield the rows of a list, or one for a recording or glob, and the base of relative paths."""
+    if not _is_list(path):
+        yield Path.cwd(), _Row(str(path), str(path))
+        return
+    readers = {".csv": _csv_rows, ".toml": _toml_rows}
+    for row in readers.get(path.suffix.lower(), _text_rows)(read_text(path), path):
+        yield path.absolute().parent, row
+
+
+def _is_list(path: Path) -> bool:
+    if os.path.isdir(path) or (has_magic(str(path)) and not os.path.exists(path)):
+        return False
+    if path.suffix.lower() in _LISTS:
+        return True
+    if b"\0" in read_head(path, _HEAD_BYTES):
+        return False
+    from tofuse.formats.recordings.open import is_recording
+
+    return not is_recording(path)
+
+
+def _text_rows(text: str, path: Path) -> Iterator[_Row]:
+    for k, line in enumerate(text.splitlines()):
+        # Only at the beginning of a line or after a blank: names may contain a #.
+        pattern = re.sub(r"(^|\s)#.*", "", line).strip()
+        if pattern:
+            yield _Row(f"{path}: line {k + 1}", pattern)
+
+
+def _csv_rows(text: str, path: Path) -> Iterator[_Row]:
+    try:
+        lines = [line for line in csv.reader(io.StringIO(text), strict=True) if any(line)]
+    except csv.Error as error:
+        raise InputError(
+            f"is not a table ({error})", where=path, remedy="check the file"
+        ) from error
+    header = [cell.strip() for cell in lines[0]] if lines else []
+    if len(set(header)) != len(header) or "" in header:
+        names = ", ".join(header)
+        raise InputError(
+            f"has the column names {names}", where=path, remedy="name each column once"
+        )
+    for k, cells in enumerate(lines[1:]):
+        where = f"{path}: row {k + 1}"
+        if len(cells) != len(header):
+            raise InputError(
+                f"has {len(cells)} cells, but there are {len(header)} columns",
+                where=where,
+                remedy="use one cell per column, and quote cells that contain a comma",
+            )
+        yield _row(dict(zip(header, (cell.strip() for cell in cells), strict=True)), where)
+
+
+def _toml_rows(text: str, path: Path) -> Iterator[_Row]:
+    data = parse_toml(text, where=path)
+    shared, tables = data.pop("all", {}), data.pop("job", [])
+    if data or not isinstance(shared, dict) or not isinstance(tables, list):
+        raise InputError(
+            f"has {', '.join(data) or 'something else'} where only [all] and [[job]] are allowed",
+            where=path,
+            remedy="use a [[job]] table per recording, and an [all] table for common options",
+        )
+    for k, table in enumerate(tables):
+        where = f"{path}: job {k + 1}"
+        if not isinstance(table, dict):
+            raise InputError("is not a table", where=where, remedy="write it below [[job]]")
+        yield _row({n: _plain(v, n, where) for n, v in {**shared, **table}.items()}, where)
+
+
+def _plain(value: Any, name: str, where: str) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str | int | float):
+        return str(value)
+    raise InputError(f"{name} is {value!r}", where=where, remedy="use a text, number or boolean")
+
+
+def _row(cells: Mapping[str, str], where: str) -> _Row:
+    pattern = cells.get("recording", "")
+    if not pattern:
+        raise InputError("names no recording", where=where, remedy="state it as `recording`")
+    return _Row(where, pattern, {n: v for n, v in cells.items() if n != "recording" and v})
+
+
+def _matches(row: _Row, base: Path) -> list[str]:
+    """The path itself, whether it exists or not, or all matches of a glob, ordered by name."""
+    if "\0" in row.pattern:
+        raise InputError("contains a NUL", where=row.where, remedy="check the file")
+    pattern = os.path.expanduser(row.pattern)
+    path = os.path.join(base, pattern)
+    if not has_magic(pattern) or os.path.exists(path):
+        return [str(Path(path))]
+    matches = glob(os.path.join(escape(str(base)), pattern), recursive=True)
+    paths = sorted(map(Path, matches), key=_path_order)
+    if not paths:
+        raise InputError(
+            f"nothing matches {row.pattern}",
+            where=row.where,
+            remedy=f"check the pattern; relative ones refer to {base}",
+        )
+    return [str(p) for p in paths]
+
+
+def _path_order(path: Path) -> list[list[tuple[int, int, str]]]:
+    return [name_order(Path(part)) for part in path.parts]
+
+
+def _check_name(name: str, taken: Iterable[str], where: str) -> str:
+    if name != _safe(name) or name.lower() in RESERVED:
+        raise InputError(
+            f"{name!r} can't be used as the name of a folder",
+            where=where,
+            remedy="use letters, digits, '-', '_' and '.', at most 100, and none of "
+            + ", ".join(RESERVED),
+        )
+    if name.lower() in taken:
+        raise InputError(f"the name {name} is used twice", where=where, remedy="use each name once")
+    return name
+
+
+def _unique_name(recording: str, taken: Iterable[str]) -> str:
+    """The recording's name, made unique by the folders above it, or a number.
+
+    Recordings that are appended to a list don't change earlier names.
+    """
+    path = Path(recording)
+    parts = [_safe(part) for part in path.parts[1:]] or ["recording"]
+    first = len(parts) - 1
+    if parts[first] == "recording" and first:  # the name that `tofuse demo` uses
+        parts[first - 1 :] = [parts[first - 1]]
+        first -= 1
+    for start in range(first, max(first - 3, -1), -1):
+        name = "-".join(parts[start:])[-_MAX_NAME_LENGTH:]
+        if name.lower() not in (*taken, *RESERVED):
+            return name
+    number = 2
+    while f"{parts[-1]}-{number}".lower() in taken:
+        number += 1
+    return f"{parts[-1]}-{number}"
+
+
+def _safe(name: str) -> str:
+    """The name with characters replaced that are special in a path, in HTML or in a shell."""
+    name = re.sub(r"[^\w.-]+", "_", name)[-_MAX_NAME_LENGTH:]
+    return re.sub(r"^[.-]+|[.]+$", "_", name) or "_"
+
+
+def parse_bytes(text: str) -> int:
+    """Return the number of bytes of a text such as 4GB, 500 MB or 2GiB.
+
+    Raises
+    ------
+    ValueError
+        If it is not a positive amount.
+    """
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)\s*([kmgt]?i?)b?", text.strip().lower())
+    unit = {**_UNITS, **_BINARY}.get(match[2]) if match else None
+    size = 0.0 if match is None or unit is None else float(match[1]) * unit
+    if not 1 <= size < 1 << 60:
+        raise ValueError(f"{text!r} is not an amount of memory, such as 4GB")
+    return int(size)
+
+
+def _bytes_of(text: str, where: str) -> int:
+    try:
+        return parse_bytes(text)
+    except ValueError as error:
+        raise InputError(f"memory: {error}", where=where) from error

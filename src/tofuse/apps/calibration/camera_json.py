@@ -1,0 +1,107 @@
+"""Writing a calibrated lens to camera.json, preserving its other fields."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.errors import InputError, OutputError
+from tofuse.formats.files.atomic import make_folder, replacing
+from tofuse.formats.files.reading import is_file, is_folder
+from tofuse.engine.cameras.cameras import Camera, RayTable
+from tofuse.formats.recordings.camera_file import SCHEMA, camera_fields, read_json
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import Recording
+
+_LENS = ("schema", "model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
+_METADATA = (
+    "depth_unit_m",
+    "depth_kind",
+    "frame_rate_hz",
+    "ambiguity_m",
+    "confidence_max",
+    "amplitude_kind",
+)
+
+
+def recording_fields(recording: Recording) -> dict[str, Any]:
+    """Return the fields of camera.json that describe a recording's images, without the lens."""
+    path = Path(recording.path) / "camera.json"
+    if is_folder(Path(recording.path)) and is_file(path):
+        return {key: value for key, value in read_json(path).items() if key not in _LENS}
+    metadata = {key: recording.metadata.get(key) for key in _METADATA}
+    present = {key: value for key, value in metadata.items() if value is not None}
+    frame = next((f for f in recording.sample(3) if isinstance(f, RangeFrame)), None)
+    if frame is not None:
+        present.setdefault("depth_kind", frame.depth_kind)
+    return present
+
+
+def write_camera_json(
+    path: str | Path, camera: Camera, about: dict[str, Any], *, overwrite: bool = False
+) -> list[Path]:
+    """Write a camera.json, and a rays.npy in the same folder for a table of rays.
+
+    Parameters
+    ----------
+    path
+        The file, for `--camera` or the folder of a native recording.
+    camera
+        The lens.
+    about
+        Other fields; by default `depth_unit_m` is 0.001 and `depth_kind` is "z".
+    overwrite
+        Whether existing files are replaced.
+
+    Returns
+    -------
+    The files that were written.
+
+    Raises
+    ------
+    OutputError
+        If a file exists already, or a rays.npy in the same folder would override the lens.
+    InputError
+        If the lens is of no known model.
+    """
+    path = Path(path)
+    table = path.with_name("rays.npy")
+    files = [table, path] if isinstance(camera, RayTable) else [path]
+    if not overwrite and (existing := [file for file in files if file.exists()]):
+        raise OutputError(
+            "exists already", where=existing[0], remedy="use --overwrite to replace it"
+        )
+    if table.exists() and table not in files:
+        raise OutputError(
+            "would override the lens that is written to the same folder",
+            where=table,
+            remedy="move it away, or choose an --out in another folder",
+        )
+    fields = {"schema": SCHEMA} | camera_fields(camera)
+    content = fields | {"depth_unit_m": 0.001, "depth_kind": "z"} | about
+    make_folder(path.parent)
+    if isinstance(camera, RayTable):
+        with replacing(table) as part:
+            np.save(part, camera.rays(), allow_pickle=False)
+    with replacing(path) as part:
+        part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return files
+
+
+def check_new(path: Path, *, overwrite: bool) -> None:
+    """Refuse an existing file before anything is computed.
+
+    Raises
+    ------
+    OutputError
+        If it exists and may not be replaced.
+    InputError
+        If it is a folder.
+    """
+    if is_folder(path):
+        raise InputError("is a folder", where="--out", remedy="pass a file, such as camera.json")
+    if path.exists() and not overwrite:
+        raise OutputError("exists already", where=path, remedy="use --overwrite to replace it")

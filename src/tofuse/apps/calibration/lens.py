@@ -1,0 +1,439 @@
+"""Calibration of intrinsics and distortion from images of a checkerboard (Zhang 2000, OpenCV)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+
+from tofuse.engine.arrays import Float64
+from tofuse.apps.calibration.board import Board, board_image, find_corners
+from tofuse.apps.calibration.board_pose import board_pose, pose_of
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Camera, Fisheye, Pinhole
+from tofuse.engine.frames.recording import Recording, evenly_spaced
+
+MIN_VIEWS = 4
+_MAX_FRAMES = 160  # maximum number of frames in which the board is searched
+_MAX_VIEWS = 40  # maximum number of views
+_MIN_MOTION_PX = 3.0  # of the corner that moves most between distinct views
+_OUTLIER_RATIO = 3.0  # ratio to the median view's residual at which a view is an outlier
+_MIN_OUTLIER_PX = 0.3
+_MIN_SPREAD = np.radians(6)  # of the board's normals
+_MAX_SIGMA = 0.01  # of the focal length
+_MIN_COVERED = 0.5
+_CELLS = 8
+_INTRINSIC = ("fx", "fy", "cx", "cy")
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """A frame in which the board was detected.
+
+    Attributes
+    ----------
+    index
+        Of the frame.
+    corners
+        (N, 2) pixels, in the order of `Board.points`.
+    """
+
+    index: int
+    corners: Float64
+
+
+@dataclass(frozen=True)
+class LensFit:
+    """A calibrated lens and its uncertainty.
+
+    Attributes
+    ----------
+    camera
+        The lens.
+    sigma
+        Standard deviation of each parameter by name, without those fixed to 0.
+    rms_px
+        Rms reprojection error of the corners.
+    before_px
+        The same for the recording's original lens.
+    views, rms_by_view_px
+        Frames that were used, and the rms reprojection error of each.
+    left_out
+        Frames that were not used, each with the reason.
+    covered
+        Fraction of the image covered by corners.
+    warnings
+        For the user, one line each.
+    """
+
+    camera: Pinhole
+    sigma: dict[str, float]
+    rms_px: float
+    before_px: float
+    views: tuple[int, ...]
+    rms_by_view_px: tuple[float, ...]
+    left_out: tuple[tuple[int, str], ...]
+    covered: float
+    warnings: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        lens = {name: getattr(self.camera, name) for name in names_of(self.camera.model)}
+        return {
+            "model": self.camera.model,
+            "width": self.camera.width,
+            "height": self.camera.height,
+            "lens": lens,
+            "sigma": dict(self.sigma),
+            "rms_px": self.rms_px,
+            "rms_px_before": self.before_px,
+            "views": list(self.views),
+            "rms_by_view_px": list(self.rms_by_view_px),
+            "left_out": [{"frame": k, "reason": reason} for k, reason in self.left_out],
+            "covered": self.covered,
+            "warnings": list(self.warnings),
+        }
+
+
+def names_of(model: str) -> tuple[str, ...]:
+    """Return the names of a lens model's parameters, as in its class."""
+    return (*_INTRINSIC, *DISTORTION_ORDER[model])
+
+
+def board_views(
+    recording: Recording, board: Board, image: str = "amplitude"
+) -> tuple[list[BoardView], list[tuple[int, str]], Camera]:
+    """Detect the board in up to 160 evenly spaced frames of a recording.
+
+    Parameters
+    ----------
+    recording
+        Depth images with amplitude, or with colour that is registered to depth.
+    board
+        The checkerboard.
+    image
+        "amplitude" or "color".
+
+    Returns
+    -------
+    The views that show the board, the other frames with the reason, and the camera.
+
+    Raises
+    ------
+    InputError
+        If the recording has no such images.
+    """
+    views: list[BoardView] = []
+    left_out: list[tuple[int, str]] = []
+    camera: Camera | None = None
+    for item in recording.images(_MAX_FRAMES):
+        grey = board_image(item, image)
+        if grey is None:
+            other = "color" if image == "amplitude" else "amplitude"
+            raise InputError(
+                f"frame {item.index} has no {image} on the pixels of its depth",
+                where=recording.path,
+                remedy=f"use --image {other}, or record it",
+            )
+        camera = camera or item.camera
+        corners = find_corners(grey, board)
+        if corners is None:
+            left_out.append((item.index, "the board was not found"))
+        else:
+            views.append(BoardView(item.index, corners))
+    if camera is None:
+        raise InputError("has no readable frame", where=recording.path)
+    return views, left_out, camera
+
+
+def calibrate_lens(
+    recording: Recording, board: Board, model: str = "brown", image: str = "amplitude"
+) -> LensFit:
+    """Estimate the lens of the depth camera from views of a checkerboard.
+
+    Up to 40 distinct views are used. Views with three times the median reprojection error are
+    removed one by one. The number of coefficients of "brown" is selected by the Bayesian
+    information criterion; the others are 0.
+
+    Parameters
+    ----------
+    recording, board, image
+        See `board_views`.
+    model
+        "pinhole", "brown", "rational" or "fisheye".
+
+    Raises
+    ------
+    InputError
+        If too few views show the board, or they are too similar to determine the lens.
+    """
+    if model not in MODELS:
+        raise InputError(
+            f"there is no lens model {model!r}",
+            where="--model",
+            remedy=f"use one of {', '.join(MODELS)}",
+        )
+    views, left_out, before = board_views(recording, board, image)
+    detected = len(views)
+    views, similar = _distinct(views)
+    left_out += [(k, "is like another view") for k in similar]
+    _check_count(recording, board, views, detected)
+    size = before.width, before.height
+    while True:
+        fit = _fit_lens(model, views, board, size, recording.path)
+        rms = fit.rms_by_view
+        worst = int(np.argmax(rms))
+        limit = max(_OUTLIER_RATIO * float(np.median(rms)), _MIN_OUTLIER_PX)
+        if rms[worst] <= limit or len(views) <= MIN_VIEWS:
+            break
+        left_out.append((views[worst].index, f"misses by {rms[worst]:.2f} px"))
+        del views[worst]
+    _check_spread(recording, fit)
+    covered = _covered(views, size)
+    original_poses = [board_pose(before, view.corners, board) for view in views]
+    original_errors = [pose[1] for pose in original_poses if pose is not None]
+    return LensFit(
+        fit.camera,
+        fit.sigma,
+        _rms(rms),
+        _rms(np.array(original_errors)) if original_errors else float("nan"),
+        tuple(view.index for view in views),
+        tuple(float(r) for r in rms),
+        tuple(sorted(left_out)),
+        covered,
+        tuple(_warnings(fit, covered, len(views))),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    camera: Pinhole
+    sigma: dict[str, float]
+    poses: list[Float64] = field(repr=False)  # T_camera_board
+    rms_by_view: Float64
+    squares: float
+
+
+def _distinct(views: list[BoardView]) -> tuple[list[BoardView], list[int]]:
+    """Return at most 40 evenly spaced distinct views, and the frames of the others."""
+    distinct: list[BoardView] = []
+    similar: list[int] = []
+    for view in views:
+        if any(np.abs(view.corners - k.corners).max() < _MIN_MOTION_PX for k in distinct):
+            similar.append(view.index)
+        else:
+            distinct.append(view)
+    if len(distinct) > _MAX_VIEWS:
+        chosen = set(evenly_spaced(np.arange(len(distinct)), _MAX_VIEWS).tolist())
+        similar += [view.index for k, view in enumerate(distinct) if k not in chosen]
+        distinct = [view for k, view in enumerate(distinct) if k in chosen]
+    return distinct, similar
+
+
+def _check_count(recording: Recording, board: Board, views: list[BoardView], detected: int) -> None:
+    if len(views) >= MIN_VIEWS:
+        return
+    name = f"{board.columns} x {board.rows} inner corners"
+    if detected == 0:
+        raise InputError(
+            f"shows no board of {name} in {min(len(recording), _MAX_FRAMES)} frames",
+            where=recording.path,
+            remedy="check --board; have all of the board in view, matt, with a white margin",
+        )
+    raise InputError(
+        f"shows the board from {len(views)} distinct viewpoints (in {detected} frames); at least "
+        f"{MIN_VIEWS} are needed",
+        where=recording.path,
+        remedy="record it from 15 places or more, tilted to all sides and all over the image",
+    )
+
+
+def _check_spread(recording: Recording, fit: _Fit) -> None:
+    normals = np.stack([T[:3, 2] * np.sign(T[2, 2]) for T in fit.poses])
+    mean = normals.mean(0) / np.linalg.norm(normals.mean(0))
+    spread = float(np.sqrt((np.arccos(np.clip(normals @ mean, -1, 1)) ** 2).mean()))
+    relative_sigma = max(fit.sigma["fx"] / fit.camera.fx, fit.sigma["fy"] / fit.camera.fy)
+    if spread < _MIN_SPREAD or not relative_sigma < _MAX_SIGMA:
+        raise InputError(
+            f"shows the board from {len(fit.poses)} viewpoints too similar (tilts differ by "
+            f"{np.degrees(spread):.0f} degrees rms, the focal length is known to "
+            f"{100 * relative_sigma:.2g} %)",
+            where=recording.path,
+            remedy="tilt it by 20 to 40 degrees to all sides, near and far; check --board",
+        )
+
+
+def _covered(views: Sequence[BoardView], size: tuple[int, int]) -> float:
+    """Return the fraction of a grid's cells that lie within the corners of a view."""
+    covered = np.zeros((_CELLS, _CELLS), bool)
+    v, u = (np.mgrid[0:_CELLS, 0:_CELLS] + 0.5) / _CELLS
+    for view in views:
+        hull = cv2.convexHull(view.corners.astype(np.float32))
+        for i, j in np.ndindex(covered.shape):
+            at = (float(u[i, j] * size[0]), float(v[i, j] * size[1]))
+            covered[i, j] |= cv2.pointPolygonTest(hull, at, False) >= 0
+    return float(covered.mean())
+
+
+def _warnings(fit: _Fit, covered: float, views: int) -> list[str]:
+    out = []
+    if covered < _MIN_COVERED:
+        out.append(
+            f"corners cover {100 * covered:.0f} % of the image: the lens is extrapolated "
+            "elsewhere; record the board near the borders too"
+        )
+    if views < 10:
+        out.append(f"{views} views were used; 15 or more are recommended")
+    if fit.camera.model == "rational" and views < 15:
+        out.append("a rational lens has 12 parameters; 15 views or more are recommended")
+    return out
+
+
+def _rms(values: Float64) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+_NO_RATIONAL = cv2.CALIB_FIX_K4 | cv2.CALIB_FIX_K5 | cv2.CALIB_FIX_K6
+# Flags that fix coefficients to 0, and the names of the free ones; the last variant is the full
+# one.
+_VARIANTS: dict[str, tuple[tuple[int, tuple[str, ...]], ...]] = {
+    "pinhole": (
+        (
+            cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
+            (),
+        ),
+    ),
+    "brown": (
+        (cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST, ("k1",)),
+        (cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST, ("k1", "k2")),
+        (cv2.CALIB_FIX_K3, ("k1", "k2", "p1", "p2")),
+        (cv2.CALIB_ZERO_TANGENT_DIST, ("k1", "k2", "k3")),
+        (0, ("k1", "k2", "p1", "p2", "k3")),
+    ),
+    "rational": ((cv2.CALIB_RATIONAL_MODEL, DISTORTION_ORDER["rational"]),),
+}
+
+
+def _fit_lens(
+    model: str, views: Sequence[BoardView], board: Board, size: tuple[int, int], path: str
+) -> _Fit:
+    """Fit a lens to views, selecting the variant with the smallest information criterion."""
+    try:
+        if model == "fisheye":
+            return _fit_fisheye(views, board, size)
+        count = 2 * sum(len(view.corners) for view in views)
+        best: tuple[float, _Fit] | None = None
+        for flags, names in _VARIANTS[model]:
+            fit = _fit_opencv(model, flags, names, views, board, size)
+            parameters = len(_INTRINSIC) + len(names) + 6 * len(views)
+            score = count * np.log(fit.squares / count) + parameters * np.log(count)
+            if best is None or score < best[0]:
+                best = score, fit
+    except (cv2.error, InputError, np.linalg.LinAlgError) as error:
+        raise InputError(
+            f"shows the board from {len(views)} viewpoints that no {model} lens fits",
+            where=path,
+            remedy="tilt it by 20 to 40 degrees to all sides, near and far; check --board",
+        ) from error
+    assert best is not None
+    return best[1]
+
+
+def _fit_opencv(
+    model: str,
+    flags: int,
+    names: tuple[str, ...],
+    views: Sequence[BoardView],
+    board: Board,
+    size: tuple[int, int],
+) -> _Fit:
+    all_flags = flags if model == "rational" else flags | _NO_RATIONAL
+    out = cv2.calibrateCameraExtended(
+        [board.points] * len(views),
+        [view.corners.astype(np.float32) for view in views],
+        size,
+        np.eye(3),
+        np.zeros(8),
+        flags=all_flags,
+    )
+    K, distortion, rvecs, tvecs, deviations = out[1], out[2].ravel(), out[3], out[4], out[5].ravel()
+    order = DISTORTION_ORDER["rational"]
+    values = {n: float(v) for n, v in zip(order, distortion, strict=False) if n in names}
+    camera = MODELS[model](
+        size[0], size[1], float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), **values
+    )
+    deviation = dict(zip((*_INTRINSIC, *order), deviations.tolist(), strict=False))
+    sigma = {name: deviation[name] for name in (*_INTRINSIC, *names)}
+    poses = [pose_of(r, t) for r, t in zip(rvecs, tvecs, strict=True)]
+    return _evaluate(camera, sigma, poses, views, board)
+
+
+def _evaluate(
+    camera: Pinhole,
+    sigma: dict[str, float],
+    poses: list[Float64],
+    views: Sequence[BoardView],
+    board: Board,
+) -> _Fit:
+    errors = [_reprojection_errors(camera, T, v, board) for T, v in zip(poses, views, strict=True)]
+    squares = np.array([(m**2).sum() for m in errors])
+    return _Fit(camera, sigma, poses, np.sqrt(squares / len(board.points)), float(squares.sum()))
+
+
+def _reprojection_errors(camera: Pinhole, T: Float64, view: BoardView, board: Board) -> Float64:
+    return camera.project(se3.transform(T, board.points.astype(float))) - view.corners
+
+
+def _fit_fisheye(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> _Fit:
+    """Run least squares over lens and poses, initialised by a lens with one radial coefficient.
+
+    OpenCV's function needs a good initial value, and returns no standard deviations.
+    """
+    flags, names = _VARIANTS["brown"][1]
+    start = _fit_opencv("brown", flags, names, views, board, size)
+    order = names_of("fisheye")
+    lens = np.array([*(getattr(start.camera, n) for n in _INTRINSIC), 0.0, 0.0, 0.0, 0.0])
+    # Parameters are scaled to steps of similar effect: pixels, ratios, radians.
+    scale = np.array([*lens[:2], *lens[:2], 1.0, 1.0, 1.0, 1.0])
+
+    def camera_of(x: Float64) -> Fisheye:
+        return Fisheye(*size, *(float(v) for v in lens + x[:8] * scale))
+
+    def poses_of(x: Float64) -> list[Float64]:
+        steps = x[8:].reshape(-1, 6)
+        return [T @ se3.exp(step) for T, step in zip(start.poses, steps, strict=True)]
+
+    def errors(x: Float64) -> Float64:
+        camera = camera_of(x)
+        parts = [
+            _reprojection_errors(camera, T, v, board)
+            for T, v in zip(poses_of(x), views, strict=True)
+        ]
+        return np.concatenate(parts).ravel()
+
+    def jacobian(x: Float64) -> Float64:
+        base, step = errors(x), 1e-6
+        J = np.zeros((base.size, x.size))
+        for k in range(8):
+            J[:, k] = (errors(x + step * np.eye(x.size)[k]) - base) / step
+        rows = 2 * len(board.points)
+        # A pose affects the corners of its own view only, so all poses are perturbed at once.
+        for axis in range(6):
+            perturbed = x.copy()
+            perturbed[8 + axis :: 6] += step
+            derivatives = ((errors(perturbed) - base) / step).reshape(-1, rows)
+            for view in range(len(views)):
+                J[view * rows : (view + 1) * rows, 8 + 6 * view + axis] = derivatives[view]
+        return J
+
+    solution = least_squares(errors, np.zeros(8 + 6 * len(views)), jac=jacobian, method="lm")
+    freedom = max(solution.fun.size - solution.x.size, 1)
+    covariance = np.linalg.inv(solution.jac.T @ solution.jac)[:8, :8] * 2 * solution.cost / freedom
+    deviations = np.sqrt(np.diag(covariance)) * scale
+    sigma = dict(zip(order, deviations.tolist(), strict=True))
+    return _evaluate(camera_of(solution.x), sigma, poses_of(solution.x), views, board)

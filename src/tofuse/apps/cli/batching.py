@@ -1,0 +1,164 @@
+"""``tofuse batch``: from the arguments of the command line to the summary."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from difflib import get_close_matches
+
+from tofuse.apps.batch.batch import pending, run_batch, status_of
+from tofuse.apps.batch.folder import BatchFolder, Record
+from tofuse.apps.batch.jobs import Job, read_jobs
+from tofuse.apps.batch.table import write_table
+from tofuse.apps.batch.workers import LocalWorkers, Workers
+from tofuse.apps.cli.progress import emit, progress_for
+from tofuse.apps.cli.run_arguments import run_arguments
+from tofuse.engine.errors import Ended, InputError, TofuseError
+from tofuse.engine.compute.cores import usable_cores
+
+_RETRIES = 3
+_MAX_LISTED = 10  # recordings without a result that the summary names
+
+
+def batch(arguments: argparse.Namespace) -> int:
+    """Do all pending jobs, and print a summary."""
+    jobs = read_jobs(arguments.recordings, run_arguments)
+    jobs = tuple(replace(j, memory=j.memory or arguments.memory) for j in jobs)
+    selected = _selected(jobs, arguments)
+    folder = BatchFolder(arguments.out.absolute())
+    remaining = pending(selected, folder, overwrite=arguments.overwrite)
+    if arguments.print_jobs:
+        for job in remaining:
+            print(_command_line(arguments, job))
+        return 0
+    if not remaining:
+        write_table(jobs, folder)  # the list may have changed
+    else:
+        try:
+            _run(arguments, jobs, remaining, folder)
+        except (KeyboardInterrupt, Ended) as error:
+            done = sum(r is not None and r.state == "done" for r in map(folder.record, selected))
+            print(
+                f"tofuse: interrupted, {done} of {len(selected)} recordings are done; run the same "
+                "command again to resume",
+                file=sys.stderr,
+            )
+            return 128 + error.number if isinstance(error, Ended) else 130
+        except TofuseError as error:
+            if status_of(selected, folder) == 2:
+                raise
+            print(f"tofuse: {error}", file=sys.stderr)  # there are results: status 3, not 2
+    return _print_summary(selected, folder, as_json=arguments.json)
+
+
+def _selected(jobs: Sequence[Job], arguments: argparse.Namespace) -> list[Job]:
+    """The jobs of --only, or all."""
+    if arguments.only is None:
+        return list(jobs)
+    names = [job.name for job in jobs]
+    for name in arguments.only:
+        if name not in names:
+            suggestions = get_close_matches(name, names, 1)
+            raise InputError(
+                f"there is no job {name}",
+                where="--only",
+                remedy=f"did you mean {suggestions[0]}?" if suggestions else "see --print-jobs",
+            )
+    return [job for job in jobs if job.name in arguments.only]
+
+
+def _command_line(arguments: argparse.Namespace, job: Job) -> str:
+    """A command that does a single job, from any folder."""
+    command = ["tofuse", "batch", *(str(path.absolute()) for path in arguments.recordings)]
+    command += ["--out", str(arguments.out.absolute()), "--only", job.name]
+    for option in ("threads", "retries"):
+        value = getattr(arguments, option)
+        command += [] if value is None else [f"--{option}", str(value)]
+    return shlex.join([*command, *(["--overwrite"] if arguments.overwrite else [])])
+
+
+def _run(
+    arguments: argparse.Namespace,
+    jobs: Sequence[Job],
+    remaining: Sequence[Job],
+    folder: BatchFolder,
+) -> None:
+    workers, threads = _workers(arguments, len(remaining))
+    try:
+        folder.prepare()
+        with progress_for(as_json=arguments.json) as progress:
+            progress.stage("jobs", len(remaining))
+
+            def on_ended(job: Job, record: Record) -> None:
+                progress.advance()
+                if arguments.json:
+                    emit({"event": "job", "name": job.name, **asdict(record)})
+
+            run_batch(
+                jobs,
+                remaining,
+                folder,
+                workers,
+                threads=threads,
+                retries=_RETRIES if arguments.retries is None else arguments.retries,
+                on_ended=on_ended,
+                note=progress.note,
+            )
+    finally:
+        workers.close()
+
+
+def _workers(arguments: argparse.Namespace, jobs: int) -> tuple[Workers, int]:
+    """The workers, and the number of threads of each job."""
+    if arguments.scheduler is not None:
+        from tofuse.apps.batch.cluster import DaskWorkers
+
+        # A worker has a thread per core that it may use, and each thread does one job.
+        return DaskWorkers(arguments.scheduler), arguments.threads or 1
+    count = min(arguments.workers or 1, jobs)
+    return LocalWorkers(count), arguments.threads or max(1, usable_cores() // count)
+
+
+def _print_summary(selected: Sequence[Job], folder: BatchFolder, *, as_json: bool) -> int:
+    """Print a summary, and return the exit status."""
+    from tofuse.apps.cli.commands import VERDICT_COLORS, make_console
+
+    records = {job.name: folder.record(job) for job in selected}
+    verdicts = Counter(r.verdict for r in records.values() if r is not None and r.state == "done")
+    failed = {n: r.reason for n, r in records.items() if r is not None and r.state == "failed"}
+    done, status = sum(verdicts.values()), status_of(selected, folder)
+    if status == 2 and failed:
+        name, reason = next(iter(failed.items()))
+        raise InputError(
+            f"none of {len(selected)} recordings gave a result; {name}: {reason}", where=folder.html
+        )
+    if as_json:
+        emit(
+            {
+                "event": "result",
+                "out": str(folder.path),
+                "jobs": len(selected),
+                "done": done,
+                "failed": len(failed),
+                "verdicts": dict(verdicts),
+            }
+        )
+        return status
+    console = make_console()
+    counts = [
+        f"[{VERDICT_COLORS[v]}]{verdicts[v]} {v}[/]"
+        for v in ("good", "degraded", "failed")
+        if verdicts[v]
+    ]
+    verdict_counts = f": {', '.join(counts)}" if counts else ""
+    console.print(f"{done} of {len(selected)} recordings have a result{verdict_counts}")
+    for name, reason in list(failed.items())[:_MAX_LISTED]:
+        console.print(f"  {name}: {reason}", markup=False)
+    if len(failed) > _MAX_LISTED:
+        console.print(f"  and {len(failed) - _MAX_LISTED} more")
+    console.print(f"see {folder.html}", markup=False)
+    return status

@@ -1,0 +1,143 @@
+"""``tofuse calibrate``: its subjects, and their summaries."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from tofuse.apps.calibration.board import Board
+from tofuse.apps.calibration.camera_json import recording_fields, write_camera_json
+from tofuse.apps.calibration.depth import calibrate_depth, compose
+from tofuse.apps.calibration.lens import calibrate_lens
+from tofuse.apps.calibration.lens_files import read_lens_file
+from tofuse.apps.calibration.plane_views import board_planes, scene_planes
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.atomic import make_folder, replacing
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.formats.recordings.camera_file import camera_fields
+from tofuse.formats.recordings.correction_file import read_correction
+from tofuse.formats.recordings.open import Opening, open_recording
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.sensor.depth_correction import DepthCorrection
+
+# Data for JSON, lines to print, and warnings.
+Summary = tuple[dict[str, Any], list[str], list[str]]
+_MAX_LISTED = 8
+_MAX_PLANES = 20
+
+
+def lens(arguments: argparse.Namespace) -> Summary:
+    """``tofuse calibrate lens``."""
+    board = _board(arguments)
+    recording = Opening.of(arguments.inputs, arguments).open()
+    fit = calibrate_lens(recording, board, arguments.model, arguments.image)
+    lines = [_number(fit.camera, name, fit.sigma.get(name)) for name in fit.to_dict()["lens"]]
+    lines.append(
+        f"{len(fit.views)} views, reprojection error {fit.rms_px:.3f} px rms (with the recording's "
+        f"own intrinsics: {fit.before_px:.3f})"
+    )
+    lines += [f"left out: frame {frame} {reason}" for frame, reason in fit.left_out[:_MAX_LISTED]]
+    if len(fit.left_out) > _MAX_LISTED:
+        lines.append(f"left out: {len(fit.left_out) - _MAX_LISTED} more frames (--json lists all)")
+    if arguments.out is not None:
+        metadata = recording_fields(recording)
+        write_camera_json(arguments.out, fit.camera, metadata, overwrite=arguments.overwrite)
+        lines.append(f"written to {arguments.out}")
+    return fit.to_dict(), lines, list(fit.warnings)
+
+
+def depth(arguments: argparse.Namespace) -> Summary:
+    """``tofuse calibrate depth``."""
+    recording = Opening.of(arguments.inputs, arguments).open()
+    previous = _previous_correction(arguments, recording)
+    if arguments.board is not None:
+        board = Board.parse(arguments.board)
+        views, camera = board_planes(recording, board, arguments.image, wall=arguments.wall)
+    else:
+        if arguments.wall:
+            raise InputError("requires --board", where="--wall", remedy="pass --board as well")
+        if arguments.planes > _MAX_PLANES:
+            raise InputError(
+                f"is {arguments.planes}", where="--planes", remedy=f"use at most {_MAX_PLANES}"
+            )
+        views, camera = scene_planes(recording, arguments.planes, arguments.seed or 0)
+    fit = calibrate_depth(views, camera, recording.path)
+    low, high = fit.range_m
+    lines = [
+        f"{fit.planes} planes in {fit.frames} frames, {low:.2f} to {high:.2f} m",
+        f"rms distance of pixels from the planes: {1000 * fit.before_m:.1f} mm, corrected "
+        f"{1000 * fit.after_m:.1f} mm (including noise)",
+        f"systematic part (means of patches): {1000 * fit.bias_before_m:.1f} mm, corrected "
+        f"{1000 * fit.bias_after_m:.1f} mm",
+        f"constant offset known to {1000 * fit.constant_sigma_m:.1f} mm, scale to "
+        f"{100 * fit.scale_sigma:.2f} %",
+    ]
+    if arguments.out is not None:
+        correction = fit.correction if previous is None else compose(previous, fit.correction)
+        make_folder(arguments.out.parent)
+        with replacing(arguments.out) as temporary:
+            correction.save(temporary)
+        lines.append(f"written to {arguments.out}")
+        if previous is not None:
+            lines.append("it includes the correction that the recording already had")
+    return fit.to_dict(), lines, list(fit.warnings)
+
+
+def _previous_correction(
+    arguments: argparse.Namespace, recording: Recording
+) -> DepthCorrection | None:
+    """Return the correction that was applied when the recording was read."""
+    if not recording.metadata.get("corrected"):
+        return None
+    path = Path(recording.path) / "correction.npz"
+    if len(arguments.inputs) != 1 or not path.is_file():
+        raise InputError(
+            "is already corrected, each input by its own correction",
+            where=recording.path,
+            remedy="pass one folder, or move its correction.npz away",
+        )
+    return read_correction(path)
+
+
+def import_lens(arguments: argparse.Namespace) -> Summary:
+    """``tofuse calibrate import``."""
+    if len(arguments.inputs) != 1:
+        raise InputError("takes one file", where="calibrate import", remedy="pass one INPUT")
+    lens_file = read_lens_file(arguments.inputs[0])
+    metadata: dict[str, Any] = {}
+    warnings: list[str] = []
+    if arguments.recording is None:
+        warnings.append(
+            "depth is assumed to be z in mm; pass --recording to take it from a recording"
+        )
+    else:
+        recording = open_recording(arguments.recording)
+        metadata = recording_fields(recording)
+    fields = camera_fields(lens_file.camera)
+    lines = [f"{name} {value}" for name, value in fields.items()]
+    lines.append(f"read as a file of {lens_file.format}")
+    if arguments.out is not None:
+        written = write_camera_json(
+            arguments.out, lens_file.camera, metadata, overwrite=arguments.overwrite
+        )
+        lines += [f"written to {path}" for path in written]
+    return {"format": lens_file.format, "warnings": warnings} | fields, lines, warnings
+
+
+def _board(arguments: argparse.Namespace) -> Board:
+    if arguments.board is None:
+        raise InputError(
+            "is missing",
+            where="--board",
+            remedy="pass inner corners and square size in metres, e.g. 8x6:0.1",
+        )
+    return Board.parse(arguments.board)
+
+
+def _number(camera: Pinhole, name: str, sigma: float | None) -> str:
+    value = getattr(camera, name)
+    if sigma is None:
+        return f"{name} {value:.6g} (fixed)"
+    digits = 2 if name in ("fx", "fy", "cx", "cy") else 5
+    return f"{name} {value:.{digits}f} +- {sigma:.{digits}f}"

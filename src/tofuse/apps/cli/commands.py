@@ -1,0 +1,750 @@
+"""The commands. Heavy imports happen in the functions, when a command runs."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rich.console import Console
+from rich.table import Table
+
+from tofuse.apps.cli.progress import JsonProgress, QuietProgress, TerminalProgress, emit, escaped, progress_for
+from tofuse.engine.quality.types import Reason, Reconstruction
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    from tofuse.apps.jobs.run_options import Options
+    from tofuse.apps.viewer.report_server import ReportServer
+
+_Options = TypeVar("_Options", bound="DataclassInstance")
+
+_SEVERITY_COLORS = {"severe": "red", "warning": "yellow", "note": "cyan"}
+_STATUS_COLORS = {True: "green", False: "red", None: "yellow"}
+VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
+
+
+def from_arguments(
+    cls: type[_Options], arguments: argparse.Namespace, **overrides: Any
+) -> _Options:
+    """Make a dataclass of options from the arguments with the names of its fields.
+
+    Fields without an argument keep their defaults; `overrides` override both.
+    """
+    names = [f.name for f in fields(cls) if hasattr(arguments, f.name)]
+    return cls(**{name: getattr(arguments, name) for name in names} | overrides)
+
+
+def make_console() -> Console:
+    """Return a console for results on standard output, without wrapping or highlighting."""
+    return Console(highlight=False, soft_wrap=True)
+
+
+def _progress_unless_json(
+    arguments: argparse.Namespace,
+) -> AbstractContextManager[TerminalProgress | JsonProgress | QuietProgress | None]:
+    """The progress of a command whose --json prints a single object."""
+    return nullcontext() if arguments.json else progress_for(as_json=False)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """``tofuse run``."""
+    from tofuse.engine.errors import InputError
+    from tofuse.apps.jobs.running import exit_status
+    from tofuse.apps.jobs.running import run as run_pipeline
+    from tofuse.formats.recordings.rig import recordings_of, rig_file_in
+
+    options = run_options(arguments)
+    if arguments.rig is None and len(arguments.inputs) == 1:
+        arguments.rig = rig_file_in(arguments.inputs[0])
+        if arguments.rig is not None:
+            arguments.inputs = [str(path) for path in recordings_of(arguments.rig).values()]
+    if arguments.rig is not None:
+        return _run_rig(arguments, options)
+    if arguments.into is not None:
+        return _run_into(arguments, options)
+    if arguments.view:
+        return _run_live(arguments, options)
+    for is_set, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
+        if is_set:
+            raise InputError("requires --view", where=name, remedy="pass --view as well")
+    with progress_for(as_json=arguments.json) as progress:
+        result = run_pipeline(arguments.inputs, options, progress)
+    print_result(result, arguments.out, as_json=arguments.json)
+    return exit_status(result)
+
+
+def run_options(arguments: argparse.Namespace) -> Options:
+    """Return the options of ``tofuse run``."""
+    from tofuse.apps.jobs.run_options import Options
+
+    return from_arguments(Options, arguments)
+
+
+def _run_into(arguments: argparse.Namespace, options: Options) -> int:
+    """Run, then merge the result into an earlier one, which stays unchanged if that fails."""
+    from tofuse.engine.errors import InputError
+    from tofuse.apps.jobs.merging import MergeOptions, check_result, merge_files
+    from tofuse.apps.jobs.running import exit_status
+    from tofuse.apps.jobs.running import run as run_pipeline
+
+    into = arguments.into
+    if arguments.view:
+        raise InputError(
+            "can't be combined with --into", where="--view", remedy="view the result afterwards"
+        )
+    if into.resolve() == options.out.resolve():
+        raise InputError("is the same folder as --out", where="--into", remedy="use two folders")
+    check_result(into)  # before hours of work
+    with progress_for(as_json=arguments.json) as progress:
+        result = run_pipeline(arguments.inputs, options, progress)
+    print_result(result, options.out, as_json=arguments.json)
+    map_options = MergeOptions(
+        into,
+        overwrite=True,
+        tolerance=options.tolerance,
+        voxel=options.voxel,
+        faces=options.faces,
+        seed=options.seed or 0,
+        threads=options.threads,
+        texture=options.texture,
+        only_joined=True,
+    )
+    with progress_for(as_json=arguments.json) as progress:
+        merged = merge_files([into, options.out], map_options, progress)
+    print_result(merged, into, as_json=arguments.json)
+    return exit_status(merged)
+
+
+def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
+    """``tofuse run --rig``."""
+    from tofuse.engine.errors import InputError
+    from tofuse.apps.jobs.running import exit_status
+    from tofuse.apps.rigs.run import run_rig
+
+    for name in (
+        "view",
+        "into",
+        "loops",
+        "guess",
+        "object",
+        "average_still",
+        "camera",
+        "topic",
+        "no_report",
+    ):
+        if getattr(arguments, name):
+            option = f"--{name.replace('_', '-')}"
+            raise InputError("can't be used with a rig", where=option, remedy="leave it out")
+    with progress_for(as_json=arguments.json) as progress:
+        rig_result = run_rig(arguments.rig, arguments.inputs, options, progress=progress)
+    print_result(rig_result.result, arguments.out, as_json=arguments.json)
+    return exit_status(rig_result.result)
+
+
+def _run_live(arguments: argparse.Namespace, options: Options) -> int:
+    """Run and show the reconstruction live; then show the result until Ctrl-C."""
+    from tofuse.engine.mapping.progress import CombinedProgress
+    from tofuse.apps.jobs.running import exit_status
+    from tofuse.apps.jobs.running import run as run_pipeline
+    from tofuse.apps.viewer.live_view import LiveView
+    from tofuse.apps.viewer.server import address, serve, stop
+
+    server = serve(arguments.port)
+    try:
+        _show(address(server), arguments)
+        live = LiveView(server)
+        with progress_for(as_json=arguments.json) as progress:
+            result = run_pipeline(arguments.inputs, options, CombinedProgress(progress, live))
+        print_result(result, arguments.out, as_json=arguments.json)
+        with _report_server(arguments.out) as report:
+            live.finish(report.address)
+            _show(report.address, arguments)
+            _wait()
+    finally:
+        stop(server)
+    return exit_status(result)
+
+
+def view(arguments: argparse.Namespace) -> int:
+    """``tofuse view``."""
+    with _report_server(arguments.result, arguments.port) as server:
+        _show(server.address, arguments)
+        _wait()
+    return 0
+
+
+def _report_server(folder: Path, port: int | None = None) -> ReportServer:
+    """Serve the report of a result, with the images of its recording where it still exists."""
+    from tofuse.engine.errors import InputError
+    from tofuse.apps.viewer.report_server import FrameImages, ReportServer, report_pages
+
+    pages, images = report_pages(folder), None
+    try:
+        images = FrameImages.of(folder)
+    except InputError as error:
+        print(f"only small images of some frames are shown: {error}", file=sys.stderr)
+    return ReportServer(pages, images, port)
+
+
+def _show(address: str, arguments: argparse.Namespace) -> None:
+    """Print the address of a page, and open it in the browser."""
+    import webbrowser
+
+    print(f"see {address}", file=sys.stderr, flush=True)
+    if not arguments.no_open:
+        webbrowser.open(address)
+
+
+def _wait() -> None:
+    """Wait for Ctrl-C."""
+    with _stop_on_signal() as stopped:
+        print("press Ctrl-C to stop", file=sys.stderr, flush=True)
+        while not stopped.wait(0.5):
+            pass
+
+
+def batch(arguments: argparse.Namespace) -> int:
+    """``tofuse batch``."""
+    from tofuse.apps.cli.batching import batch as run_jobs
+
+    return run_jobs(arguments)
+
+
+def register(arguments: argparse.Namespace) -> int:
+    """``tofuse register``."""
+    from tofuse.apps.cli import registering
+    from tofuse.apps.jobs.pair import PairOptions, exit_status, register_files
+    from tofuse.apps.report.pair_words import decision
+    from tofuse.apps.results.pair import pair_json
+
+    _check_overwrite(arguments)
+    options = from_arguments(PairOptions, arguments)
+    with _progress_unless_json(arguments) as progress:
+        result = register_files(arguments.source, arguments.target, options, progress)
+    if arguments.json:
+        emit({**pair_json(result), "out": None if options.out is None else str(options.out)})
+        return exit_status(result)
+    console = make_console()
+    head, tail = decision(result)
+    color = _STATUS_COLORS[result.registration.believed]
+    console.print(f"[bold {color}]{head.lower()}[/]" + (f": {escaped(tail)}" if tail else ""))
+    for line in registering.text(result):
+        console.print(line, markup=False)
+    _print_warnings(console, pair_json(result)["warnings"])
+    if options.out is not None:
+        console.print(f"see {options.out / 'report.html'}", markup=False)
+    return exit_status(result)
+
+
+def rig_calibrate(arguments: argparse.Namespace) -> int:
+    """``tofuse rig calibrate``."""
+    from tofuse.apps.calibration.camera_json import check_new
+    from tofuse.apps.cli import rigging
+    from tofuse.formats.recordings.rig import write_rig
+    from tofuse.apps.rigs.calibrating import calibrate as calibrate_rig
+
+    check_new(arguments.out, overwrite=arguments.overwrite)
+    with _progress_unless_json(arguments) as progress:
+        calibration = calibrate_rig(
+            arguments.inputs,
+            motion=arguments.motion,
+            format=arguments.format,
+            threads=arguments.threads,
+            progress=progress,
+        )
+    write_rig(arguments.out, calibration.rig)
+    if arguments.json:
+        emit(
+            {**calibration.rig.to_dict(), "how": calibration.how, "notes": list(calibration.notes)}
+        )
+        return rigging.exit_status(calibration)
+    console = make_console()
+    for table in rigging.tables(calibration.rig):
+        console.print(table)
+    _print_warnings(console, rigging.notes(calibration))
+    console.print(f"from {calibration.how}; see {arguments.out}", markup=False)
+    return rigging.exit_status(calibration)
+
+
+def rig_check(arguments: argparse.Namespace) -> int:
+    """``tofuse rig check``."""
+    from tofuse.apps.cli import rigging
+    from tofuse.formats.recordings.rig import read_rig
+    from tofuse.apps.rigs.calibrating import check
+
+    rig = read_rig(arguments.rig)
+    with _progress_unless_json(arguments) as progress:
+        calibration, cameras = check(
+            rig,
+            arguments.inputs,
+            motion=arguments.motion,
+            format=arguments.format,
+            threads=arguments.threads,
+            progress=progress,
+        )
+    if arguments.json:
+        emit(rigging.check_json(cameras))
+        return rigging.check_status(cameras)
+    console = make_console()
+    for line in rigging.check_lines(cameras):
+        console.print(line, markup=False)
+    _print_warnings(console, calibration.notes)
+    return rigging.check_status(cameras)
+
+
+def judge(arguments: argparse.Namespace) -> int:
+    """``tofuse judge``."""
+    from tofuse.apps.jobs.judging import JudgeOptions, judge_files, sentence
+    from tofuse.apps.results.run_json import plain
+
+    _check_overwrite(arguments)
+    options = from_arguments(JudgeOptions, arguments)
+    with _progress_unless_json(arguments) as progress:
+        judgement = judge_files([arguments.recording], arguments.trajectory, options, progress)
+    status = 3 if judgement.verdict == "failed" else 0
+    if arguments.json:
+        emit(
+            {**plain(judgement.to_dict()), "out": None if options.out is None else str(options.out)}
+        )
+        return status
+    console = make_console()
+    console.print(f"[bold {VERDICT_COLORS[judgement.verdict]}]{judgement.verdict}[/]")
+    _print_reasons(console, judgement.reasons)
+    console.print(sentence(judgement, arguments.trajectory.name), markup=False)
+    consistencies = (("given", judgement.consistency), ("refined", judgement.refined_consistency))
+    texts = [
+        f"{name} {1e3 * c.rms_m:.1f} mm rms, {c.inlier_ratio:.1%} inliers"
+        for name, c in consistencies
+        if c is not None
+    ]
+    if texts:
+        console.print(f"map consistency: {'; '.join(texts)}", markup=False)
+    if options.out is not None:
+        console.print(f"see {options.out / 'report.html'}", markup=False)
+    return status
+
+
+def merge(arguments: argparse.Namespace) -> int:
+    """``tofuse merge``."""
+    from tofuse.apps.jobs.merging import MergeOptions, merge_files
+    from tofuse.apps.jobs.running import exit_status
+
+    options = from_arguments(MergeOptions, arguments, seed=arguments.seed or 0)
+    with progress_for(as_json=arguments.json) as progress:
+        result = merge_files(arguments.results, options, progress)
+    print_result(result, arguments.out, as_json=arguments.json)
+    return exit_status(result)
+
+
+def _check_overwrite(arguments: argparse.Namespace) -> None:
+    """Refuse --overwrite without --out, where that is optional."""
+    from tofuse.engine.errors import InputError
+
+    if arguments.overwrite and arguments.out is None:
+        raise InputError("requires --out", where="--overwrite", remedy="pass --out as well")
+
+
+def demo(arguments: argparse.Namespace) -> int:
+    """``tofuse demo``."""
+    from tofuse.engine.compute.thread_pool import threads
+    from tofuse.lab.demo import FAILURE
+    from tofuse.lab.demo import demo as run_demo
+    from tofuse.apps.jobs.running import exit_status
+
+    with progress_for(as_json=arguments.json) as progress, threads(arguments.threads):
+        result = run_demo(
+            FAILURE if arguments.failure else arguments.scene,
+            arguments.out,
+            method=arguments.method,
+            seed=arguments.seed or 0,
+            threads=arguments.threads,
+            overwrite=arguments.overwrite,
+            progress=progress,
+        )
+    print_result(result, arguments.out, as_json=arguments.json)
+    return exit_status(result)
+
+
+def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
+    """Print a summary of a result, or with `as_json` one JSON line."""
+    from tofuse.engine.quality.accuracy_card import SEPARATOR, card
+    from tofuse.apps.results.folder import component_name
+    from tofuse.engine.frames.ranges import in_words
+    from tofuse.apps.results.run_json import accuracy_json, plain, reasons_json
+    from tofuse.apps.results.session_words import session_sentences
+
+    d = result.diagnostics
+    sessions = session_sentences(result)
+    counts = {s: sum(f.status == s for f in d.frames) for s in ("tracked", "predicted", "lost")}
+    skipped = sum(f.status == "skipped" for f in d.frames)
+    if as_json:
+        emit(
+            {
+                "event": "result",
+                "out": str(out),
+                "verdict": d.verdict,
+                "accuracy": plain(accuracy_json(d.accuracy)),
+                "reasons": reasons_json(d.reasons),
+                "frames": {**counts, "skipped": skipped},
+                "loops": sum(p.accepted for p in d.loops),
+                "sessions": sessions,
+                "points": len(result.cloud),
+                "seconds": round(sum(d.seconds.values()), 2),
+            }
+        )
+        return
+    console = make_console()
+    console.print(f"[bold {VERDICT_COLORS[d.verdict]}]{d.verdict}[/]")
+    _print_reasons(console, d.reasons)
+    for line in sessions:
+        console.print(line, markup=False)
+    console.print(SEPARATOR.join(card(result)), markup=False)
+    parts = [f"{counts['tracked']} of {len(d.frames)} frames tracked"]
+    parts += [f"{counts[s]} {s}" for s in ("predicted", "lost") if counts[s]]
+    parts += [f"{skipped} unreadable"] if skipped else []
+    closures = sum(p.accepted for p in d.loops)
+    parts.append(f"{closures} loop{'' if closures == 1 else 's'} closed")
+    parts.append(f"{len(result.cloud):,} points")
+    console.print(", ".join(parts), markup=False)
+    console.print(f"see {_page_of(out)}", markup=False)
+    for number, component in enumerate(result.components):
+        if component.result is not None and not component.connected:
+            path = _page_of(out / component_name(number))
+            console.print(f"and {path}, for {in_words(component.frames)}", markup=False)
+
+
+def _page_of(folder: Path) -> Path:
+    """Return the report of a result; its folder with --no-report."""
+    page = folder / "report.html"
+    return page if page.is_file() else folder
+
+
+def _print_warnings(console: Console, warnings: Iterable[str]) -> None:
+    for warning in warnings:
+        console.print(f"[yellow]warning:[/] {escaped(warning)}")
+
+
+def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
+    from tofuse.engine.quality.verdict import ADVICE, REASONS, ranked
+
+    for reason in ranked(reasons):
+        level = REASONS[reason.code][0]
+        console.print(f"  [{VERDICT_COLORS[level]}]{level}:[/] {escaped(reason.text)}")
+        if reason.code in ADVICE:
+            console.print(f"    {ADVICE[reason.code]}", markup=False, style="dim")
+
+
+def simulate(arguments: argparse.Namespace) -> int:
+    """``tofuse simulate``."""
+    from tofuse.engine.compute.thread_pool import threads
+    from tofuse.lab.demo import simulate_to
+    from tofuse.lab.simulation.passing import Passing
+
+    passing = None
+    if arguments.with_person is not None:
+        passing = Passing("person", arguments.with_person)
+    elif arguments.with_box is not None:
+        passing = Passing("box", arguments.with_box)
+    with progress_for(as_json=False) as progress, threads(arguments.threads):
+        frames = simulate_to(
+            arguments.scene,
+            arguments.out,
+            camera=arguments.camera,
+            seed=arguments.seed or 0,
+            every=arguments.every,
+            frames=arguments.frames,
+            first=arguments.first or 0,
+            texture=not arguments.uniform,
+            passing=passing,
+            without=tuple(w for w in arguments.without.split(",") if w),
+            correction=not arguments.no_correction,
+            imu=arguments.imu,
+            sigma=arguments.sigma,
+            progress=progress,
+        )
+    print(f"{frames} frames in {arguments.out}")
+    return 0
+
+
+def inspect(arguments: argparse.Namespace) -> int:
+    """``tofuse inspect``."""
+    from tofuse.apps.inspection.inspect import inspect_recording
+    from tofuse.formats.recordings.open import Opening
+
+    recording = Opening.of(arguments.inputs, arguments).open()
+    inspection = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
+    if arguments.sheet is not None:
+        inspection.save_sheet(arguments.sheet)
+    if arguments.json:
+        emit(inspection.to_dict())
+        return 0
+    console = make_console()
+    width = max(map(len, inspection.facts))
+    for name, value in inspection.facts.items():
+        console.print(f"[bold]{name:<{width}}[/]  {escaped(value)}")
+    _print_warnings(console, inspection.notes)
+    for finding in inspection.findings:
+        color = _SEVERITY_COLORS[finding.severity]
+        console.print(f"[{color}]{finding.severity}:[/] {finding.code}: {escaped(finding.text)}")
+        console.print(f"  {escaped(finding.remedy)}")
+    if not inspection.findings:
+        other = " other" if inspection.notes else ""
+        console.print(f"[green]No{other} problems found.[/]")
+    if arguments.sheet is not None:
+        console.print(f"see {escaped(str(arguments.sheet))}")
+    return 0
+
+
+def convert(arguments: argparse.Namespace) -> int:
+    """``tofuse convert``."""
+    from tofuse.formats.export.conversion import convert as convert_recording
+    from tofuse.formats.export.conversion import convert_to
+    from tofuse.formats.recordings.open import Opening
+
+    recording = Opening.of(arguments.inputs, arguments).open()
+    if arguments.to == "native":
+        conversion = convert_recording(recording, arguments.out)
+    else:
+        conversion = convert_to(recording, arguments.out, arguments.to)
+    console = make_console()
+    console.print(f"{conversion.frames} frames in {escaped(str(conversion.folder))}")
+    _print_warnings(console, (*recording.warnings, *conversion.warnings))
+    return 0
+
+
+def record(arguments: argparse.Namespace) -> int:
+    """``tofuse record``."""
+    from tofuse.engine.errors import InputError
+    from tofuse.apps.live.device import device, devices, is_installed
+    from tofuse.apps.live.recorder import record as record_stream
+
+    console = make_console()
+    if arguments.device is None:
+        table = Table("camera", "needs", "")
+        for name, kind in devices().items():
+            installed = "installed" if is_installed(kind) else "not installed"
+            table.add_row(name, f"pip install {kind.package[0]}", installed)
+        console.print(table)
+        return 0
+    if arguments.out is None:
+        raise InputError("is missing", where="--out", remedy="pass a new folder")
+    options = dict(part.partition("=")[::2] for part in arguments.set)
+    with (
+        device(arguments.device, options).open() as stream,
+        _stop_on_signal() as stopped,
+        progress_for(as_json=False) as progress,
+    ):
+        progress.stage("recording (Ctrl-C stops)", arguments.frames)
+        recorded = record_stream(
+            stream,
+            arguments.out,
+            seconds=arguments.seconds,
+            frames=arguments.frames,
+            stopped=stopped.is_set,
+            progress=lambda _: progress.advance(),
+        )
+    console.print(f"{recorded.frames} frames in {escaped(str(recorded.folder))}")
+    if recorded.dropped:
+        console.print(
+            f"[yellow]warning:[/] {recorded.dropped} frames dropped: the disk was too slow"
+        )
+    if recorded.ended_by != "asked":
+        console.print(f"[yellow]warning:[/] {escaped(recorded.ended_by)}")
+    return 0
+
+
+@contextmanager
+def _stop_on_signal() -> Iterator[threading.Event]:
+    """Yield an event that Ctrl-C or SIGTERM sets; a second signal terminates the process."""
+    event = threading.Event()
+
+    def request_stop(number: int, frame: object) -> None:
+        signal.signal(number, previous[number])
+        event.set()
+
+    numbers: list[int] = [signal.SIGINT, signal.SIGTERM]
+    previous = {number: signal.signal(number, request_stop) for number in numbers}
+    try:
+        yield event
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def calibrate(arguments: argparse.Namespace) -> int:
+    """``tofuse calibrate``."""
+    from tofuse.apps.calibration.camera_json import check_new
+    from tofuse.apps.cli import calibrating
+
+    if arguments.out is not None:
+        check_new(arguments.out, overwrite=arguments.overwrite)
+    console = make_console()
+    subjects = {
+        "lens": calibrating.lens,
+        "depth": calibrating.depth,
+        "import": calibrating.import_lens,
+    }
+    data, lines, warnings = subjects[arguments.subject](arguments)
+    if arguments.json:
+        emit(data)
+        return 0
+    for line in lines:
+        console.print(escaped(line))
+    _print_warnings(console, warnings)
+    return 0
+
+
+def noise(arguments: argparse.Namespace) -> int:
+    """``tofuse noise``."""
+    from tofuse.apps.calibration.camera_json import check_new
+    from tofuse.apps.calibration.noise_estimation import estimate_noise
+    from tofuse.formats.recordings.open import Opening
+
+    if arguments.out is not None:
+        check_new(arguments.out, overwrite=arguments.overwrite)
+    recording = Opening.of(arguments.inputs, arguments).open()
+    fit = estimate_noise(recording, arguments.name)
+    if arguments.out is not None:
+        fit.model.save(arguments.out)
+    if arguments.json:
+        emit(fit.to_dict())
+        return 0
+    units = {"amplitude": "raw amplitude", "confidence": "confidence", "range": "range (m)"}
+    table = Table(units[fit.law], "pixels", "measured (mm)", "model (mm)", box=None)
+    for item in fit.bins:
+        low_high = f"{item.low:.4g} to {item.high:.4g}"
+        label = f"{(item.low + item.high) / 2:.0f}" if fit.law == "confidence" else low_high
+        measured, predicted = 1000 * item.measured_m, 1000 * item.predicted_m
+        table.add_row(label, str(item.pixels), f"{measured:.2f}", f"{predicted:.2f}")
+    console = make_console()
+    console.print(table)
+    console.print(
+        f"{escaped(fit.model.name)}, {fit.frames} frames in {fit.stretches} static "
+        f"segment{'' if fit.stretches == 1 else 's'}: the noise model over {fit.law} deviates by "
+        f"{100 * fit.rms_log_error:.0f} % rms (built-in model: {100 * fit.before:.0f} %)"
+    )
+    _print_warnings(console, fit.warnings)
+    return 0
+
+
+def evaluate(arguments: argparse.Namespace) -> int:
+    """``tofuse evaluate``."""
+    from tofuse.engine.quality.trajectory import MAX_GAP_S
+    from tofuse.apps.jobs.evaluating import evaluate as evaluate_poses
+
+    evaluation = evaluate_poses(
+        arguments.estimate,
+        arguments.reference,
+        recording=arguments.recording,
+        reference_error_m=arguments.reference_error,
+    )
+    data, error, interval = evaluation.to_dict(), evaluation.error, evaluation.ate_interval_m
+    if error.mostly_unmatched:
+        print(
+            f"note: only {error.associated} of {error.estimated} estimated poses have a reference "
+            f"pose within {1000 * MAX_GAP_S:.0f} ms: check that both files have the same clock",
+            file=sys.stderr,
+        )
+    if arguments.json:
+        emit(data)
+        return 0
+    table = Table.grid(padding=(0, 2))
+    table.add_row("poses compared", f"{error.associated} ({error.coverage:.1%} of the reference)")
+    table.add_row("ATE rms", f"{error.ate_rms_m:.4f} m, {data['rotation_rms_deg']:.3f} deg")
+    if interval is not None:
+        table.add_row("true ATE within", f"{interval[0]:.4f} to {interval[1]:.4f} m")
+    table.add_row("ATE maximum", f"{error.ate_max_m:.4f} m")
+    for r in error.relative:
+        value = "too few poses"
+        if r.pairs:
+            angle = r.to_dict()["rotation_rms_deg"]
+            value = f"{r.translation_rms_m:.4f} m, {angle:.3f} deg"
+        table.add_row(f"RPE over {r.frames} frame{'' if r.frames == 1 else 's'}", value)
+    if evaluation.consistency is not None:
+        m = data["map_consistency"]
+        value = "no two images overlap enough"
+        if m["rms_m"] is not None:
+            value = f"{m['rms_m']:.5f} m rms, {m['inlier_share']:.4f} inliers, {m['pairs']} pairs"
+        table.add_row("map consistency", value)
+    make_console().print(table)
+    return 0
+
+
+def optimize(arguments: argparse.Namespace) -> int:
+    """``tofuse optimize``."""
+    from tofuse.apps.calibration.camera_json import check_new
+    from tofuse.engine.mapping.config import changed, from_method
+    from tofuse.formats.files.g2o import read_g2o, write_g2o
+
+    check_new(arguments.out, overwrite=arguments.overwrite)
+    config = from_method("default", "range")
+    if arguments.optimiser is not None:
+        part = {"part": arguments.optimiser}
+        config = changed(config, {"optimiser": part}, where="--optimiser")
+    graph = read_g2o(arguments.input)
+    solution = config.optimiser.optimise(graph)
+    write_g2o(arguments.out, solution.graph)
+    print(
+        f"{len(graph.ids)} poses, {len(graph.edges)} edges: squared error {graph.chi2():.6g} "
+        f"to {solution.graph.chi2():.6g} in {max(len(solution.objective) - 1, 0)} iterations"
+        + ("" if solution.converged else " (not converged)")
+    )
+    if solution.weights is not None and (solution.weights < 0.5).any():
+        left_out = solution.weights < 0.5
+        count = int(left_out.sum())
+        before, after = graph.chi2(~left_out), solution.graph.chi2(~left_out)
+        print(
+            f"{count} edge{'' if count == 1 else 's'} rejected as inconsistent with "
+            f"the others; squared error of the others {before:.6g} to {after:.6g}"
+        )
+    for piece in solution.parts if len(solution.parts) > 1 else ():
+        print(
+            f"part from vertex {piece.first}: {piece.vertices} poses, {piece.edges} edges, "
+            f"objective {piece.before:.6g} to {piece.after:.6g}"
+        )
+    if not solution.improved:
+        print("no improvement: the poses are those of the input")
+    return 0
+
+
+def export(arguments: argparse.Namespace) -> int:
+    """``tofuse export``."""
+    from tofuse.apps.export.exporting import export as export_result
+
+    for path in export_result(
+        arguments.result,
+        arguments.formats,
+        arguments.out,
+        faces=arguments.faces,
+        every=arguments.every,
+        pinhole=arguments.pinhole,
+        overwrite=arguments.overwrite,
+    ):
+        print(path)
+    return 0
+
+
+def experiments(arguments: argparse.Namespace) -> int:
+    """``tofuse experiments``."""
+    from tofuse.engine.compute.thread_pool import threads
+    from tofuse.lab.experiments.page import run_experiments
+
+    with progress_for(as_json=False) as progress, threads(arguments.threads):
+        page = run_experiments(
+            arguments.out,
+            cases=tuple(c for c in arguments.cases.split(",") if c),
+            seeds=arguments.seeds,
+            seed=arguments.seed or 0,
+            overwrite=arguments.overwrite,
+            progress=progress,
+        )
+    print(f"see {page}")
+    return 0

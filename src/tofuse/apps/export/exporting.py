@@ -1,0 +1,263 @@
+"""A result in other formats, for `tofuse export`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64, Intp, UInt8
+from tofuse.engine.errors import InputError, OutputError
+from tofuse.formats.files.atomic import make_folder
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.images import jpeg_bytes
+from tofuse.formats.files.staging import replacing_folder
+from tofuse.formats.files.stamps import stamp
+from tofuse.formats.files.trajectory import associate, read_tum, write_kitti, write_log
+from tofuse.formats.export import exchange
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.texture import baked
+from tofuse.apps.export.colmap import write_colmap
+from tofuse.apps.results.folder import RESULT, claimed, finish_interrupted, is_result, result_folder
+from tofuse.apps.results.loading import read_cloud, read_mesh
+from tofuse.apps.export.nerfstudio import write_nerfstudio
+from tofuse.apps.results.run_json import read_run_json, rotation_up_world, run_json_checked
+
+# Default number of triangles, and the maximum size of a .glb with their texture.
+FACES = 60_000
+_MAX_BYTES = 8_000_000
+_VERTEX_BYTES, _FACE_BYTES, _OTHER_BYTES = 32, 12, 4096
+_QUALITIES = (92, 85, 75, 60, 40)
+# Texture layout takes minutes for more faces.
+_MAX_TEXTURED_FACES = 120_000
+_TEXTURE_SIZE = 2048
+
+
+@dataclass(frozen=True)
+class _Result:
+    """The files of a result, read on demand."""
+
+    folder: Path
+    faces: int | None
+    every: int
+    pinhole: bool
+
+    @cached_property
+    def cloud(self) -> GeometryRecord:
+        """The cloud, with the number of views and sigma of each point."""
+        cloud = read_cloud(self.folder)
+        scalars = {name: cloud.scalars[name] for name in _SCALARS if name in cloud.scalars}
+        return replace(cloud, faces=None, scalars=scalars)
+
+    @cached_property
+    def trajectory(self) -> tuple[Float64, Float64]:
+        return read_tum(self.folder / "trajectory.txt")
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        path = self.folder / "mesh.ply"
+        mesh = read_mesh(path)
+        if mesh is None:
+            raise InputError(
+                "doesn't exist: clouds without a camera model have no surface",
+                where=path,
+                remedy="choose a format for clouds",
+            )
+        return mesh
+
+    @cached_property
+    def R_up_world(self) -> Float64:
+        """The rotation (3, 3) that makes the mesh upright."""
+        path = self.folder / "run.json"
+        return rotation_up_world(read_run_json(path), path)
+
+    @cached_property
+    def textured(self) -> GeometryRecord:
+        """The simplified mesh, with its colours in a texture unless that takes too long."""
+        max_faces = self.faces or FACES
+        if self.mesh.color is None or not len(self.mesh.faces):
+            return self.mesh.decimated(max_faces).record()
+        if min(max_faces, len(self.mesh.faces)) > _MAX_TEXTURED_FACES:
+            return self.mesh.decimated(max_faces).record()
+        baked_mesh = baked(self.mesh, max_faces, _TEXTURE_SIZE)
+        vertex_rows = baked_mesh.atlas.vertices
+        return GeometryRecord(
+            baked_mesh.mesh.vertices[vertex_rows],
+            baked_mesh.atlas.faces,
+            baked_mesh.mesh.normals[vertex_rows],
+            uv=baked_mesh.atlas.uv,
+            texture=_jpeg(baked_mesh.image, len(vertex_rows), len(baked_mesh.atlas.faces)),
+        )
+
+    @cached_property
+    def frame_numbers(self) -> Intp:
+        """(N,) frame index of each pose."""
+        path = self.folder / "run.json"
+        run = read_run_json(path)
+        with run_json_checked(path):
+            index = np.array([frame["index"] for frame in run["frames"]], np.intp)
+            times = np.array([frame["timestamp"] for frame in run["frames"]], float)
+        return index[associate(self.trajectory[0], times, limit=1e-6)]
+
+
+_SCALARS = ("views", "sigma")
+
+
+def _jpeg(image: UInt8, vertices: int, faces: int) -> bytes:
+    """The best JPEG that keeps a mesh of this size below `_MAX_BYTES`, or the smallest one."""
+    max_bytes = _MAX_BYTES - _VERTEX_BYTES * vertices - _FACE_BYTES * faces - _OTHER_BYTES
+    data = b""
+    for quality in _QUALITIES:
+        data = jpeg_bytes(image, quality)
+        if len(data) <= max_bytes:
+            break
+    return data
+
+
+def _cloud(result: _Result, path: Path) -> None:
+    exchange.save(result.cloud, path)
+
+
+def _mesh(result: _Result, path: Path) -> None:
+    exchange.save(result.textured, path, result.R_up_world)
+
+
+def _stl(result: _Result, path: Path) -> None:
+    mesh = result.mesh if result.faces is None else result.mesh.decimated(result.faces)
+    exchange.save(mesh.record(), path, result.R_up_world)
+
+
+def _nerfstudio(result: _Result, path: Path) -> None:
+    with _folder(path) as folder:
+        write_nerfstudio(result.folder, folder, result.every, result.pinhole)
+
+
+def _colmap(result: _Result, path: Path) -> None:
+    with _folder(path) as folder:
+        write_colmap(result.folder, folder, result.every, result.pinhole)
+
+
+@contextmanager
+def _folder(path: Path) -> Iterator[Path]:
+    """Yield a new folder that then replaces an earlier export in its place."""
+
+    def check(folder: Path) -> None:
+        if unexpected := RESULT.foreign(folder, f"{path.name}/"):
+            raise OutputError(
+                f"contains {unexpected}, which is not part of an export",
+                where=path,
+                remedy="move it away, or pass another --out",
+            )
+
+    with replacing_folder(path, check) as folder:
+        yield folder
+
+
+def _kitti(result: _Result, path: Path) -> None:
+    write_kitti(path, result.trajectory[1])
+
+
+def _log(result: _Result, path: Path) -> None:
+    write_log(path, result.trajectory[1], result.frame_numbers)
+
+
+# The file of each format, and the function that writes it.
+FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
+    "pcd": ("cloud.pcd", _cloud),
+    "las": ("cloud.las", _cloud),
+    "laz": ("cloud.laz", _cloud),
+    "e57": ("cloud.e57", _cloud),
+    "glb": ("mesh.glb", _mesh),
+    "gltf": ("mesh.gltf", _mesh),
+    "obj": ("mesh.obj", _mesh),
+    "stl": ("mesh.stl", _stl),
+    "kitti": ("trajectory.kitti.txt", _kitti),
+    "log": ("trajectory.log", _log),
+    "nerfstudio": ("nerfstudio", _nerfstudio),
+    "colmap": ("colmap", _colmap),
+}
+
+
+def export(
+    folder: str | Path,
+    formats: Sequence[str],
+    out: str | Path | None = None,
+    *,
+    faces: int | None = None,
+    every: int = 1,
+    pinhole: bool = False,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write a result in other formats, and return the paths of the files.
+
+    A target folder that is a result is locked against other processes.
+
+    Parameters
+    ----------
+    folder
+        A result of `tofuse run`.
+    formats
+        Names in `FORMATS`.
+    out
+        Folder for the files; by default that of the result.
+    faces
+        Maximum number of triangles; by default `FACES`, for STL all.
+    every
+        Every n-th of the images with a pose.
+    pinhole
+        Whether to rectify images, for programs without distortion models.
+    overwrite
+        Whether existing files may be replaced.
+
+    Raises
+    ------
+    InputError
+        If the folder contains no result, a format is unknown or lacks its input, or the result was
+        replaced while it was read.
+    OutputError
+        If a file exists already, or can't be written, or another process writes into the folder.
+    """
+    folder = Path(folder)
+    finish_interrupted(result_folder(folder))
+    if not is_result(folder):
+        raise InputError("is not a result", where=folder, remedy="pass the --out of `tofuse run`")
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown:
+        available = ", ".join(FORMATS)
+        raise InputError(
+            f"unknown format {unknown[0]}", where="FORMAT", remedy=f"use one of {available}"
+        )
+    target = folder if out is None else Path(out)
+    files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
+    make_folder(target)
+    with claimed(target), _unchanged(folder):
+        for path in files.values():
+            if path.exists() and not overwrite:
+                raise OutputError(
+                    "already exists", where=path, remedy="pass --overwrite to replace it"
+                )
+        result = _Result(folder, faces, every, pinhole)
+        # Images first: only they can be missing after a complete run.
+        for name in sorted(files, key=lambda name: name not in ("nerfstudio", "colmap")):
+            FORMATS[name][1](result, files[name])
+    return list(files.values())
+
+
+@contextmanager
+def _unchanged(folder: Path) -> Iterator[None]:
+    """Raise an error if a run replaced the result while the block read it.
+
+    The result itself is not locked: it may be read-only.
+    """
+    before = stamp(folder / RESULT.marker)
+    yield
+    if not is_result(folder) or stamp(folder / RESULT.marker) != before:
+        raise InputError(
+            "was replaced by another run while it was read",
+            where=folder,
+            remedy="export it again with --overwrite",
+        )

@@ -1,0 +1,175 @@
+"""Checks that depth, amplitude and colour are aligned to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import cv2
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.apps.inspection.finding import Finding, is_significant
+from tofuse.apps.inspection.sample import Sample
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
+
+# Images are downscaled to this width.
+_COLUMNS = 160
+# Orientations of one channel relative to the other.
+_ORIENTATIONS: dict[str, Callable[[Float32], Float32]] = {
+    "as it is": lambda a: a,
+    "mirrored left to right": lambda a: a[:, ::-1],
+    "mirrored upside down": lambda a: a[::-1],
+    "rotated by 180 degrees": lambda a: a[::-1, ::-1],
+}
+# Minimum correlation of the edges of two channels, and its lead over the identity, also in standard
+# errors.
+_MIN_CORRELATION, _MIN_LEAD, _MIN_LEAD_SIGMAS = 0.15, 0.06, 4.0
+# Minimum relevant and maximum tested shift of colour, as fractions of the width.
+_MIN_SHIFT, _MAX_SHIFT = 0.02, 0.12
+_MIN_FRAMES = 3
+# Minimum correlation of edges at the best shift, its lead over no shift, and the maximum fraction
+# of it without a shift, or at shifts farther than this number of pixels from the best: edges in one
+# direction correlate at many shifts.
+_MIN_COLOR_CORRELATION, _MIN_COLOR_LEAD, _MAX_COLOR_UNSHIFTED = 0.42, 0.16, 0.68
+_MAX_ELSEWHERE, _PEAK_RADIUS_PX = 0.95, 4
+# Gain in correlation by a shift of up to some pixels that shows camera motion.
+_MIN_MOTION_GAIN, _MAX_MOTION_PX = 0.03, 6
+
+
+def check_mirrored(sample: Sample) -> Iterator[Finding]:
+    """Check that edges of depth and amplitude (else colour) do not match better if mirrored."""
+    for name, channel_of in (("amplitude", _amplitude), ("colour", _grey)):
+        pairs = [(f, image) for f in sample.images if (image := channel_of(f)) is not None]
+        if len(pairs) < _MIN_FRAMES:
+            continue
+        edges = [(_edges(_log_depth(f)), _edges(image)) for f, image in pairs]
+        scores = {
+            label: np.array([_correlation(d, transform(a)) for d, a in edges])
+            for label, transform in _ORIENTATIONS.items()
+        }
+        identity = scores.pop("as it is")
+        orientation, best = max(scores.items(), key=lambda item: float(item[1].mean()))
+        reoriented = [(d, np.ascontiguousarray(_ORIENTATIONS[orientation](a))) for d, a in edges]
+        if (
+            best.mean() > _MIN_CORRELATION
+            and is_significant(best - identity, _MIN_LEAD, _MIN_LEAD_SIGMAS)
+            and _peaks_at_zero_shift(reoriented)
+        ):
+            yield Finding(
+                "mirrored",
+                f"Depth and {name} do not match: their edges correlate by {best.mean():.2f} with "
+                f"one of them {orientation}, and by {identity.mean():.2f} as they are.",
+                "Mirror or rotate one of them, and check that the rays (x right, y down) are those "
+                "of the images.",
+                {
+                    "correlation": float(identity.mean()),
+                    "correlation_if_turned": float(best.mean()),
+                },
+            )
+            return
+
+
+def check_color(sample: Sample) -> Iterator[Finding]:
+    """Check that the edges of colour coincide with those of depth."""
+    pairs = [
+        (f, grey) for f in sample.images if f.color_registered and (grey := _grey(f)) is not None
+    ]
+    if len(pairs) < _MIN_FRAMES:
+        return
+    columns = min(_COLUMNS, pairs[0][0].camera.width)
+    max_shift = round(_MAX_SHIFT * columns)
+    correlations = np.stack(
+        [_shift_correlations(_edges(_log_depth(f)), _edges(grey), max_shift) for f, grey in pairs]
+    )
+    mean = correlations.mean(0)
+    i, j = np.unravel_index(int(mean.argmax()), mean.shape)
+    lead = correlations[:, i, j] - correlations[:, max_shift, max_shift]
+    shift = float(np.hypot(i - max_shift, j - max_shift)) / columns
+    down, right = np.mgrid[: mean.shape[0], : mean.shape[1]]
+    elsewhere = mean[np.hypot(down - i, right - j) > _PEAK_RADIUS_PX].max()
+    if (
+        mean[i, j] < _MIN_COLOR_CORRELATION
+        or mean[max_shift, max_shift] > _MAX_COLOR_UNSHIFTED * mean[i, j]
+        or elsewhere > _MAX_ELSEWHERE * mean[i, j]
+    ):
+        return
+    if shift > _MIN_SHIFT and is_significant(lead, _MIN_COLOR_LEAD, _MIN_LEAD_SIGMAS):
+        pixels = shift * pairs[0][0].camera.width
+        yield Finding(
+            "color_unregistered",
+            f"Colour is not registered to depth: its edges lie {pixels:.0f} pixels away from "
+            "those of depth.",
+            "Add the colour camera's intrinsics and T_color_depth, or remove the colour.",
+            {"shift_px": pixels, "lead": float(lead.mean())},
+        )
+
+
+def shifted(first: RangeFrame, second: RangeFrame) -> bool:
+    """Whether the edges of one image are shifted relative to those of the other."""
+    for channel_of in (_amplitude, _log_depth):
+        a, b = channel_of(first), channel_of(second)
+        if a is None or b is None:
+            continue
+        scores = _shift_correlations(_edges(a), _edges(b), _MAX_MOTION_PX)
+        if scores.max() - scores[_MAX_MOTION_PX, _MAX_MOTION_PX] > _MIN_MOTION_GAIN:
+            return True
+    return False
+
+
+def _amplitude(frame: RangeFrame) -> Float32 | None:
+    amplitude = frame.amplitude_image
+    if amplitude is None:
+        return None
+    return np.log1p(np.where(amplitude < SATURATED_AMPLITUDE, amplitude, 0)).astype(np.float32)
+
+
+def _grey(frame: RangeFrame) -> Float32 | None:
+    if frame.color_image is None:
+        return None
+    grey = cv2.cvtColor(np.ascontiguousarray(frame.color_image), cv2.COLOR_RGB2GRAY)
+    return np.log1p(grey.astype(np.float32))
+
+
+def _log_depth(frame: RangeFrame) -> Float32:
+    """Logarithm of depth (H, W); holes are filled from their surroundings to avoid edges."""
+    z = np.where(frame.valid, frame.z, 0).astype(np.float32)
+    valid = (z > 0).astype(np.float32)
+    blurred = cv2.GaussianBlur(np.log(np.maximum(z, 1e-3)) * valid, (0, 0), 3)
+    weight = cv2.GaussianBlur(valid, (0, 0), 3)
+    filled = blurred / np.maximum(weight, 1e-6)
+    return np.where(valid > 0, np.log(np.maximum(z, 1e-3)), filled).astype(np.float32)
+
+
+def _edges(image: Float32) -> Float32:
+    """Edge strength (h, w) of a downscaled image, 0 to 1."""
+    columns = min(_COLUMNS, image.shape[1])
+    rows = max(round(image.shape[0] * columns / image.shape[1]), 2)
+    small = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), 1.0)
+    strength = np.hypot(cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1))
+    # Strong edges saturate.
+    saturation = float(np.percentile(strength, 95)) or 1.0
+    return np.minimum(strength / max(saturation, 1e-6), 1.0).astype(np.float32)
+
+
+def _correlation(a: Float32, b: Float32) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    size = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum()) / size if size > 0 else 0.0
+
+
+def _peaks_at_zero_shift(edges: Sequence[tuple[Float32, Float32]]) -> bool:
+    """Whether edges of two channels coincide best without a shift.
+
+    Unrelated edges in the same part of the images correlate too, but then a shift fits as well.
+    """
+    max_shift = round(_MAX_SHIFT * edges[0][0].shape[1])
+    scores = np.mean([_shift_correlations(a, b, max_shift) for a, b in edges], axis=0)
+    i, j = np.unravel_index(int(scores.argmax()), scores.shape)
+    return bool(np.hypot(i - max_shift, j - max_shift) <= _PEAK_RADIUS_PX)
+
+
+def _shift_correlations(a: Float32, b: Float32, max_shift: int) -> Float64:
+    """Correlations of the centre of `a` with `b`, for shifts of up to `max_shift` pixels."""
+    template = a[max_shift:-max_shift, max_shift:-max_shift]
+    return cv2.matchTemplate(b, np.ascontiguousarray(template), cv2.TM_CCOEFF_NORMED).astype(float)

@@ -1,0 +1,209 @@
+"""Checks of pixel values: unit of depth, invalid pixels, saturation, phase wraps, flying pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from tofuse.engine.arrays import Bool, Float32
+from tofuse.apps.inspection.finding import Finding
+from tofuse.apps.inspection.sample import Sample
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.engine.sensor.unwrap import on_surface
+
+# Range of typical distances of ToF cameras, m.
+_MIN_DISTANCE_M, _MAX_DISTANCE_M = 0.15, 12.0
+_MIN_VALID, _MAX_SATURATED = 0.1, 0.05
+# At an edge the surfaces _REACH pixels to both sides differ by the fraction _MIN_STEP of the depth,
+# and each changes by less than the fraction _MAX_CHANGE of that difference over two pixels; flying
+# pixels are farther than the fraction _MIN_INSIDE of it from both.
+_REACH, _MIN_STEP, _MIN_INSIDE, _MAX_CHANGE = 4, 0.15, 0.2, 0.1
+_MAX_EDGE_WIDTH, _MAX_FLYING = 4.5, 0.01
+# At a seam of a phase wrap, ranges above and below these fractions of the period are adjacent.
+_LATE, _EARLY = 0.85, 0.15
+_MAX_SEAM_FRACTION = 0.003
+# Pixels nearer than this fraction of the period with a lower apparent albedo, relative to the
+# median, are wrapped.
+_DARK, _NEAR = 0.12, 0.5
+_MAX_DARK_FRACTION = 0.08
+# Minimum number of edge pixels per image to assess flying pixels.
+_MIN_EDGES = 100
+
+
+def depths_of(frame: Frame) -> Float32:
+    """Return the valid depths or distances (N,) of a view, m."""
+    if isinstance(frame, RangeFrame):
+        return frame.depth[frame.valid]
+    return np.linalg.norm(frame.points - frame.origin.astype(np.float32), axis=1)
+
+
+def check_unit(sample: Sample) -> Iterator[Finding]:
+    """Check that the typical distance is plausible for a ToF camera."""
+    depths = np.concatenate([depths_of(f) for f in sample.frames])
+    if len(depths) == 0:
+        yield Finding(
+            "few_valid",
+            "There is no valid point in the sampled frames: is the depth unit right?",
+            "Check depth_unit_m, and that the depth images have 16 bits.",
+            {"valid_fraction": 0.0},
+        )
+        return
+    median = float(np.median(depths))
+    period = sample.period_m
+    evidence = {"median_m": median, "far_m": float(np.percentile(depths, 99))}
+    if period is not None and median > period:
+        problem = f"but the ambiguity range of this camera is {period:.3g} m"
+    elif median > _MAX_DISTANCE_M:
+        problem = "farther than ToF cameras measure"
+    elif median < _MIN_DISTANCE_M:
+        problem = "nearer than ToF cameras measure"
+    else:
+        return
+    yield Finding(
+        "depth_unit",
+        f"The median depth is {median:.3g} m, {problem}.",
+        f"Check depth_unit_m: it may be wrong by a factor of {_factor(median):g}.",
+        evidence | {"factor": _factor(median)},
+    )
+
+
+def _factor(median: float) -> float:
+    """The power of ten by which a distance is nearest to 2 m."""
+    return float(10.0 ** np.round(np.log10(median / 2.0)))
+
+
+def check_valid(sample: Sample) -> Iterator[Finding]:
+    """Check that enough pixels are valid."""
+    valid = float(np.mean([len(f) / max(f.valid.size, 1) for f in sample.frames]))
+    if 0 < valid < _MIN_VALID:
+        yield Finding(
+            "few_valid",
+            f"Only {valid:.1%} of the pixels are valid.",
+            "Move closer, use a longer exposure, or check the confidence threshold.",
+            {"valid_fraction": valid},
+        )
+
+
+def check_saturation(sample: Sample) -> Iterator[Finding]:
+    """Check for saturated pixels."""
+    saturated = [
+        float(np.mean(f.amplitude_image >= SATURATED_AMPLITUDE))
+        for f in sample.images
+        if f.amplitude_image is not None
+    ]
+    if saturated and (fraction := float(np.mean(saturated))) > _MAX_SATURATED:
+        yield Finding(
+            "saturated",
+            f"{fraction:.0%} of the pixels are saturated and invalid.",
+            "Use a shorter exposure, or keep farther from shiny and bright objects.",
+            {"saturated_fraction": fraction},
+        )
+
+
+def check_flying(sample: Sample) -> Iterator[Finding]:
+    """Check the number of flying pixels and the width of depth edges."""
+    flying = edges = valid = 0
+    for frame in sample.images:
+        is_flying, is_edge = _flying(frame.radial_range, frame.valid)
+        flying += int(np.count_nonzero(is_flying))
+        edges += int(np.count_nonzero(is_edge))
+        valid += len(frame)
+    if edges < _MIN_EDGES * max(len(sample.images), 1):
+        return
+    width, fraction = 2 * _REACH * flying / edges, flying / valid
+    if width > _MAX_EDGE_WIDTH and fraction > _MAX_FLYING:
+        yield Finding(
+            "flying_pixels",
+            f"{fraction:.1%} of the pixels are flying pixels between near and far surfaces: edges "
+            f"are {width:.1f} pixels wide.",
+            "Keep the filters against flying pixels on; clean the lens, and check its focus.",
+            {"flying_fraction": fraction, "edge_width_px": width},
+        )
+
+
+def flying_pixels(frame: RangeFrame) -> Bool:
+    """Return the (H, W) mask of flying pixels."""
+    return _flying(frame.radial_range, frame.valid)[0]
+
+
+def _flying(r: Float32, valid: Bool) -> tuple[Bool, Bool]:
+    """Masks (H, W) of flying pixels, and of all pixels at depth edges between smooth surfaces."""
+    is_flying, is_edge = np.zeros(r.shape, bool), np.zeros(r.shape, bool)
+    margin = _REACH + 2
+    for axis in (0, 1):
+        n = r.shape[axis]
+        if n <= 2 * margin:
+            continue
+
+        def shifted(shift: int, axis: int = axis, n: int = n) -> tuple[slice, ...]:
+            part = slice(margin + shift, n - margin + shift)
+            return (part, slice(None)) if axis == 0 else (slice(None), part)
+
+        center, a, b = r[shifted(0)], r[shifted(-_REACH)], r[shifted(_REACH)]
+        gap = np.abs(b - a)
+        measured = valid[shifted(0)] & valid[shifted(-_REACH)] & valid[shifted(_REACH)]
+        measured &= valid[shifted(-margin)] & valid[shifted(margin)]
+        edge = measured & (gap > _MIN_STEP * np.minimum(a, b))
+        edge &= (np.abs(a - r[shifted(-margin)]) < _MAX_CHANGE * gap) & (
+            np.abs(b - r[shifted(margin)]) < _MAX_CHANGE * gap
+        )
+        # Also smooth in the other direction, unlike noise.
+        for side in (-_REACH, _REACH):
+            for offset in (-1, 1):
+                neighbour = np.roll(r, offset, 1 - axis)[shifted(side)]
+                edge &= np.abs(r[shifted(side)] - neighbour) < _MAX_CHANGE * gap
+        is_edge[shifted(0)] |= edge
+        inner = np.minimum(np.abs(center - a), np.abs(b - center)) > _MIN_INSIDE * gap
+        is_flying[shifted(0)] |= edge & inner & ((center - a) * (b - center) > 0)
+    return is_flying, is_edge
+
+
+def check_wrap(sample: Sample) -> Iterator[Finding]:
+    """Check for seams at which the range wraps, and for near surfaces of too low albedo.
+
+    A surface that continues beyond the camera's period reappears at range 0, so far and near touch,
+    and returns less light than its wrapped range implies: its apparent albedo, amplitude times the
+    squared range, is small. Pixels with too weak a signal have random ranges and are dark as well:
+    only pixels on a surface with their neighbours count.
+    """
+    period = sample.period_m
+    if period is None:
+        return
+    seams = dark = valid = with_albedo = 0
+    for frame in sample.images:
+        r = frame.radial_range
+        surface = on_surface(np.where(frame.valid, r, np.float32(0)), period)
+        late, early = surface & (r > _LATE * period), surface & (r < _EARLY * period)
+        for a, b in ((np.s_[:, :-2], np.s_[:, 2:]), (np.s_[:-2], np.s_[2:])):
+            seams += int(np.count_nonzero((late[a] & early[b]) | (early[a] & late[b])))
+        valid += len(frame)
+        albedo = _apparent_albedo(frame, r)
+        if albedo is None:
+            continue
+        usable = frame.valid & (albedo > 0)
+        with_albedo += int(np.count_nonzero(usable))
+        if not usable.any():
+            continue
+        typical = float(np.median(albedo[usable]))
+        near = usable & surface & (r < _NEAR * period)
+        dark += int(np.count_nonzero(near & (albedo < _DARK * typical)))
+    seam_fraction, dark_fraction = seams / max(valid, 1), dark / max(with_albedo, 1)
+    if seam_fraction > _MAX_SEAM_FRACTION or dark_fraction > _MAX_DARK_FRACTION:
+        yield Finding(
+            "phase_wrap",
+            f"Phase wrapping: surfaces beyond the ambiguity range ({period:.3g} m) appear too "
+            f"close: {seam_fraction:.2%} of the pixels are at seams from far to near, and "
+            f"{dark_fraction:.1%} are near but {1 / _DARK:.0f} times darker than the rest.",
+            "Use --unwrap (it needs the amplitude), record with a lower modulation frequency, or "
+            "drop weak pixels by an amplitude filter.",
+            {"seam_fraction": seam_fraction, "dark_fraction": dark_fraction, "period_m": period},
+        )
+
+
+def _apparent_albedo(frame: RangeFrame, r: Float32) -> Float32 | None:
+    amplitude = frame.amplitude_image
+    if amplitude is None:
+        return None
+    amplitude = np.where(amplitude < SATURATED_AMPLITUDE, amplitude, np.float32(0))
+    return amplitude if frame.amplitude_kind == "range_compensated" else amplitude * r * r

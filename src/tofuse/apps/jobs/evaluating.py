@@ -1,0 +1,171 @@
+"""`tofuse evaluate`: compare a trajectory with a reference, and with the images at its poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.sensor.base import Corrector
+from tofuse.engine.sensor.camera_errors import CameraErrors
+from tofuse.engine.errors import InputError
+from tofuse.engine.quality.consistency import Consistency, map_consistency, poses_of_frames
+from tofuse.engine.quality.trajectory import TrajectoryError, evaluate_trajectory
+from tofuse.formats.files.trajectory_formats import Clock, TimedPoses, read_poses
+from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.open import open_recording, read_reference
+from tofuse.engine.frames.recording import Recording
+from tofuse.apps.results.folder import is_result
+from tofuse.apps.results.run_json import frame_clock, read_run_json, run_json_checked
+from tofuse.engine.quality.types import Reconstruction
+
+Poses = str | Path | Float64 | Reconstruction
+
+_TRAJECTORY = "trajectory.txt"  # of a result
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Errors of a trajectory relative to a reference.
+
+    Attributes
+    ----------
+    error
+        Absolute and relative errors.
+    ate_interval_m
+        Bounds of the true ATE; None if the error of the reference is unknown.
+    consistency
+        Map consistency of the recording's images at these poses; None without a recording.
+    """
+
+    error: TrajectoryError
+    ate_interval_m: tuple[float, float] | None = None
+    consistency: Consistency | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures as plain data, angles in degrees."""
+        data: dict[str, Any] = self.error.to_dict()
+        if self.ate_interval_m is not None:
+            data["ate_interval_m"] = list(self.ate_interval_m)
+        if self.consistency is not None:
+            data["map_consistency"] = self.consistency.to_dict()
+        return data
+
+    def __repr__(self) -> str:
+        e = self.error
+        return (
+            f"Evaluation: ATE {e.ate_rms_m:.4f} m, {np.degrees(e.rotation_rms_rad):.3f} deg rms "
+            f"over {e.associated} poses"
+        )
+
+
+def evaluate(
+    estimate: Poses,
+    reference: Poses,
+    *,
+    recording: Recording | str | Path | None = None,
+    reference_error_m: float | None = None,
+    config: Mapping[str, Any] | None = None,
+) -> Evaluation:
+    """Compare a trajectory with a reference.
+
+    Parameters
+    ----------
+    estimate, reference
+        A file or folder of any supported format (a result, a recording with a reference), a
+        result in memory, or (N, 4, 4) T_world_camera of the frames of the recording, NaN where
+        there is none.
+    recording
+        Provides the timestamps of frames if the files don't, and images whose map consistency is
+        measured.
+    reference_error_m
+        Rms error of the reference, m.
+    config
+        Configuration of the result that the poses belong to: images are compared with its
+        self-calibrated camera, if any. By default read from an estimate that is a result.
+
+    Raises
+    ------
+    InputError
+        If a file can't be read, or nothing can be associated.
+    """
+    if isinstance(recording, str | Path):
+        recording = open_recording(recording)
+    names = [
+        str(p) if isinstance(p, str | Path) else n
+        for p, n in ((estimate, "estimate"), (reference, "reference"))
+    ]
+    clock = frame_clock(Path(estimate)) if isinstance(estimate, str | Path) else None
+    if recording is not None:
+        clock = recording.timestamps, recording.indices
+    timed_estimate, timed_reference = (
+        _poses(estimate, names[0]),
+        _poses(reference, names[1], is_reference=True),
+    )
+    if clock is None and (timed_estimate.timestamps is None) != (
+        timed_reference.timestamps is None
+    ):
+        raise InputError(
+            "has poses by frame, the other file by time",
+            where=names[0] if timed_estimate.timestamps is None else names[1],
+            remedy="pass the recording, which has the times, with --recording",
+        )
+    times, poses = _timed(timed_estimate, estimate, clock, names[0])
+    reference_times, reference_poses = _timed(timed_reference, reference, clock, names[1])
+    frame_times = None if recording is None else recording.timestamps
+    try:
+        error = evaluate_trajectory(times, poses, reference_times, reference_poses, frame_times)
+    except InputError as cause:
+        raise InputError(cause.problem, where=", ".join(names), remedy=cause.remedy) from cause
+    interval = None if reference_error_m is None else error.ate_within(reference_error_m)
+    consistency = None
+    if recording is not None:
+        frame_poses = poses_of_frames(recording.timestamps, times, poses)
+        consistency = map_consistency(
+            recording, frame_poses, correctors=_correctors(estimate, config)
+        )
+    return Evaluation(error, interval, consistency)
+
+
+def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corrector, ...]:
+    """Return the correctors of the result that the poses belong to; none without a result."""
+    if config is not None:
+        return CameraErrors.made_with(config)
+    if isinstance(estimate, Reconstruction):
+        return CameraErrors.made_with(estimate.config)
+    if not isinstance(estimate, str | Path):
+        return ()
+    folder = Path(estimate)
+    folder = folder.parent if folder.name == _TRAJECTORY else folder
+    if not is_result(folder):
+        return ()
+    path = folder / "run.json"
+    run = read_run_json(path)
+    with run_json_checked(path):
+        return CameraErrors.made_with(run["config"])
+
+
+def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:
+    if isinstance(source, str | Path):
+        return read_reference(source) if is_reference else read_poses(source)
+    if isinstance(source, Reconstruction):
+        return TimedPoses(source.trajectory, timestamps=source.timestamps)
+    poses = se3.check_poses(source, where=name)
+    return TimedPoses(poses, frames=np.arange(len(poses)))
+
+
+def _timed(
+    timed: TimedPoses, source: Poses, clock: Clock | None, name: str
+) -> tuple[Float64, Float64]:
+    """Return times (N,) and poses (N, 4, 4); those of an array are of the recording's frames."""
+    if isinstance(source, str | Path | Reconstruction) or clock is None:
+        return timed.timed(clock, name)
+    if len(timed.poses) != len(clock[0]):
+        raise InputError(
+            f"holds {len(timed.poses)} poses, and the recording {len(clock[0])} frames", where=name
+        )
+    return clock[0], timed.poses

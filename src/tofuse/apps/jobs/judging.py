@@ -1,0 +1,528 @@
+"""Assessing poses from other sources: their consistency with the depth, and their accuracy.
+
+The poses replace tracking; otherwise it is a run: loops are closed, and all views are refined
+jointly. The error bound of the given poses is their distance from the refined ones plus the error
+bound of those. If images contradict even the refined poses, the recording is tracked again, and the
+trajectory with more support by the images counts.
+
+Refined poses have errors too, mostly in poorly observable directions, so a distance from them does
+not prove the given poses wrong. Pairs of views, registered around the refined poses, test that
+(`evaluation.deviation`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounds
+from tofuse.engine.errors import InputError
+from tofuse.engine.quality.consistency import Consistency, map_consistency
+from tofuse.engine.quality.cross_view import CrossViewConsistency, compare_views, prepare_for_comparison
+from tofuse.engine.quality.pose_deviation import Deviation, fitted
+from tofuse.engine.quality.pose_deviation import deviation as deviation_of
+from tofuse.engine.quality.trajectory import displacement, distances_between
+from tofuse.formats.files.trajectory_formats import TimedPoses, read_poses
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import threads as use_threads
+from tofuse.engine.tracking.given import GivenPoses
+from tofuse.engine.tracking.motion import FrameTime, find_jumps
+from tofuse.engine.parts import check_number
+from tofuse.engine.quality.checks import accuracy_reasons, cross_view_reasons, tolerance_of
+from tofuse.engine.mapping.config import Config, check_views, from_method
+from tofuse.engine.mapping.priors import with_odometry
+from tofuse.engine.mapping.progress import Progress, Silent
+from tofuse.engine.mapping.reconstruction import reconstruct_with_views, view_kind
+from tofuse.engine.quality.accuracy import Accuracy, WorstFrame
+from tofuse.engine.quality.pair_measurements import measured_pairs
+from tofuse.engine.stored_views.view_store import PosedView
+from tofuse.formats.recordings.open import Opening, OpeningOptions, read_reference
+from tofuse.formats.recordings.phones import POSES_BY
+from tofuse.engine.frames.recording import Recording, evenly_spaced
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.quality.accuracy_card import bound, length
+from tofuse.apps.results.folder import OutputFolder
+from tofuse.apps.results.output import write_result
+from tofuse.engine.frames.ranges import Range, in_words, runs_of
+from tofuse.apps.results.run_json import accuracy_json, plain, reasons_json
+from tofuse.engine.quality.types import Reason, Reconstruction, Verdict
+from tofuse.engine.quality.verdict import ranked, verdict_of
+
+Views = Sequence[PosedView[PreparedView]]
+
+# Number of frames whose images are compared under the poses.
+_CHECKED = 60
+# With a smaller fraction of supporting measurements the recording is tracked again.
+_SUPPORTED = 0.95
+# With fewer overlapping views, relative to the refined poses, most poses are wrong.
+_MIN_OVERLAPPING = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Assessment of poses from another source by the depth images.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4) T_world_camera of the frames as given, NaN where there is none.
+    accuracy
+        Of these poses.
+    verdict, reasons
+        As of a run.
+    consistency, refined_consistency
+        Map consistency of the given poses and of the refined ones; None if no two views overlap.
+    deviation
+        Deviation of these poses from pairwise registrations, and its significance; None if no two
+        views could be compared.
+    displacement_m
+        (N,) distance of each given pose from the refined one after alignment, m; NaN where unknown.
+    refined
+        The result of a refinement initialised with the poses; or of an independent run, if the
+        images support that better.
+    started
+        Whether `refined` was initialised with the poses.
+    """
+
+    poses: Float64
+    accuracy: Accuracy
+    verdict: Verdict
+    reasons: tuple[Reason, ...]
+    consistency: Consistency | None
+    refined_consistency: Consistency | None
+    deviation: Deviation | None
+    displacement_m: Float64
+    refined: Reconstruction
+    started: bool = True
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of `judge.json`, with inf as it is."""
+        return {
+            "schema": 1,
+            "verdict": self.verdict,
+            "accuracy": accuracy_json(self.accuracy),
+            "reasons": reasons_json(self.reasons),
+            "frames": int(np.isfinite(self.poses[:, 0, 0]).sum()),
+            "map_consistency": None if self.consistency is None else self.consistency.to_dict(),
+            "deviation": None if self.deviation is None else self.deviation.to_dict(),
+            "displacement_m": self.displacement_m,
+            "refined": {
+                "from_these_poses": self.started,
+                "verdict": self.refined.diagnostics.verdict,
+                "accuracy": accuracy_json(self.refined.diagnostics.accuracy),
+                "map_consistency": None
+                if self.refined_consistency is None
+                else self.refined_consistency.to_dict(),
+            },
+        }
+
+
+def judge(
+    recording: Recording,
+    trajectory: str | Path | Float64 | Reconstruction,
+    *,
+    tolerance_m: float | None = None,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Judgement:
+    """Assess the accuracy of poses from any source, without a reference.
+
+    Parameters
+    ----------
+    recording
+        Range images, as of `tofuse.open`.
+    trajectory
+        A file of any format of `files.trajectory_formats`, a result or its folder, a recording with
+        poses, or (N, 4, 4) T_world_camera of the frames, NaN where there is none. Timed poses are
+        assigned to the nearest frames in time, within 20 ms.
+    tolerance_m
+        Accuracy required of good poses, m; see `Config`.
+    threads
+        Number of threads; None: all cores. The result does not depend on it.
+    progress
+        Shows the progress.
+
+    Raises
+    ------
+    InputError
+        If fewer than two frames have a pose, or the recording contains clouds.
+    """
+    progress = progress or Silent()
+    if tolerance_m is not None:
+        check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
+    poses = poses_for(recording, trajectory)
+    kind = view_kind(recording)
+    # External sensors do not measure these poses, and images are compared with the stated camera.
+    config = replace(
+        from_method("default", kind), tolerance_m=tolerance_m, priors=(), self_calibration=False
+    )
+    given_config = replace(config, odometry=GivenPoses())
+    check_views(given_config, kind)
+    compared_images = _Images(recording)
+
+    def reconstructed(
+        source: Recording, config_used: Config
+    ) -> tuple[Reconstruction, Views, ViewSupport]:
+        result, views = reconstruct_with_views(
+            source, config_used, threads=threads, progress=progress
+        )
+        return result, views, compared_images.support_at(result.trajectory)
+
+    progress.stage("comparing images")
+    initial_support = compared_images.support_at(poses)
+    refined, views, refined_support = reconstructed(with_odometry(recording, poses), given_config)
+    from_poses = True
+    if not refined_support.is_supported:
+        independent, independent_views, independent_support = reconstructed(recording, config)
+        if independent_support.support > refined_support.support:
+            refined, views, refined_support, from_poses = (
+                independent,
+                independent_views,
+                independent_support,
+                False,
+            )
+    progress.stage("registering pairs")
+    with use_threads(threads), threadpool_limits(1):
+        deviation = _deviation(poses, refined, views)
+    distances = _distances(poses, refined.trajectory)
+    accuracy = _accuracy(distances, poses, refined)
+    reasons = ranked(
+        [
+            *_reasons(
+                poses, accuracy, deviation, initial_support, refined_support, refined, tolerance_m
+            ),
+        ]
+    )
+    return Judgement(
+        poses,
+        accuracy,
+        verdict_of(reasons),
+        reasons,
+        _consistency(recording, poses),
+        _consistency(recording, refined.trajectory),
+        deviation,
+        distances,
+        refined,
+        from_poses,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSupport:
+    """Cross-view consistency of overlapping images under given poses."""
+
+    cross_view: CrossViewConsistency
+
+    @property
+    def overlapping(self) -> float:
+        """Fraction of the views that overlap with another one."""
+        support = self.cross_view.support_of_views()
+        return float(np.isfinite(support).mean()) if len(support) else 0.0
+
+    @property
+    def support(self) -> float:
+        """Fraction of the overlapping measurements that support the poses, times `overlapping`."""
+        return float(np.nan_to_num(self.cross_view.support())) * self.overlapping
+
+    @property
+    def is_supported(self) -> bool:
+        """Whether almost all views overlap, and almost no measurement contradicts the poses."""
+        return self.support >= _SUPPORTED
+
+
+class _Images:
+    """A sample of frames, read and prepared once, to be compared under different poses."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._views: dict[int, PreparedView | None] = {}
+
+    def support_at(self, poses: Float64) -> ViewSupport:
+        """Compare the frames under their poses (N, 4, 4), NaN where there is none."""
+        rows = evenly_spaced(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
+        views = [(k, view) for k in rows if (view := self._view(k)) is not None]
+        used_rows = [k for k, _ in views]
+        return ViewSupport(compare_views([view for _, view in views], poses[used_rows]))
+
+    def _view(self, k: int) -> PreparedView | None:
+        """Return the k-th frame as a prepared view; None if it can't be read."""
+        if k not in self._views:
+            frame = self._recording.image(k)
+            self._views[k] = None if frame is None else prepare_for_comparison(frame)
+        return self._views[k]
+
+
+@dataclass(frozen=True)
+class JudgeOptions(OpeningOptions):
+    """The options of ``tofuse judge``; see its ``--help``."""
+
+    out: Path | None = None
+    overwrite: bool = False
+    tolerance: float | None = None
+    threads: int | None = None
+
+
+def judge_files(
+    inputs: Sequence[str | Path],
+    trajectory: Path,
+    options: JudgeOptions | None = None,
+    progress: Progress | None = None,
+) -> Judgement:
+    """Judge the poses in a file, and write the refined result if an output folder is given.
+
+    Raises
+    ------
+    InputError
+        If the recording or the poses can't be used.
+    OutputError
+        If the result can't be written; an existing folder is then unchanged.
+    """
+    options, progress = options or JudgeOptions(), progress or Silent()
+    opening = Opening.of(inputs, options)
+    recording = opening.open()
+    out = options.out
+    with nullcontext() if out is None else OutputFolder(out, overwrite=options.overwrite) as folder:
+        judgement = judge(
+            recording,
+            trajectory,
+            tolerance_m=options.tolerance,
+            threads=options.threads,
+            progress=progress,
+        )
+        facts = {**judgement.refined.recording, "opening": opening.to_dict()}
+        judgement = replace(judgement, refined=replace(judgement.refined, recording=facts))
+        if folder is not None:
+            progress.stage("writing")
+            with threadpool_limits(1):
+                _write(judgement, trajectory, recording, folder)
+    return judgement
+
+
+def _write(
+    judgement: Judgement, trajectory: Path, recording: Recording, folder: OutputFolder
+) -> None:
+    """Write the refined result, with `judge.json` and the judgement as headline of the report."""
+    from tofuse.apps.report.extras import ReportExtras
+    from tofuse.apps.report.html import write_report
+
+    def report(result: Reconstruction, path: Path) -> None:
+        headline = sentence(judgement, trajectory.name) if result is judgement.refined else ""
+        title = f"{trajectory.name} on {Path(recording.path).name}"
+        write_report(result, path / "report.html", ReportExtras(title, headline=headline))
+        if result is judgement.refined:
+            text = json.dumps(plain(judgement.to_dict()), indent=1, allow_nan=False)
+            (path / "judge.json").write_text(text + "\n", encoding="utf-8")
+
+    write_result(judgement.refined, folder, report)
+
+
+def sentence(judgement: Judgement, name: str) -> str:
+    """Summarise the judgement: "poses.txt: ±31 mm ...; refined: ±9 mm ..."."""
+    diagonal = judgement.refined.cloud.diagonal_m
+    given_bound = bound(judgement.accuracy, diagonal)
+    refined_bound = bound(judgement.refined.diagnostics.accuracy, diagonal)
+    label = "refined" if judgement.started else "tracked again"
+    readable = [f.status != "skipped" for f in judgement.refined.diagnostics.frames]
+    posed = np.isfinite(judgement.poses[readable, 0, 0])
+    return (
+        f"{name}: {given_bound}, poses of {posed.sum()} of {len(posed)} frames; {label}: "
+        f"{refined_bound}.{_agreement(judgement.deviation)}"
+    )
+
+
+def _agreement(deviation: Deviation | None) -> str:
+    """State whether the depth contradicts the poses."""
+    if deviation is None:
+        return ""
+    if not deviation.consistent:
+        return (
+            " Inconsistent with the depth: surfaces displaced by about "
+            f"{length(deviation.estimate_m)}, at least {length(deviation.at_least_m)} (95 %)."
+        )
+    if not np.isfinite(deviation.at_most_m):
+        return " Consistent with the depth, as far as that constrains them."
+    return f" Consistent with the depth to within {length(deviation.at_most_m)} (95 %)."
+
+
+def device_sentence(recording: Recording, result: Reconstruction) -> str:
+    """State the accuracy of a phone's own poses; empty if there are none.
+
+    "ARKit's poses: ±31 mm (95 %); these: ±9 mm."
+    """
+    by, poses = recording.metadata.get(POSES_BY), recording.reference
+    if by is None or poses is None:
+        return ""
+    distances = _distances(poses, result.trajectory)
+    distances = distances[np.isfinite(distances)]
+    if len(distances) < 2:
+        return ""
+    rms, bound_m = float(np.sqrt((distances**2).mean())), result.diagnostics.accuracy.position_m
+    if not np.isfinite(bound_m):
+        return f"{by}'s poses differ from these by {length(rms)} rms."
+    return f"{by}'s poses: ±{length(rms + bound_m)} (95 %); these: ±{length(bound_m)}."
+
+
+def _read(path: Path) -> TimedPoses:
+    """Read a trajectory, or the poses in a recording, such as those of a phone."""
+    try:
+        return read_poses(path)
+    except InputError as no_trajectory:
+        try:
+            return read_reference(path)
+        except InputError:
+            raise no_trajectory from None
+
+
+def poses_for(recording: Recording, trajectory: str | Path | Float64 | Reconstruction) -> Float64:
+    """Return the (N, 4, 4) poses of a recording's frames, NaN where there is none; see `judge`.
+
+    Raises
+    ------
+    InputError
+        If fewer than two frames have a pose, or an array has the wrong shape.
+    """
+    where = "trajectory"
+    if isinstance(trajectory, str | Path):
+        path = Path(trajectory)
+        where = str(path)
+        poses = _read(path).of_frames(recording.timestamps, recording.indices)
+    elif isinstance(trajectory, Reconstruction):
+        timed = TimedPoses(trajectory.trajectory, timestamps=trajectory.timestamps)
+        poses = timed.of_frames(recording.timestamps, recording.indices)
+    else:
+        poses = se3.check_poses(trajectory, where=where, count=len(recording))
+    n_posed = int(np.isfinite(poses).all((1, 2)).sum())
+    if n_posed < 2:
+        raise InputError(
+            f"has a pose for {n_posed} of the {len(recording)} frames",
+            where=where,
+            remedy="pass timestamps in seconds on the clock of the recording",
+        )
+    return poses
+
+
+def _distances(poses: Float64, refined: Float64) -> Float64:
+    common = np.isfinite(poses[:, 0, 0]) & np.isfinite(refined[:, 0, 0])
+    out = np.full(len(poses), np.nan)
+    if common.any():
+        out[common] = distances_between(poses[common], refined[common])
+    return out
+
+
+def _accuracy(distances: Float64, poses: Float64, refined: Reconstruction) -> Accuracy:
+    """Return the bound of the given poses: distance from the refined ones plus their bound."""
+    refined_accuracy = refined.diagnostics.accuracy
+    common = np.flatnonzero(np.isfinite(distances))
+    if not refined_accuracy.assessed or not len(common):
+        return refined_accuracy
+    moved, turned = displacement(refined.trajectory[common], poses[common])
+    # In the worst case both have the same direction.
+    position, rotation = moved + refined_accuracy.position_m, turned + refined_accuracy.rotation_rad
+    worst = int(common[np.argmax(distances[common])])
+    at_worst = WorstFrame(
+        int(refined.diagnostics.frames[worst].index),
+        float(distances[worst]) + refined_accuracy.position_m,
+        rotation,
+    )
+    if refined_accuracy.unbounded and refined_accuracy.worst is not None:
+        at_worst = refined_accuracy.worst
+    diagonal = refined.cloud.diagonal_m
+    relative = position / diagonal if diagonal > 0 else np.inf
+    return Accuracy(position, rotation, relative, True, at_worst, refined_accuracy.unbounded)
+
+
+def _deviation(poses: Float64, refined: Reconstruction, views: Views) -> Deviation | None:
+    """Compare the poses with registered pairs of views that have a given and a refined pose."""
+    row_of = {f.index: k for k, f in enumerate(refined.diagnostics.frames)}
+    common = np.flatnonzero(np.isfinite(poses[:, 0, 0]) & np.isfinite(refined.trajectory[:, 0, 0]))
+    common_rows = set(common.tolist())
+    posed = [view for view in views if row_of[view.index] in common_rows]
+    if len(posed) < 2:
+        return None
+    rows = [row_of[view.index] for view in posed]
+    depth_m = float(np.median([view.depth for view in posed]))
+    fit = fitted(measured_pairs(posed, refined.trajectory[rows]), depth_m)
+    return deviation_of(fit, poses[rows]) if fit.dof > 0 else None
+
+
+def _reasons(
+    poses: Float64,
+    accuracy: Accuracy,
+    deviation: Deviation | None,
+    initial_support: ViewSupport,
+    refined_support: ViewSupport,
+    refined: Reconstruction,
+    tolerance_m: float | None,
+) -> Iterator[Reason]:
+    frames = refined.diagnostics.frames
+    indices = [f.index for f in frames]
+    full_range = ((indices[0], indices[-1]),)
+    if initial_support.overlapping < _MIN_OVERLAPPING * refined_support.overlapping:
+        text = (
+            f"Only {initial_support.overlapping:.0%} of the images overlap with another under "
+            f"these poses; under the refined ones {refined_support.overlapping:.0%} do."
+        )
+        yield Reason("images_disagree", full_range, text)
+    yield from cross_view_reasons(initial_support.cross_view, full_range)
+    allowed_m = tolerance_of(tolerance_m, refined.cloud.diagonal_m)
+    contradictions = (
+        [] if deviation is None else [*_contradiction(deviation, allowed_m, full_range)]
+    )
+    yield from contradictions
+    # Uncertain poses are no further reason if they are known to be wrong.
+    yield from (
+        r
+        for r in accuracy_reasons(accuracy, allowed_m, indices)
+        if not contradictions or r.code != "uncertain_poses"
+    )
+    # The camera itself may have moved abruptly; then the refined poses jump as well.
+    moments = [FrameTime(f.index, f.timestamp) for f in frames]
+    actual_jumps = {k for k, _ in find_jumps(_or_none(refined.trajectory), moments)}
+    jumped = {
+        k: words for k, words in find_jumps(_or_none(poses), moments) if k not in actual_jumps
+    }
+    if jumped:
+        first = next(iter(jumped))
+        ranges = runs_of(indices, [indices[k] for k in jumped])
+        text = (
+            f"The poses of {in_words(ranges)} jump, and the refined ones don't; that of frame "
+            f"{indices[first]} is {jumped[first]}."
+        )
+        yield Reason("jumped", ranges, text)
+
+
+def _contradiction(
+    deviation: Deviation, allowed_m: float, full_range: tuple[Range, ...]
+) -> Iterator[Reason]:
+    """Yield a reason if poses contradict the depth by more than the tolerance."""
+    if deviation.at_least_m <= allowed_m:
+        return
+    text = (
+        f"Registrations contradict the poses: surfaces are displaced by about "
+        f"{length(deviation.estimate_m)} rms, at least {length(deviation.at_least_m)} (95 %); the "
+        f"tolerance is {length(allowed_m)}."
+    )
+    steps = tuple((int(a), int(b)) for a, b in deviation.ids[deviation.steps])
+    if steps:
+        a, b = steps[0]
+        text += f" The motion from frame {a} to {b} is wrong by itself"
+        others = len(steps) - 1
+        text += f", and {others} other{'' if others == 1 else 's'}." if others else "."
+    yield Reason("inconsistent_poses", steps or full_range, text)
+
+
+def _or_none(poses: Float64) -> list[Float64 | None]:
+    return [T if np.isfinite(T).all() else None for T in poses]
+
+
+def _consistency(recording: Recording, poses: Float64) -> Consistency | None:
+    consistency = map_consistency(recording, poses)
+    return consistency if consistency.pairs else None

@@ -1,0 +1,339 @@
+"""Multi-session mapping: merging the results of several runs into one map.
+
+Each session, a recording with the poses of its result, is a component of one large run. Its further
+stages are those of a run: components are joined where registered views of both confirm it and none
+contradicts, loops between them are closed, all views are refined jointly, and fused. The world
+frame is that of the first result. Sessions that can't be joined remain separate components.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounds
+from tofuse.engine.quality.trajectory import align
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import threads as use_threads
+from tofuse.engine.tracking.given import GivenPoses, StatedPose, StatedPoses
+from tofuse.engine.parts import check_number
+from tofuse.engine.mapping.config import Config, from_method
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.texturing import make_texture
+from tofuse.engine.mapping.progress import Progress, Silent
+from tofuse.engine.mapping.reconstruction import push_frames, with_recording_facts
+from tofuse.apps.jobs.run_options import ModelOptions
+from tofuse.apps.jobs.session_pairs import SessionModel, session_changes, session_pairs
+from tofuse.apps.jobs.sessions import Session, read_sessions, sessions_of
+from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.stored_views.view_store import PosedView
+from tofuse.engine.frames.recording import Recording, Source
+from tofuse.formats.recordings.sources import JoinedSource
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.apps.results.folder import OutputFolder
+from tofuse.apps.results.output import write_result
+from tofuse.apps.results.session_words import session_sentences
+from tofuse.engine.quality.types import Reason, Reconstruction, SessionRecord, in_main_model
+from tofuse.engine.quality.verdict import verdict_of
+
+# Maximum number of view pairs that are registered to join two sessions, and number of searches per
+# session to be joined.
+_TRIES, _SEARCHES = 24, 48
+# Minimum probability that a join is correct.
+_MIN_PROBABILITY = 0.99
+
+
+@dataclass(frozen=True)
+class MergeOptions(ModelOptions):
+    """The options of ``tofuse merge``; see its ``--help``.
+
+    Attributes
+    ----------
+    only_joined
+        Whether nothing is written if the last session can't be joined to the first.
+    """
+
+    out: Path
+    overwrite: bool = False
+    seed: int = 0
+    threads: int | None = None
+    only_joined: bool = False
+
+
+def merge(
+    results: Sequence[str | Path],
+    *,
+    tolerance_m: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """Merge the results of several runs into one map, in the world frame of the first.
+
+    Parameters
+    ----------
+    results
+        Output folders of `tofuse run` or `tofuse merge`; at least two sessions. Their recordings
+        must still be available.
+    tolerance_m
+        As in `Config`, m; by default that of the first result.
+    seed, threads, progress
+        As in `reconstruct`.
+
+    Returns
+    -------
+    A result as of a run, with `sessions` and `session_pairs`. Sessions that can't be joined to the
+    first one are components with their own models.
+
+    Raises
+    ------
+    InputError
+        If a folder is not a result, or its recording is missing or has changed.
+    """
+    progress = progress or Silent()
+    if tolerance_m is not None:
+        check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
+    sessions = read_sessions(results, threads, progress)
+    config = merged_config(sessions)
+    if tolerance_m is not None:
+        config = replace(config, tolerance_m=tolerance_m)
+    return merge_sessions(sessions, config, seed=seed, threads=threads, progress=progress)
+
+
+def merged_config(sessions: Sequence[Session]) -> Config:
+    """Return the configuration of a merge: the default, with the model options of the first."""
+    first = sessions[0].config
+    default = from_method("default")
+    priors = default.priors if all(s.config.priors for s in sessions) else ()
+    searches = _SEARCHES * (len(sessions) - 1)
+    joining = replace(
+        default.joining,
+        main="first",
+        tries=_TRIES,
+        searches=searches,
+        min_probability=_MIN_PROBABILITY,
+    )
+    return replace(
+        default,
+        corrections=first.corrections,
+        filters=first.filters,
+        model_filters=first.model_filters,
+        odometry=first.odometry,
+        fusion=first.fusion,
+        tolerance_m=first.tolerance_m,
+        priors=priors,
+        joining=joining,
+        self_calibration=False,  # done for each session
+    )
+
+
+def merge_sessions(
+    sessions: Sequence[Session],
+    config: Config,
+    *,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """Join, refine and fuse sessions; see `merge`."""
+    progress = progress or Silent()
+    recording, offsets = joined_recording(sessions)
+    links = _earlier_links(sessions, offsets)
+    mapper = Mapper(config, seed=seed, threads=threads, loops=links, progress=progress)
+    progress.stage("reading sessions", len(recording))
+    with threadpool_limits(1):
+        for session, offset in zip(sessions, offsets, strict=True):
+            mapper.interrupt(_config_of(session, offset))
+            session_recording = replace(recording, indices=session.recording.indices + offset)
+            push_frames(mapper, session_recording, session.config.window)
+        result = mapper.finish()
+        progress.stage("comparing sessions")
+        with use_threads(mapper.threads):
+            return _with_sessions(result, sessions, offsets, mapper.views, recording)
+
+
+def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]:
+    """Return the recordings of all sessions as one, and the first frame index of each."""
+    sources: list[Source] = []
+    names: list[str] = []
+    offsets, count = [], 0
+    for session in sessions:
+        source = session.recording.source
+        offsets.append(count)
+        count += len(source.timestamps)
+        if isinstance(source, JoinedSource):
+            sources += source.parts
+            names += [f"{session.name}, {part['name']}" for part in source.metadata["parts"]]
+        else:
+            sources.append(source)
+            names.append(session.name)
+    indices = [s.recording.indices + offset for s, offset in zip(sessions, offsets, strict=True)]
+    formats = dict.fromkeys(s.recording.format for s in sessions)
+    path = " ".join(s.recording.path for s in sessions)
+    joined = JoinedSource(sources, names)
+    return Recording(joined, path, "+".join(formats), np.concatenate(indices)), offsets
+
+
+def _earlier_links(sessions: Sequence[Session], offsets: Sequence[int]) -> list[PriorLoop]:
+    """Return the loops that earlier merges closed between sessions, to be registered again.
+
+    The loop search selects the pairs with the largest overlap, which need not connect all sessions.
+    """
+    return [
+        PriorLoop(i + offset, j + offset, by_user=False)
+        for session, offset in zip(sessions, offsets, strict=True)
+        for i, j in session.links
+    ]
+
+
+def _config_of(session: Session, offset: int) -> Config:
+    """Return the configuration of a session, with its stated poses as odometry."""
+    odometry = session.config.odometry
+    assert isinstance(odometry, GivenPoses)
+    stated = {k + offset: pose for k, pose in session.stated.items()}
+    return replace(session.config, odometry=StatedPoses(stated, odometry))
+
+
+def _with_sessions(
+    result: Reconstruction,
+    sessions: Sequence[Session],
+    offsets: Sequence[int],
+    views: Sequence[PosedView[PreparedView]],
+    recording: Recording,
+) -> Reconstruction:
+    """Return the result with its sessions, their overlaps and changes."""
+    merged_poses = SessionModel.of(result).poses
+    records = tuple(
+        SessionRecord(
+            session.name,
+            str(session.result.absolute()),
+            session.opening.to_dict(),
+            session.config.to_dict(),
+            offset,
+            len(session.recording.source.timestamps),
+            _T_main_session(session.posed, offset, merged_poses, fixed=k == 0),
+        )
+        for k, (session, offset) in enumerate(zip(sessions, offsets, strict=True))
+    )
+    facts = {
+        "path": recording.path,
+        "format": recording.format,
+        "frames": len(recording),
+        "warnings": list(recording.warnings),
+    }
+    components_before = [{s.component for s in session.posed.values()} for session in sessions]
+    pairs = session_pairs(result, records, components_before, views)
+    result = replace(
+        with_recording_facts(result, facts),
+        sessions=records,
+        session_pairs=pairs,
+        changes=session_changes(result, records, views),
+    )
+    reasons = tuple(_reasons(result))
+    diagnostics = replace(result.diagnostics, reasons=reasons, verdict=verdict_of(reasons))
+    return replace(result, diagnostics=diagnostics)
+
+
+def _T_main_session(
+    posed: dict[int, StatedPose], offset: int, merged_poses: dict[int, Float64], *, fixed: bool
+) -> Float64 | None:
+    """Return (4, 4) T_main_session between the world frames; None if the session is not joined.
+
+    Refinement has changed the relative poses of its frames, so this is a least squares alignment;
+    for the first session (`fixed`), whose world frame is the main one, that of its first frame.
+    """
+    main = min((s.component for s in posed.values()), default=None)
+    common = [k for k, s in posed.items() if s.component == main and k + offset in merged_poses]
+    if not common:
+        return None
+    stated = np.array([posed[k].T_component_camera for k in common])
+    merged = np.array([merged_poses[k + offset] for k in common])
+    if fixed:
+        return np.asarray(merged[0] @ se3.inverse(stated[0]), np.float64)
+    return align(stated, merged)
+
+
+def _reasons(result: Reconstruction) -> Iterator[Reason]:
+    """Return the reasons, with the names of sessions that are not joined."""
+    unjoined = [s.name for s in result.sessions if s.T_main_session is None]
+    for reason in result.diagnostics.reasons:
+        if unjoined and reason.code == "few_poses" and _covers_most(result):
+            continue
+        if unjoined and reason.code == "disconnected":
+            main = [s.name for s in result.sessions if s.T_main_session is not None]
+            text = f"No overlap could be confirmed between {' or '.join(main)} and "
+            yield replace(reason, text=f"{text}{', '.join(unjoined)}. {reason.text}")
+        else:
+            yield reason
+
+
+def _covers_most(result: Reconstruction) -> bool:
+    """Whether the main model contains most frames of the sessions joined to it."""
+    joined = [s for s in result.sessions if s.T_main_session is not None]
+    frames = [
+        f
+        for f in result.diagnostics.frames
+        if f.status != "skipped" and any(s.has(f.index) for s in joined)
+    ]
+    return 2 * sum(in_main_model(f, result.components) for f in frames) >= len(frames)
+
+
+def check_result(folder: Path) -> None:
+    """Raise InputError if a result can't be merged with a later one; see `merge`."""
+    sessions_of(folder, 0, None, Silent())
+
+
+def merge_files(
+    results: Sequence[str | Path], options: MergeOptions, progress: Progress | None = None
+) -> Reconstruction:
+    """Merge results and write the output folder.
+
+    Raises
+    ------
+    InputError
+        See `merge`.
+    OutputError
+        If the result can't be written; an existing folder is then unchanged.
+    """
+    # Claimed before the results are read: it may be one of them.
+    with OutputFolder(options.out, overwrite=options.overwrite) as folder:
+        return _merge_into(folder, results, options, progress or Silent())
+
+
+def _merge_into(
+    folder: OutputFolder, results: Sequence[str | Path], options: MergeOptions, progress: Progress
+) -> Reconstruction:
+    progress.stage("opening")
+    sessions = read_sessions(results, options.threads, progress)
+    config = options.applied(merged_config(sessions))
+    result = merge_sessions(
+        sessions, config, seed=options.seed, threads=options.threads, progress=progress
+    )
+    if options.only_joined and result.sessions[-1].T_main_session is None:
+        progress.note(f"{options.out} is left as it was")
+        return result
+    texture = None
+    if config.fusion.texture:
+        recording, _ = joined_recording(sessions)
+        texture = make_texture(recording, result, config.fusion.texture, options.threads, progress)
+    progress.stage("writing")
+    with threadpool_limits(1):
+        write_result(result, folder, _report, texture)
+    return result
+
+
+def _report(result: Reconstruction, folder: Path) -> None:
+    from tofuse.apps.report.extras import ReportExtras
+    from tofuse.apps.report.html import write_report
+
+    names = ", ".join(session.name for session in result.sessions)
+    extras = ReportExtras(
+        title=f"{names} merged" if names else f"{folder.name} of a merged result",
+        headline=" ".join(session_sentences(result)),
+    )
+    write_report(result, folder / "report.html", extras)

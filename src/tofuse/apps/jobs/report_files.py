@@ -1,0 +1,139 @@
+"""The report of a result, with data from the recording."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.errors import UnreadableFrameError
+from tofuse.formats.files.ply import read_ply
+from tofuse.engine.filters.base import apply_filters
+from tofuse.engine.geometry import se3
+from tofuse.engine.parts import name_of
+from tofuse.engine.mapping.config import Config, changed
+from tofuse.apps.jobs.judging import device_sentence
+from tofuse.engine.mapping.reconstruction import past_frames
+from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.frames.recording import Recording
+from tofuse.apps.results.folder import RECORDING, component_number
+from tofuse.engine.quality.types import Reconstruction
+
+_DRAWN_CLOUDS = 12  # views in the report, if they are clouds
+_TRUTH_POINTS = 100_000
+
+
+def write_report_files(
+    recording: Recording, config: Config, result: Reconstruction, folder: Path
+) -> None:
+    """Write `report.html` into a folder."""
+    from tofuse.apps.report.extras import ReportExtras
+    from tofuse.apps.report.html import write_report
+
+    title = _title(Path(recording.path)) or recording.path
+    truth = truth_points(recording)
+    component = component_number(folder)
+    if component is not None:
+        title += f", component {component}"
+        truth = None  # its pose relative to this component is unknown
+        recording = _frames_of(recording, result)
+    clouds = () if result.diagnostics.samples else recording.sample(_DRAWN_CLOUDS)
+    extras = ReportExtras(
+        title=title,
+        headline=device_sentence(recording, result) if component is None else "",
+        filter_steps=_filter_steps(_final_config(config, result), recording, result),
+        reference=reference_in_world(recording, result),
+        truth_points=truth,
+        clouds=tuple(item for item in clouds if isinstance(item, CloudFrame)),
+    )
+    write_report(result, folder / "report.html", extras)
+
+
+def _frames_of(recording: Recording, result: Reconstruction) -> Recording:
+    """Select the frames of a result."""
+    frames = [record.index for record in result.diagnostics.frames]
+    return replace(recording, indices=recording.indices[np.isin(recording.indices, frames)])
+
+
+def _title(path: Path) -> str:
+    """Return the name of a recording; that of its folder for a native recording in a result."""
+    return (path.parent.name if path.name == RECORDING else "") or path.name
+
+
+def _final_config(config: Config, result: Reconstruction) -> Config:
+    """Return the configuration with the corrections of the result, after self-calibration.
+
+    Self-calibration adds its corrections before the others. Those are kept as they are, as parts
+    contain what they estimated from the recording, which their options don't state.
+    """
+    final = {"corrections": result.config["corrections"]}
+    corrections = changed(config, final, where="the result's config").corrections
+    added = len(corrections) - len(config.corrections)
+    return replace(config, corrections=(*corrections[:added], *config.corrections))
+
+
+def _filter_steps(
+    config: Config, recording: Recording, result: Reconstruction
+) -> tuple[tuple[str, Frame], ...]:
+    """Return one frame, raw and after each filter (figure 3.2); none if it can't be read again."""
+    posed = np.flatnonzero(result.has_pose)
+    k = int(posed[len(posed) // 2])
+    index = int(recording.indices[k])
+    try:
+        frame = recording[k]
+        history = past_frames(recording, index, config.window - 1)
+    except UnreadableFrameError:  # the recording has been moved or deleted
+        return ()
+    steps: list[tuple[str, Frame]] = [("raw", frame)]
+    for correction in config.corrections:
+        corrector = correction.start()
+        frame = corrector.apply(frame)
+        history = [corrector.apply(past) for past in history]
+        steps.append((name_of(correction), frame))
+    for item in (*config.filters, *config.model_filters):
+        frame, removals = apply_filters([item], frame, history)
+        steps.append((removals[0].name, frame))
+    return tuple(steps)
+
+
+def reference_in_world(recording: Recording, result: Reconstruction) -> Float64 | None:
+    """Return the reference poses (N, 4, 4) in the result's world, NaN for frames without one.
+
+    They are aligned at the first frame that has both poses.
+    """
+    reference = recording.reference
+    if reference is None:
+        return None
+    common = np.flatnonzero(np.isfinite(reference[:, 0, 0]) & result.has_pose)
+    if len(common) == 0:
+        return None
+    k = common[0]
+    T_world_reference = result.trajectory[k] @ se3.inverse(reference[k])
+    return np.where(np.isfinite(reference), T_world_reference @ reference, np.nan)
+
+
+def truth_points(recording: Recording) -> Float32 | None:
+    """Return points (K, 3) on the true surfaces of a simulated recording, in its world frame."""
+    path = Path(recording.path) / "truth" / "surface.ply"
+    if not path.is_file():
+        return None
+    truth = read_ply(path)
+    if truth.faces is None or len(truth.faces) == 0:
+        return truth.points.astype(np.float32)
+    corners = truth.points[truth.faces].astype(float)
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    rng = np.random.default_rng(0)
+    triangles = corners[rng.choice(len(corners), _TRUTH_POINTS, p=area / area.sum())]
+    u, v = rng.random((2, _TRUTH_POINTS, 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    points = (
+        triangles[:, 0]
+        + u * (triangles[:, 1] - triangles[:, 0])
+        + v * (triangles[:, 2] - triangles[:, 0])
+    )
+    return points.astype(np.float32)

@@ -1,0 +1,157 @@
+"""The options of ``tofuse run``, and the configuration that they specify."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from tofuse.engine.filters.raw_amplitude import range_and_amplitude
+from tofuse.engine.errors import InputError
+from tofuse.engine.mapping.config import MIN_MEMORY_MB, Config, ViewKind, changed, from_method, read_changes
+from tofuse.engine.mapping.texturing import TEXTURE
+from tofuse.engine.mapping.priors import Prior
+from tofuse.formats.recordings.open import OpeningOptions
+from tofuse.engine.frames.recording import Recording
+from tofuse.apps.results.run_json import read_run_json
+
+_SAMPLED = 8  # frames that are checked for the input of --unwrap
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions:
+    """Options of the model and of its verdict, of ``tofuse run`` and ``tofuse merge``.
+
+    What is None is as in the configuration.
+
+    Attributes
+    ----------
+    tolerance
+        Accuracy required of a good model, m.
+    texture
+        Whether the surface gets a texture.
+    faces
+        Maximum number of triangles.
+    voxel
+        Edge of a voxel, m.
+    """
+
+    tolerance: float | None = None
+    texture: bool = False
+    faces: int | None = None
+    voxel: float | None = None
+
+    def applied(self, config: Config) -> Config:
+        """Return the configuration with these options."""
+        if self.texture and not config.fusion.texture:
+            config = changed(config, {"fusion": {"texture": TEXTURE}}, where="--texture")
+        if self.faces is not None:
+            config = changed(config, {"fusion": {"faces": self.faces}}, where="--faces")
+        if self.voxel is not None:
+            config = changed(config, {"fusion": {"voxel_m": self.voxel}}, where="--voxel")
+        if self.tolerance is not None:
+            config = changed(config, {"tolerance_m": self.tolerance}, where="--tolerance")
+        return config
+
+
+@dataclass(frozen=True)
+class Options(OpeningOptions, ModelOptions):
+    """The options of ``tofuse run``; see its ``--help``."""
+
+    out: Path
+    method: str | None = None
+    config: Path | None = None
+    seed: int | None = None
+    threads: int | None = None
+    min_depth: float | None = None
+    max_depth: float | None = None
+    guess: Literal["identity", "previous", "odometry"] | None = None
+    prior: Prior = "auto"
+    loops: Path | None = None
+    object: bool = False
+    unwrap: bool = False
+    memory: int | None = None
+    overwrite: bool = False
+    no_report: bool = False
+
+
+def resolve(options: Options, kind: ViewKind = "range") -> Config:
+    """Return the configuration that the options specify, for a kind of view."""
+    changes: dict[str, Any] = read_changes(options.config) if options.config else {}
+    method = options.method or changes.get("method") or "default"
+    if not isinstance(method, str):
+        raise InputError(f"is {method!r}", where=f"{options.config}: method")
+    config = from_method(method, kind)
+    config = changed(config, {**changes, "method": method}, where=str(options.config or "--config"))
+    if options.guess:
+        config = changed(config, {"odometry": {"guess": options.guess}}, where="--guess")
+    config = options.applied(config)
+    if options.memory is not None:
+        megabytes = options.memory // 1_000_000
+        if megabytes < MIN_MEMORY_MB:
+            raise InputError(
+                f"is less than {MIN_MEMORY_MB} MB",
+                where="--memory",
+                remedy="allow more, e.g. --memory 2GB",
+            )
+        config = changed(config, {"memory_mb": megabytes}, where="--memory")
+    leading_filters: list[dict[str, Any]] = []
+    if options.min_depth is not None or options.max_depth is not None:
+        low = options.min_depth or 0.0
+        if options.max_depth is not None and options.max_depth <= low:
+            raise InputError(
+                f"is {options.max_depth} m and the minimum depth {low} m",
+                where="--max-depth",
+                remedy="use a larger one",
+            )
+        leading_filters.append({"part": "distance", "minimum": low, "maximum": options.max_depth})
+    current = config.to_dict()
+    filters = {item["part"] for item in current["filters"]}
+    corrections = list(current["corrections"])
+    if options.object:
+        if options.max_depth is None and not filters & {"background", "foreground", "mask", "box"}:
+            leading_filters.append({"part": "background"})
+        # Scattered light of the background is fixed to the image, and drags the object along.
+        names = [item["part"] for item in corrections]
+        if "multipath" in names and "scattering" not in names:
+            corrections.insert(names.index("multipath"), {"part": "scattering"})
+        # Neither gravity nor the camera's odometry applies to the coordinate frame of the object.
+        config = changed(config, {"priors": []}, where="--object")
+    if options.unwrap and kind == "range" and "unwrap" not in [c["part"] for c in corrections]:
+        corrections.insert(0, {"part": "unwrap"})
+    if leading_filters or corrections != current["corrections"]:
+        lists = {"filters": [*leading_filters, *current["filters"]], "corrections": corrections}
+        config = changed(config, lists, where="--object" if options.object else "--max-depth")
+    return config
+
+
+def check_unwrap(recording: Recording) -> None:
+    """Raise InputError if the recording can't be unwrapped."""
+    if not any(range_and_amplitude(frame, None) for frame in recording.readable(_SAMPLED)):
+        raise InputError(
+            "the recording can't be unwrapped: that needs its amplitude, and the ambiguity range "
+            "of its camera",
+            where="--unwrap",
+            remedy='set "ambiguity_m" in a camera.json passed with --camera, or omit --unwrap',
+        )
+
+
+def seed_of(options: Options) -> int:
+    """Return the seed: the option, or that of a `run.json` used as configuration; else 0."""
+    if options.seed is not None:
+        return options.seed
+    if options.config is not None and options.config.suffix == ".json":
+        seed = read_run_json(options.config).get("seed", 0)
+        if isinstance(seed, int) and seed >= 0:
+            return seed
+    return 0
+
+
+def check_guess(options: Options, recording: Recording) -> None:
+    """Raise InputError if the recording lacks the odometry to start from."""
+    if options.guess == "odometry" and recording.odometry is None:
+        raise InputError(
+            "is odometry, and the recording has none",
+            where="--guess",
+            remedy="put an odometry.txt next to the images, or use --guess previous",
+        )

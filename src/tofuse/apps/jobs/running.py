@@ -1,0 +1,256 @@
+"""The complete job of ``tofuse run``: options, recording, reconstruction, output folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from tofuse._version import __version__
+from tofuse.engine.sensor.unwrap_correction import Unwrap
+from tofuse.engine.errors import InputError
+from tofuse.engine.compute.memory import trim_memory
+from tofuse.formats.files.stamps import stamps_of
+from tofuse.engine.fusion.texture import Textured
+from tofuse.apps.inspection.finding import Finding
+from tofuse.apps.inspection.inspect import inspect_recording
+from tofuse.engine.mapping.adaptation import adapted
+from tofuse.engine.mapping.config import Config
+from tofuse.apps.jobs.judging import device_sentence
+from tofuse.engine.mapping.texturing import make_texture
+from tofuse.engine.mapping.priors import with_prior
+from tofuse.engine.mapping.progress import Progress, Silent, Stopwatch
+from tofuse.engine.mapping.reconstruction import reconstruct, view_kind
+from tofuse.apps.jobs.report_files import write_report_files
+from tofuse.apps.jobs.run_options import Options, check_guess, check_unwrap, resolve, seed_of
+from tofuse.apps.jobs.tracked_file import TrackedFile
+from tofuse.formats.files.given_loops import read_loops
+from tofuse.engine.loops.loops import PriorLoop
+from tofuse.formats.recordings.open import Opening
+from tofuse.engine.frames.recording import Recording
+from tofuse.apps.results.folder import TRACKED, OutputFolder, check_output
+from tofuse.apps.results.output import write_result
+from tofuse.apps.results.run_json import plain
+from tofuse.engine.quality.types import Reason, Reconstruction, in_main_model
+from tofuse.engine.quality.verdict import ranked, verdict_of
+
+
+def run(
+    inputs: Sequence[str | Path],
+    options: Options,
+    progress: Progress | None = None,
+    folder: OutputFolder | None = None,
+) -> Reconstruction:
+    """Reconstruct recordings and write the output folder.
+
+    The folder may be claimed already; the recording is then temporary, and an interrupted run can't
+    go on.
+
+    Raises
+    ------
+    InputError, OutputError
+        If nothing could be written; see the message for the remedy.
+    """
+    progress = progress or Silent()
+    if folder is None:
+        check_output(options.out, overwrite=options.overwrite)
+    watch = Stopwatch()
+    with watch.timing("opening"):
+        job = _open(inputs, options, progress)
+    tracked_file = _tracked_file(inputs, options, job, progress) if folder is None else None
+    with (
+        OutputFolder(options.out, overwrite=options.overwrite)
+        if folder is None
+        else nullcontext(folder)
+    ) as out:
+        try:
+            result = reconstruct(
+                job.recording,
+                job.config,
+                seed=job.seed,
+                threads=options.threads,
+                loops=job.loops,
+                progress=progress,
+                tracked_file=tracked_file,
+            )
+            texture = _texture(job, result, options, progress, watch)
+            result = _with_job(result, job, options, watch)
+            if device := device_sentence(job.recording, result):
+                progress.note(device)
+            progress.stage("writing")
+            trim_memory()
+            # BLAS results depend on its number of threads, and idle threads busy-wait.
+            with threadpool_limits(1):
+                report = partial(write_report_files, job.recording, job.config)
+                write_result(result, out, None if options.no_report else report, texture)
+        except BaseException as error:
+            if tracked_file is not None:
+                tracked_file.keep_after(error)
+            raise
+        if tracked_file is not None:
+            tracked_file.remove()
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A recording and the settings of its reconstruction.
+
+    `findings` are problems of the recording that a quick inspection found.
+    """
+
+    opening: Opening
+    recording: Recording
+    config: Config
+    seed: int
+    loops: tuple[PriorLoop, ...]
+    findings: tuple[Finding, ...]
+
+
+def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) -> _Job:
+    """Open and inspect the recording, and resolve its configuration."""
+    seed = seed_of(options)
+    opening = Opening.of(inputs, options)
+    recording = opening.open()
+    _preview(recording, progress)
+    config = resolve(options, view_kind(recording))
+    if not options.object:  # no sensor measures the motion relative to a moving object
+        recording, config = with_prior(recording, config, options.prior)
+    check_guess(options, recording)
+    if options.unwrap:
+        check_unwrap(recording)
+    config = adapted(config, recording, options.threads, progress)
+    indices = frozenset(recording.indices.tolist())
+    loops = tuple(read_loops(options.loops, indices)) if options.loops else ()
+    # At the start, so that problems of the recording are reported before hours of work.
+    findings = quick_findings(recording, config, turning=options.object)
+    for warning in (*recording.warnings, *(str(f) for f in findings)):
+        progress.note(warning)
+    return _Job(opening, recording, config, seed, loops, findings)
+
+
+def _texture(
+    job: _Job, result: Reconstruction, options: Options, progress: Progress, watch: Stopwatch
+) -> Textured | None:
+    """Make the texture if one is configured; with a note if that is impossible."""
+    size = job.config.fusion.texture
+    if not size:
+        return None
+    with watch.timing("texture"):
+        texture = make_texture(job.recording, result, size, options.threads, progress)
+    if texture is None:
+        progress.note("no texture: there is no surface, or neither colour nor amplitude")
+    return texture
+
+
+def _with_job(
+    result: Reconstruction, job: _Job, options: Options, watch: Stopwatch
+) -> Reconstruction:
+    """Add findings, how the recording was opened, and times to the result."""
+    result = with_findings(result, job.findings, turning=options.object)
+    seconds = {**watch.seconds, **result.diagnostics.seconds}
+    return replace(
+        result,
+        recording={**result.recording, "opening": job.opening.to_dict()},
+        diagnostics=replace(result.diagnostics, seconds=seconds),
+    )
+
+
+def _preview(recording: Recording, progress: Progress) -> None:
+    """Show the first frame before any work begins, at the first pose."""
+    frame = recording.first_readable()
+    if frame is not None:
+        progress.placed(frame, np.eye(4))
+
+
+def _tracked_file(
+    inputs: Sequence[str | Path], options: Options, job: _Job, progress: Progress
+) -> TrackedFile:
+    """Return the file of the tracked frames for this input, these options and this version."""
+    out = options.out.absolute()
+    paths = [Path(path) for path in (*inputs, options.camera, options.loops) if path is not None]
+    facts = {
+        "version": __version__,
+        "options": repr(replace(options, out=Path(), overwrite=False, threads=None)),
+        "config": plain(job.config.to_dict()),
+        "seed": job.seed,
+        "files": [stamps_of(path.absolute(), out) for path in paths],
+    }
+    key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+    return TrackedFile(out / TRACKED, key, progress.note)
+
+
+def quick_findings(
+    recording: Recording, config: Config, *, turning: bool = False
+) -> tuple[Finding, ...]:
+    """Return the findings of a quick inspection; none if no frames can be read.
+
+    Parameters
+    ----------
+    recording
+        The recording.
+    config
+        Configuration of the run; faults that its corrections remove are no findings.
+    turning
+        Whether the camera shows a turning object.
+    """
+    try:
+        findings = inspect_recording(recording, turning=turning, quick=True).findings
+    except InputError:
+        return ()
+    unwraps = any(isinstance(part, Unwrap) for part in config.corrections)
+    return tuple(f for f in findings if not (unwraps and f.code == "phase_wrap"))
+
+
+def with_findings(
+    result: Reconstruction, findings: Sequence[Finding], *, turning: bool = False
+) -> Reconstruction:
+    """Return the result with the findings of an inspection, which may change the verdict.
+
+    Two kinds of faults are ignored: wrapped background behind a turning object, as it is removed,
+    and intrinsics that self-calibration has corrected.
+    """
+    indices = [f.index for f in result.diagnostics.frames]
+    full_range = ((indices[0], indices[-1]),)
+    calibrated = result.diagnostics.calibrated
+    harmless = {"phase_wrap"} if turning else set()
+    if calibrated is not None:
+        corrections = {
+            "focal_length": calibrated.focal,
+            "other_intrinsics": calibrated.center_x or calibrated.center_y,
+            "lens_distortion": calibrated.distortion,
+        }
+        harmless |= {code for code, correction in corrections.items() if correction}
+    severe = [
+        Reason("faulty_recording", full_range, f"{f.text} {f.remedy}")
+        for f in findings
+        if f.severity == "severe" and f.code not in harmless
+    ]
+    reasons = ranked((*result.diagnostics.reasons, *severe))
+    verdict = verdict_of(reasons)
+    recording = {
+        **result.recording,
+        "warnings": [*result.recording["warnings"], *(str(f) for f in findings)],
+        "findings": [f.to_dict() for f in findings],
+    }
+    diagnostics = replace(result.diagnostics, verdict=verdict, reasons=reasons)
+    components = tuple(
+        c
+        if c.result is None
+        else replace(c, result=with_findings(c.result, findings, turning=turning))
+        for c in result.components
+    )
+    return replace(result, recording=recording, diagnostics=diagnostics, components=components)
+
+
+def exit_status(result: Reconstruction) -> int:
+    """Return 0 if every readable frame is in the main model, else 3."""
+    readable = (f for f in result.diagnostics.frames if f.status != "skipped")
+    return 0 if all(in_main_model(f, result.components) for f in readable) else 3

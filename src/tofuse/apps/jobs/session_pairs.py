@@ -1,0 +1,163 @@
+"""Overlap of the sessions of a merged result, with its evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.quality.change_detection import changes
+from tofuse.engine.quality.cross_view import CrossViewConsistency, compare_views
+from tofuse.engine.stored_views.view_store import PosedView
+from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.apps.results.session_words import MAX_STATED_PROBABILITY
+from tofuse.engine.quality.types import Reconstruction, SessionChange, SessionPair, SessionRecord
+
+View = PosedView[PreparedView]
+
+# Maximum number of views of each session for the comparison with others.
+_COMPARED = 60
+
+
+@dataclass(frozen=True, eq=False)
+class SessionModel:
+    """One of the models of a result: the main one, or that of a separate component.
+
+    Attributes
+    ----------
+    poses
+        (4, 4) T_world_camera by frame index.
+    """
+
+    result: Reconstruction
+    poses: dict[int, Float64]
+
+    @classmethod
+    def of(cls, result: Reconstruction) -> SessionModel:
+        """The main model of a result."""
+        frames = zip(result.diagnostics.frames, result.trajectory, strict=True)
+        return cls(result, {f.index: T for f, T in frames if np.isfinite(T).all()})
+
+    def views(self, session: SessionRecord, views: Sequence[View]) -> list[View]:
+        """Return evenly spaced views of a session that have a pose in this model."""
+        members = [v for v in views if session.has(v.index) and v.index in self.poses]
+        return [members[k] for k in evenly_spaced(np.arange(len(members)), _COMPARED)]
+
+    def links(self, first: SessionRecord, second: SessionRecord) -> set[tuple[int, int]]:
+        """Return frame pairs (i < j) of two sessions with accepted registrations."""
+        diagnostics = self.result.diagnostics
+        ends = [(join.link.i, join.link.j) for join in diagnostics.joins]
+        ends += [(loop.i, loop.j) for loop in diagnostics.loops if loop.accepted]
+        return {
+            (min(i, j), max(i, j))
+            for i, j in ends
+            if (first.has(i) and second.has(j)) or (first.has(j) and second.has(i))
+        }
+
+    def join_probability(self, first: SessionRecord, second: SessionRecord) -> float | None:
+        """Return the probability that the join of two sessions is correct; None if indirect."""
+        probabilities = [
+            join.probability
+            for join in self.result.diagnostics.joins
+            if join.probability is not None
+            and any(first.has(k) for k in (join.link.i, join.link.j))
+            and any(second.has(k) for k in (join.link.i, join.link.j))
+        ]
+        return min(max(probabilities), MAX_STATED_PROBABILITY) if probabilities else None
+
+    def cross_view(self, first: Sequence[View], second: Sequence[View]) -> CrossViewConsistency:
+        """Return the cross-view consistency between views of two sessions."""
+        views = [*first, *second]
+        poses = np.array([self.poses[v.index] for v in views]).reshape(-1, 4, 4)
+        return compare_views([v.view for v in views], poses, [0] * len(first) + [1] * len(second))
+
+
+def session_pairs(
+    result: Reconstruction,
+    records: Sequence[SessionRecord],
+    components_before: Sequence[Collection[int]],
+    views: Sequence[View],
+) -> tuple[SessionPair, ...]:
+    """Return for each pair of sessions whether they are in one model, and the evidence of overlap.
+
+    Parameters
+    ----------
+    result, records
+        The merged result, and its sessions.
+    components_before
+        For each session, the components of its frames before the merge.
+    views
+        Prepared views of frames with a pose.
+    """
+    separate = [c.result for c in result.components if c.result is not None and not c.connected]
+    models = [SessionModel.of(each) for each in (result, *separate)]
+    pairs = []
+    for a, b in combinations(range(len(records)), 2):
+        first, second = records[a], records[b]
+        for model in models:
+            first_views, second_views = model.views(first, views), model.views(second, views)
+            if first_views and second_views:
+                before = bool(set(components_before[a]) & set(components_before[b]))
+                pairs.append(
+                    _pair(a, b, first, second, model, first_views, second_views, before=before)
+                )
+                break
+        else:
+            pairs.append(SessionPair(a, b, joined=False))
+    return tuple(pairs)
+
+
+def _pair(
+    a: int,
+    b: int,
+    first: SessionRecord,
+    second: SessionRecord,
+    model: SessionModel,
+    first_views: Sequence[View],
+    second_views: Sequence[View],
+    *,
+    before: bool,
+) -> SessionPair:
+    """Return the links and the overlap of two sessions in one model."""
+    cross_view = model.cross_view(first_views, second_views)
+    overlap = np.isfinite(cross_view.support_of_views())
+    support = cross_view.support()
+    return SessionPair(
+        a,
+        b,
+        True,
+        before,
+        len(model.links(first, second)),
+        model.join_probability(first, second),
+        float(min(overlap[: len(first_views)].mean(), overlap[len(first_views) :].mean())),
+        float(support) if np.isfinite(support) else None,
+    )
+
+
+def session_changes(
+    result: Reconstruction, records: Sequence[SessionRecord], views: Sequence[View]
+) -> tuple[SessionChange, ...]:
+    """Detect changes of the scene between each pair of sessions in the main model.
+
+    Parameters
+    ----------
+    views
+        Prepared views of frames with a pose.
+    """
+    model = SessionModel.of(result)
+    views_of = [model.views(record, views) for record in records]
+    detected = []
+    for a, b in combinations(range(len(records)), 2):
+        inputs = [
+            (
+                [v.view for v in session_views],
+                np.array([model.poses[v.index] for v in session_views]),
+            )
+            for session_views in (views_of[a], views_of[b])
+        ]
+        detected += [SessionChange(a, b, change) for change in changes(*inputs[0], *inputs[1])]
+    return tuple(detected)

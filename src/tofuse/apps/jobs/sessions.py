@@ -1,0 +1,247 @@
+"""Results of earlier runs as sessions: reopened recordings with their poses."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any, get_args
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.reading import path_of
+from tofuse.engine.tracking.base import Status
+from tofuse.engine.tracking.given import GivenPoses, StatedPose
+from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.mapping.adaptation import adapted
+from tofuse.engine.mapping.config import Config, changed, from_method, kind_of
+from tofuse.engine.mapping.progress import Progress
+from tofuse.formats.recordings.open import Opening
+from tofuse.engine.frames.recording import Recording
+from tofuse.apps.results.folder import component_name, finish_interrupted, is_result
+from tofuse.apps.results.reopening import StoredRecording, locate_recording, reopen, stored_recordings
+from tofuse.apps.results.run_json import frame_covariance, main_poses, read_run_json, run_json_checked
+
+_REMEDY = "pass the --out of `tofuse run`"
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """One recording, and the poses that a result states for its frames.
+
+    Attributes
+    ----------
+    name
+        Unique name for display.
+    result
+        Folder of the result.
+    opening
+        How its recording was opened.
+    recording
+        The frames of the result.
+    config
+        Their corrections and filters, with odometry "given".
+    stated
+        By the index of a frame in the recording. Components are numbered over all sessions: joined
+        components of one result have the same number and coordinate frame.
+    links
+        (i, j) frames in the result, of the loop closures between its sessions; empty for all but
+        the first session of a result.
+    """
+
+    name: str
+    result: Path
+    opening: Opening
+    recording: Recording
+    config: Config
+    stated: Mapping[int, StatedPose]
+    links: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def posed(self) -> dict[int, StatedPose]:
+        """The stated frames with a pose."""
+        return {k: s for k, s in self.stated.items() if s.T_component_camera is not None}
+
+
+def read_sessions(
+    results: Sequence[str | Path], threads: int | None, progress: Progress
+) -> list[Session]:
+    """Read the sessions of several results, in order; a merged result yields all of its sessions.
+
+    Raises
+    ------
+    InputError
+        If a folder contains no result, its recording is missing, has changed or contains clouds;
+        or if a result was given twice, or only one session.
+    """
+    folders = [
+        path_of(each, "results", "pass folders, to which result.save(folder) writes results")
+        for each in results
+    ]
+    for a, b in combinations(folders, 2):
+        if a.resolve() == b.resolve():
+            raise InputError("is given twice", where=b, remedy="pass each result once")
+    sessions: list[Session] = []
+    components = 0
+    for folder in folders:
+        new_sessions = sessions_of(folder, components, threads, progress)
+        sessions += new_sessions
+        numbers = [s.component for session in new_sessions for s in session.posed.values()]
+        components = max([components, *(number + 1 for number in numbers)])
+    if len(sessions) < 2:
+        raise InputError(
+            "is a single session",
+            where=folders[0] if folders else None,
+            remedy="pass two or more results of `tofuse run`",
+        )
+    for first, second in combinations(sessions, 2):
+        _check_different(first, second)
+    return _uniquely_named(sessions)
+
+
+def sessions_of(
+    folder: Path, components: int, threads: int | None, progress: Progress
+) -> list[Session]:
+    """Read the sessions of one result; its components are numbered from `components`.
+
+    Raises
+    ------
+    InputError
+        If the result can't be merged with any other; see `read_sessions`.
+    """
+    parts, links = _read_parts(folder, components)
+    sessions = [_session(part, stated, folder, threads, progress) for part, stated in parts]
+    return [replace(sessions[0], links=links), *sessions[1:]]
+
+
+def _read_parts(
+    folder: Path, components: int
+) -> tuple[list[tuple[StoredRecording, dict[int, StatedPose]]], tuple[tuple[int, int], ...]]:
+    """Read the recordings of a result and the poses of their frames, by index in the recording.
+
+    Also the loop closures between them, see `Session`. Its components are numbered from
+    `components`.
+    """
+    finish_interrupted(folder)
+    if not folder.exists():
+        raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
+    if not folder.is_dir() or not is_result(folder):
+        raise InputError("contains no result (no run.json)", where=folder, remedy=_REMEDY)
+    run = read_run_json(folder / "run.json")
+    with run_json_checked(folder / "run.json"):
+        stated = _stated(folder, run, components)
+        parts = list(stored_recordings(folder, run))
+        posed = [(p, {k: stated[p.first + k] for k in p.frames}) for p in parts]
+        return posed, _links(run, parts)
+
+
+def _links(run: Mapping[str, Any], parts: Sequence[StoredRecording]) -> tuple[tuple[int, int], ...]:
+    """Return the loop closures (i, j) of a result between its sessions."""
+    starts = sorted(p.first for p in parts)
+    loops = ((int(p["i"]), int(p["j"])) for p in run.get("loops", ()) if p["accepted"])
+    return tuple((i, j) for i, j in loops if bisect_right(starts, i) != bisect_right(starts, j))
+
+
+def _session(
+    part: StoredRecording,
+    stated: dict[int, StatedPose],
+    folder: Path,
+    threads: int | None,
+    progress: Progress,
+) -> Session:
+    """Reopen the recording of a part of a result."""
+    recording = reopen(part, folder)
+    frame = recording.first_readable()
+    if frame is not None and kind_of(frame) != "range":
+        raise InputError(
+            "is of clouds, and only results of images can be merged",
+            where=folder,
+            remedy="pass their clouds together to one `tofuse run`",
+        )
+    config = _config(part.config, recording, folder, threads, progress)
+    opening = locate_recording(part.opening, folder)
+    return Session(part.name, folder, opening, recording, config, stated)
+
+
+def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, StatedPose]:
+    """Return the pose and status that a result states for each frame, by index."""
+    poses = _poses(folder, dict(run))
+    main = {k: (T, components) for k, T in poses.items()}
+    separate = [k for k, c in enumerate(run["components"]) if c["T_main_component"] is None]
+    for number, k in enumerate(separate, components + 1):
+        component_folder = folder / component_name(k)
+        if is_result(component_folder):
+            main |= {i: (T, number) for i, T in _poses(component_folder, None).items()}
+    stated = {}
+    for frame in run["frames"]:
+        index, status = int(frame["index"]), frame["status"]
+        if status not in get_args(Status):
+            raise ValueError(f"frame {index} is {status!r}")
+        if index in main:
+            T, component = main[index]
+            C = frame_covariance(frame) if component == components else None
+            stated[index] = StatedPose(status, str(frame["reason"]), T, component, C)
+        else:
+            reason = str(frame["reason"]) if status in ("lost", "skipped") else "was in no model"
+            stated[index] = StatedPose("lost", reason)
+    return stated
+
+
+def _poses(folder: Path, run: dict[str, Any] | None) -> dict[int, Float64]:
+    """Return (4, 4) T_world_camera by index, of the frames in a folder's main model."""
+    run = read_run_json(folder / "run.json") if run is None else run
+    indices, poses = main_poses(folder, run)
+    return dict(zip(indices, poses, strict=True))
+
+
+def _config(
+    stored: Mapping[str, Any],
+    recording: Recording,
+    folder: Path,
+    threads: int | None,
+    progress: Progress,
+) -> Config:
+    """Return the stored configuration of a result, with `GivenPoses` as odometry."""
+    where = f"{folder / 'run.json'}: config"
+    config = changed(from_method("default"), stored, where=where)
+    given_poses = GivenPoses()
+    if isinstance(config.odometry, Keyframes | GivenPoses):
+        odometry = config.odometry
+        given_poses = GivenPoses(
+            odometry.views, odometry.keyframe_angle, odometry.keyframe_distance
+        )
+    config = replace(config, odometry=given_poses)
+    return adapted(config, recording, threads, progress)
+
+
+def _check_different(first: Session, second: Session) -> None:
+    """Raise InputError if frames of one recording are in both sessions."""
+
+    def facts(session: Session) -> tuple[object, ...]:
+        o = session.opening
+        return tuple(path.resolve() for path in o.paths), o.average_still
+
+    common = first.posed.keys() & second.posed.keys()
+    if facts(first) == facts(second) and common:
+        raise InputError(
+            f"is of the same recording as {first.result}: {len(common)} frames are in both",
+            where=second.result,
+            remedy="pass one of the two results",
+        )
+
+
+def _uniquely_named(sessions: list[Session]) -> list[Session]:
+    """Return the sessions with unique names."""
+    names = [session.name for session in sessions]
+    taken: set[str] = set()
+    out = []
+    for session, name in zip(sessions, names, strict=True):
+        unique, number = name, 1
+        while unique in taken or (number > 1 and unique in names):
+            number += 1
+            unique = f"{name} ({number})"
+        taken.add(unique)
+        out.append(replace(session, name=unique))
+    return out

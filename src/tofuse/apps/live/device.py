@@ -1,0 +1,198 @@
+"""The interface of live cameras."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.util
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from types import ModuleType, TracebackType
+from typing import Any, ClassVar, Protocol, Self
+
+from tofuse.engine.errors import InputError
+from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.parts import discover, from_dict, registered
+from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
+
+TIMEOUT_S = 2.0  # without a frame until a camera counts as stopped
+
+
+class DeviceError(InputError):
+    """A camera can't be opened, or has stopped sending."""
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """Properties of all frames of a camera, as in a recording's camera.json.
+
+    Attributes
+    ----------
+    sensor
+        The camera's name.
+    camera
+        Rays of the pixels.
+    depth_unit_m
+        Metres per count.
+    depth_kind
+        "z" or "range".
+    frame_rate_hz
+        As requested.
+    amplitude_kind
+        See `RangeFrame`; None without amplitude.
+    """
+
+    sensor: str
+    camera: Camera
+    depth_unit_m: float
+    depth_kind: DepthKind
+    frame_rate_hz: float
+    amplitude_kind: AmplitudeKind | None = None
+
+
+class Stream(ABC):
+    """A running camera; closed at the end of its ``with`` block.
+
+    Attributes
+    ----------
+    settings
+        Available when the stream is opened.
+    """
+
+    settings: Settings
+
+    @abstractmethod
+    def read(self, index: int) -> RangeFrame:
+        """Wait for the next frame, and return it with this index.
+
+        Raises
+        ------
+        DeviceError
+            If none arrives within `TIMEOUT_S`.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop the camera."""
+
+    def __iter__(self) -> Iterator[RangeFrame]:
+        """Yield frames endlessly, for example to push them into a `Mapper`."""
+        index = 0
+        while True:
+            yield self.read(index)
+            index += 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Device(Protocol):
+    """A kind of camera, registered by ``@part("device", name)`` in a module of `devices`.
+
+    Attributes
+    ----------
+    package
+        Name of the required package for pip, and for import.
+    """
+
+    part_kind: ClassVar[str] = "device"
+    package: ClassVar[tuple[str, str]]
+
+    def open(self) -> AbstractContextManager[Stream]:
+        """Start the camera.
+
+        Raises
+        ------
+        DeviceError
+            If the package is missing, no camera is connected, or it doesn't start.
+        """
+        ...
+
+
+def device(name: str, options: Mapping[str, str]) -> Device:
+    """Return a kind of camera by its name, with options as text.
+
+    Raises
+    ------
+    InputError
+        For an unknown camera or option, or a value of the wrong type.
+    """
+    kinds = devices()
+    if name not in kinds:
+        raise InputError(
+            f"there is no camera {name!r}", where="record", remedy=f"use one of {list(kinds)}"
+        )
+    types = {f.name: f.type for f in dataclasses.fields(kinds[name])}
+    values: dict[str, Any] = {"part": name}
+    for key, text in options.items():
+        values[key] = _read(text, str(types.get(key)), f"--set {key}")
+    kind: Device = from_dict(Device, values, where="--set")
+    return kind
+
+
+def _read(text: str, kind: str, where: str) -> object:
+    if kind == "bool":
+        if text not in ("true", "false"):
+            raise InputError(f"is {text!r}", where=where, remedy="use true or false")
+        return text == "true"
+    if kind == "int":
+        try:
+            return int(text)
+        except ValueError as error:
+            raise InputError(f"is {text!r}", where=where, remedy="use a whole number") from error
+    return text
+
+
+def devices() -> dict[str, type[Any]]:
+    """Return the known kinds of camera by name."""
+    discover("tofuse.apps.live.devices")
+    return registered("device")
+
+
+def is_installed(device: type[Any]) -> bool:
+    """Return whether the maker's package can be found."""
+    return importlib.util.find_spec(device.package[1]) is not None
+
+
+def vendor(package: tuple[str, str]) -> ModuleType:
+    """Import the maker's package, see `Device.package`.
+
+    Raises
+    ------
+    DeviceError
+        Stating what to install.
+    """
+    pip, module = package
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise DeviceError(
+            f"needs the package {pip}, which can't be imported ({error})",
+            where="camera",
+            remedy=f"run `pip install {pip}`",
+        ) from error
+
+
+def no_frame(sensor: str) -> DeviceError:
+    """Return the error of a camera that sends no frames."""
+    return DeviceError(
+        f"sent no frame for {TIMEOUT_S:g} s",
+        where=sensor,
+        remedy="check its cable and power supply",
+    )
+
+
+def not_started(name: str, error: Exception) -> DeviceError:
+    """Return the error of a camera that does not start."""
+    return DeviceError(
+        f"does not start ({type(error).__name__}: {error})",
+        where=name,
+        remedy="check that it is connected, and not used by another program",
+    )

@@ -1,0 +1,132 @@
+"""Intel RealSense cameras, by the package pyrealsense2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from tofuse.engine.cameras.cameras import BrownConrady, Camera, Pinhole
+from tofuse.apps.live.device import TIMEOUT_S, DeviceError, Settings, Stream, no_frame, not_started, vendor
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.lenses import inverse_brown
+
+
+@part("device", "realsense")
+@dataclass(frozen=True)
+class RealSense:
+    """A RealSense: depth, and the infrared image of ToF models (L515).
+
+    Attributes
+    ----------
+    serial
+        Serial number of the camera, if several are connected.
+    width, height
+        Of the depth image; 0 for the camera's default.
+    frame_rate_hz
+        An integer rate that the camera supports.
+    """
+
+    package: ClassVar[tuple[str, str]] = ("pyrealsense2", "pyrealsense2")
+    serial: str = ""
+    width: int = 0
+    height: int = 0
+    frame_rate_hz: int = 30
+
+    def open(self) -> RealSenseStream:
+        """See `Device.open`."""
+        return RealSenseStream(self)
+
+
+class RealSenseStream(Stream):
+    """See `Stream`."""
+
+    def __init__(self, options: RealSense) -> None:
+        rs: Any = vendor(options.package)
+        self._pipeline = rs.pipeline()
+        config = rs.config()
+        if options.serial:
+            config.enable_device(options.serial)
+        size = (options.width, options.height)
+        try:
+            self._infrared = _is_tof(rs, options.serial)
+            config.enable_stream(rs.stream.depth, *size, rs.format.z16, options.frame_rate_hz)
+            if self._infrared:
+                config.enable_stream(rs.stream.infrared, *size, rs.format.y8, options.frame_rate_hz)
+            profile = self._pipeline.start(config)
+        except RuntimeError as error:
+            raise not_started("RealSense", error) from error
+        try:
+            device = profile.get_device()
+            stream = profile.get_stream(rs.stream.depth).as_video_stream_profile()
+            self.settings = Settings(
+                str(device.get_info(rs.camera_info.name)),
+                _camera(rs, stream.get_intrinsics()),
+                float(device.first_depth_sensor().get_depth_scale()),
+                "z",
+                float(stream.fps()),
+                "ir" if self._infrared else None,
+            )
+        except BaseException:
+            self._pipeline.stop()
+            raise
+
+    def read(self, index: int) -> RangeFrame:
+        """See `Stream.read`."""
+        try:
+            frames = self._pipeline.wait_for_frames(int(TIMEOUT_S * 1000))
+        except RuntimeError as error:
+            raise no_frame(self.settings.sensor) from error
+        depth = frames.get_depth_frame()
+        counts = np.asanyarray(depth.get_data()).astype(np.float32)
+        amplitude = None
+        if self._infrared:
+            amplitude = np.asanyarray(frames.get_infrared_frame().get_data()).astype(np.float32)
+        return RangeFrame(
+            index,
+            depth.get_timestamp() / 1000.0,
+            self.settings.camera,
+            counts * np.float32(self.settings.depth_unit_m),
+            "z",
+            amplitude,
+            amplitude_kind="ir",
+        )
+
+    def close(self) -> None:
+        """See `Stream.close`."""
+        self._pipeline.stop()
+
+
+def _is_tof(rs: Any, serial: str) -> bool:
+    """Whether the camera is of the L500 line, whose infrared image has the pixels of depth."""
+    cameras = [
+        camera
+        for camera in rs.context().query_devices()
+        if serial in ("", camera.get_info(rs.camera_info.serial_number))
+    ]
+    if not cameras:
+        raise DeviceError(
+            f"no camera {serial} is connected" if serial else "no camera is connected",
+            where="RealSense",
+            remedy="connect it, or pass its --serial",
+        )
+    return str(cameras[0].get_info(rs.camera_info.product_line)) == "L500"
+
+
+def _camera(rs: Any, lens: Any) -> Camera:
+    size = (int(lens.width), int(lens.height))
+    intrinsics = (float(lens.fx), float(lens.fy), float(lens.ppx), float(lens.ppy))
+    coefficients = [float(c) for c in lens.coeffs]
+    if lens.model == rs.distortion.none or not any(coefficients):
+        return Pinhole(*size, *intrinsics)
+    if lens.model == rs.distortion.brown_conrady:
+        return BrownConrady(*size, *intrinsics, *coefficients)
+    if lens.model == rs.distortion.inverse_brown_conrady:
+        return inverse_brown(BrownConrady(*size, *intrinsics, *coefficients))
+    raise DeviceError(
+        f"has a lens of the model {lens.model}",
+        where="RealSense",
+        remedy="record the undistorted stream, or pass a camera.json with rays",
+    )

@@ -1,0 +1,171 @@
+"""Recording a live camera to a native recording."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.staging import new_folder
+from tofuse.apps.live.device import DeviceError, Stream
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.native import RecordingWriter
+
+_JOIN_TIMEOUT_S = 5.0  # for a camera's last frame
+QUEUE_FRAMES = 64  # maximum number that may wait for the disk
+MIN_SIGMA_UNIT_M = 1e-5
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The result of a recording.
+
+    Attributes
+    ----------
+    folder
+        The recording.
+    frames
+        Number of frames written.
+    dropped
+        Number of frames dropped, as the disk was too slow.
+    ended_by
+        Reason for the end: "asked" as requested, or the camera's error.
+    """
+
+    folder: Path
+    frames: int
+    dropped: int
+    ended_by: str
+
+
+def record(
+    stream: Stream,
+    folder: str | Path,
+    *,
+    seconds: float | None = None,
+    frames: int | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+    progress: Callable[[int], None] | None = None,
+) -> Recorded:
+    """Write the frames of a camera as a native recording.
+
+    The camera is read on its own thread, so that a slow disk drops frames without delaying others.
+    If the camera fails, the frames so far are kept. The folder appears when it is complete.
+
+    Parameters
+    ----------
+    stream
+        A running camera.
+    folder
+        Must not exist, or be empty.
+    seconds, frames
+        Limits by the camera's clock, and by count; None: no limit.
+    stopped
+        Called after each frame; recording ends if it returns true.
+    progress
+        Called with the number of frames written so far.
+
+    Raises
+    ------
+    DeviceError
+        If the camera sent no frame.
+    OutputError
+        If the folder isn't empty, or can't be written.
+    """
+    if (seconds is not None and not seconds > 0) or (frames is not None and frames < 1):
+        raise InputError("there is nothing to record", remedy="use more seconds, or frames")
+    with new_folder(folder) as temporary, _Reader(stream) as reader:
+        first = reader.next()
+        if first is None:
+            raise reader.error or DeviceError("sent no frame", where=stream.settings.sensor)
+        writer = _writer(stream, first, temporary)
+        frame: RangeFrame | None = first
+        while frame is not None:
+            if seconds is not None and frame.timestamp - first.timestamp >= seconds:
+                break
+            writer.add(frame)
+            if progress is not None:
+                progress(len(writer))
+            if len(writer) == frames or stopped():
+                break
+            frame = reader.next()
+        ended_by = str(reader.error) if frame is None and reader.error else "asked"
+        writer.finish()
+    return Recorded(Path(folder), len(writer), reader.dropped, ended_by)
+
+
+class _Reader:
+    """Reads a camera on its own thread into a queue, and drops new frames while it is full."""
+
+    def __init__(self, stream: Stream) -> None:
+        self.dropped = 0
+        self.error: DeviceError | None = None
+        self._stream = stream
+        self._queue: queue.Queue[RangeFrame | None] = queue.Queue(QUEUE_FRAMES)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="tofuse-camera", daemon=True)
+        self._thread.start()
+
+    def next(self) -> RangeFrame | None:
+        """Wait for the next frame; None if the camera has failed."""
+        return self._queue.get()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        # A camera that has gone silent may never return from `read`; the thread is a daemon.
+        self._thread.join(_JOIN_TIMEOUT_S)
+
+    def _work(self) -> None:
+        index = 0
+        try:
+            while not self._stop.is_set():
+                frame = self._stream.read(index)
+                index += 1
+                try:
+                    self._queue.put_nowait(frame)
+                except queue.Full:
+                    self.dropped += 1
+        except DeviceError as error:
+            self.error = error
+        except Exception as error:  # the maker's package may raise anything
+            self.error = DeviceError(
+                f"failed ({type(error).__name__}: {error})", where=self._stream.settings.sensor
+            )
+        while not self._stop.is_set():
+            try:
+                self._queue.put(None, timeout=0.1)
+                return
+            except queue.Full:
+                time.sleep(0)
+
+
+def _writer(stream: Stream, first: RangeFrame, folder: Path) -> RecordingWriter:
+    settings = stream.settings
+    sigma_unit = None
+    if first.sigma_image is not None:
+        max_sigma = float(np.nanmax(first.sigma_image, initial=0.0))
+        # Later frames may be noisier than the first.
+        sigma_unit = max(MIN_SIGMA_UNIT_M, 4 * max_sigma / 65535)
+    return RecordingWriter(
+        folder,
+        settings.camera,
+        depth_unit_m=settings.depth_unit_m,
+        depth_kind=settings.depth_kind,
+        frame_rate_hz=settings.frame_rate_hz,
+        amplitude_kind=settings.amplitude_kind,
+        sensor=settings.sensor,
+        sigma_unit_m=sigma_unit,
+    )

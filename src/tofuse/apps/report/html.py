@@ -1,0 +1,90 @@
+"""The pages for a human reader, each a single file without external resources."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from tofuse._version import __version__
+from tofuse.formats.files.atomic import write_text
+from tofuse.apps.report.extras import ReportExtras
+from tofuse.apps.report.policy import secured
+from tofuse.engine.quality.types import Reconstruction
+
+# Files of the pages' script; each uses functions of the previous ones.
+SCRIPTS = (
+    "bytes.js",
+    "eye.js",
+    "gestures.js",
+    "painter.js",
+    "section.js",
+    "measure.js",
+    "overlay.js",
+    "cameras.js",
+    "timeline.js",
+    "viewer.js",
+    "frames.js",
+    "main.js",
+)
+
+
+def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> None:
+    """Write `report.html` of a result to `path`, atomically.
+
+    Raises
+    ------
+    OutputError
+        If the file can't be written; an earlier one is unchanged then.
+    """
+    from tofuse.apps.report.sections import sections
+
+    write_page(path, "report.html.j2", script=script(), **sections(result, extras))
+
+
+def write_page(path: Path, template: str, **values: Any) -> None:
+    """Write a page: a template of `templates` with values, which it escapes.
+
+    Raises
+    ------
+    OutputError
+        If the file can't be written; an earlier one is unchanged then.
+    """
+    write_text(path, secured(page(template, **values)))
+
+
+def page(template: str, **values: Any) -> str:
+    """Return a page as HTML, with a mark for each byte of a file's name that is not UTF-8."""
+    made = _environment().get_template(template)
+    text = made.render(version=__version__, style=asset("style.css"), **values)
+    return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text)
+
+
+def script() -> str:
+    """Return the script of a page with a 3D view."""
+    parts = "\n".join(asset(f"js/{name}") for name in SCRIPTS)
+    return f'"use strict";\n(() => {{\n{parts}}})();'
+
+
+def asset(name: str) -> str:
+    """Return the text of a file in `templates`."""
+    folder = resources.files("tofuse.apps.report") / "templates"
+    return (folder / name).read_text(encoding="utf-8")
+
+
+@cache
+def _environment() -> Any:
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    loader = FunctionLoader(asset)
+    environment = Environment(
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        loader=loader,
+    )
+    environment.policies["json.dumps_kwargs"] = {}  # keys in their order
+    return environment

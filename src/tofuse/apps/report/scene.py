@@ -1,0 +1,458 @@
+"""The content of the 3D view: model, cameras and loops as compact arrays, and a still image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
+from tofuse.engine.fusion.cloud import Cloud
+from tofuse.engine.fusion.colors import display_colors
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.geometry import se3
+from tofuse.apps.report import thumbnails
+from tofuse.apps.report.packing import normal_bytes, pack, quantized
+from tofuse.engine.quality.types import Reconstruction
+
+MAX_POINTS = 150_000
+MAX_FACES = 300_000
+MAX_CAMERAS = 72
+_MAX_SEGMENTS = 1000  # segments of a trajectory
+_MAX_EXTENT_RATIO = 1.8  # of model and cameras to the model; beyond, cameras are not framed
+_MAX_NORMALS, _MIN_AREA_RATIO = 5000, 1.05  # sampled normals; area to the default view's
+_DIRECTIONS = 100  # in which the outermost points are framed
+_MAX_FRAMED = 50_000  # of these points
+# Of the cameras of a rig, in their order; the first is also that of a single camera.
+CAMERA_COLORS = (
+    (90, 176, 245), (243, 122, 160), (95, 208, 138), (226, 200, 84),
+    (178, 144, 245), (240, 140, 84), (84, 214, 214), (205, 208, 214),
+)  # fmt: skip
+YAW, PITCH = -0.5, 0.75  # rad, the view that the report opens with
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The content of the 3D view, in the world frame.
+
+    Attributes
+    ----------
+    points, colors, normals
+        (K, 3) float64 m, (K, 3) uint8, (K, 3) float or None where the cloud has none.
+    total
+        Number of points of the full model.
+    spacing
+        Typical distance between neighbouring points shown, m.
+    before, after, reference
+        (n, 4, 4) finite poses T_world_camera before and after loop closure, and of the reference;
+        may be empty.
+    loops
+        (L, 2, 3) camera centres of the accepted loop closures.
+    surface
+        The full surface; None without one.
+    sigma, views
+        (K,) standard deviation of the points, m, and (K,) number of views that observed them; None
+        if unknown.
+    """
+
+    points: Float64
+    colors: UInt8
+    normals: Float32 | Float64 | None
+    total: int
+    spacing: float
+    before: Float64
+    after: Float64
+    reference: Float64
+    loops: Float64
+    surface: Mesh | None = None
+    sigma: Float32 | None = None
+    views: Int32 | None = None
+
+    @cached_property
+    def mesh(self) -> Mesh | None:
+        """The surface, simplified for a browser on a phone; None without one."""
+        if self.surface is None or len(self.surface.faces) == 0:
+            return None
+        return self.surface.clustered(MAX_FACES)
+
+    @property
+    def box(self) -> Float64:
+        """(2, 3) corners of the box to be shown, without the outermost points.
+
+        It includes the cameras unless they would enlarge it much, like those around an object.
+        """
+        points, cameras = self.points, self.after[:, :3, 3]
+        boxes = [np.percentile(p, [3, 97], axis=0) for p in (points, cameras) if len(p)]
+        if not boxes:
+            return np.zeros((2, 3))
+        combined = np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)])
+        combined_size, points_size = (
+            float(np.linalg.norm(np.ptp(box, axis=0))) for box in (combined, boxes[0])
+        )
+        return (
+            boxes[0]
+            if points_size > 0 and combined_size > _MAX_EXTENT_RATIO * points_size
+            else combined
+        )
+
+    @property
+    def framed(self) -> Float64:
+        """(K, 3) extreme points of the content of the box, which must be in view."""
+        low, high = self.box
+        cameras = self.after[:, :3, 3]
+        cameras_in_box = cameras[((cameras >= low) & (cameras <= high)).all(1)]
+        extremes = [
+            extreme_points(part, outer)
+            for part, outer in ((self.points, 0.5), (cameras_in_box, 0.0))
+            if len(part)
+        ]
+        return np.concatenate(extremes) if extremes else np.stack([low, high])
+
+    @property
+    def center(self) -> Float64:
+        """(3,) centre of rotation of the view."""
+        return self.box.mean(0)
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the box, m; positive."""
+        return max(float(np.linalg.norm(np.ptp(self.box, axis=0))), 1e-3)
+
+    def view_rotation(self, R: Float64) -> Scene:
+        """Return the scene in the axes given by the rows of R (3, 3)."""
+        T = np.eye(4)
+        T[:3, :3] = R
+        return replace(
+            self,
+            points=self.points @ R.T,
+            normals=None if self.normals is None else self.normals @ R.T,
+            before=T @ self.before,
+            after=T @ self.after,
+            reference=T @ self.reference,
+            loops=self.loops @ R.T,
+            surface=self.mesh
+            and replace(
+                self.mesh,
+                vertices=(self.mesh.vertices @ R.T).astype(np.float32),
+                normals=(self.mesh.normals @ R.T).astype(np.float32),
+            ),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RigCameras:
+    """The camera of each frame of a rig's recording.
+
+    Attributes
+    ----------
+    names
+        Names of the cameras.
+    colors
+        RGB colour of each.
+    of_frames
+        (N,) number of the camera of each frame.
+    """
+
+    names: tuple[str, ...]
+    colors: tuple[tuple[int, int, int], ...]
+    of_frames: Intp
+
+    @classmethod
+    def of(cls, rig: Any, frames: int) -> RigCameras | None:
+        """Read the entry `rig` of `run.json`; None if it does not match the number of frames."""
+        if not isinstance(rig, dict):
+            return None
+        names = tuple(str(name) for name in rig.get("cameras", ()))
+        try:
+            of_frames = np.array(rig.get("of_frames", ()), np.intp)
+        except (TypeError, ValueError, OverflowError):
+            return None
+        if of_frames.shape != (frames,) or not frames or not names:
+            return None
+        if of_frames.min() < 0 or of_frames.max() >= len(names):
+            return None
+        colors = tuple(CAMERA_COLORS[k % len(CAMERA_COLORS)] for k in range(len(names)))
+        return cls(names, colors, of_frames)
+
+
+def finite_poses(poses: Float64 | None) -> Float64:
+    """Return the finite poses, (n, 4, 4)."""
+    if poses is None or len(poses) == 0:
+        return np.zeros((0, 4, 4))
+    return poses[np.isfinite(poses).all((1, 2))]
+
+
+def make_scene(
+    result: Reconstruction, rows: dict[int, int], reference: Float64 | None = None
+) -> Scene:
+    """Collect and subsample the content of the 3D view.
+
+    Parameters
+    ----------
+    result
+        The result.
+    rows
+        Row of the trajectory, by frame index.
+    reference
+        (N, 4, 4) reference poses, NaN where there is none; or None.
+    """
+    cloud = result.cloud
+    sampled = random_subset(len(cloud), MAX_POINTS)
+    points = cloud.points[sampled].astype(float) + cloud.offset
+    finite = np.isfinite(points).all(1)
+    points, sampled = points[finite], sampled[finite]
+    ends = [
+        (result.trajectory[rows[p.i], :3, 3], result.trajectory[rows[p.j], :3, 3])
+        for p in result.diagnostics.loops
+        if p.accepted and p.i in rows and p.j in rows
+    ]
+    loops = np.array(ends, float).reshape(-1, 2, 3)
+    return Scene(
+        points,
+        _colors(cloud, sampled, points),
+        None if cloud.normals is None else cloud.normals[sampled],
+        len(cloud),
+        spacing_of(points),
+        finite_poses(result.diagnostics.sequential),
+        finite_poses(result.trajectory),
+        finite_poses(reference),
+        loops[np.isfinite(loops).all((1, 2))],
+        _display_colors(result.mesh),
+        None if cloud.sigma is None else cloud.sigma[sampled],
+        None if cloud.views is None else cloud.views[sampled],
+    )
+
+
+def packed(scene: Scene) -> dict[str, Any]:
+    """Return the scene for the viewer: plain data, arrays as `pack` packs them.
+
+    Where there is a surface its vertices are the points that are shown.
+    """
+    mesh = scene.mesh
+    points = scene.points if mesh is None else mesh.vertices.astype(float)
+    low = points.min(0) if len(points) else np.zeros(3)
+    extent = np.maximum(np.ptp(points, axis=0), 1e-6) if len(points) else np.ones(3)
+    return {
+        "count": len(points),
+        "low": low.tolist(),
+        "extent": extent.tolist(),
+        "center": scene.center.tolist(),
+        "size": scene.size,
+        "framed": np.round(scene.framed, 4).tolist(),
+        "spacing": scene.spacing if mesh is None else spacing_of(points),
+        "yaw": opening_yaw(scene),
+        "pitch": PITCH,
+        "model": _packed_model(scene, quantized(points, low, extent)) if len(points) else None,
+        "lines": {
+            "reference": pack(path_lines(scene.reference).astype("<f4")),
+            "loops": pack(scene.loops.reshape(-1, 3).astype("<f4")),
+        },
+    }
+
+
+def _packed_model(scene: Scene, steps: UInt16) -> dict[str, Any]:
+    mesh = scene.mesh
+    if mesh is None:
+        normals, colors, faces = scene.normals, scene.colors, None
+    else:
+        normals, faces = mesh.normals, pack(mesh.faces.astype("<u4"))
+        color = mesh.color
+        colors = height_colors(mesh.vertices.astype(float)) if color is None else color
+    return {
+        "points": pack(steps),
+        "colors": pack(colors),
+        "normals": None if normals is None else pack(normal_bytes(normals)),
+        "faces": faces,
+    }
+
+
+def _display_colors(mesh: Mesh | None) -> Mesh | None:
+    if mesh is None or mesh.color is None:
+        return mesh
+    return replace(mesh, color=display_colors(mesh.color))
+
+
+def opening_yaw(scene: Scene) -> float:
+    """Return the yaw in rad that shows the largest front-facing area of the model.
+
+    The best of eight directions, but `YAW` unless another one shows considerably more.
+    """
+    normals = scene.normals if scene.mesh is None else scene.mesh.normals
+    if normals is None or not len(normals):
+        return YAW
+    sampled = np.nan_to_num(normals[:: -(-len(normals) // _MAX_NORMALS)].astype(float))
+    yaws = YAW + np.arange(8) * np.pi / 4
+    view_directions = np.array([-thumbnails.view_rotation(yaw, PITCH)[2] for yaw in yaws])
+    visible_area = np.maximum(sampled @ view_directions.T, 0).sum(0)
+    best = int(visible_area.argmax())
+    return float(yaws[best]) if visible_area[best] > _MIN_AREA_RATIO * visible_area[0] else YAW
+
+
+def camera_lines(poses: Float64, edge: float, step: int = 1) -> Float64:
+    """Return end points of lines (2 n, 3): cameras as pyramids, and the trajectory.
+
+    Parameters
+    ----------
+    poses
+        (N, 4, 4) T_world_camera; the first camera is drawn larger, as in the thesis.
+    edge
+        Width of a pyramid, m.
+    step
+        Every n-th camera is drawn.
+    """
+    if len(poses) == 0:
+        return np.zeros((0, 3))
+    w, h, d = 0.5, 0.4, 0.8
+    apex = np.zeros(3)
+    a, b, c, e = ([x * w, y * h, d] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
+    shape = np.array([apex, a, apex, b, apex, c, apex, e, a, b, b, c, c, e, e, a], float) * edge
+    drawn = poses[::step]
+    out = [se3.transform(drawn, shape[None]).reshape(-1, 3), path_lines(poses)]
+    out.append(se3.transform(poses[0], 1.8 * shape))
+    return np.concatenate(out)
+
+
+def path_lines(poses: Float64) -> Float64:
+    """Return end points of the lines (2 n, 3) that join the camera centres in order.
+
+    Of long trajectories every k-th centre is joined: wide lines cost a browser more than triangles.
+    """
+    centers = poses[:, :3, 3]
+    step = max(1, -(-len(centers) // _MAX_SEGMENTS))
+    centers = np.concatenate([centers[:-1:step], centers[-1:]])
+    return np.stack([centers[:-1], centers[1:]], axis=1).reshape(-1, 3)
+
+
+def render(
+    scene: Scene,
+    size: tuple[int, int] = (960, 600),
+    *,
+    yaw: float = YAW,
+    pitch: float = PITCH,
+    eye_at: tuple[Float64, float] | None = None,
+    peel: bool = True,
+    min_radius: int = 1,
+) -> UInt8:
+    """Render the initial 3D view as an image (H, W, 3), for browsers without WebGL.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    size
+        Width and height, pixels.
+    yaw, pitch
+        Viewing direction, rad.
+    eye_at
+        Point (3,) to look at, and the distance from it, m; by default the full scene.
+    peel
+        Whether to leave out back faces.
+    min_radius
+        Minimum size of a point, pixels.
+    """
+    center, distance = (scene.center, 1.2 * scene.size) if eye_at is None else eye_at
+    R = thumbnails.view_rotation(yaw, pitch)
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = -R @ center
+    scale = size[1] / (2 * np.tan(0.35) * distance)
+    points, colors = scene.points, (36 + 0.86 * scene.colors).astype(np.uint8)
+    if scene.normals is not None and len(points):
+        # Surfaces that face away are walls in front of the interior.
+        eye = center - R.T @ np.array([0, 0, distance])
+        to_eye = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
+        facing = (to_eye * np.nan_to_num(scene.normals)).sum(1)
+        colors = (colors * (0.6 + 0.4 * np.abs(facing[:, None]))).astype(np.uint8)
+        if peel:
+            points, colors = points[facing >= 0], colors[facing >= 0]
+    radius = int(np.clip(np.ceil(scene.spacing * scale), min_radius, 6))
+    rgba = thumbnails.splat(points, colors, T, size, scale=scale, distance=distance, radius=radius)
+    image = np.empty((*rgba.shape[:2], 3), np.uint8)
+    image[:] = thumbnails.BACKGROUND
+    covered = rgba[..., 3] > 0
+    image[covered] = rgba[covered, :3]
+    edge, step = 0.018 * scene.size, -(-max(len(scene.after), 1) // MAX_CAMERAS)
+    for poses, color in ((scene.before, (240, 160, 60)), (scene.after, (90, 176, 245))):
+        line_points = _sample_lines(camera_lines(poses, edge, step))
+        lines_rgba = thumbnails.splat(
+            line_points,
+            np.broadcast_to(np.array(color, np.uint8), line_points.shape),
+            T,
+            size,
+            scale=scale,
+            distance=distance,
+        )
+        covered = lines_rgba[..., 3] > 0
+        image[covered] = lines_rgba[covered, :3]
+    return image
+
+
+def render_thumbnail(scene: Scene, size: tuple[int, int]) -> UInt8:
+    """Render the model so that it fills a small image (H, W, 3)."""
+    if len(scene.points) == 0:
+        return render(scene, size)
+    framing = thumbnails.Framing.around(scene.points, size, yaw=YAW, pitch=PITCH)
+    R, t = framing.T_view_world[:3, :3], framing.T_view_world[:3, 3]
+    # So distant that the nearest points, which appear largest, fit.
+    depth = np.ptp(np.percentile(scene.points @ R[2], [0.2, 99.8]))
+    distance = size[1] / (2 * np.tan(0.35) * framing.scale) + 0.5 * float(depth)
+    return render(scene, size, eye_at=(-R.T @ t, distance), min_radius=2)
+
+
+def _sample_lines(lines: Float64, number: int = 24) -> Float64:
+    ends = lines.reshape(-1, 2, 3)
+    t = np.linspace(0, 1, number)[None, :, None]
+    return (ends[:, :1] * (1 - t) + ends[:, 1:] * t).reshape(-1, 3)
+
+
+def extreme_points(points: Float64, outer: float = 2.0) -> Float64:
+    """Return the extreme points (K, 3) in many directions, without outliers, of a sample.
+
+    Parameters
+    ----------
+    points
+        (N, 3).
+    outer
+        Percentage of points at each end of each axis that count as outliers.
+    """
+    points = points[random_subset(len(points), _MAX_FRAMED)]
+    low, high = np.percentile(points, [outer, 100 - outer], axis=0)
+    inside = points[((points >= low) & (points <= high)).all(1)]
+    points = inside if len(inside) else points
+    k = np.arange(_DIRECTIONS) + 0.5
+    height, azimuth = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
+    radius = np.sqrt(1 - height**2)
+    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
+    return points[np.unique((points @ directions).argmax(0))]
+
+
+def random_subset(count: int, max_count: int) -> Intp:
+    """Return the indices of at most `max_count` points, random to avoid regular patterns."""
+    if count <= max_count:
+        return np.arange(count)
+    return np.sort(np.random.default_rng([0, count]).permutation(count)[:max_count])
+
+
+def _colors(cloud: Cloud, sampled: Intp, points: Float64) -> UInt8:
+    if cloud.color is not None:
+        return display_colors(cloud.color[sampled])
+    return height_colors(points)
+
+
+def height_colors(points: Float64) -> UInt8:
+    """Return colours (N, 3) of points by height, which is -y."""
+    low, high = thumbnails.percentile_range(-points[:, 1])
+    return thumbnails.viridis(0.1 + 0.9 * (-points[:, 1] - low) / max(high - low, 1e-6))
+
+
+def spacing_of(points: Float64) -> float:
+    """Return the typical distance in m between neighbours among points (N, 3)."""
+    if len(points) < 2:
+        return 0.01
+    from scipy.spatial import cKDTree
+
+    sampled = points[:: max(1, len(points) // 2000)]
+    distances, _ = cKDTree(points).query(sampled, k=2)
+    return float(max(np.median(distances[:, 1]), 1e-5))

@@ -1,0 +1,239 @@
+"""The frames: outcome and images of each, loop closures, the effect of the filters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tofuse.engine.compute.memory import trim_memory
+from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.apps.report import plots, thumbnails, words
+from tofuse.apps.report.pictures import FATES, KINDS, depth_range, draw
+from tofuse.apps.report.section_parts import component_color
+from tofuse.apps.report.subject import ROWS, Subject, Values
+from tofuse.engine.quality.types import Component, FrameRecord, in_main_model
+
+_STRIP = 600  # cells in the strip of frames
+_THUMBNAIL, _FILTER = (220, 165), (320, 240)  # px
+_SEVERITY = {"skipped": 0, "tracked": 1, "predicted": 2, "lost": 3}
+
+
+def frames(s: Subject) -> Values:
+    """Return the strip of frames, the plots of registration quality and the table of problems."""
+    records, components = s.result.diagnostics.frames, s.result.components
+    statuses: list[str] = [r.status for r in records]
+    runs = words.runs((r.index, r.status, r.reason) for r in records)
+    runs = [run for run in runs if run[3] != "tracked"]
+    hint, found = "", words.frame_range(records[0].index, records[-1].index) if records else ""
+    if found:
+        has_bounds = any(r.covariance is not None for r in records)
+        hint = ": status above, accuracy below (dark = accurate)." if has_bounds else ": status."
+    counts = [(name, statuses.count(name)) for name in words.STATUSES]
+    return {
+        "facts": _facts(s, counts),
+        "lanes": [*words.STATUSES, *(["component"] if len(components) > 1 else [])],
+        "strip": _strip(records, components),
+        "label": "Status of each frame: " + ", ".join(f"{n} {name}" for name, n in counts),
+        "short_hint": found.capitalize() + hint,
+        "hint": f"From left to right: {found}. Point at a frame to see its status.",
+        "figures": _health(records),
+        "has_bad": "lost" in statuses or "skipped" in statuses,
+        "player": _player(s),
+        "problems": [
+            (words.frame_range(a, b), f"{n:,}", status, reason or "–", [[a, b]])
+            for a, b, n, status, reason in runs[:ROWS]
+        ],
+        "more": words.more(len(runs) - ROWS),
+        "apart": any(not c.connected for c in components),
+    }
+
+
+def _facts(s: Subject, counts: Sequence[tuple[str, int]]) -> list[tuple[str, str]]:
+    facts = [(f"frames {name}", f"{number:,}") for name, number in counts]
+    if s.scene.surface is not None:
+        facts.append(("surface", words.count(len(s.scene.surface.faces), "triangle")))
+    facts.append(("point cloud", words.count(s.scene.total, "point")))
+    path = s.scene.after[:, :3, 3]
+    if len(path) > 1:
+        travelled = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+        facts.append(("trajectory length", words.length(travelled)))
+    closures = sum(p.accepted for p in s.result.diagnostics.loops)
+    return [*facts, ("loop closures", f"{closures:,}")]
+
+
+def _strip(records: Sequence[FrameRecord], components: Sequence[Component]) -> list[Values]:
+    """The cells of the strip; with more frames than cells, a cell shows the worst of several."""
+    strip = []
+    cell_frames = -(-len(records) // _STRIP)
+    for start in range(0, len(records), max(cell_frames, 1)):
+        worst = max(records[start : start + cell_frames], key=lambda r: _SEVERITY[r.status])
+        is_colored = worst.component is not None and len(components) > 1
+        strip.append(
+            {
+                "status": worst.status,
+                "lane": words.STATUSES.index(worst.status),
+                "title": frame_text(worst, components),
+                "index": worst.index,
+                "color": component_color(worst.component or 0) if is_colored else None,
+            }
+        )
+    return strip
+
+
+def _health(records: Sequence[FrameRecord]) -> list[tuple[str, str]]:
+    """The plots of inliers and residuals over frames."""
+    index = np.array([r.index for r in records], float)
+    bad = index[[r.status in ("lost", "skipped") for r in records]]
+    figures = []
+    for values, scale, ylabel, label in (
+        ([r.inlier_share for r in records], 100.0, "inliers, %", "Inliers over frames"),
+        ([r.rms_m for r in records], 1000.0, "rms residual, mm", "Rms residual over frames"),
+    ):
+        y = scale * np.array(values, float)  # NaN where there is none
+        if np.isfinite(y).any():
+            series = [(y, plots.AFTER, "-")]
+            svg = plots.lines(index, series, label=label, ylabel=ylabel, bad=bad, floor=True)
+            figures.append((svg, ""))
+    return figures
+
+
+def frame_text(record: FrameRecord, components: Sequence[Component] = ()) -> str:
+    """Return the outcome of a frame as text, with its component if there are several."""
+    parts = [f"Frame {record.index}: {record.status}"]
+    if record.reason:
+        parts[0] += f" – {record.reason}"
+    if record.inlier_share is not None:
+        parts.append(f"{words.percent(record.inlier_share)} inliers")
+    if record.rms_m is not None:
+        parts.append(f"rms residual {words.length(record.rms_m)}")
+    if len(record.unobservable):
+        parts.append(f"{len(record.unobservable)} of 6 directions unobservable")
+    if record.component is not None and len(components) > 1:
+        note = "" if in_main_model(record, components) else " (not connected to the main one)"
+        parts.append(f"component {record.component}{note}")
+    return ", ".join(parts)
+
+
+def _player(s: Subject) -> Values | None:
+    """The images of frames, with the status of each."""
+    shown = draw(s.result.diagnostics.samples)
+    trim_memory()
+    if not shown:
+        return None
+    records = {r.index: r for r in s.result.diagnostics.frames}
+    listed = [records.get(p.index) for p in shown]
+    kinds = {kind: title for kind, title in KINDS.items() if kind in shown[0].images}
+    low, high = depth_range(s.result.diagnostics.samples)
+    note = f"Range from dark ({words.length(low)}) to bright ({words.length(high)})."
+    if len(shown) < len(records):
+        note = f"{len(shown):,} of {len(records):,} frames have images here. " + note
+    return {
+        "data": {
+            "index": [p.index for p in shown],
+            "descriptions": [frame_text(r, s.result.components) if r else "" for r in listed],
+            "status": [r.status if r else "" for r in listed],
+            "images": {kind: [p.uri(kind) for p in shown] for kind in kinds},
+        },
+        "kinds": kinds,
+        "note": note,
+        "fates": [(thumbnails.css(color), text) for color, text in FATES.values()],
+    }
+
+
+def loops(s: Subject) -> Values:
+    """Return the table of candidates for loop closures."""
+    loops = sorted(s.result.diagnostics.loops, key=lambda p: (not p.accepted, p.i, p.j))
+    accepted = sum(p.accepted for p in loops)
+    rows = [
+        (
+            f"{p.i} and {p.j}",
+            "✓ accepted" if p.accepted else "✗ rejected",
+            p.reason or "–",
+            words.percent(p.overlap),
+            words.length(p.rms_m),
+            words.percent(p.free_space_violation),
+            words.percent(p.margin),
+            [[p.i, p.i], [p.j, p.j]],
+        )
+        for p in loops[:ROWS]
+    ]
+    text = f"{words.count(len(loops), 'candidate')}: {accepted:,} accepted, "
+    text += f"{len(loops) - accepted:,} rejected."
+    return {"rows": rows, "text": text, "more": words.more(len(loops) - ROWS)}
+
+
+def filters(s: Subject) -> Values:
+    """Return one frame after each filter (figure 3.2), and the fractions removed."""
+    removed, steps = s.result.diagnostics.removed, s.extras.filter_steps
+    counts: dict[str, tuple[int, int]] = {}  # points removed, of all; a filter may be used twice
+    shown: list[tuple[str, str, list[str]]] = []
+    note = ""
+    if steps:
+        (first, raw), *later = steps
+        limits = thumbnails.depth_limits(raw)
+        low, high = (words.length(limit) for limit in limits)
+        note = (
+            f"Frame {raw.index} after each filter; colours from dark (near, {low}) to bright (far, "
+            f"{high})."
+        )
+        if isinstance(raw, RangeFrame):
+            note += (
+                " Grey pixels have no measurement, pink ones were removed by this filter. Below: "
+                "the points from above and to the side."
+            )
+        framing = thumbnails.Framing.around(raw.points.astype(float), _FILTER)
+        images = _step_images(raw, None, limits, framing)
+        shown.append((first, words.count(len(raw), "point"), images))
+        previous = raw
+        for name, frame in later:
+            num_removed = len(previous) - len(frame)
+            fraction = words.percent(num_removed / len(previous) if len(previous) else None)
+            text = f"removed {fraction} ({num_removed:,} points), {len(frame):,} are left"
+            if not num_removed and name not in removed:
+                text = f"corrects; {words.count(len(frame), 'point')}"
+            before = counts.get(name, (0, 0))
+            counts[name] = (before[0] + num_removed, before[1] + len(previous))
+            shown.append((name, text, _step_images(frame, previous, limits, framing)))
+            previous = frame
+    # Corrections remove nothing.
+    names = [*removed, *(n for n in counts if n not in removed and counts[n][0])]
+    rows = []
+    for name in names:
+        num_removed, num_points = counts.get(name, (0, 0))
+        fraction = words.percent(num_removed / num_points if num_points else None)
+        rows.append((name, words.percent(removed.get(name)), fraction))
+    return {"rows": rows, "steps": shown, "note": note}
+
+
+def _step_images(
+    frame: Frame,
+    previous: Frame | None,
+    limits: tuple[float, float],
+    framing: thumbnails.Framing,
+) -> list[str]:
+    """The depth image of a frame, with the pixels removed since the previous one; its points."""
+    images = []
+    if isinstance(frame, RangeFrame):
+        removed = previous.valid & ~frame.valid if isinstance(previous, RangeFrame) else None
+        images.append(thumbnails.depth_image(frame, limits, removed, _FILTER[0]))
+    images.append(thumbnails.cloud_image(frame, limits, framing))
+    return [thumbnails.data_uri(image) for image in images]
+
+
+def recording(s: Subject) -> Values | None:
+    """Return samples of the recording, if its views are clouds."""
+    frames = s.extras.clouds
+    if not frames:
+        return None
+    ranges = [thumbnails.depth_limits(f) for f in frames if len(f)]
+    low, high = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else (0.0, 1.0)
+    samples = []
+    for frame in frames:
+        framing = thumbnails.Framing.around(frame.points.astype(float), _THUMBNAIL)
+        image = thumbnails.cloud_image(frame, (low, high), framing)
+        samples.append((frame.index, thumbnails.data_uri(image)))
+    note = "Sample views before filtering, from above and to the side."
+    if ranges:
+        note += f" Depth from dark ({words.length(low)}) to bright ({words.length(high)})."
+    return {"samples": samples, "note": note}

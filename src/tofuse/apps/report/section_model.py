@@ -1,0 +1,192 @@
+"""The model: in 3D with the cameras, from above and from the side, and its size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.fusion.pose_errors import UNKNOWN_M
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import Pinhole, RayTable
+from tofuse.engine.normal import OF_95_PERCENT
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.apps.report import plots, thumbnails, words
+from tofuse.apps.report.fields import fields, normalized_accuracy
+from tofuse.apps.report.packing import pack
+from tofuse.apps.report.scene import RigCameras, Scene, opening_yaw, packed, render
+from tofuse.apps.report.subject import OUTER, Subject, Values
+
+
+def model(s: Subject) -> Values:
+    """Return the data of the 3D view, its switches, and a rendered image of it."""
+    scene = s.scene
+    if len(scene.points) == 0 and len(scene.after) == 0:
+        return {"scene": None}
+    displayed = scene.view_rotation(s.R_display_world)
+    errors = position_errors(s)
+    shown = fields(displayed, errors) if len(scene.points) else []
+    rig = RigCameras.of(s.result.recording.get("rig"), len(s.index))
+    color_source = _color_source(s)
+    if scene.mesh is not None and scene.surface is not None:
+        thinned = words.thinned(len(scene.mesh.faces), len(scene.surface.faces), "triangles")
+    else:
+        thinned = words.thinned(len(scene.points), scene.total, "points")
+    return {
+        "scene": packed(displayed)
+        | {
+            "fields": {field.name: field.packed() for field in shown},
+            "frames": _packed_cameras(s, errors, rig),
+            "lens": None if rig is not None else _lens(s),
+            "axes": s.R_display_world.tolist(),
+        },
+        "still": thumbnails.data_uri(render(displayed, yaw=opening_yaw(displayed))),
+        "toggles": _toggles(scene),
+        "colorings": [
+            *([("", color_source)] if color_source else []),
+            *((field.name, field.label) for field in shown),
+        ],
+        "cameras": []
+        if rig is None
+        else [
+            (name, thumbnails.css(color)) for name, color in zip(rig.names, rig.colors, strict=True)
+        ],
+        "thinned": thinned,
+    }
+
+
+def _toggles(scene: Scene) -> list[tuple[str, str, str, bool]]:
+    """Name, label, colour and initial state of the switches below the view."""
+    has_mesh = scene.mesh is not None
+    has_normals = has_mesh or scene.normals is not None
+    switches = (
+        (has_mesh, ("mesh", "Surface", "", True)),
+        (True, ("points", "Points", "", not has_mesh)),
+        (has_normals, ("peel", "Hide walls seen from behind", "", True)),
+        (len(scene.after), ("after", "Cameras", "#5ab0f5", True)),
+        (len(scene.before), ("before", "Cameras before optimisation", "#f0a03c", False)),
+        (len(scene.reference), ("reference", "Reference trajectory", "#d8dade", False)),
+        (len(scene.loops), ("loops", "Loop closures", "#5fd08a", True)),
+    )
+    return [switch for is_available, switch in switches if is_available]
+
+
+def _color_source(s: Subject) -> str:
+    """The source of the model's colours: colour images or amplitude; empty without any."""
+    mesh = s.scene.mesh
+    color = s.result.cloud.color if mesh is None else mesh.color
+    if color is None or not len(color):
+        return ""
+    grey = bool((np.ptp(color, axis=1) == 0).all())
+    return "Amplitude" if grey else "Colour"
+
+
+def _packed_cameras(s: Subject, errors: Float64, rig: RigCameras | None) -> dict[str, Any]:
+    """Every frame for the viewer: its index, status, error and poses.
+
+    Poses (3, 4) are in the axes of the displayed model, row by row, zeros where there is none;
+    errors are bytes on the scale of the accuracy field.
+    """
+    records = {r.index: r for r in s.result.diagnostics.frames}
+    index = s.index.astype(int)
+    statuses = [records[k].status if k in records else "tracked" for k in index.tolist()]
+    error_bytes = np.round(255 * normalized_accuracy(errors)).astype(np.uint8)
+
+    def displayed(poses: Float64) -> str:
+        rows = np.nan_to_num(s.R_display_world @ poses[:, :3]).reshape(len(poses), 12)
+        return pack(rows.astype("<f4"))
+
+    return {
+        "rig": rig and {"colors": rig.colors, "of": pack(rig.of_frames.astype("u1"))},
+        "index": pack(index.astype("<u4")),
+        "status": "".join(str(words.STATUSES.index(status)) for status in statuses),
+        "errors": pack(error_bytes) if np.isfinite(errors).any() else None,
+        "after": displayed(s.result.trajectory),
+        "before": displayed(s.sequential),
+    }
+
+
+def _lens(s: Subject) -> dict[str, float] | None:
+    """Intrinsics of the images without distortion, in pixels; None if not known."""
+    raw = s.extras.filter_steps[0][1] if s.extras.filter_steps else None
+    if not isinstance(raw, RangeFrame):
+        return None
+    camera = raw.camera.fit if isinstance(raw.camera, RayTable) else raw.camera
+    assert isinstance(camera, Pinhole)
+    return {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+
+
+def position_errors(s: Subject) -> Float64:
+    """Return (N,) 95 % bounds in m of the camera centres, in the worst direction.
+
+    `UNKNOWN_M` where a pose is not bounded, NaN where there is none or it was not assessed.
+    """
+    covariances = {r.index: r.covariance for r in s.result.diagnostics.frames}
+    unbounded = set(s.result.diagnostics.accuracy.unbounded)
+    errors = np.full(len(s.index), np.nan)
+    for row, index in enumerate(s.index.astype(int).tolist()):
+        C = covariances.get(index)
+        if index in unbounded:
+            errors[row] = OF_95_PERCENT * UNKNOWN_M
+        elif C is not None and np.isfinite(C).all():
+            errors[row] = OF_95_PERCENT * float(se3.largest_sigmas(C)[0])
+    errors[~s.result.has_pose] = np.nan
+    return errors
+
+
+def views(s: Subject) -> Values:
+    """Return the drawings from above and from the side, and the table of sizes."""
+    if len(s.scene.points) == 0:
+        return {"figures": []}
+    R = s.R_display_world
+    truth = None if s.truth is None else s.truth @ R.T
+
+    def drawing(points: Float64, poses: Float64, view: str, name: str) -> tuple[str, str]:
+        measured = np.percentile(points, [OUTER, 100 - OUTER], axis=0)
+        path, label = poses[:, :3, 3] @ R.T, f"Model, {name}"
+        return plots.model(points, path, truth, view, measured=measured, label=label), name
+
+    points = s.scene.points @ R.T
+    figures = [
+        drawing(points, s.scene.after, "above", "From above"),
+        drawing(points, s.scene.after, "side", "From the side"),
+    ]
+    before = s.result.diagnostics.cloud_before
+    if before is not None and len(before):
+        earlier = (before.points[np.isfinite(before.points).all(1)] + before.offset) @ R.T
+        name = "From above, before optimisation"
+        figures.insert(0, drawing(earlier, s.scene.before, "above", name))
+    legend = [("after", "", "measured extents")]
+    if len(s.scene.after):
+        legend.append(("ink", "", "camera trajectory (dot: start)"))
+    if truth is not None:
+        legend.insert(0, ("bad", "6 3", "true outline"))
+    angle = float(np.degrees(se3.angle(R)))
+    note = "Axes: right, down and forward of the first camera"
+    if angle >= 0.5:
+        note += f", rotated by {angle:.0f}° so that the model is upright and axis-aligned"
+    sizes = _sizes(s.result.cloud.points @ R.T.astype(np.float32), points, truth)
+    return {
+        "figures": figures,
+        "sizes": sizes,
+        "true_sizes": truth is not None,
+        "dimensions": [(row[0], row[1 if truth is None else 2]) for row in sizes],
+        "legend": legend,
+        "note": f"{note}.",
+    }
+
+
+def _sizes(every: Float32, points: Float64, truth: Float64 | None) -> list[list[str]]:
+    """Extents of the points without outliers, and of every point of the model."""
+    every = every[np.isfinite(every).all(1)]
+    extents = np.ptp(np.percentile(points, [OUTER, 100 - OUTER], axis=0), axis=0).tolist()
+    rows = []
+    for axis, name in enumerate(("width", "height", "depth")):
+        row = [words.length(extents[axis]), words.length(float(np.ptp(every[:, axis])))]
+        if truth is not None:
+            true_extent = float(np.ptp(truth[:, axis]))
+            row.insert(0, words.length(true_extent))
+            row.insert(2, words.signed_length(extents[axis] - true_extent))
+        rows.append([name, *row])
+    return rows

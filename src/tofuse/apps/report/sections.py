@@ -1,0 +1,123 @@
+"""The content of the report: name and values of each section, for its template."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from tofuse._version import __version__
+from tofuse.engine.compute.thread_pool import job_pool
+from tofuse.apps.report import section_frames, section_model, section_parts, section_trajectory, words
+from tofuse.apps.report.extras import ReportExtras
+from tofuse.apps.report.subject import Subject, Values
+from tofuse.engine.quality.accuracy_card import bound, weakest_frame
+from tofuse.engine.quality.types import Reconstruction
+
+Section = Callable[[Subject], Values | None]
+
+
+def sections(result: Reconstruction, extras: ReportExtras) -> Values:
+    """Return all values that the template shows."""
+    subject = Subject.of(result, extras)
+    # In their order: name, title in the table of contents, and content; None leaves a section out.
+    listed: tuple[tuple[str, str, Section], ...] = (
+        ("verdict", "Accuracy", _verdict),
+        ("sessions", "Sessions", section_parts.sessions),
+        ("rig", "Rig", section_parts.rig),
+        ("components", "Components", section_parts.components),
+        ("frames", "Frames", section_frames.frames),
+        ("views", "Dimensions", section_model.views),
+        (
+            "error",
+            "Displacement" if subject.reference is None else "Error",
+            section_trajectory.error,
+        ),
+        ("objective", "Objective", section_trajectory.optimisation),
+        ("filters", "Filters", section_frames.filters),
+        ("loops", "Loop closures", section_frames.loops),
+        ("recording", "Recording", section_frames.recording),
+        ("timings", "Time", _timings),
+        ("settings", "Settings", _settings),
+    )
+    # Simplifying the surface takes as long as all plots, and releases the interpreter lock.
+    with job_pool(1, "tofuse-report") as background:
+        model = background.submit(section_model.model, subject)
+        contents = {name: content(subject) for name, _, content in listed}
+        shown = [(name, title) for name, title, _ in listed if contents[name] is not None]
+        return {
+            "title": extras.title,
+            "subtitle": _subtitle(result),
+            "contents": [("model", "Model"), *shown, ("reading", "How to read this")],
+            **model.result(),
+            **contents,
+        }
+
+
+def _subtitle(result: Reconstruction) -> str:
+    parts = [words.count(len(result.diagnostics.frames), "frame")]
+    if name := result.recording.get("format"):
+        parts.append(f"format {name}")
+    if method := result.config.get("method"):
+        parts.append(f"method {method}")
+    return ", ".join([*parts, f"tofuse {__version__}"])
+
+
+def _verdict(s: Subject) -> Values:
+    d = s.result.diagnostics
+    findings = words.findings(d.reasons, len(d.frames))
+    head, _, tail = words.verdict_sentence(s.result, findings).partition(":")
+    return {
+        "headline": s.extras.headline,
+        "card": _card(s.result),
+        "card_tone": d.verdict if d.accuracy.assessed else "",
+        "tone": d.verdict,
+        "head": head + ":",
+        "tail": tail,
+        "findings": findings,
+    }
+
+
+def _card(result: Reconstruction) -> list[tuple[str, str, str]]:
+    """Name, value and frame ranges of each line of the accuracy card."""
+    d, a = result.diagnostics, result.diagnostics.accuracy
+    readable = sum(f.status != "skipped" for f in d.frames)
+    closures = sum(p.accepted for p in d.loops)
+    covered = f"{int(result.has_pose.sum()):,} of {words.count(readable, 'frame')}"
+    lines = [
+        ("Accuracy", bound(a, result.cloud.diagonal_m).removeprefix("accuracy "), ""),
+        ("Coverage", f"{covered}, {words.count(closures, 'loop closure')}", ""),
+    ]
+    if weakest := weakest_frame(a):
+        frames = [a.unbounded[0], a.unbounded[-1]] if a.unbounded else []
+        if a.worst is not None and not frames:
+            frames = [a.worst.frame, a.worst.frame]
+        lines.append(("Weakest", weakest, json.dumps([frames])))
+    return lines
+
+
+def _timings(s: Subject) -> Values:
+    durations = s.result.diagnostics.seconds
+    total = sum(durations.values())
+    frames = len(s.result.diagnostics.frames)
+    rows = [
+        (name, words.seconds(value), f"{100 * value / total if total else 0:.1f}")
+        for name, value in durations.items()
+    ]
+    per_frame = f"{words.seconds(total / frames)} per frame" if frames else ""
+    return {"rows": rows, "total": words.seconds(total), "per_frame": per_frame}
+
+
+def _settings(s: Subject) -> Values:
+    result = s.result
+    recording = {k: v for k, v in result.recording.items() if k not in ("warnings", "findings")}
+    source = {"version": __version__, **recording, "seed": result.seed, "threads": result.threads}
+    return {
+        "warnings": [str(w) for w in result.recording.get("warnings", ())],
+        "input": _pretty(source),
+        "config": _pretty(result.config),
+    }
+
+
+def _pretty(data: Any) -> str:
+    return json.dumps(data, indent=2, ensure_ascii=False, default=str)

@@ -1,0 +1,228 @@
+"""Small pictures as data URIs: depth, amplitude and colour images, and splatted clouds."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
+from tofuse.apps.report.splat_kernels import nearest_points
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+
+# A grey that differs from both ends of the colour map.
+NO_MEASUREMENT = (128, 128, 132)
+REMOVED = (225, 40, 135)  # removed by the filter shown; not in the colour map
+BACKGROUND = (22, 25, 30)  # of the 3D view
+
+
+def viridis(value: Float64) -> UInt8:
+    """Return viridis colours (..., 3) of values from 0 to 1: near is dark, far is bright."""
+    return _ramp()[np.round(255 * np.clip(np.nan_to_num(value), 0, 1)).astype(np.intp)]
+
+
+@cache
+def _ramp() -> UInt8:
+    """The 256 colours of the map, (256, 3) RGB."""
+    import cv2
+
+    levels = np.arange(256, dtype=np.uint8)[:, None]
+    return np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8)
+
+
+def css(color: Sequence[int]) -> str:
+    """Return an RGB colour as in a style sheet."""
+    return f"rgb{tuple(color)}"
+
+
+def encode(image: UInt8, *, jpeg: bool = False) -> bytes:
+    """Encode an (H, W, 3) RGB or (H, W, 4) RGBA image as PNG (or JPEG, for photographs)."""
+    import cv2
+
+    code = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    flipped = cv2.cvtColor(np.ascontiguousarray(image), code)
+    if jpeg:
+        _, data = cv2.imencode(".jpg", flipped, [cv2.IMWRITE_JPEG_QUALITY, 82])
+    else:
+        _, data = cv2.imencode(".png", flipped, [cv2.IMWRITE_PNG_COMPRESSION, 7])
+    return bytes(data.tobytes())
+
+
+def data_uri(image: UInt8, *, jpeg: bool = False) -> str:
+    """Encode an image as `encode` does, for a page."""
+    kind = "jpeg" if jpeg else "png"
+    return f"data:image/{kind};base64,{base64.b64encode(encode(image, jpeg=jpeg)).decode()}"
+
+
+def subsample(image: UInt8, width: int) -> UInt8:
+    """Take every n-th pixel until the image is at most `width` wide.
+
+    Averaging would invent depths between an edge and what is behind it.
+    """
+    step = -(-image.shape[1] // width)
+    return np.ascontiguousarray(image[::step, ::step])
+
+
+def depth_limits(frame: Frame) -> tuple[float, float]:
+    """Return the depths in m at the ends of the colour map: the 2nd and 98th percentile."""
+    if isinstance(frame, RangeFrame):
+        values = frame.z[frame.valid].astype(float)
+    else:
+        values = np.linalg.norm(frame.points - frame.origin, axis=1)
+    return percentile_range(values, min_width=1e-3)
+
+
+def percentile_range(values: NDArray[np.floating], min_width: float = 0.0) -> tuple[float, float]:
+    """Return values that bound the middle 96 % of the finite ones, (K,); 0 and 1 if there are none.
+
+    Parameters
+    ----------
+    values
+        The values.
+    min_width
+        Minimum difference between the bounds.
+    """
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return 0.0, 1.0
+    low, high = np.percentile(values.astype(float), [2, 98])
+    return float(low), float(max(high, low + min_width))
+
+
+def depth_image(
+    frame: RangeFrame, limits: tuple[float, float], removed: Bool | None, width: int | None = None
+) -> UInt8:
+    """Return the z depth in colours (H, W, 3); pixels without a measurement are grey.
+
+    Parameters
+    ----------
+    frame
+        The frame.
+    limits
+        Depths at the ends of the colour map, m.
+    removed
+        (H, W) pixels to be marked; or None.
+    width
+        Maximum width; wider images are subsampled.
+    """
+    low, high = limits
+    step = 1 if width is None else -(-frame.z.shape[1] // width)
+    image = viridis((frame.z[::step, ::step].astype(float) - low) / (high - low))
+    image[~frame.valid[::step, ::step]] = NO_MEASUREMENT
+    if removed is not None:
+        image[removed[::step, ::step]] = REMOVED
+    return image
+
+
+def grey(amplitude: Float32) -> UInt8:
+    """Stretch amplitude (H, W) to grey (H, W, 3), with the gamma of a screen."""
+    valid = (amplitude > 0) & (amplitude < SATURATED_AMPLITUDE)
+    low, high = np.percentile(amplitude[valid], [1, 99]) if valid.any() else (0.0, 1.0)
+    level = ((amplitude - low) / max(high - low, 1e-9)).clip(0, 1) ** (1 / 2.2)
+    return np.repeat(np.round(255 * level).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def splat(
+    points: Float64,
+    colors: UInt8,
+    T_view_world: Float64,
+    size: tuple[int, int],
+    *,
+    scale: float,
+    distance: float | None = None,
+    radius: int = 1,
+) -> UInt8:
+    """Render points as squares, with occlusion.
+
+    Parameters
+    ----------
+    points, colors
+        (N, 3) m, and (N, 3) RGB.
+    T_view_world
+        (4, 4) into a view whose axes are x right, y down, z into the picture.
+    size
+        Width and height in pixels.
+    scale
+        Pixels per metre (at the centre, where there is a perspective).
+    distance
+        Of the eye from the view's origin in m; None for a parallel projection.
+    radius
+        Pixels along the side of a square.
+
+    Returns
+    -------
+    (H, W, 4) RGBA, transparent where there is no point.
+    """
+    indices = np.full(size[::-1], -1, np.int32)
+    depth = np.full(indices.shape, np.inf)
+    nearest_points(
+        np.ascontiguousarray(points), T_view_world, scale, distance or 0.0, radius, depth, indices
+    )
+    covered = indices >= 0
+    image = np.zeros((*indices.shape, 4), np.uint8)
+    image[covered, :3] = colors[indices[covered]]
+    image[covered, 3] = 255
+    return image
+
+
+def view_rotation(yaw: float, pitch: float) -> Float64:
+    """Return the rotation (3, 3) into a view rotated by `yaw` and tilted down by `pitch` (rad)."""
+    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
+    return about_x @ about_y
+
+
+@dataclass(frozen=True, eq=False)
+class Framing:
+    """A parallel projection that shows all but the outermost points.
+
+    Attributes
+    ----------
+    T_view_world
+        (4, 4).
+    scale
+        Pixels per metre.
+    size
+        Width and height in pixels.
+    """
+
+    T_view_world: Float64
+    scale: float
+    size: tuple[int, int]
+
+    @classmethod
+    def around(
+        cls, points: Float64, size: tuple[int, int], *, yaw: float = 0.7, pitch: float = 0.45
+    ) -> Framing:
+        """Frame (N, 3) points, seen from above and to the side."""
+        R = view_rotation(yaw, pitch)
+        T = np.eye(4)
+        T[:3, :3] = R
+        if len(points) == 0:
+            return cls(T, 1.0, size)
+        view = points @ R.T
+        low, high = np.percentile(view, [0.2, 99.8], axis=0)
+        T[:3, 3] = -(low + high) / 2
+        extent = np.maximum(high - low, 1e-6)
+        return cls(T, float(0.9 * min(size[0] / extent[0], size[1] / extent[1])), size)
+
+
+def cloud_image(frame: Frame, limits: tuple[float, float], framing: Framing) -> UInt8:
+    """Render a view's points in the colours of `depth_image`, (H, W, 4) RGBA."""
+    points = frame.points.astype(float)
+    is_range = isinstance(frame, RangeFrame)
+    depth = points[:, 2] if is_range else np.linalg.norm(points - frame.origin, axis=1)
+    low, high = limits
+    return splat(
+        points,
+        viridis((depth - low) / (high - low)),
+        framing.T_view_world,
+        framing.size,
+        scale=framing.scale,
+        radius=1 if len(points) > 60_000 else 2,
+    )

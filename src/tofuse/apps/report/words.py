@@ -1,0 +1,166 @@
+"""Numbers and reasons as text: lengths, ranges of frames, the verdict in a sentence."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofuse.engine.frames.ranges import Range, in_words, size
+from tofuse.engine.quality.types import Reason, Reconstruction
+from tofuse.engine.quality.verdict import ADVICE, REASONS, ranked
+
+STATUSES = ("tracked", "predicted", "lost", "skipped")
+
+
+def length(metres: float | None) -> str:
+    """Return a length as text: mm below 10 cm, else m."""
+    if metres is None or not np.isfinite(metres):
+        return "–"
+    if abs(metres) < 0.1:
+        mm = metres * 1000
+        return f"{mm:.0f} mm" if abs(mm) >= 10 else f"{mm:.1f} mm"
+    return f"{metres:.2f} m"
+
+
+def signed_length(metres: float) -> str:
+    """Return a difference of lengths as text, with its sign."""
+    return ("+" if metres >= 0 else "−") + length(abs(metres))
+
+
+def coordinates(values: Iterable[float], digits: int) -> str:
+    """Return the coordinates of a point as text."""
+    return ", ".join(f"{value:.{digits}f}" for value in values).replace("-", "−")
+
+
+def percent(value: float | None) -> str:
+    """Return a fraction as text, in percent."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    return f"{100 * value:.1f} %"
+
+
+def seconds(value: float) -> str:
+    """Return a duration as text."""
+    if value < 1:
+        return f"{1000 * value:.0f} ms"
+    return f"{value:.1f} s" if value < 120 else f"{int(value) // 60} min {int(value) % 60:02d} s"
+
+
+def count(number: int, noun: str) -> str:
+    """Return a number of things as text: "1 frame", "12,000 points"."""
+    return f"{number:,} {noun}" + ("" if number == 1 else "s")
+
+
+def thinned(shown: int, total: int, noun: str) -> str:
+    """Return how many of a number of things are shown; empty if that is all."""
+    return "" if shown == total else f"{shown:,} of {total:,} {noun} are shown."
+
+
+def more(number: int) -> str:
+    """Return how many further rows a table doesn't show; empty if none."""
+    return f"{number:,} more are not shown." if number > 0 else ""
+
+
+def frame_range(first: int, last: int) -> str:
+    """Return "frame 3" or "frames 3–17"."""
+    return f"frame {first}" if first == last else f"frames {first}–{last}"
+
+
+def runs(items: Iterable[tuple[int, str, str]]) -> list[tuple[int, int, int, str, str]]:
+    """Merge consecutive (index, status, reason) with the same status and reason.
+
+    Returns (first index, last index, count, status, reason). Items that follow each other count as
+    consecutive even if their indices have gaps, as in a recording read with a stride.
+    """
+    merged: list[tuple[int, int, int, str, str]] = []
+    for index, status, reason in items:
+        if merged and merged[-1][3:] == (status, reason):
+            first, _, number, _, _ = merged[-1]
+            merged[-1] = (first, index, number + 1, status, reason)
+        else:
+            merged.append((index, index, 1, status, reason))
+    return merged
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A reason for the verdict in the report.
+
+    Attributes
+    ----------
+    level
+        "failed", "degraded" or "note".
+    text
+        The finding, with its frames where that adds information.
+    ranges
+        The frames.
+    advice
+        What the user can do; may be empty.
+    where
+        The frames as text; empty if they are all frames.
+    """
+
+    level: str
+    text: str
+    ranges: tuple[Range, ...]
+    advice: str
+
+    where: str = ""
+
+
+def findings(reasons: Sequence[Reason], total: int) -> list[Finding]:
+    """Return the reasons as findings, the most severe first.
+
+    Parameters
+    ----------
+    reasons
+        The reasons.
+    total
+        Number of frames: reasons that concern the majority don't list them.
+    """
+    listed = []
+    for reason in ranked(reasons):
+        level, meaning = REASONS[reason.code]
+        text = _with_frames(reason, total) if reason.text.strip() else meaning
+        is_subset = 0 < size(reason.ranges) < total
+        where = in_words(reason.ranges).replace("-", "–") if is_subset else ""
+        listed.append(Finding(level, text, reason.ranges, ADVICE.get(reason.code, ""), where))
+    return listed
+
+
+def _with_frames(reason: Reason, total: int) -> str:
+    """Add a reason's frames to its text, unless it names them or they are the majority."""
+    text = sentence(reason.text)
+    first, last = reason.frames
+    named = {str(first), str(last)} <= set(re.findall(r"\d+", text))
+    if named or in_words(reason.ranges) in text or 2 * size(reason.ranges) > total:
+        return text
+    return f"{text.rstrip('.')} ({in_words(reason.ranges)})."
+
+
+def sentence(text: str) -> str:
+    """Return a text with a capital at its beginning and a full stop at its end."""
+    text = text.strip()
+    first = text.split(maxsplit=1)[:1]
+    if first and first[0].isalpha():  # a path or a number stays as it is
+        text = text[0].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) or not text else text + "."
+
+
+def verdict_sentence(result: Reconstruction, findings: Sequence[Finding]) -> str:
+    """Return the verdict in a sentence or two."""
+    d = result.diagnostics
+    readable = sum(f.status != "skipped" for f in d.frames)
+    posed = int(result.has_pose.sum())
+    poses_text = f"{posed} of {readable} readable frames have a pose"
+    if posed == readable:
+        poses_text = f"all {posed} frames have a pose" if posed > 1 else "the only frame has a pose"
+    decisive = [f for f in findings if f.level == d.verdict]
+    if d.verdict == "good":
+        return f"Good: {poses_text}. No problems found."
+    if d.verdict == "degraded":
+        return "Degraded: use this model with care."
+    return f"Failed: do not rely on this model.{'' if decisive else f' {poses_text}.'}"

@@ -1,0 +1,267 @@
+"""The output folder of a run: locked first, written beside it, moved into place at the end.
+
+A folder is not modified before it is known to contain an earlier result and nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from tofuse.engine.errors import InputError, OutputError
+from tofuse.formats.files.atomic import UNFINISHED, output_error
+from tofuse.formats.files.locking import Claim
+from tofuse.formats.files.reading import path_of, read_text
+from tofuse.formats.files.staging import StagedFolder, beside, finish_replacing, is_interrupted
+
+TRACKED = f"{UNFINISHED}tracked.npz"  # tracked frames of an interrupted run
+RECORDING = "recording"  # written by `tofuse demo` next to its result, and kept with it
+
+# Files of a result, by `tofuse run` and `tofuse export`; all of them are removed with it.
+FILES = (
+    "trajectory.txt",
+    "pose_graph.g2o",
+    "cloud.ply",
+    "mesh.ply",
+    "mesh.glb",
+    "changes.ply",
+    "mesh.obj",
+    "mesh.mtl",
+    "mesh.png",
+    "mesh.jpg",
+    "mesh.stl",
+    "report.html",
+    "run.json",
+    "judge.json",
+    "rig_trajectory.txt",
+    "cloud.pcd",
+    "cloud.las",
+    "cloud.laz",
+    "cloud.e57",
+    "mesh.gltf",
+    "trajectory.kitti.txt",
+    "trajectory.log",
+)
+# The model of a separate component is in its own folder, with the same files.
+_COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
+_IMAGES = r"(images|depth|sigma|masks|sparse)/.+"  # exported, with their poses
+_OF_SYSTEMS = re.compile(r"(.*/)?(\.DS_Store|Thumbs\.db|desktop\.ini)")
+
+
+@dataclass(frozen=True)
+class Contract:
+    """What one kind of result consists of.
+
+    Attributes
+    ----------
+    files
+        Pattern of the paths of its files, relative to its folder.
+    marker
+        The file by which it is recognised.
+    is_ours
+        Whether a folder contains a result of this kind.
+    """
+
+    files: re.Pattern[str]
+    marker: str
+    is_ours: Callable[[Path], bool]
+
+    def foreign(self, folder: Path, prefix: str = "") -> str | None:
+        """Return the path of a file or link in a folder that no such result has, relative to it.
+
+        Parameters
+        ----------
+        folder
+            The folder; its recording and files of an interrupted run are ignored.
+        prefix
+            Its path in the result, with a slash at the end.
+        """
+        for parent, folders, names in os.walk(folder):
+            relative = Path(parent).relative_to(folder)
+            if parent == str(folder):
+                folders[:] = [f for f in folders if f != RECORDING or prefix]
+            folders[:] = sorted(f for f in folders if not f.startswith(UNFINISHED))
+            links = [f for f in folders if (Path(parent) / f).is_symlink()]
+            for name in (*links, *sorted(n for n in names if not n.startswith(UNFINISHED))):
+                path = (relative / name).as_posix()
+                known = self.files.fullmatch(prefix + path) or _OF_SYSTEMS.fullmatch(path)
+                if not known or (Path(parent) / name).is_symlink():
+                    return path
+        return None
+
+
+class OutputFolder(StagedFolder):
+    """A folder that a run may write into, locked against other processes.
+
+    The constructor checks everything that can be checked before hours of work: that the folder is
+    empty or has an earlier result, that no other process writes into it, and that it can be
+    replaced.
+
+    The lock is released when the result is written; in a `with` statement, at its end.
+    """
+
+    def __init__(
+        self, path: str | Path, *, overwrite: bool = False, contract: Contract | None = None
+    ) -> None:
+        """Check, create and lock the folder.
+
+        Parameters
+        ----------
+        path
+            The folder.
+        overwrite
+            Whether an earlier result may be replaced.
+        contract
+            What will be written; by default the files of a run.
+
+        Raises
+        ------
+        OutputError
+            If it contains anything but an earlier result, or a result and `overwrite` is not set,
+            or another process writes into it, or it can't be written.
+        """
+        self.path = path_of(path, "folder", "pass the path of a folder")
+        self._contract, self._overwrite = contract or RESULT, overwrite
+        super().__init__(self.path, self._check_content, kept=RECORDING)
+        self._overwrite = True  # of a recording that is simulated meanwhile
+
+    def _check_content(self, folder: Path) -> None:
+        """Reject a folder with anything but a result that may be replaced."""
+        if not folder.exists():
+            if self.path.is_symlink():
+                raise OutputError(
+                    f"is a link to {os.readlink(self.path)}, which doesn't exist",
+                    where=self.path,
+                    remedy="create its target, or pass another --out",
+                )
+            return
+        entries = {p.name for p in folder.iterdir() if not p.name.startswith(UNFINISHED)}
+        if not entries:
+            return
+        if not self._contract.is_ours(folder) and entries - {RECORDING}:
+            raise OutputError(
+                f"contains {min(entries)}, but no earlier result of this command",
+                where=self.path,
+                remedy="pass a new or empty folder as --out",
+            )
+        if not self._overwrite:
+            recording = entries == {RECORDING}
+            raise OutputError(
+                "contains a recording" if recording else "contains an earlier result",
+                where=self.path,
+                remedy="pass --overwrite to replace it, or another --out",
+            )
+        if foreign := self._contract.foreign(folder):
+            raise OutputError(
+                "is not a file of an earlier result",
+                where=self.path / foreign,
+                remedy="move it away, or choose another --out",
+            )
+
+
+def check_output(path: Path, *, overwrite: bool) -> None:
+    """Check early whether `OutputFolder` will accept a folder, before long work.
+
+    Parameters
+    ----------
+    path, overwrite
+        As for `OutputFolder`.
+
+    Raises
+    ------
+    OutputError
+        If the folder can't be written into, or another process writes into it.
+    """
+    OutputFolder(path, overwrite=overwrite).discard()
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Hold the lock of a result, or that of a component, in the block: no run replaces it then.
+
+    Other folders are not locked.
+
+    Raises
+    ------
+    OutputError
+        If another process writes into it, or it can't be written.
+    """
+    result = result_folder(folder)
+    claim = Claim(beside(result, "lock"), target=result) if is_result(result) else None
+    try:
+        yield
+    finally:
+        if claim is not None:
+            claim.release()
+
+
+def result_folder(folder: Path) -> Path:
+    """Return the result that the folder of a component belongs to; any other folder itself."""
+    folder = Path(os.path.realpath(folder))
+    is_component = component_number(folder) is not None and is_result(folder.parent)
+    return folder.parent if is_component else folder
+
+
+def finish_interrupted(folder: Path) -> None:
+    """Finish the replacement of a result that was interrupted, so that it can be read.
+
+    Raises
+    ------
+    InputError
+        If another process is replacing it, or that can't be finished.
+    """
+    place = Path(os.path.realpath(folder))
+    if not is_interrupted(place):
+        return
+    try:
+        claim = Claim(beside(place, "lock"), target=folder)
+        try:
+            finish_replacing(place, RECORDING)
+        finally:
+            claim.release()
+    except (OutputError, OSError) as error:
+        reason = error if isinstance(error, OutputError) else output_error(error, folder)
+        raise InputError(
+            f"is being replaced, or that was interrupted: {reason.problem}",
+            where=folder,
+            remedy="wait until it is done, or make the folder that it is in writable",
+        ) from error
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder contains the result of a run."""
+    data = read_json_object(folder / RESULT.marker)
+    return data is not None and {"schema", "version", "verdict"} <= set(data)
+
+
+def read_json_object(path: Path) -> dict[str, object] | None:
+    """Return the object in a JSON file; None if it can't be read or is something else."""
+    try:
+        data = json.loads(read_text(path))
+    except (InputError, ValueError, RecursionError):
+        return None
+    return data if isinstance(data, dict) else None
+
+
+def component_name(number: int) -> str:
+    """Return the name of the folder of a component with its own model."""
+    return f"component-{number}"
+
+
+def component_number(folder: Path) -> int | None:
+    """Return the number of the component that a folder is named after; None for any other name."""
+    return int(folder.name.split("-")[1]) if _COMPONENT.fullmatch(folder.name) else None
+
+
+_FILE = "|".join(map(re.escape, FILES))
+_EXPORTED = rf"nerfstudio/(transforms\.json|points\.ply|{_IMAGES})|colmap/{_IMAGES}"
+RESULT = Contract(
+    re.compile(rf"({_COMPONENT.pattern}/)?({_FILE})|{_EXPORTED}", re.ASCII),
+    "run.json",
+    is_result,
+)

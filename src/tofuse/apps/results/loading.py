@@ -1,0 +1,203 @@
+"""Reading a result from its output folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.ply import read_ply
+from tofuse.formats.files.reading import path_of
+from tofuse.engine.fusion.cloud import Cloud
+from tofuse.engine.fusion.mesh import Mesh, mesh_of
+from tofuse.engine.quality.accuracy import Accuracy, WorstFrame
+from tofuse.engine.graph.external_sensors import SensorRecord
+from tofuse.formats.files.g2o import read_g2o
+from tofuse.engine.graph.graph import GraphPart, LoopRecord
+from tofuse.formats.readers.scans import read_las
+from tofuse.apps.results.folder import component_name, finish_interrupted, is_result
+from tofuse.apps.results.run_json import frame_covariance, main_poses, read_run_json, rotation_up_world, run_json_checked
+from tofuse.engine.quality.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction, SelfCalibration, SessionPair, SessionRecord
+
+
+def load_result(folder: str | Path) -> Reconstruction:
+    """Read the output folder of a run.
+
+    Empty, as they are not stored: poses before loop closure (NaN), the values of the optimiser's
+    objective, the refinement, sample images, and the model before optimisation.
+
+    Raises
+    ------
+    InputError
+        If it is not an output folder, or its files are damaged or of different runs.
+    """
+    folder = path_of(folder, "folder", "pass the folder of a result")
+    finish_interrupted(folder)
+    if not folder.is_dir() or not is_result(folder):
+        raise InputError(
+            "is not a result (no run.json)", where=folder, remedy="pass the --out of `tofuse run`"
+        )
+    run = read_run_json(folder / "run.json")
+    with run_json_checked(folder / "run.json"):
+        return _reconstruction(folder, run)
+
+
+def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
+    frames = tuple(_frame(each) for each in run["frames"])
+    row = {frame.index: k for k, frame in enumerate(frames)}
+    trajectory = np.full((len(frames), 4, 4), np.nan)
+    indices, poses = main_poses(folder, run)
+    trajectory[[row[index] for index in indices]] = poses
+    diagnostics = Diagnostics(
+        run["verdict"],
+        tuple(
+            Reason(r["code"], tuple((a, b) for a, b in r["ranges"]), r["text"])
+            for r in run["reasons"]
+        ),
+        frames,
+        tuple(LoopRecord(**p) for p in run["loops"]),
+        np.full_like(trajectory, np.nan),
+        (),
+        {name: each["removed"] for name, each in run["filters"].items()},
+        run["seconds"],
+        parts=tuple(_part(each) for each in run["optimiser"]),
+        priors=tuple(SensorRecord(**s) for s in run["priors"]),
+        accuracy=_accuracy(run["accuracy"]),
+        calibrated=_calibration(run.get("self_calibration")),
+    )
+    return Reconstruction(
+        trajectory,
+        np.array([frame.timestamp for frame in frames]),
+        read_g2o(folder / "pose_graph.g2o"),
+        _cloud(folder),
+        diagnostics,
+        run["config"],
+        {
+            **run["input"],
+            "warnings": run["warnings"],
+            "findings": run["findings"],
+            "rig": run.get("rig"),
+        },
+        run["seed"],
+        run["threads"],
+        read_mesh(folder / "mesh.ply"),
+        tuple(_component(folder, k, c) for k, c in enumerate(run["components"])),
+        tuple(_session(each) for each in run.get("sessions", ())),
+        tuple(SessionPair(**each) for each in run.get("session_pairs", ())),
+        up=rotation_up_world(run, folder / "run.json")[1],
+    )
+
+
+def _frame(data: dict[str, Any]) -> FrameRecord:
+    unobservable = np.array(data["unobservable"], float).reshape(-1, 6)
+    covariance = {"covariance": frame_covariance(data)}
+    stated = {name: data[name] for name in data if name != "session"}
+    return FrameRecord(**{**stated, **covariance, "unobservable": unobservable})
+
+
+def _session(data: dict[str, Any]) -> SessionRecord:
+    T = data["T_main_session"]
+    return SessionRecord(**{**data, "T_main_session": None if T is None else np.array(T, float)})
+
+
+def _part(data: dict[str, Any]) -> GraphPart:
+    names = ("first", "vertices", "edges", "before", "after", "converged")
+    return GraphPart(**{name: data[name] for name in names})
+
+
+def _accuracy(data: dict[str, Any]) -> Accuracy:
+    def bound(value: float | None) -> float:
+        return np.inf if value is None else float(value)
+
+    worst = data["worst"]
+    return Accuracy(
+        bound(data["position_m"]),
+        bound(data["rotation_rad"]),
+        bound(data["relative"]),
+        data["assessed"],
+        worst
+        and WorstFrame(worst["frame"], bound(worst["position_m"]), bound(worst["rotation_rad"])),
+        tuple(data["unbounded"]),
+        tuple(data["by_odometry"]),
+    )
+
+
+def _calibration(data: dict[str, Any] | None) -> SelfCalibration | None:
+    if data is None:
+        return None
+    bounds = (data["stated_bound_m"], data["corrected_bound_m"])
+    before, after = (np.inf if b is None else float(b) for b in bounds)
+    return SelfCalibration(
+        data["focal"],
+        data["offset_m"],
+        data.get("center_x", 0.0),
+        data.get("center_y", 0.0),
+        data.get("distortion", 0.0),
+        data["sigma"],
+        (before, after),
+    )
+
+
+def _component(folder: Path, number: int, data: dict[str, Any]) -> Component:
+    T = data["T_main_component"]
+    component_folder = folder / component_name(number)
+    return Component(
+        tuple((a, b) for a, b in data["frames"]),
+        None if T is None else np.array(T, float).reshape(4, 4),
+        data["joined"],
+        load_result(component_folder) if T is None and is_result(component_folder) else None,
+    )
+
+
+def read_cloud(folder: Path) -> GeometryRecord:
+    """Read the points of a result: `cloud.ply`, or `cloud.laz` if they are many.
+
+    Raises
+    ------
+    InputError
+        If there are none, or they are damaged.
+    """
+    compressed = folder / "cloud.laz"
+    if compressed.is_file() and not (folder / "cloud.ply").exists():
+        return _compressed_cloud(compressed)
+    return read_ply(folder / "cloud.ply")
+
+
+def _compressed_cloud(path: Path) -> GeometryRecord:
+    points = read_las(path)
+    names = set(points.point_format.dimension_names)
+
+    def columns(*of: str) -> Any:
+        return np.stack([points[name] for name in of], 1) if names.issuperset(of) else None
+
+    color = columns("red", "green", "blue")
+    return GeometryRecord(
+        np.asarray(points.xyz),
+        normals=columns("normal x", "normal y", "normal z"),
+        color=None if color is None else (color >> 8).astype(np.uint8),
+        scalars={name: np.asarray(points[name]) for name in ("views", "sigma") if name in names},
+    )
+
+
+def _cloud(folder: Path) -> Cloud:
+    record = read_cloud(folder)
+    sigma = record.scalars.get("sigma")
+    return Cloud(
+        record.points.astype(np.float32),
+        record.normals,
+        record.color,
+        np.asarray(record.scalars["views"], np.int32),
+        np.zeros(3),
+        None if sigma is None else np.asarray(sigma, np.float32),
+    )
+
+
+def read_mesh(path: Path) -> Mesh | None:
+    """Read the surface of a result, None if it has none.
+
+    Columns that another program left out are 0.
+    """
+    return mesh_of(read_ply(path)) if path.is_file() else None

@@ -1,0 +1,166 @@
+"""Writes the files of an output folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse._version import __version__
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.glb import write_glb
+from tofuse.formats.files.images import png_bytes
+from tofuse.formats.files.obj import write_obj
+from tofuse.formats.files.ply import write_ply
+from tofuse.formats.files.trajectory import write_tum
+from tofuse.engine.fusion.colors import display_colors
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.texture import Textured
+from tofuse.engine.compute.thread_pool import job_pool
+from tofuse.formats.files.g2o import write_g2o
+from tofuse.apps.results.folder import OutputFolder, component_name
+from tofuse.apps.results.run_json import write_run_json
+from tofuse.engine.quality.types import Reconstruction
+
+# Colours of surfaces that changed between sessions, distinguishable by colour-blind people.
+CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
+
+MAX_PLY_POINTS = 4_000_000  # a larger cloud is compressed
+OVERVIEW_BYTES = 8_000_000  # of `mesh.glb`
+# A vertex has a position, normal and colour; a triangle has its corners.
+_VERTEX_BYTES, _FACE_BYTES, _HEAD_BYTES = 12 + 12 + 8, 12, 2000
+
+
+def write_result(
+    result: Reconstruction,
+    folder: OutputFolder,
+    report: Callable[[Reconstruction, Path], None] | None = None,
+    texture: Textured | None = None,
+) -> None:
+    """Write all files of a result.
+
+    Components that are not connected to the main one but have their own model are written to
+    `component-1` and so on, by their numbers.
+
+    Parameters
+    ----------
+    result
+        The result.
+    folder
+        The output folder; existing files are replaced together, when all new ones are complete.
+    report
+        Writes the report of a result into a folder; None: no report.
+    texture
+        Texture of the main model for `mesh.glb`; `mesh.obj` is written with it as well.
+
+    Raises
+    ------
+    OutputError
+        If a file can't be written; existing files are unchanged then.
+    """
+    with folder.staging() as staging:
+        for number, component in enumerate(result.components):
+            if component.result is not None and not component.connected:
+                component_folder = staging / component_name(number)
+                component_folder.mkdir()
+                _write_files(component.result, component_folder, report, None)
+        _write_files(result, staging, report, texture)
+
+
+def _write_files(
+    result: Reconstruction,
+    folder: Path,
+    report: Callable[[Reconstruction, Path], None] | None,
+    texture: Textured | None,
+) -> None:
+    # Both release the interpreter lock for much of their time.
+    with job_pool(1, "tofuse-writer") as background:
+        model = background.submit(_write_model, result, folder, texture)
+        posed = result.has_pose
+        write_tum(folder / "trajectory.txt", result.timestamps[posed], result.trajectory[posed])
+        write_g2o(folder / "pose_graph.g2o", result.graph)
+        if report is not None:
+            report(result, folder)
+        model.result()
+        write_run_json(folder / "run.json", result)
+
+
+def _write_model(result: Reconstruction, folder: Path, texture: Textured | None) -> None:
+    """Write cloud and surface."""
+    if len(result.cloud) > MAX_PLY_POINTS:
+        result.cloud.save(folder / "cloud.laz")
+    else:
+        write_ply(folder / "cloud.ply", result.cloud.local_record())
+    if result.mesh is not None:
+        _write_mesh(result.mesh, result, folder, texture)
+    if result.changes:
+        _write_changes(result, folder / "changes.ply")
+
+
+def _write_changes(result: Reconstruction, path: Path) -> None:
+    """Write the surfaces that changed between sessions, in the colours of `CHANGE_COLORS`."""
+    changes = [c.change for c in result.changes]
+    counts = [len(change.points) for change in changes]
+    colors = np.array([CHANGE_COLORS[change.kind] for change in changes], np.uint8)
+    write_ply(
+        path,
+        GeometryRecord(
+            np.concatenate([change.points for change in changes]).astype(np.float32),
+            color=np.repeat(colors, counts, axis=0),
+            scalars={"change": np.repeat(np.arange(len(changes), dtype=np.int32), counts)},
+        ),
+    )
+
+
+def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textured | None) -> None:
+    """Write `mesh.ply`, in the world frame, and `mesh.glb`, whose node makes it upright.
+
+    `mesh.glb` is an overview of at most `OVERVIEW_BYTES`, or has a texture.
+    """
+    write_ply(folder / "mesh.ply", mesh.local_record())
+    upright: dict[str, Any] = {"T_scene_node": result.T_up_world}
+    generator = f"tofuse {__version__}"
+    if texture is None:
+        displayed = overview(mesh)
+        write_glb(
+            folder / "mesh.glb",
+            GeometryRecord(
+                displayed.vertices,
+                displayed.faces,
+                normals=displayed.normals,
+                color=None if displayed.color is None else display_colors(displayed.color),
+            ),
+            generator=generator,
+            **upright,
+        )
+        return
+    atlas, image = texture.atlas, png_bytes(texture.image)
+    points, normals = (
+        values[atlas.vertices] for values in (texture.mesh.vertices, texture.mesh.normals)
+    )
+    write_glb(
+        folder / "mesh.glb",
+        GeometryRecord(points, atlas.faces, normals=normals, uv=atlas.uv, texture=image),
+        generator=generator,
+        **upright,
+    )
+    R = result.T_up_world[:3, :3].T
+    write_obj(
+        folder / "mesh.obj",
+        GeometryRecord(points @ R, atlas.faces, normals=normals @ R, uv=atlas.uv, texture=image),
+    )
+
+
+def overview(mesh: Mesh) -> Mesh:
+    """Return the surface, simplified until it fits into `OVERVIEW_BYTES` of glTF."""
+    faces = OVERVIEW_BYTES / (_FACE_BYTES + _VERTEX_BYTES / 2)
+    simplified = mesh
+    while (
+        _HEAD_BYTES + _VERTEX_BYTES * len(simplified) + (_FACE_BYTES * len(simplified.faces))
+        > OVERVIEW_BYTES
+    ):
+        simplified = mesh.decimated(int(faces))
+        faces *= 0.9
+    return simplified

@@ -1,0 +1,303 @@
+"""The result of registering one pair of views: poses in the files' coordinates, and the folder."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse._version import __version__
+from tofuse.engine.arrays import Float64
+from tofuse.formats.files.atomic import write_text
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.ply import write_ply
+from tofuse.formats.files.pose import pose_text
+from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.cloud_sequence import MAP_COORDINATES_M
+from tofuse.engine.frames.frames import Frame
+from tofuse.formats.recordings.open import SingleView
+from tofuse.engine.alignment.base import Registration
+from tofuse.apps.results.folder import Contract, OutputFolder, read_json_object
+from tofuse.apps.results.run_json import plain
+
+MARKER = "registration.json"
+FILES = ("transform.txt", "aligned.ply", "report.html", MARKER)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalView:
+    """A view translated to the origin, where single precision is sufficient.
+
+    Attributes
+    ----------
+    view
+        The view as it was read.
+    frame
+        The same view, with `center` as its origin.
+    center
+        (3,) m, in the coordinates of the file; zero for images, and for clouds near the origin.
+    """
+
+    view: SingleView
+    frame: Frame
+    center: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class PairResult:
+    """A registration of two views.
+
+    Attributes
+    ----------
+    source, target
+        The views.
+    registration
+        The registration of the local frames.
+    T_start
+        (4, 4) initial guess T_target_source of the local frames.
+    guess
+        The file of the initial guess, or None.
+    seconds
+        Time that registration took.
+    """
+
+    source: LocalView
+    target: LocalView
+    registration: Registration
+    T_start: Float64
+    guess: str | None = None
+    seconds: float = 0.0
+
+    def in_files(self, T: Float64) -> Float64:
+        """Convert T_target_source (4, 4) of the local frames to the coordinates of the files."""
+        out = np.array(T, float)
+        out[:3, 3] += self.target.center - out[:3, :3] @ self.source.center
+        return out
+
+    @property
+    def T_target_source(self) -> Float64:
+        """(4, 4), maps coordinates of the source's file to those of the target's."""
+        return self.in_files(self.registration.T_target_source)
+
+    @property
+    def moved_m(self) -> Float64:
+        """(3,) displacement of the source's `center`, m: the translation if that is the origin."""
+        center = self.source.center
+        displacement: Float64 = se3.transform(self.T_target_source, center[None])[0] - center
+        return displacement
+
+    @property
+    def runner_up(self) -> Float64 | None:
+        """(4, 4) T_target_source of the best rival pose; None where there is none."""
+        T_rival = self.registration.runner_up
+        return None if T_rival is None else self.in_files(T_rival)
+
+    @property
+    def runner_up_distance(self) -> tuple[float, float] | None:
+        """Distance of the runner-up at the source's median point (m), and its angle (rad)."""
+        T_rival = self.registration.runner_up
+        if T_rival is None:
+            return None
+        T = self.registration.T_target_source
+        center = np.median(self.source.frame.points.astype(float), axis=0)[None]
+        displacement = se3.transform(T_rival, center) - se3.transform(T, center)
+        return float(np.linalg.norm(displacement)), float(se3.angle(se3.inverse(T) @ T_rival))
+
+    @cached_property
+    def lever_m(self) -> float:
+        """Median distance of the source's points from `center`: converts radians to metres."""
+        distance = np.linalg.norm(self.source.frame.points.astype(float), axis=1)
+        return max(float(np.median(distance)), 1e-6) if len(distance) else 1.0
+
+    @cached_property
+    def covariance(self) -> Float64 | None:
+        """(6, 6) of the right perturbation at the source's `center`; None if unbounded."""
+        if len(self.registration.unobservable):
+            return None
+        return self._observed_covariance
+
+    @cached_property
+    def sigma(self) -> tuple[float | None, float | None]:
+        """Standard deviations (m, rad) in the worst observable direction.
+
+        None where not known, or where no direction is observable.
+        """
+        covariance = self._observed_covariance
+        if covariance is None:
+            return None, None
+        variances = [
+            float(np.linalg.eigvalsh(covariance[k, k])[-1]) for k in (_TRANSLATION, _ROTATION)
+        ]
+        # In metres both are of similar size; a negligible one is rounding error.
+        limit = 1e-12 * max(variances[0], variances[1] * self.lever_m**2)
+        significant = variances[0] > limit, variances[1] * self.lever_m**2 > limit
+        sigma_m, sigma_rad = (float(np.sqrt(max(value, 0.0))) for value in variances)
+        return sigma_m if significant[0] else None, sigma_rad if significant[1] else None
+
+    @property
+    def _observed_covariance(self) -> Float64 | None:
+        """(6, 6), without the unobservable directions; None where the information is unusable."""
+        units = np.array([1, 1, 1, *[self.lever_m] * 3])
+        information = np.asarray(self.registration.information, float)
+        if information.shape != (6, 6) or not np.isfinite(information).all():
+            return None
+        basis = np.eye(6)
+        if len(self.registration.unobservable):
+            _, s, vt = np.linalg.svd(self.registration.unobservable * units)
+            basis = vt[int((s > 1e-9 * s[0]).sum()) :].T
+        if basis.shape[1] == 0:
+            return None
+        scaled = information / np.outer(units, units)
+        values, vectors = np.linalg.eigh(basis.T @ scaled @ basis)
+        if not values[0] > 1e-12 * values[-1]:
+            return None
+        root = basis @ vectors / np.sqrt(values)
+        return root @ root.T / np.outer(units, units)
+
+    @cached_property
+    def free_motions(self) -> tuple[Float64, Float64]:
+        """Unobservable directions: axes (a, 3) of translations, and axes (b, 3) of rotations."""
+        directions = np.asarray(self.registration.unobservable, float).reshape(-1, 6)
+        if not len(directions):
+            return np.zeros((0, 3)), np.zeros((0, 3))
+        # An orthonormal basis in metres, with as many pure translations as possible.
+        _, s, vt = np.linalg.svd(directions * np.array([1, 1, 1, *[self.lever_m] * 3]))
+        basis = vt[: int((s > 1e-9 * s[0]).sum())]
+        u, rotations, _ = np.linalg.svd(basis[:, 3:])
+        basis = u.T @ basis
+        is_rotation = (
+            np.concatenate([rotations, np.zeros(len(basis))])[: len(basis)] > _MAX_ROTATION
+        )
+        return _unit(basis[~is_rotation, :3]), _unit(basis[is_rotation, 3:])
+
+    def aligned(self) -> Float64:
+        """(N, 3) points of the source in the coordinates of the target's file, m."""
+        points = se3.transform(
+            self.registration.T_target_source, self.source.frame.points.astype(np.float64)
+        )
+        return points + self.target.center
+
+
+_TRANSLATION, _ROTATION = slice(0, 3), slice(3, 6)
+# A free direction with a smaller fraction of rotation counts as a translation.
+_MAX_ROTATION = 0.4
+
+
+def _unit(vectors: Float64) -> Float64:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+
+
+def pair_json(result: PairResult) -> dict[str, Any]:
+    """Return the content of `registration.json`: SI units and radians, null where unknown."""
+    registration = result.registration
+    sigma_m, sigma_rad = result.sigma
+    covariance = result.covariance
+    data: dict[str, Any] = plain(
+        {
+            "schema": 1,
+            "version": __version__,
+            "source": _view_json(result.source),
+            "target": _view_json(result.target),
+            "guess": result.guess,
+            "T_target_source": result.T_target_source,
+            "believed": registration.believed,
+            "probability": registration.probability,
+            "reason": registration.reason,
+            "converged": registration.converged,
+            "overlap": registration.overlap,
+            "support": registration.support,
+            "contradiction": registration.contradiction,
+            "margin": registration.margin,
+            "runner_up": result.runner_up,
+            "unobservable": registration.unobservable,
+            "covariance": None if covariance is None else covariance.ravel(),
+            "sigma_m": sigma_m,
+            "sigma_rad": sigma_rad,
+            "information": np.asarray(registration.information).ravel(),
+            "reference_point_m": result.source.center,
+            "rms_m": registration.rms_m,
+            "correspondences": registration.correspondences,
+            "points": registration.points,
+            "iterations": registration.iterations,
+            "seconds": round(result.seconds, 4),
+            "warnings": [*result.source.view.warnings, *result.target.view.warnings],
+        }
+    )
+    return data
+
+
+def _view_json(local: LocalView) -> dict[str, Any]:
+    view = local.view
+    return {
+        "name": view.name,
+        "path": view.path,
+        "format": view.format,
+        "frame": view.index,
+        "points": len(view.frame),
+    }
+
+
+def is_registration(folder: Path) -> bool:
+    """Whether a folder contains an earlier registration."""
+    data = read_json_object(folder / MARKER)
+    return data is not None and {"schema", "version", "T_target_source"} <= set(data)
+
+
+CONTRACT = Contract(re.compile("|".join(map(re.escape, FILES))), MARKER, is_registration)
+
+
+def pair_folder(path: Path, *, overwrite: bool = False) -> OutputFolder:
+    """Check, create and lock the folder for a registration; see `OutputFolder`."""
+    return OutputFolder(path, overwrite=overwrite, contract=CONTRACT)
+
+
+def write_pair(
+    result: PairResult, folder: OutputFolder, report: Callable[[PairResult, Path], None]
+) -> None:
+    """Write the files of a registration.
+
+    Parameters
+    ----------
+    result
+        The registration.
+    folder
+        The output folder.
+    report
+        Writes the report of a registration to a path.
+
+    Raises
+    ------
+    OutputError
+        If a file can't be written; existing files are unchanged then.
+    """
+    with folder.staging() as staging:
+        write_text(staging / "transform.txt", pose_text(result.T_target_source))
+        write_aligned(result, staging / "aligned.ply")
+        report(result, staging / "report.html")
+        text = json.dumps(pair_json(result), indent=1, allow_nan=False)
+        write_text(staging / MARKER, text + "\n")
+
+
+def write_aligned(result: PairResult, path: Path) -> None:
+    """Write the source in the target's coordinates, with normals, colour and intensity."""
+    frame = result.source.frame
+    points = result.aligned()
+    normals = frame.normals
+    if normals is not None:
+        normals = (normals @ result.registration.T_target_source[:3, :3].T).astype(np.float32)
+    write_ply(
+        path,
+        GeometryRecord(
+            points,
+            normals=normals,
+            color=frame.color,
+            scalars={} if frame.amplitude is None else {"intensity": frame.amplitude},
+        ),
+        double=bool(np.abs(points).max(initial=0) > MAP_COORDINATES_M),
+    )

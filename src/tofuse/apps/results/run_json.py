@@ -1,0 +1,297 @@
+"""`run.json`: its content, writing, and reading by other commands."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from tofuse._version import __version__
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.reading import damage_reported, parsed, read_text
+from tofuse.formats.files.trajectory import read_tum
+from tofuse.engine.geometry import se3
+from tofuse.engine.quality.accuracy import Accuracy
+from tofuse.engine.refinement.calibration_check import CalibrationCheck
+from tofuse.engine.refinement.refinement import Refinement
+from tofuse.apps.results.folder import is_result
+from tofuse.engine.quality.types import FrameRecord, Reason, Reconstruction, SelfCalibration
+
+
+def write_run_json(path: Path, result: Reconstruction) -> None:
+    """Write `run.json`, schema 1: SI units and radians, null instead of NaN.
+
+    It is written frame by frame, as all frames of a long recording would need much memory.
+
+    Parameters
+    ----------
+    path
+        The new file.
+    result
+        The result.
+    """
+    with path.open("w", encoding="utf-8") as file:
+        file.write("{")
+        separator = ""
+        for key, value in _content(result).items():
+            file.write(f'{separator}\n "{key}": ')
+            separator = ","
+            if isinstance(value, Iterator):
+                _write_rows(file, value)
+            else:
+                file.write(_indented(value, 1))
+        file.write("\n}\n")
+
+
+def _write_rows(file: TextIO, rows: Iterator[Any]) -> None:
+    """Write a JSON list at the first level, item by item."""
+    separator = "["
+    for row in rows:
+        file.write(f"{separator}\n  {_indented(row, 2)}")
+        separator = ","
+    file.write("[]" if separator == "[" else "\n ]")
+
+
+def _indented(value: Any, level: int) -> str:
+    """Return the JSON of a value at a level of indentation: null instead of NaN."""
+    text = json.dumps(plain(value), indent=1, allow_nan=False)
+    return text.replace("\n", "\n" + level * " ")
+
+
+def _content(result: Reconstruction) -> dict[str, Any]:
+    """Return the content; that of `frames` is an iterator."""
+    d = result.diagnostics
+    return {
+        "schema": 1,
+        "version": __version__,
+        "input": {
+            **{key: result.recording[key] for key in ("path", "format", "frames")},
+            "opening": result.recording.get("opening"),
+        },
+        "warnings": result.recording.get("warnings", []),
+        "findings": result.recording.get("findings", []),
+        "seed": result.seed,
+        "threads": result.threads,
+        "config": result.config,
+        "seconds": {k: round(v, 4) for k, v in d.seconds.items()},
+        "verdict": d.verdict,
+        "accuracy": accuracy_json(d.accuracy),
+        "self_calibration": _calibration(d.calibrated),
+        "reasons": reasons_json(d.reasons),
+        "frames": (_frame(f, result) for f in d.frames),
+        "T_up_world": result.T_up_world,
+        "rig": result.recording.get("rig"),
+        "components": [
+            _fields(c, "frames", "T_main_component", "joined") for c in result.components
+        ],
+        "sessions": [vars(session) for session in result.sessions],
+        "session_pairs": [vars(pair) for pair in result.session_pairs],
+        "changes": [
+            {
+                **_fields(c, "a", "b"),
+                "kind": c.change.kind,
+                "centre_m": c.change.centre,
+                "size_m": c.change.size,
+                "volume_m3": c.change.volume_m3,
+            }
+            for c in result.changes
+        ],
+        "loops": [vars(loop) for loop in d.loops],
+        "optimiser": [
+            _fields(p, "first", "vertices", "edges", "before", "after", "improved", "converged")
+            for p in d.parts
+        ],
+        "priors": [_fields(s, "sensor", "measured", "used", "scale", "text") for s in d.priors],
+        "refinement": _refinement(d.refinement),
+        "filters": {name: {"removed": fraction} for name, fraction in d.removed.items()},
+    }
+
+
+def _fields(record: Any, *names: str) -> dict[str, Any]:
+    """Some fields of a record, in this order."""
+    return {name: getattr(record, name) for name in names}
+
+
+def _frame(f: FrameRecord, result: Reconstruction) -> dict[str, Any]:
+    covariance = None if f.covariance is None else f.covariance.ravel()
+    return {**vars(f), "covariance": covariance, "session": _session_of(f.index, result)}
+
+
+def _session_of(index: int, result: Reconstruction) -> int | None:
+    """Number of the session that a frame belongs to; None where there is only one recording."""
+    return next((k for k, session in enumerate(result.sessions) if session.has(index)), None)
+
+
+def frame_clock(folder: Path) -> tuple[Float64, Intp] | None:
+    """Return (N,) timestamps in s and (N,) indices of a result's frames; None for other folders."""
+    if not is_result(folder):
+        return None
+    path = folder / "run.json"
+    frames = read_run_json(path).get("frames", [])
+    with run_json_checked(path):
+        times = np.array([frame["timestamp"] for frame in frames], float)
+        return times, np.array([frame["index"] for frame in frames], np.intp)
+
+
+def accuracy_json(a: Accuracy) -> dict[str, Any]:
+    """Return the accuracy as in `run.json`, except that infinite bounds are not yet null."""
+    return asdict(a)
+
+
+def reasons_json(reasons: Sequence[Reason]) -> list[dict[str, Any]]:
+    """Return the reasons as `run.json` has them."""
+    return [_fields(reason, "code", "frames", "ranges", "text") for reason in reasons]
+
+
+def _refinement(r: Refinement | None) -> dict[str, Any] | None:
+    """Outcome of the global refinement; None where no view took part."""
+    if r is None or not r.views:
+        return None
+    return {
+        **_fields(r, "kept", "views", "pairs", "moved_m", "moved_rad"),
+        "support_before": r.support[0],
+        "support_after": r.support[1],
+        "camera": r.errors,
+        "suspicion": _suspicion(r.calibration_check),
+    }
+
+
+def _calibration(calibration: SelfCalibration | None) -> dict[str, Any] | None:
+    """The self-calibration; None where there was none."""
+    if calibration is None:
+        return None
+    return {
+        **_fields(calibration, "focal", "offset_m", "center_x", "center_y", "distortion"),
+        "sigma": dict(calibration.sigmas),
+        "stated_bound_m": calibration.bound_m[0],
+        "corrected_bound_m": calibration.bound_m[1],
+    }
+
+
+def _suspicion(check: CalibrationCheck | None) -> dict[str, Any] | None:
+    """The check of the camera's calibration; None where it was not made."""
+    if check is None:
+        return None
+    gap = check.gap
+    return {
+        "alarm": check.alarm,
+        "camera": check.errors,
+        "sigma": check.sigmas,
+        "focal_sigma": check.focal_sigma,
+        "focal_motion_m": 0.01 * check.motion["focal"][0] if check.motion else None,
+        "support": check.support,
+        "loop": None
+        if gap is None
+        else {
+            "i": gap.i,
+            "j": gap.j,
+            "gap_m": gap.before[0],
+            "gap_rad": gap.before[1],
+            "calibrated_gap_m": gap.after[0],
+            "calibrated_gap_rad": gap.after[1],
+        },
+    }
+
+
+def plain(value: Any) -> Any:
+    """Convert arrays and NumPy numbers to JSON values; NaN and infinity become null."""
+    if isinstance(value, dict):
+        return {k: plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        is_finite = value.dtype.kind in "iub" or (
+            value.dtype.kind == "f" and np.isfinite(value).all()
+        )
+        return value.tolist() if is_finite else plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def read_run_json(path: str | Path) -> dict[str, Any]:
+    """Read a `run.json`.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, or is not a `run.json` of schema 1.
+    """
+    path = Path(path)
+    data = parsed(json.loads, read_text(path), where=path, format_name="JSON")
+    if not isinstance(data, dict) or data.get("schema") != 1:
+        raise InputError("is not a run.json of schema 1", where=path)
+    return data
+
+
+def run_json_checked(path: Path) -> AbstractContextManager[None]:
+    """Turn errors of a block that reads fields of a `run.json` into InputError."""
+    return damage_reported(path, "a run.json")
+
+
+def rotation_up_world(data: Mapping[str, Any], path: Path) -> Float64:
+    """Return the rotation (3, 3) of `T_up_world` in data from a file.
+
+    Raises
+    ------
+    InputError
+        If it is missing, or not a pose.
+    """
+    with damage_reported(path, f"a {path.name}"):
+        return se3.check_pose(data["T_up_world"], where=f"{path}: T_up_world")[:3, :3]
+
+
+def frame_covariance(frame: Mapping[str, Any]) -> Float64 | None:
+    """Return the (6, 6) covariance of the pose of an entry of `frames`; None if it is unknown."""
+    values = frame["covariance"]
+    C = None if values is None else np.array(values, float).reshape(6, 6)
+    return None if C is None or not np.isfinite(C).all() else C
+
+
+def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
+    """Return the frame indices and poses (N, 4, 4) T_world_camera of the main model of a result.
+
+    Parameters
+    ----------
+    folder
+        The result.
+    run
+        Its `run.json`.
+
+    Raises
+    ------
+    InputError
+        If `run.json` is damaged, or `trajectory.txt` is of another run.
+    """
+    with run_json_checked(folder / "run.json"):
+        indices = [int(frame["index"]) for frame in frames_in_main_model(run)]
+    _, poses = read_tum(folder / "trajectory.txt")
+    if len(indices) != len(poses):
+        raise InputError(
+            f"lists {len(indices)} frames with a pose, but trajectory.txt has {len(poses)}",
+            where=folder / "run.json",
+            remedy="copy the whole folder, or run again",
+        )
+    return indices, poses
+
+
+def frames_in_main_model(run: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the entries of `run.json` for the frames with a line in `trajectory.txt`, in order.
+
+    See `types.in_main_model`.
+    """
+    connected = [c["T_main_component"] is not None for c in run["components"]]
+    return [
+        frame
+        for frame in run["frames"]
+        if frame["status"] in ("tracked", "predicted")
+        and (frame["component"] is None or connected[frame["component"]])
+    ]

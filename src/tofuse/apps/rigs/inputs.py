@@ -1,0 +1,112 @@
+"""The recordings of a rig's cameras: named, checked, and prepared for comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from tofuse.engine.errors import InputError
+from tofuse.engine.filters.base import apply_filters
+from tofuse.engine.mapping.adaptation import with_recording_defaults
+from tofuse.engine.mapping.config import Config, from_method
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.views.prepared_view import PreparedView, prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
+
+_MAX_CAMERAS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera of a rig: its name and its recording."""
+
+    name: str
+    recording: Recording
+
+    @cached_property
+    def config(self) -> Config:
+        """The configuration that prepares its images.
+
+        Corrections that need a trial are omitted: it compares consecutive views of a moving camera.
+        """
+        config = with_recording_defaults(from_method("default", "range"), self.recording)
+        corrections = tuple(c for c in config.corrections if not c.needs_trial)
+        return replace(config, corrections=corrections)
+
+    def images(self, count: int) -> list[RangeFrame]:
+        """Read up to `count` evenly spaced images.
+
+        Raises
+        ------
+        InputError
+            If none can be read, or the recording contains clouds.
+        """
+        frames = [frame for frame in self.recording.images(count) if len(frame)]
+        if not frames:
+            raise InputError(
+                "has no readable image with a valid measurement",
+                where=self.recording.path,
+                remedy="check the recording with `tofuse inspect`",
+            )
+        return frames
+
+    def image(self, k: int) -> RangeFrame | None:
+        """Read image `k`; None if it can't be read, or is empty."""
+        frame = self.recording.image(k)
+        return frame if frame is not None and len(frame) else None
+
+    def every_image(self) -> Iterator[RangeFrame]:
+        """Read all images that can be read."""
+        for item in self.recording.read_all():
+            if isinstance(item, RangeFrame):
+                yield item
+
+    def corrected(self, frame: RangeFrame) -> RangeFrame:
+        """Return an image after corrections and filters."""
+        for correction in self.config.corrections:
+            corrected = correction.start().apply(frame)
+            frame = corrected if isinstance(corrected, RangeFrame) else frame
+        filtered, _ = apply_filters(self.config.filters, frame, ())
+        return filtered if isinstance(filtered, RangeFrame) else frame
+
+    def surface(self, frame: RangeFrame) -> PreparedView:
+        """Return an image prepared for comparison."""
+        return prepare_view(self.corrected(frame), SurfaceOptions())
+
+
+def open_cameras(paths: Sequence[str | Path], format: str | None = None) -> list[Camera]:  # noqa: A002
+    """Open the recordings of a rig's cameras, each named after its file or folder.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two or too many, one can't be opened, or one is given twice.
+    """
+    if len(paths) < 2:
+        raise InputError("is one camera", where="a rig", remedy="pass two recordings or more")
+    if len(paths) > _MAX_CAMERAS:
+        raise InputError(
+            f"has {len(paths)} cameras", where="a rig", remedy=f"pass at most {_MAX_CAMERAS}"
+        )
+    resolved = [Path(path).resolve() for path in paths]
+    for k, path in enumerate(resolved):
+        if path in resolved[:k]:
+            raise InputError("is given twice", where=paths[k], remedy="pass each camera once")
+    names = unique_names(resolved)
+    return [
+        Camera(name, open_recording(path, format=format))
+        for name, path in zip(names, paths, strict=True)
+    ]
+
+
+def unique_names(paths: Sequence[Path]) -> list[str]:
+    """Return the shortest suffixes of the paths that are unique."""
+    for parts in range(1, 1 + max(len(path.parts) for path in paths)):
+        names = ["/".join(path.parts[-parts:]) for path in paths]
+        if len(set(names)) == len(names):
+            return names
+    return [f"camera {k}" for k in range(len(paths))]

@@ -1,0 +1,281 @@
+"""Calibration of a moving rig: cameras are tracked separately, and their trajectories aligned.
+
+The cameras need not overlap at any instant. Views of the same place at different times are used in
+a joint refinement of all views, once the trajectories are in one world frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.errors import InputError, RegistrationError
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.progress import Progress, Silent
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.refinement.joint_alignment import refine
+from tofuse.engine.stored_views.pair_equations import RefineOptions
+from tofuse.engine.refinement.pose_priors import Priors
+from tofuse.engine.refinement.refinement import propagate_poses
+from tofuse.engine.refinement.split_half import refined_by_halves
+from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.quality.types import Reconstruction
+from tofuse.apps.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
+from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.joint import disagreements_of
+
+# Number of views of each camera that are refined jointly, and of their points.
+_VIEWS, _POINTS = 70, 1500
+# Clock differences above this, s, are reported.
+_MAX_CLOCK_DIFFERENCE_S = 0.5
+# Maximum sigma of a placed camera: fraction of the depth, and rad.
+_MAX_SIGMA_FRACTION, _MAX_SIGMA_RAD = 0.05, float(np.radians(4.0))
+_OPTIONS = RefineOptions(neighbours=16)
+
+
+@dataclass(frozen=True, eq=False)
+class MovingRig:
+    """The calibration of a moving rig.
+
+    Attributes
+    ----------
+    results
+        The separate reconstruction of each camera.
+    tracks
+        Trajectories by camera, in one world frame; those of cameras not placed are in their own.
+    fits
+        Calibration of each camera but the first relative to the first, by camera.
+    reasons
+        Why a camera is not placed, by camera.
+    disagreement
+        By pair of cameras (a, b), a < b: median distance between their surfaces, at any time, in
+        m, and the number of compared pixels.
+    notes
+        Messages for the user.
+    """
+
+    results: tuple[Reconstruction, ...]
+    tracks: dict[int, Track]
+    fits: dict[int, HandEye]
+    reasons: dict[int, str]
+    disagreement: dict[tuple[int, int], tuple[float, int]]
+    notes: tuple[str, ...]
+
+
+def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig:
+    """Track each camera, fit the trajectories to each other, and refine all views jointly.
+
+    Raises
+    ------
+    InputError
+        If the first camera has no trajectory.
+    """
+    results, tracks = [], []
+    for camera in cameras:
+        progress.stage(f"tracking {camera.name}")
+        result = reconstruct(camera.recording, progress=Silent())
+        results.append(result)
+        tracks.append(Track.of(result.timestamps, result.trajectory))
+    if len(tracks[0].times) < 2:
+        raise InputError(
+            "has no trajectory",
+            where=cameras[0].recording.path,
+            remedy="pass the camera with the best tracking first",
+        )
+    progress.stage("fitting trajectories")
+    fits: dict[int, HandEye] = {}
+    reasons: dict[int, str] = {}
+    notes: list[str] = []
+    for k in range(1, len(cameras)):
+        try:
+            offset = _initial_offset(cameras, tracks, k, notes)
+            fits[k] = hand_eye(tracks[0], tracks[k], offset)
+        except RegistrationError as error:
+            reasons[k] = str(error)
+    progress.stage("refining")
+    joint = _JointViews.of(cameras, tracks, fits)
+    refined = joint.refined()
+    for k in list(fits):
+        offset = fits[k].time_offset_s
+        fits[k] = hand_eye(refined[0], refined[k], offset)
+        if joint.improved:
+            common_fit = hand_eye(refined[0], refined[k], offset, common_world=True)
+            systematic = joint.systematic(k, common_fit)
+            fits[k] = combined(
+                fits[k], replace(common_fit, covariance=common_fit.covariance + systematic)
+            )
+        reason = _too_uncertain(fits[k], joint.depth)
+        if reason:
+            reasons[k] = reason
+            del fits[k]
+    placed = {0, *fits}
+    return MovingRig(
+        tuple(results),
+        {k: refined.get(k, tracks[k]) for k in range(len(cameras))},
+        fits,
+        reasons,
+        {ends: distance for ends, distance in joint.disagreement().items() if set(ends) <= placed},
+        tuple(notes),
+    )
+
+
+def _initial_offset(
+    cameras: Sequence[Camera], tracks: Sequence[Track], k: int, notes: list[str]
+) -> float:
+    """Return the initial offset to add to the timestamps of camera k.
+
+    Raises
+    ------
+    RegistrationError
+        If neither rotations nor timestamps determine it.
+    """
+    lag = clock_of(tracks[0], tracks[k]) if len(tracks[k].times) > 1 else None
+    if lag is not None and lag.certain:
+        if abs(lag.seconds) > _MAX_CLOCK_DIFFERENCE_S:
+            notes.append(
+                f"the clock of {cameras[k].name} differs by {lag.seconds:.3f} s from that of "
+                f"{cameras[0].name}, by their rotations"
+            )
+        return lag.seconds
+    if len(tracks[k].times) < 2:
+        raise RegistrationError("has no trajectory", remedy="check its tracking with `tofuse run`")
+    first, last = tracks[0].times[[0, -1]]
+    if min(last, tracks[k].times[-1]) - max(first, tracks[k].times[0]) <= 0:
+        raise RegistrationError(
+            f"its timestamps begin {tracks[k].times[0] - first:+.1f} s after those of "
+            f"{cameras[0].name} and don't overlap with them, and its rotation differs",
+            remedy="record all cameras at the same time, and rotate the rig",
+        )
+    if lag is not None and lag.correlation < 0.5:
+        raise RegistrationError(
+            f"its rotation differs from that of {cameras[0].name}",
+            remedy="record all cameras at the same time, fixed to each other",
+        )
+    notes.append(
+        f"{cameras[k].name}: the rotation of the rig does not determine its clock; its timestamps "
+        f"are assumed to be those of {cameras[0].name}"
+    )
+    return 0.0
+
+
+def _too_uncertain(fit: HandEye, depth: float) -> str:
+    """Return why a pose is too uncertain; empty if it is not."""
+    position, rotation = se3.largest_sigmas(fit.covariance).tolist()
+    if position <= _MAX_SIGMA_FRACTION * depth and rotation <= _MAX_SIGMA_RAD:
+        return ""
+    return (
+        f"the motion does not constrain its pose ({1000 * position:.0f} mm, "
+        f"{np.degrees(rotation):.1f} deg); rotate the rig about two axes"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _CameraViews:
+    """Views of one camera, and the rows (N,) of their poses in its track."""
+
+    rows: Intp
+    views: tuple[SampledView, ...]
+
+
+class _JointViews:
+    """Views of all cameras in the world of the first one."""
+
+    def __init__(
+        self,
+        tracks: dict[int, Track],
+        camera_views: dict[int, _CameraViews],
+        fits: dict[int, HandEye],
+    ) -> None:
+        self.tracks, self._views = tracks, camera_views
+        self.improved = False
+        self._fits = fits
+        views = [v for k in sorted(camera_views) for v in camera_views[k].views]
+        self.depth = float(np.median([v.depth for v in views])) if views else 1.0
+        self._halves: list[tuple[dict[int, Track], ...]] = []
+        self._pairs = np.zeros((0, 2), np.intp)
+        self._poses = np.zeros((0, 4, 4))
+
+    @classmethod
+    def of(
+        cls, cameras: Sequence[Camera], tracks: Sequence[Track], fits: dict[int, HandEye]
+    ) -> _JointViews:
+        """Prepare views of the calibrated cameras."""
+        world = {0: tracks[0]}
+        for k, fit in fits.items():
+            world[k] = replace(tracks[k], poses=fit.T_world_other @ tracks[k].poses)
+        camera_views = {}
+        for k, track in world.items():
+            rows, sampled = [], []
+            for p in evenly_spaced(np.arange(len(track.times)), _VIEWS):
+                row = int(np.searchsorted(cameras[k].recording.timestamps, track.times[p]))
+                frame = cameras[k].image(row)
+                if frame is not None:
+                    rows.append(p)
+                    sampled.append(SampledView.of(cameras[k].surface(frame), _POINTS))
+            camera_views[k] = _CameraViews(np.array(rows, np.intp), tuple(sampled))
+        return cls(world, camera_views, fits)
+
+    def refined(self) -> dict[int, Track]:
+        """Return the tracks in one world, after a joint refinement if that improved them."""
+        order = sorted(self._views)
+        views = [v for k in order for v in self._views[k].views]
+        poses = np.concatenate([self.tracks[k].poses[self._views[k].rows] for k in order])
+        first = poses[0]
+        refinement = refine(views, np.asarray(se3.inverse(first) @ poses), _OPTIONS)
+        count = len(views)
+        before, after = refinement.before.of_views(count), refinement.after.of_views(count)
+        camera = np.repeat(order, [len(self._views[k].views) for k in order])
+        # The cameras are in one world frame only if views of each and the first were compared.
+        compared = {tuple(sorted(ends)) for ends in camera[refinement.pairs].tolist()}
+        connected = all((0, k) in compared for k in order if k)
+        self._pairs, self._poses = refinement.pairs, first @ refinement.poses
+        self._camera = camera
+        if after.mean() < before.mean() or not connected:
+            self._poses = poses
+            return dict(self.tracks)
+        self.improved = True
+        self._halves = [
+            tuple(self._propagated(first @ poses) for poses in pair)
+            for pair in refined_by_halves(views, refinement, _OPTIONS, Priors.none())
+        ]
+        return self._propagated(self._poses)
+
+    def _propagated(self, poses: Float64) -> dict[int, Track]:
+        """Return the tracks that follow the refined poses of all views."""
+        start, tracks = 0, {}
+        for k in sorted(self._views):
+            camera_views = self._views[k]
+            new_poses = poses[start : start + len(camera_views.views)]
+            start += len(camera_views.views)
+            tracks[k] = replace(
+                self.tracks[k],
+                poses=propagate_poses(self.tracks[k].poses, camera_views.rows, new_poses),
+            )
+        return tracks
+
+    def systematic(self, k: int, fit: HandEye) -> Float64:
+        """Return the covariance (6, 6) of camera k from halves of the images (`split_half`).
+
+        Distortions common to all views deform the common world, and cause no residuals.
+        """
+        C = np.zeros((6, 6))
+        for halves in self._halves:
+            xi_first, xi_second = (
+                se3.log(
+                    se3.inverse(fit.T_a_b)
+                    @ hand_eye(tracks[0], tracks[k], fit.time_offset_s, common_world=True).T_a_b
+                )
+                for tracks in halves
+            )
+            C -= 0.5 * (np.outer(xi_first, xi_second) + np.outer(xi_second, xi_first))
+        values, vectors = np.linalg.eigh(C)
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, np.float64)
+
+    def disagreement(self) -> dict[tuple[int, int], tuple[float, int]]:
+        """See `MovingRig`."""
+        views = [v for k in sorted(self._views) for v in self._views[k].views]
+        return disagreements_of(views, self._camera, self._poses, self._pairs)

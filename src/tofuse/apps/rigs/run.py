@@ -1,0 +1,326 @@
+"""Reconstruction with a rig: one model, and one rig pose for each instant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.trajectory import write_tum
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import threads as using_threads
+from tofuse.engine.tracking.given import GivenPoses
+from tofuse.engine.mapping.config import Config
+from tofuse.engine.mapping.priors import with_odometry
+from tofuse.engine.mapping.progress import Progress, Silent
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.apps.jobs.run_options import Options, resolve
+from tofuse.engine.quality.accuracy import UNOBSERVED_ERROR_FACTOR
+from tofuse.engine.graph.build import Measured
+from tofuse.engine.loops.nearby import Nearby
+from tofuse.engine.refinement.refinement import AlreadyRefined, NoRefinement
+from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import Recording
+from tofuse.formats.recordings.rig import Disagreement, Rig, RigSource, read_rig, recordings_of
+from tofuse.apps.results.folder import OutputFolder
+from tofuse.apps.results.output import write_result
+from tofuse.engine.quality.types import Reason, Reconstruction
+from tofuse.engine.quality.verdict import ranked, verdict_of
+from tofuse.apps.rigs.calibrating import Motion, cameras_of, moves
+from tofuse.apps.rigs.checking import CameraMotion, compare
+from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.joint import RigView, disagreements, refine_together
+from tofuse.apps.rigs.rig_trajectory import track_rig
+
+# No loops are searched: poses of the rig are final.
+_NO_LOOPS = Nearby(min_gap=1_000_000)
+TRAJECTORY = "rig_trajectory.txt"
+# Reason codes that apply only to single-camera tracking.
+_TRACKING_REASONS = frozenset({"jumped", "weak_registration", "not_converged", "repeated_images"})
+# Minimum variances of a camera's pose, m^2 and rad^2: 0.1 mm and 0.005 degrees.
+_MIN_VARIANCES = np.array([1e-4**2] * 3 + [np.radians(0.005) ** 2] * 3)
+# Number of points of a view when the calibration is checked.
+_POINTS = 6000
+
+
+@dataclass(frozen=True, eq=False)
+class RigResult:
+    """Reconstruction of a rig's recordings.
+
+    Attributes
+    ----------
+    result
+        The model of all cameras; its frames are ordered by instant, then by camera.
+    times, poses
+        (N,) times of the instants in s, and (N, 4, 4) T_world_rig; NaN where no camera has a pose.
+    rig
+        The rig, with the distances between the surfaces measured by its cameras in these images.
+    """
+
+    result: Reconstruction
+    times: Float64
+    poses: Float64
+    rig: Rig
+
+
+def run_rig(
+    rig_file: Path,
+    inputs: Sequence[str | Path],
+    options: Options,
+    *,
+    progress: Progress | None = None,
+) -> RigResult:
+    """Reconstruct the recordings of a rig's cameras, and write the output folder.
+
+    Raises
+    ------
+    InputError
+        If the rig or a recording can't be used.
+    OutputError
+        If the result can't be written.
+    """
+    progress = progress or Silent()
+    names = list(recordings_of(rig_file))
+    with using_threads(options.threads), threadpool_limits(1):
+        progress.stage("opening")
+        cameras = cameras_of(names, inputs, options.format)
+        recordings = [camera.recording for camera in cameras]
+        rig = read_rig(rig_file)
+        source = RigSource(rig, recordings)
+        full_recording = Recording.of(source, " ".join(map(str, inputs)), "rig")
+        recording = _selected(full_recording, source, options)
+        config = resolve(options)
+        with OutputFolder(options.out, overwrite=options.overwrite) as folder:
+            result = reconstruct_rig(
+                rig, cameras, recording, config, seed=options.seed or 0, progress=progress
+            )
+            progress.stage("writing")
+            _write(result, recording, folder)
+    return result
+
+
+def _selected(full_recording: Recording, source: RigSource, options: Options) -> Recording:
+    """Return the recording of the instants that the options select."""
+    count = int(source.instant[-1]) + 1
+    chosen = np.arange(count)[slice(options.start, options.end, options.every)]
+    if not len(chosen):
+        raise InputError(
+            f"has {count} instants, of which the selection leaves none",
+            where="the rig",
+            remedy="change --start, --end or --every",
+        )
+    return replace(full_recording, indices=np.flatnonzero(np.isin(source.instant, chosen)))
+
+
+def reconstruct_rig(
+    rig: Rig,
+    cameras: Sequence[Camera],
+    recording: Recording,
+    config: Config,
+    *,
+    motion: Motion = "auto",
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> RigResult:
+    """Estimate a rig pose for each instant, and fuse the images of all cameras.
+
+    Parameters
+    ----------
+    rig, cameras
+        The calibrated rig, and its opened cameras in the same order.
+    recording
+        Of a `RigSource`.
+    config, seed
+        As in `reconstruct`.
+    motion
+        Whether the rig moves; "auto" detects it.
+    """
+    progress = progress or Silent()
+    source = recording.source
+    assert isinstance(source, RigSource)
+    instants, first = np.unique(source.instant[recording.indices], return_index=True)
+    times = recording.timestamps[first]
+    poses = np.tile(np.eye(4), (len(instants), 1, 1))
+    T_rig_frame = source.T_rig_camera[recording.indices]
+    displaced: list[CameraMotion] = []
+    measured: tuple[Measured, ...] = ()
+    tracked: tuple[Measured, ...] = ()
+    if moves(cameras, motion):
+        trajectory = track_rig(cameras, recording, progress)
+        poses, T_rig_frame, distances = (
+            trajectory.poses,
+            trajectory.T_rig_frame,
+            trajectory.disagreement,
+        )
+        measured, tracked = trajectory.measured, trajectory.tracked
+    else:
+        displaced, distances = _check_calibration(rig, cameras, recording)
+    instant = np.searchsorted(instants, source.instant[recording.indices])
+    frame_poses = poses[instant] @ T_rig_frame
+    fusion_config = replace(
+        config,
+        odometry=GivenPoses(),
+        loops=_NO_LOOPS,
+        refinement=NoRefinement(),
+        priors=(),
+        self_calibration=False,
+    )
+    is_moving = bool(measured or tracked)
+    calibration_edges = _calibration_edges(
+        rig, source, recording, instant, frame_poses, follow=not is_moving
+    )
+    refined_config = replace(
+        fusion_config, refinement=AlreadyRefined(measured, (*tracked, *calibration_edges))
+    )
+    result = reconstruct(
+        with_odometry(recording, frame_poses), refined_config, seed=seed, progress=progress
+    )
+    names = [camera.name for camera in rig.cameras]
+    rig_fields = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}
+    result = replace(
+        _without_tracking_diagnostics(result, names, source.camera, moves=is_moving),
+        config=fusion_config.to_dict(),
+        recording={**result.recording, "rig": rig_fields},
+    )
+    pairs = tuple(
+        Disagreement(names[a], names[b], median, pixels)
+        for (a, b), (median, pixels) in sorted(distances.items())
+    )
+    return RigResult(
+        _with_rig_reason(result, displaced), times, poses, replace(rig, disagreement=pairs)
+    )
+
+
+def _calibration_edges(
+    rig: Rig,
+    source: RigSource,
+    recording: Recording,
+    instant: Intp,
+    T_world_frame: Float64,
+    *,
+    follow: bool,
+) -> list[Measured]:
+    """Return edges from the first camera's frame of each instant to the others, with information.
+
+    Calibration errors are the same at all instants: if the rig is static (`follow`), later frames
+    are tied to the first frame of their camera.
+    """
+    # The bound on the errors is enlarged for systematic ones, which these covariances include.
+    covariances = [
+        c.covariance / UNOBSERVED_ERROR_FACTOR**2 + np.diag(_MIN_VARIANCES) for c in rig.cameras
+    ]
+    covariances[0] = np.diag(_MIN_VARIANCES)
+    posed = np.flatnonzero(np.isfinite(T_world_frame[:, 0, 0]))
+    cameras = source.camera[recording.indices]
+    edges: list[Measured] = []
+    reference: dict[int, int] = {}
+    first_of_camera: dict[int, int] = {}
+    for k in posed:
+        c = int(cameras[k])
+        i = reference.setdefault(0 if follow else int(instant[k]), int(k))
+        C = covariances[c]
+        if follow and c in first_of_camera:
+            C, i = np.diag(_MIN_VARIANCES), first_of_camera[c]
+        first_of_camera.setdefault(c, int(k))
+        if i != k:
+            T = se3.inverse(T_world_frame[i]) @ T_world_frame[k]
+            ends = int(recording.indices[i]), int(recording.indices[k])
+            edges.append(Measured(*ends, T, np.asarray(np.linalg.inv(C), np.float64)))
+    return edges
+
+
+def _without_tracking_diagnostics(
+    result: Reconstruction, names: Sequence[str], cameras: Intp, *, moves: bool
+) -> Reconstruction:
+    """Return the result without diagnostics that apply only to single-camera tracking.
+
+    `cameras` (F,) are the cameras of all frames, as indices into `names`.
+    """
+    d = result.diagnostics
+    reasons = ranked([r for r in d.reasons if r.code not in _TRACKING_REASONS])
+    worst = d.accuracy.worst
+    if not moves and worst is not None:
+        name = names[cameras[worst.frame]]
+        reasons = ranked([_calibration_reason(r, worst.frame, name) for r in reasons])
+    d = replace(d, reasons=reasons, verdict=verdict_of(reasons), refinement=None, cloud_before=None)
+    return replace(result, diagnostics=d)
+
+
+def _calibration_reason(reason: Reason, worst: int, name: str) -> Reason:
+    """Return the reason, attributing uncertain poses of static cameras to the calibration.
+
+    `worst` is the frame with the largest uncertainty, and `name` its camera.
+    """
+    if reason.code != "uncertain_poses":
+        return reason
+    text = reason.text.replace(f"Frame {worst} is", f"Camera {name!r} is")
+    text += (
+        " The bound follows from the covariances in rig.json, which include systematic errors such "
+        "as multipath."
+    )
+    return replace(reason, code="uncertain_rig", text=text)
+
+
+def _check_calibration(
+    rig: Rig, cameras: Sequence[Camera], recording: Recording
+) -> tuple[list[CameraMotion], dict[tuple[int, int], tuple[float, int]]]:
+    """Return the cameras that differ from the calibration, after aligning their views.
+
+    Also the distances between the surfaces of each pair at the calibrated poses, see `JointPoses`.
+    """
+    source = recording.source
+    assert isinstance(source, RigSource)
+    first = np.flatnonzero(source.instant == source.instant[recording.indices[0]])
+    views = []
+    for index in first:
+        frame = source.read(int(index))
+        if isinstance(frame, RangeFrame):
+            c = int(source.camera[index])
+            views.append(RigView(c, 0, SampledView.of(cameras[c].surface(frame), _POINTS)))
+    calibrated = np.stack([camera.T_rig_camera for camera in rig.cameras])
+    refined = refine_together(views, calibrated)
+    recalibrated = tuple(
+        replace(camera, T_rig_camera=T, covariance=C[:6, :6])
+        for camera, T, C in zip(rig.cameras, refined.poses, refined.covariance, strict=True)
+    )
+    displaced = [motion for motion in compare(rig, Rig(recalibrated)) if motion.moved]
+    return displaced, disagreements(views, calibrated)
+
+
+def _with_rig_reason(result: Reconstruction, displaced: Sequence[CameraMotion]) -> Reconstruction:
+    """Return the result with a reason for the cameras that differ from the calibration."""
+    if not displaced:
+        return result
+    d = result.diagnostics
+    changes = ", ".join(
+        f"{m.name} by {1000 * m.distance_m:.0f} mm and {np.degrees(m.angle_rad):.1f} degrees"
+        for m in displaced
+    )
+    text = f"Camera poses differ from those of the rig: {changes}."
+    all_frames = ((d.frames[0].index, d.frames[-1].index),)
+    reasons = ranked((*d.reasons, Reason("rig_changed", all_frames, text)))
+    verdict = verdict_of(reasons)
+    return replace(result, diagnostics=replace(d, reasons=reasons, verdict=verdict))
+
+
+def _write(rig_result: RigResult, recording: Recording, folder: OutputFolder) -> None:
+    from tofuse.apps.report.extras import ReportExtras
+    from tofuse.apps.report.html import write_report
+
+    def report(result: Reconstruction, target: Path) -> None:
+        source = recording.source
+        assert isinstance(source, RigSource)
+        cameras = ", ".join(camera.name for camera in source.rig.cameras)
+        extras = ReportExtras(f"rig of {cameras}", rig=rig_result.rig)
+        write_report(result, target / "report.html", extras)
+        if result is rig_result.result:
+            posed = np.isfinite(rig_result.poses[:, 0, 0])
+            write_tum(target / TRAJECTORY, rig_result.times[posed], rig_result.poses[posed])
+
+    write_result(rig_result.result, folder, report)

@@ -1,0 +1,377 @@
+"""Calibration of static cameras: synchronisation of their images, and poses.
+
+In a static scene the images of each camera are averaged. In a dynamic scene all cameras observe the
+moving objects at each instant, and all instants are used jointly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import stdtr
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
+from tofuse.engine.normal import MEDIAN_OF_NORMAL
+from tofuse.engine.mapping.progress import Progress
+from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.filters.background_model import BackgroundSurface, background_surface
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.noise.choice import noise_model_for
+from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.formats.recordings.still import average_of, change_between
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.apps.rigs.clocks import lag_between
+from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.joint import JointPoses, RigView, distances_between, refine_together, refined_poses
+from tofuse.apps.rigs.placing import Placement, place
+
+# A camera is static if this fraction of its pixels measure the same surface in this fraction of the
+# sampled frames.
+_SAMPLED_FRAMES, _STATIC_PIXELS, _STATIC_FRAMES = 12, 0.5, 0.75
+# Maximum number of instants of a dynamic scene, and of averaged images of a static one.
+_MAX_INSTANTS, _MAX_AVERAGED = 60, 48
+# Maximum and minimum number of points of a view, and target number over all instants.
+_POINTS, _MIN_POINTS, _TOTAL_POINTS = 6000, 1500, 60_000
+# Maximum time between the images of an instant, in frame intervals.
+_MAX_INTERVALS = 0.6
+# Standard deviation of a clock, in frames: images are paired to within half a frame.
+_CLOCK_SIGMA = 0.3
+# Maximum lag in either direction, in images; number of instants at which lags are compared; and the
+# truncation of distances, as a fraction of the depth.
+_MAX_LAG, _COMPARED_INSTANTS, _MAX_DISTANCE = 6, 10, 0.03
+# Minimum number of instants to compare two lags, and the significance level: about a dozen lags
+# are compared with the best one.
+_MIN_INSTANTS, _SIGNIFICANCE = 5, 0.001
+
+
+@dataclass(frozen=True, eq=False)
+class StaticRig:
+    """The calibration of static cameras.
+
+    Attributes
+    ----------
+    placement
+        The placed cameras, and why others are not.
+    refined
+        Refined poses of the placed cameras, in the order of `cameras`.
+    cameras
+        (M,) the placed cameras, ascending.
+    time_offsets
+        (K,) of all cameras, s.
+    instants
+        Number of instants.
+    notes
+        Notes for the user.
+    """
+
+    placement: Placement
+    refined: JointPoses
+    cameras: tuple[int, ...]
+    time_offsets: Float64
+    instants: int
+    notes: tuple[str, ...]
+
+
+def is_static(camera: Camera) -> bool:
+    """Whether a camera does not move: most pixels measure the same surface repeatedly."""
+    frames = camera.images(_SAMPLED_FRAMES)
+    if len(frames) < 3:
+        model = noise_model_for(camera.recording)
+        return len(frames) < 2 or change_between(frames[0], frames[1], model).still
+    return bool(_static_fraction(frames) >= _STATIC_PIXELS)
+
+
+def _static_fraction(frames: Sequence[RangeFrame]) -> float:
+    """Return the fraction of pixels that measure the same surface in most of the frames."""
+    background: BackgroundSurface = background_surface(frames)
+    has_background = np.isfinite(background.z) & (background.z > 0)
+    valid = np.mean([f.valid for f in frames], axis=0) > 0.5
+    observed = valid | has_background
+    return (
+        float((background.static_fraction[observed] >= _STATIC_FRAMES).mean())
+        if observed.any()
+        else 1.0
+    )
+
+
+def calibrate_static(cameras: Sequence[Camera], progress: Progress) -> StaticRig:
+    """Place and refine static cameras relative to each other."""
+    notes: list[str] = []
+    progress.stage("instants")
+    offsets, instants = _views_by_instant(cameras, notes)
+    progress.stage("placing")
+    placement = place(instants)
+    order = tuple(sorted(placement.poses))
+    progress.stage("refining")
+    refined = refine_together(
+        _views(instants, order), np.stack([placement.poses[c] for c in order])
+    )
+    count = max((len(row) for row in instants), default=0)
+    if count > 1:
+        progress.stage("clocks")
+        new_offsets = _refined_offsets(cameras, order, refined, offsets, notes)
+        if (new_offsets != offsets).any():
+            offsets = new_offsets
+            times = _common_times(cameras, offsets)
+            instants = [_views_at(c, o, times) for c, o in zip(cameras, offsets, strict=True)]
+            refined = refine_together(_views(instants, order), refined.poses)
+        refined = _with_clock_uncertainty(cameras, order, refined, offsets, instants)
+    return StaticRig(placement, refined, order, offsets, count, tuple(notes))
+
+
+def _with_clock_uncertainty(
+    cameras: Sequence[Camera],
+    order: Sequence[int],
+    refined: JointPoses,
+    offsets: Float64,
+    instants: Sequence[Sequence[PreparedView | None]],
+) -> JointPoses:
+    """Add the uncertainty of the clocks to the covariances, by the change of poses per frame."""
+    times = _common_times(cameras, offsets)
+    clock_covariance = np.zeros_like(refined.covariance)
+    for c in order[1:]:
+        interval = float(np.median(np.diff(cameras[c].recording.timestamps)))
+        delayed = list(instants)
+        delayed[c] = _views_at(cameras[c], offsets[c] + interval, times)
+        shifted = refined_poses(_views(delayed, order), refined.poses)
+        for k in range(1, len(order)):
+            xi = _CLOCK_SIGMA * se3.log(se3.inverse(refined.poses[k]) @ shifted[k])
+            clock_covariance[k, :6, :6] += np.outer(xi, xi)
+    return replace(
+        refined,
+        covariance=refined.covariance + clock_covariance,
+        random_covariance=refined.random_covariance + clock_covariance,
+    )
+
+
+def _views(
+    instants: Sequence[Sequence[PreparedView | None]], order: Sequence[int]
+) -> list[RigView]:
+    """Return the views of the placed cameras, numbered in their order."""
+    count = max((len(row) for row in instants), default=1)
+    points = int(np.clip(_TOTAL_POINTS / count, _MIN_POINTS, _POINTS))
+    return [
+        RigView(k, m, SampledView.of(view, points))
+        for k, c in enumerate(order)
+        for m, view in enumerate(instants[c])
+        if view is not None
+    ]
+
+
+def _refined_offsets(
+    cameras: Sequence[Camera],
+    order: Sequence[int],
+    refined: JointPoses,
+    offsets: Float64,
+    notes: list[str],
+) -> Float64:
+    """Return time offsets (K,) at which moving surfaces of all placed cameras coincide.
+
+    The images of each camera are compared with those of the preceding cameras at several lags, one
+    frame apart; the distance between surfaces is minimal at the correct lag, and quadratic nearby.
+    A clock is corrected only if most instants agree on the lag (`minimum_cost_lag`).
+    """
+    corrected = offsets.copy()
+    instants = _common_times(cameras, offsets)
+    instants = evenly_spaced(instants, _COMPARED_INSTANTS)
+    views_of = {
+        0: [_sampled(v) for v in _views_at(cameras[order[0]], corrected[order[0]], instants)]
+    }
+    for k, c in enumerate(order):
+        if k == 0:
+            continue
+        times = cameras[c].recording.timestamps
+        interval = float(np.median(np.diff(times)))
+        cached: dict[int, SampledView | None] = {}
+        costs = np.full((len(instants), 2 * _MAX_LAG + 1), np.nan)
+        lags = np.full(2 * _MAX_LAG + 1, np.nan)
+        for column, shift in enumerate(range(-_MAX_LAG, _MAX_LAG + 1)):
+            differences: list[float] = []
+            for m, t in enumerate(instants):
+                row = int(np.abs(times + corrected[c] - t).argmin()) + shift
+                if not 0 <= row < len(times):
+                    continue
+                if row not in cached:
+                    frame = cameras[c].image(row)
+                    cached[row] = None if frame is None else _sampled(cameras[c].surface(frame))
+                view = cached[row]
+                parts = [np.zeros(0)]
+                for camera, views in views_of.items():
+                    target = views[m]
+                    if view is not None and target is not None:
+                        T = se3.inverse(refined.poses[camera]) @ refined.poses[k]
+                        distance = distances_between(target, view, T)
+                        parts.append(np.minimum(distance, _MAX_DISTANCE * target.depth))
+                distances = np.concatenate(parts)
+                if len(distances):
+                    costs[m, column] = distances.mean()
+                    differences.append(float(times[row] + corrected[c] - t))
+            if differences:
+                lags[column] = np.mean(differences)
+        lag = minimum_cost_lag(lags, costs)
+        if lag is None:
+            notes.append(f"{cameras[c].name}: its clock can't be estimated from the motion")
+        elif abs(lag) > 0.02 * interval:
+            corrected[c] -= lag
+        views_of[k] = [_sampled(v) for v in _views_at(cameras[c], corrected[c], instants)]
+    return corrected
+
+
+def _sampled(surface: PreparedView | None) -> SampledView | None:
+    return None if surface is None else SampledView.of(surface, _MIN_POINTS)
+
+
+def minimum_cost_lag(lags: Float64, costs: Float64) -> float | None:
+    """Return the interpolated lag of minimum cost; None at an end, or if it is not distinct.
+
+    Of lags that are not significantly worse than the best one, as for a periodic motion, the
+    smallest is taken. It is distinct if the lags two images away on both sides are worse. Costs are
+    compared instant by instant, as static surfaces contribute equally to all lags of an instant.
+
+    Parameters
+    ----------
+    lags
+        (L,) s, ascending; NaN if unknown.
+    costs
+        (M, L) at M instants; NaN if unknown.
+    """
+    valid = np.isfinite(lags) & (np.isfinite(costs).sum(0) >= _MIN_INSTANTS)
+    if valid.sum() < 5:
+        return None
+    lags, costs = lags[valid], costs[:, valid]
+    mean = np.nanmean(costs, axis=0)
+    lowest = int(np.argmin(mean))
+    equivalent = [k for k in range(len(lags)) if not _is_positive(costs[:, k] - costs[:, lowest])]
+    best = min(equivalent, key=lambda k: abs(lags[k]))
+    if not 2 <= best < len(lags) - 2:
+        return None
+    if not all(_is_positive(costs[:, best + k] - costs[:, best]) for k in (-2, 2)):
+        return None
+    window = slice(best - 2, best + 3)
+    curvature, slope, _ = np.polyfit(lags[window] - lags[best], mean[window], 2)
+    if curvature <= 0:
+        return None
+    step = float(
+        np.clip(-0.5 * slope / curvature, lags[best - 1] - lags[best], lags[best + 1] - lags[best])
+    )
+    return float(lags[best] + step)
+
+
+def _is_positive(differences: Float64) -> bool:
+    """Whether the mean of differences (M,) is significantly above 0 (Student's t-test)."""
+    d = differences[np.isfinite(differences)]
+    if len(d) < _MIN_INSTANTS:
+        return False
+    standard_error = float(d.std(ddof=1)) / np.sqrt(len(d))
+    return bool(
+        d.mean() > 0 and stdtr(len(d) - 1, -d.mean() / max(standard_error, 1e-12)) < _SIGNIFICANCE
+    )
+
+
+def _views_by_instant(
+    cameras: Sequence[Camera], notes: list[str]
+) -> tuple[Float64, list[list[PreparedView | None]]]:
+    """Return time offsets (K,), and for each camera the views of all instants."""
+    offsets = np.zeros(len(cameras))
+    images = [camera.images(_SAMPLED_FRAMES) for camera in cameras]
+    if all(len(frames) == 1 for frames in images) or not any(map(_is_dynamic, cameras)):
+        averaged = [[camera.surface(_average(camera))] for camera in cameras]
+        return offsets, [list(row) for row in averaged]
+    offsets = _time_offsets(cameras, notes)
+    times = _common_times(cameras, offsets)
+    return offsets, [_views_at(c, o, times) for c, o in zip(cameras, offsets, strict=True)]
+
+
+def _views_at(camera: Camera, offset: float, times: Float64) -> list[PreparedView | None]:
+    """Return the views of a camera at the rig's times; None where it has none."""
+    timestamps = camera.recording.timestamps + offset
+    nearest = np.abs(timestamps[None] - times[:, None]).argmin(1)
+    differences = np.abs(timestamps[nearest] - times)
+    interval = float(np.median(np.diff(timestamps))) if len(timestamps) > 1 else np.inf
+    row: list[PreparedView | None] = []
+    for k, difference in zip(nearest, differences, strict=True):
+        frame = camera.image(int(k)) if difference <= _MAX_INTERVALS * interval else None
+        row.append(None if frame is None else camera.surface(frame))
+    return row
+
+
+def _is_dynamic(camera: Camera) -> bool:
+    """Whether the scene changes by more than noise."""
+    frames = camera.images(_SAMPLED_FRAMES)
+    model = noise_model_for(camera.recording)
+    return any(not change_between(frames[0], f, model).still for f in frames[1:])
+
+
+def _average(camera: Camera) -> RangeFrame:
+    frames = camera.images(_MAX_AVERAGED)
+    if len(frames) == 1:
+        return frames[0]
+    return average_of(frames, noise_model_for(camera.recording))
+
+
+def _common_times(cameras: Sequence[Camera], offsets: Float64) -> Float64:
+    """Return the times of the instants: those of the first camera that all recordings cover."""
+    begin = max(c.recording.timestamps[0] + o for c, o in zip(cameras, offsets, strict=True))
+    end = min(c.recording.timestamps[-1] + o for c, o in zip(cameras, offsets, strict=True))
+    times = cameras[0].recording.timestamps
+    margin = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    common = times[(times >= begin - margin) & (times <= end + margin)]
+    if not len(common):
+        common = times[:1]
+    return evenly_spaced(common, _MAX_INSTANTS)
+
+
+def _time_offsets(cameras: Sequence[Camera], notes: list[str]) -> Float64:
+    """Return the initial (K,) offset to add to each camera's timestamps, s.
+
+    It is 0 if the timestamps overlap; otherwise it is estimated by correlating the fractions of
+    pixels that change over time.
+
+    Raises
+    ------
+    InputError
+        If the offset can't be determined.
+    """
+    offsets = np.zeros(len(cameras))
+    first = cameras[0].recording.timestamps
+    signal = None
+    for k in range(1, len(cameras)):
+        times = cameras[k].recording.timestamps
+        overlap = min(first[-1], times[-1]) - max(first[0], times[0])
+        if overlap > 0.2 * min(np.ptp(first), np.ptp(times)):
+            continue
+        signal = _activity(cameras[0]) if signal is None else signal
+        lag = lag_between(*signal, *_activity(cameras[k]))
+        if lag is None or not lag.certain:
+            raise InputError(
+                f"begins {times[0] - first[0]:+.1f} s after {cameras[0].name} by its clock, when "
+                f"that had ended, and no motion that both see determines the offset of the clocks",
+                where=cameras[k].recording.path,
+                remedy="pass recordings of the same time",
+            )
+        offsets[k] = lag.seconds
+        notes.append(
+            f"the clock of {cameras[k].name} differs by {lag.seconds:.2f} s from that of "
+            f"{cameras[0].name}, by the timing of motion"
+        )
+    return offsets
+
+
+def _activity(camera: Camera) -> tuple[Float64, Float64]:
+    """Return times (N,) and the fraction of pixels that changed since the previous frame."""
+    times, fractions = [], []
+    previous: RangeFrame | None = None
+    for frame in camera.every_image():
+        if previous is not None:
+            valid = previous.valid & frame.valid
+            change = np.abs(frame.z - previous.z)[valid]
+            noise = float(np.median(change)) / MEDIAN_OF_NORMAL if len(change) else 0.0
+            limit = np.maximum(5 * noise, 0.01 * previous.z[valid])
+            times.append(0.5 * (previous.timestamp + frame.timestamp))
+            fractions.append(float((change > limit).mean()) if len(change) else 0.0)
+        previous = frame
+    return np.array(times), np.array(fractions)

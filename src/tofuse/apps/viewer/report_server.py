@@ -1,0 +1,191 @@
+"""The report of a result in the browser, with the images of its recording at full resolution.
+
+Only this machine is answered (see `server`), and only pages read at the start and images of frames
+have addresses: no path of a request reaches the file system.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any, Self
+
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.reading import read_bytes
+from tofuse.engine.frames.recording import Recording
+from tofuse.apps.report.thumbnails import depth_image, depth_limits, encode, grey
+from tofuse.apps.results.folder import component_number, finish_interrupted, is_result
+from tofuse.apps.results.reopening import reopen, stored_recordings
+from tofuse.apps.results.run_json import read_run_json, run_json_checked
+from tofuse.apps.viewer.server import HOST, choose_port, is_same_origin
+
+_FRAME = re.compile(r"/frame/(\d{1,9})\.png", re.ASCII)
+_HTML, _PNG, _PLY = "text/html; charset=utf-8", "image/png", "application/octet-stream"
+
+
+class FrameImages:
+    """The images of a result's frames.
+
+    Parameters
+    ----------
+    recordings
+        Recordings, each with the offset of its frame indices in the result.
+    """
+
+    def __init__(self, recordings: Sequence[tuple[int, Recording]]) -> None:
+        self._places = {
+            first + index: (recording, row)
+            for first, recording in recordings
+            for row, index in enumerate(recording.indices.tolist())
+        }
+        self._lock = Lock()
+
+    @classmethod
+    def of(cls, folder: Path) -> Self:
+        """Open the recordings of a result again.
+
+        Raises
+        ------
+        InputError
+            If one is missing, can't be opened, or has changed.
+        """
+        path = folder / "run.json"
+        run = read_run_json(path)
+        with run_json_checked(path):
+            parts = list(stored_recordings(folder, run))
+        return cls([(part.first, reopen(part, folder)) for part in parts])
+
+    def png(self, index: int) -> bytes | None:
+        """Return the colours of a frame, or else amplitudes or ranges; None without an image."""
+        if index not in self._places:
+            return None
+        recording, row = self._places[index]
+        with self._lock:  # readers serve one thread
+            frame = recording.image(row)
+        if frame is None:
+            return None
+        if frame.color_image is not None:
+            return encode(frame.color_image)
+        if frame.amplitude_image is not None:
+            return encode(grey(frame.amplitude_image))
+        return encode(depth_image(frame, depth_limits(frame), None))
+
+
+def report_pages(folder: Path) -> dict[str, tuple[str, bytes]]:
+    """Read the reports of a result: type and content by address.
+
+    Raises
+    ------
+    InputError
+        If the folder is not a result, or has no report.
+    """
+    if not folder.exists():
+        raise InputError("doesn't exist", where=folder, remedy="pass the --out of `tofuse run`")
+    finish_interrupted(folder)
+    if not folder.is_dir() or not is_result(folder):
+        raise InputError(
+            "is not a result (no run.json)", where=folder, remedy="pass the --out of `tofuse run`"
+        )
+    pages = {"/": (_HTML, read_bytes(folder / "report.html"))}
+    for path in sorted(folder.glob("component-*/report.html")):
+        if component_number(path.parent) is not None:
+            pages[f"/{path.parent.name}/report.html"] = _HTML, read_bytes(path)
+    if (folder / "changes.ply").is_file():
+        pages["/changes.ply"] = _PLY, read_bytes(folder / "changes.ply")
+    return pages
+
+
+class ReportServer(ThreadingHTTPServer):
+    """Serves pages and the images of frames on threads of its own, until it is stopped.
+
+    Parameters
+    ----------
+    pages
+        See `report_pages`.
+    images
+        Images of the frames, which the reports show where they are known; None without them.
+    port
+        None: the first free one from 8080 on.
+
+    Raises
+    ------
+    InputError
+        If the port is in use.
+    """
+
+    daemon_threads = True
+
+    def __init__(
+        self,
+        pages: Mapping[str, tuple[str, bytes]],
+        images: FrameImages | None,
+        port: int | None = None,
+    ) -> None:
+        super().__init__((HOST, choose_port(port)), _Handler)
+        self._pages, self._images = pages, images
+        Thread(target=self.serve_forever, name="tofuse-report", daemon=True).start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    @property
+    def address(self) -> str:
+        """The address of the report."""
+        return f"http://{HOST}:{self.server_port}"
+
+    def stop(self) -> None:
+        """Stop serving."""
+        self.shutdown()
+        self.server_close()
+
+    def content(self, path: str) -> tuple[str, bytes] | None:
+        """Return type and content at the path of a request; None if there is nothing."""
+        if path in self._pages:
+            kind, body = self._pages[path]
+            if self._images is not None and kind == _HTML:
+                body = body.replace(b"<html", b'<html data-frames="/frame/"', 1)
+            return kind, body
+        frame = _FRAME.fullmatch(path)
+        image = self._images and frame and self._images.png(int(frame[1]))
+        return (_PNG, image) if image else None
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore browsers that close a connection early."""
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
+            super().handle_error(request, client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: ReportServer
+    server_version, sys_version = "tofuse", ""
+    timeout = 30
+
+    def do_GET(self) -> None:
+        if not is_same_origin(*(self.headers.get_all(name, []) for name in ("Host", "Origin"))):
+            self._answer(403, "text/plain", b"not from this machine\n")
+            return
+        found = self.server.content(self.path)
+        if found is None:
+            self._answer(404, "text/plain", b"not found\n")
+        else:
+            self._answer(200, *found)
+
+    def _answer(self, status: int, kind: str, body: bytes) -> None:
+        self.send_response(status)
+        for name, value in (
+            ("Content-Type", kind),
+            ("Content-Length", str(len(body))),
+            ("Cache-Control", "no-store"),
+            ("X-Content-Type-Options", "nosniff"),
+            ("Referrer-Policy", "no-referrer"),
+        ):
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing."""

@@ -1,0 +1,180 @@
+"""The server of the live view, reachable from this machine only.
+
+It answers only requests whose Host and Origin are names of this machine, which excludes pages of
+other sites whose name resolves to this machine (DNS rebinding).
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import logging
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
+from typing import TYPE_CHECKING, Any
+
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.reading import required_package
+from tofuse.apps.report.policy import script_hashes
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+HOST, PORT = "127.0.0.1", 8080
+# The script in the page of viser 1.1.1 unpacks another script.
+_UNPACKED = {
+    "'sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw='": (
+        "'sha256-o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE='"
+    )
+}
+_NAMES = ("127.0.0.1", "localhost")  # of this machine, in a browser on it
+_MAX_PORTS = 100  # that are tried if none is given
+
+
+def serve(port: int | None = None) -> ViserServer:
+    """Start the server, which runs on its own threads until it is stopped.
+
+    Parameters
+    ----------
+    port
+        None: the first free one from 8080 on.
+
+    Raises
+    ------
+    InputError
+        If viser is not installed, or the port is in use.
+    """
+    viser = required_package("viser", "viewer", "the viewer")
+    chosen = choose_port(port)
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)
+    # Standard output is for results.
+    with redirect_stdout(io.StringIO()), _guarded() as guards:
+        server = viser.ViserServer(host=HOST, port=chosen, label="tofuse", verbose=False)
+    if not guards:
+        stop(server)
+        raise InputError(
+            f"can't be secured with viser {viser.__version__}",
+            where="the viewer",
+            remedy="pip install 'viser==1.1.1'",
+        )
+    server.gui.configure_theme(
+        control_width="medium",
+        dark_mode=True,
+        show_logo=False,
+        show_share_button=False,
+    )
+    return server
+
+
+@contextmanager
+def _guarded() -> Iterator[list[int]]:
+    """Check each request to a server that is created in the block.
+
+    viser has no hook for that, so its call of the websockets library is wrapped. Yields a list that
+    is not empty once that has happened.
+    """
+    import websockets.asyncio.server as library
+    from websockets.datastructures import Headers
+    from websockets.http11 import Request, Response
+
+    guards: list[int] = []
+    original = library.serve
+
+    def serve_guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def process(connection: Any, request: Request) -> Response | None:
+            host, origin = request.headers.get_all("Host"), request.headers.get_all("Origin")
+            if not is_same_origin(host, origin):
+                return Response(403, "Forbidden", Headers(), b"not from this machine\n")
+            response: Response | None = None
+            if process_request is not None:
+                response = process_request(connection, request)
+            if response is not None:
+                for name, value in page_headers(response.headers, bytes(response.body)).items():
+                    response.headers[name] = value
+            return response
+
+        guards.append(1)
+        return original(*arguments, process_request=process, **options)
+
+    library.serve = serve_guarded  # type: ignore[misc,assignment]
+    try:
+        yield guards
+    finally:
+        library.serve = original  # type: ignore[misc]
+
+
+def is_same_origin(hosts: Sequence[str], origins: Sequence[str]) -> bool:
+    """Whether a request addresses this machine, and comes from this server's page or no page.
+
+    Parameters
+    ----------
+    hosts, origins
+        Values of the headers of those names.
+    """
+    if len(hosts) != 1 or len(origins) > 1:
+        return False
+    name, _, port = hosts[0].lower().partition(":")
+    if name not in _NAMES or not ((port.isascii() and port.isdecimal()) or not port):
+        return False
+    return all(o.lower() in (f"http://{hosts[0].lower()}",) for o in origins)
+
+
+def page_headers(headers: Mapping[str, str], body: bytes) -> dict[str, str]:
+    """Return the headers of a response that keep its page from running foreign scripts."""
+    secure_headers = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
+    if not headers.get("Content-Type", "").startswith("text/html"):
+        return secure_headers
+    if headers.get("Content-Encoding") == "gzip":
+        body = gzip.decompress(body)
+    hashes = script_hashes(body.decode("utf-8", "replace"))
+    unpacked = [_UNPACKED[outer] for outer in hashes if outer in _UNPACKED]
+    # The hash of the script that other versions unpack is not known.
+    scripts = " ".join([*hashes, *unpacked]) if unpacked else "'unsafe-inline'"
+    policy = (
+        f"default-src 'self'; script-src 'self' blob: 'unsafe-eval' {scripts}; "
+        "worker-src 'self' blob:; style-src 'self' 'unsafe-inline'; "
+        "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob:; "
+        "object-src 'none'; base-uri 'none'; form-action 'none'; "
+        "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # notebooks
+    )
+    return {**secure_headers, "Content-Security-Policy": policy}
+
+
+def stop(server: ViserServer) -> None:
+    """Stop the server."""
+    with redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def address(server: ViserServer) -> str:
+    """Return the address of the page."""
+    return f"http://{HOST}:{server.get_port()}"
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except (OSError, OverflowError):
+            return False
+    return True
+
+
+def choose_port(port: int | None) -> int:
+    """Return a port if it is free, or for None the first free one from 8080 on.
+
+    Raises
+    ------
+    InputError
+        If it is in use.
+    """
+    if port is None:
+        free = next((p for p in range(PORT, PORT + _MAX_PORTS) if _is_free(p)), None)
+        if free is None:
+            raise InputError(f"no port from {PORT} on is free", where="--port", remedy="use it")
+        return free
+    if not _is_free(port):
+        raise InputError("is in use", where=f"--port {port}", remedy="use another, or none")
+    return port

@@ -1,1 +1,0 @@
-"""Many recordings as separate, resumable jobs: on this machine, or on a Dask cluster."""

@@ -1,1 +1,0 @@
-"""Calibration of a camera from its own recordings: lens, range errors, noise."""

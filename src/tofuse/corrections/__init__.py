@@ -1,1 +1,0 @@
-"""Corrections: each removes one systematic error from a view before it is filtered."""

@@ -1,0 +1,291 @@
+"""Gauss-Newton iterations of an alignment: from summed normal equations to a converged pose."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.views import residual_kernels as sums
+from tofuse.engine.views.residual_kernels import Residuals, TargetImage, accumulate, bin_edge, normal_equations
+from tofuse.engine.compute.jit import kernel
+from tofuse.engine.geometry.rigid_motion_kernels import compose, retract, twist_between
+from tofuse.engine.alignment.spurious_information_kernels import spurious_information
+
+# Number of points from which the spurious information is estimated.
+SAMPLE_SIZE = 500
+# Nuisance parameters that are also estimated: log albedo of the targets minus that of the source,
+# scale of the sigmas of distances, and sigma of the log albedo (0 leaves it out).
+EXPOSURE, SCALE_G, SCALE_P = 0, 1, 2
+
+
+class LevelSettings(NamedTuple):
+    """Settings of one pyramid level of an alignment.
+
+    Attributes
+    ----------
+    iterations
+        Maximum number of iterations.
+    tolerance
+        Iterations stop when the step is smaller than this, in `units`.
+    max_scale
+        Upper limit of the scale of the sigmas.
+    inflation, albedo_inflation
+        Noise inflation of distances, m, and of the log albedo.
+    robust, min_cosine
+        As in `Residuals`.
+    remap
+        Whether degenerate directions stay at the prediction (solution remapping, Zhang et al.
+        2016).
+    tilt, slope
+        As in `spurious_information`.
+    max_sigma
+        As in `degenerate_directions`.
+    prior, units
+        As in `solve_step`.
+    """
+
+    iterations: int
+    tolerance: float
+    max_scale: float
+    inflation: float
+    albedo_inflation: float
+    robust: float
+    min_cosine: float
+    remap: bool
+    tilt: float
+    slope: float
+    max_sigma: float
+    prior: Float64
+    units: Float64
+
+
+@kernel
+def iterate_level(
+    points: Float32,
+    targets: tuple[TargetImage, ...],
+    T_targets: Float64,
+    T: Float64,
+    T_predicted: Float64,
+    estimates: Float64,
+    settings: LevelSettings,
+) -> tuple[Float64, Float64, Float64, float, int]:
+    """Iterate one pyramid level of an alignment until it converges.
+
+    Parameters
+    ----------
+    points, targets
+        Source points as in `accumulate`, and n targets.
+    T_targets
+        (n, 4, 4) T_target_world of each target.
+    T, estimates
+        (4, 4) T_world_source and (3,) nuisance parameters, both updated in place.
+    T_predicted
+        As in `solve_step`.
+    settings
+        Of the level.
+
+    Returns
+    -------
+    The last sums (SIZE,), the spurious information (6, 6), the degenerate directions (k, 6), the
+    size of the last step in `units`, and the number of iterations. If sums or step are not finite,
+    the returned sums are 0, all directions are degenerate, and T keeps its last value.
+    """
+    inflation, prior, units = settings.inflation, settings.prior, settings.units
+    total = np.zeros(sums.SIZE)
+    degenerate = np.zeros((0, 6))
+    spurious = np.zeros((6, 6))
+    step_size = np.inf
+    iterations = 0
+    while iterations < settings.iterations and step_size >= settings.tolerance:
+        total[:] = 0.0
+        residuals = Residuals(
+            estimates[EXPOSURE],
+            estimates[SCALE_G],
+            estimates[SCALE_P],
+            inflation,
+            settings.robust,
+            settings.min_cosine,
+        )
+        for k in range(len(targets)):
+            total += accumulate(points, targets[k], compose(T_targets[k], T), residuals)
+        if settings.remap and iterations == 0:
+            spurious = total[sums.INLIERS] * spurious_information(
+                points,
+                max(1, len(points) // SAMPLE_SIZE),
+                estimates[SCALE_G],
+                inflation,
+                estimates[SCALE_P] ** 2,
+                settings.tilt,
+                settings.slope,
+            )
+        finite = np.isfinite(total.sum() + spurious.sum())
+        if finite:
+            if settings.remap:
+                cross = cross_information(total) - spurious
+                degenerate = degenerate_directions(cross, units, settings.max_sigma)
+            T_updated, step = solve_step(total, T, T_predicted, degenerate, prior, units)
+            finite = np.isfinite(step.sum())
+        if not finite:  # planes fitted to mere noise can have unbounded coefficients
+            return np.zeros(sums.SIZE), np.zeros((6, 6)), np.eye(6), np.inf, iterations
+        T[:] = T_updated
+        iterations += 1
+        step_size = 0.0
+        for p in range(6):
+            step_size = max(step_size, abs(step[p] / units[p]))
+        if estimates[SCALE_P] > 0:
+            estimates[EXPOSURE] += step[6]
+        _rescale(total, estimates, settings.max_scale, settings.albedo_inflation)
+    return total, spurious, degenerate, step_size, iterations
+
+
+@kernel
+def _rescale(total: Float64, estimates: Float64, max_scale: float, albedo_inflation: float) -> None:
+    """Estimate the sigmas from the residuals, which include both views' noise and bias."""
+    scale = scale_of_distances(total[sums.HISTOGRAM :])
+    if not np.isnan(scale):
+        estimates[SCALE_G] = min(max(scale, 0.7), max_scale)
+    if estimates[SCALE_P] > 0 and total[sums.WEIGHT_P] > 0:
+        variance = total[sums.SQUARES_P] / total[sums.WEIGHT_P] / 0.72
+        estimates[SCALE_P] = min(max(np.sqrt(variance + albedo_inflation**2), 0.005), 0.5)
+
+
+@kernel
+def _without_exposure(A: Float64) -> Float64:
+    """Marginalise the seventh unknown, the exposure: (6, 6)."""
+    out = np.empty((6, 6))
+    for p in range(6):
+        for o in range(6):
+            marginalised = A[p, 6] * A[6, o] / A[6, 6] if A[6, 6] > 0 else 0.0
+            out[p, o] = A[p, o] - marginalised
+    return out
+
+
+@kernel
+def information(total: Float64) -> Float64:
+    """Return the information (6, 6) of the pose, from the sums of `accumulate`."""
+    return _without_exposure(normal_equations(total)[0])
+
+
+@kernel
+def cross_information(total: Float64) -> Float64:
+    """Return the symmetrised product (6, 6) of the target's and source's pose Jacobians."""
+    return _without_exposure(normal_equations(total)[2])
+
+
+@kernel
+def degenerate_directions(cross: Float64, units: Float64, max_sigma: float) -> Float64:
+    """Return the unit directions (k, 6), in `units` (6,), whose sigma exceeds `max_sigma`."""
+    scaled = np.empty((6, 6))
+    for p in range(6):
+        for o in range(6):
+            scaled[p, o] = cross[p, o] * units[p] * units[o]
+    values, vectors = np.linalg.eigh(scaled)
+    count = 0
+    while count < 6 and values[count] < 1 / (max_sigma * max_sigma):
+        count += 1
+    out = np.empty((count, 6))
+    for k in range(count):
+        for p in range(6):
+            out[k, p] = vectors[p, k]
+    return out
+
+
+@kernel
+def solve_step(
+    total: Float64,
+    T: Float64,
+    T_predicted: Float64,
+    degenerate: Float64,
+    prior: Float64,
+    units: Float64,
+) -> tuple[Float64, Float64]:
+    """Solve the normal equations and apply the update.
+
+    Parameters
+    ----------
+    total
+        (SIZE,) sums of `accumulate`.
+    T, T_predicted
+        (4, 4) current and predicted pose of the source.
+    degenerate
+        (k, 6) unit directions, in `units`, in which the pose stays at the prediction.
+    prior
+        (6,) sigma of the prediction, m and rad.
+    units
+        (6,) scale of each component, in which directions are compared.
+
+    Returns
+    -------
+    The updated pose (4, 4) and the step (7,), whose last element is the exposure's.
+    """
+    A, g, _ = normal_equations(total)
+    deviation = twist_between(T_predicted, T)
+    for p in range(6):
+        deviation[p] /= units[p]
+        g[p] *= units[p]
+        for o in range(7):
+            A[p, o] *= units[p]
+            A[o, p] *= units[p]
+    for p in range(6):
+        weight = (units[p] / prior[p]) ** 2
+        A[p, p] += weight
+        g[p] += weight * deviation[p]
+    if degenerate.shape[0]:
+        # Degenerate directions get a stiff prior, much stronger than the information of noise.
+        trace = 0.0
+        for p in range(6):
+            trace += A[p, p]
+        stiffness = 1e3 * max(trace, 1.0)
+        for k in range(degenerate.shape[0]):
+            along = 0.0
+            for p in range(6):
+                along += degenerate[k, p] * deviation[p]
+            for p in range(6):
+                g[p] += stiffness * along * degenerate[k, p]
+                for o in range(6):
+                    A[p, o] += stiffness * degenerate[k, p] * degenerate[k, o]
+    _solve(A, g)
+    for p in range(7):
+        g[p] *= -units[p] if p < 6 else -1.0
+    return retract(T, g), g
+
+
+@kernel
+def _solve(A: Float64, b: Float64) -> None:
+    """Solve A x = b in place for a symmetric positive definite A, by Cholesky decomposition."""
+    n = len(b)
+    for p in range(n):
+        for o in range(p + 1):
+            total = A[p, o]
+            for k in range(o):
+                total -= A[p, k] * A[o, k]
+            A[p, o] = total / A[o, o] if o < p else np.sqrt(total)
+        for k in range(p):
+            b[p] -= A[p, k] * b[k]
+        b[p] /= A[p, p]
+    for p in range(n - 1, -1, -1):
+        for k in range(p + 1, n):
+            b[p] -= A[k, p] * b[k]
+        b[p] /= A[p, p]
+
+
+@kernel
+def scale_of_distances(histogram: Float64) -> float:
+    """Return the ratio of observed to stated sigma of all compared distances; NaN without any.
+
+    It is 1.48 times the median absolute distance. Outliers are included, as a scale estimated from
+    inliers only would confirm itself.
+    """
+    count = 0.0
+    for k in range(sums.BINS):
+        count += histogram[k]
+    cumulative = 0.0
+    for k in range(sums.BINS):
+        in_bin = histogram[k]
+        if in_bin > 0 and 2 * (cumulative + in_bin) >= count:
+            low, high = bin_edge(k), bin_edge(k + 1)
+            return 1.48 * np.sqrt(low + (high - low) * (0.5 * count - cumulative) / in_bin)
+        cumulative += in_bin
+    return np.nan

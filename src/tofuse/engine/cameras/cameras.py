@@ -1,0 +1,429 @@
+"""Camera models: the ray of each pixel, and the projection of points.
+
+Camera axes are x right, y down, z forward; pixel centres lie at integer coordinates. A camera
+offers `rays()`, the (H, W, 2) table of x/z and y/z, and `project()`. Everything else, such as
+range to x, y, z (eqs 2.3 to 2.5), follows from the rays and is the same for every lens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.engine.arrays import Bool, Float32, Float64
+from tofuse.engine.errors import InputError
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """The interface of all camera models."""
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        ...
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        ...
+
+    def rays(self) -> Float32:
+        """Return the (H, W, 2) table of x/z and y/z of every pixel; NaN where undefined."""
+        ...
+
+    def project(self, points: ArrayLike) -> Float64:
+        """Return pixel coordinates (..., 2) = (u, v) of points (..., 3) in m; NaN if z <= 0."""
+        ...
+
+
+def ray_lengths(camera: Camera) -> Float32:
+    """Return the length (H, W) of the rays (x/z, y/z, 1): radial range over z depth (eq 2.3)."""
+    return _derived(camera)[0]
+
+
+def unknown_rays(camera: Camera) -> Bool | None:
+    """Return the mask (H, W) of pixels whose ray is unknown; None if there are none."""
+    return _derived(camera)[1]
+
+
+# Cache by camera, as these are needed for every frame.
+_cache: WeakKeyDictionary[Camera, tuple[Float32, Bool | None]] = WeakKeyDictionary()
+
+
+def _derived(camera: Camera) -> tuple[Float32, Bool | None]:
+    derived = _cache.get(camera)
+    if derived is None:
+        rays = camera.rays()
+        unknown: Bool = np.isnan(rays.sum(-1))
+        lengths = _frozen(np.sqrt(1 + (rays * rays).sum(-1)))
+        derived = (lengths, unknown if unknown.any() else None)
+        _cache[camera] = derived
+    return derived
+
+
+def z_from_range(camera: Camera, radial_range: ArrayLike) -> Float32:
+    """Convert radial range (H, W) to z depth (H, W), in m (eq 2.3); 0 stays 0."""
+    return _nan_to_zero(np.asarray(radial_range, np.float32) / ray_lengths(camera))
+
+
+def range_from_z(camera: Camera, z: ArrayLike) -> Float32:
+    """Convert z depth (H, W) to radial range (H, W), in m; 0 stays 0."""
+    return _nan_to_zero(np.asarray(z, np.float32) * ray_lengths(camera))
+
+
+def points_from_z(camera: Camera, z: ArrayLike) -> Float32:
+    """Convert z depth (H, W) to points (H, W, 3), in m (eqs 2.4, 2.5); the origin where invalid."""
+    z = np.asarray(z, np.float32)
+    out = np.empty((*z.shape, 3), np.float32)
+    out[..., :2] = camera.rays() * z[..., None]
+    out[..., 2] = z
+    return _nan_to_zero(out)
+
+
+def _nan_to_zero(a: Float32) -> Float32:
+    return np.where(np.isfinite(a), a, np.float32(0))
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """Pinhole camera (eq 2.1): u = fx x/z + cx, v = fy y/z + cy.
+
+    Attributes
+    ----------
+    width, height
+        Size of the image, pixels.
+    fx, fy
+        Focal lengths, pixels.
+    cx, cy
+        Principal point, pixels; (0, 0) is the centre of the first pixel.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    model = "pinhole"
+
+    def __post_init__(self) -> None:
+        check_intrinsics(self)
+
+    def rays(self) -> Float32:
+        """See `Camera.rays`."""
+        return self._rays
+
+    @cached_property
+    def _rays(self) -> Float32:
+        return _frozen(self._undistort(_pixel_grid(self)).astype(np.float32))
+
+    def project(self, points: ArrayLike) -> Float64:
+        """Project points (..., 3) in m; see `Camera.project`."""
+        points = np.asarray(points, float)
+        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+        distorted = self._distort(points[..., :2] / z[..., None])
+        return distorted * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def _distort(self, xy: Float64) -> Float64:
+        return xy
+
+    def _undistort(self, xy: Float64) -> Float64:
+        """Invert `_distort` by Newton's method with a numeric Jacobian; NaN where it fails."""
+        if type(self) is Pinhole:
+            return xy
+        shape = xy.shape
+        xy = xy.reshape(-1, 2)
+        out = xy.copy()
+        # Indices that have not converged; beyond a fold of the distortion, some never do.
+        active = np.arange(len(xy))
+        step = 1e-6
+        for _ in range(30):
+            guess = out[active]
+            error = self._distort(guess) - xy[active]
+            columns = [
+                (self._distort(guess + d) - self._distort(guess - d)) / (2 * step)
+                for d in np.eye(2) * step
+            ]
+            (a, c), (b, d) = (np.moveaxis(k, -1, 0) for k in columns)
+            determinant = a * d - b * c
+            with np.errstate(all="ignore"):
+                move = (
+                    np.stack(
+                        [
+                            d * error[..., 0] - b * error[..., 1],
+                            a * error[..., 1] - c * error[..., 0],
+                        ],
+                        -1,
+                    )
+                    / determinant[..., None]
+                )
+            out[active] = guess - np.clip(move, -0.5, 0.5)
+            active = active[np.abs(move).max(-1) >= 1e-12]
+            if len(active) == 0:
+                break
+        bad = ~(np.abs(self._distort(out) - xy).max(-1) < 1e-7)
+        out[bad] = np.nan
+        return out.reshape(shape)
+
+
+@dataclass(frozen=True)
+class BrownConrady(Pinhole):
+    """Pinhole with radial k1, k2, k3 and tangential p1, p2 distortion (Brown 1966, OpenCV)."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    model = "brown"
+
+    def _distort(self, xy: Float64) -> Float64:
+        r2 = (xy * xy).sum(-1)
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        return xy * radial[..., None] + _tangential(xy, r2, self.p1, self.p2)
+
+
+@dataclass(frozen=True)
+class Rational(BrownConrady):
+    """Brown-Conrady over a denominator with k4, k5, k6 (OpenCV's rational model, Azure Kinect)."""
+
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+
+    model = "rational"
+
+    def _distort(self, xy: Float64) -> Float64:
+        r2 = (xy * xy).sum(-1)
+        above = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        below = 1 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
+        return xy * (above / below)[..., None] + _tangential(xy, r2, self.p1, self.p2)
+
+
+@dataclass(frozen=True)
+class Fisheye(Pinhole):
+    """Equidistant lens with k1, k2, k3, k4 on the angle (Kannala and Brandt 2006, OpenCV)."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+    model = "fisheye"
+
+    def _distort(self, xy: Float64) -> Float64:
+        r = np.sqrt((xy * xy).sum(-1))
+        theta = np.arctan(r)
+        t2 = theta * theta
+        distorted = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+        return xy * np.where(r > 1e-9, distorted / np.where(r > 1e-9, r, 1), 1.0)[..., None]
+
+    def _undistort(self, xy: Float64) -> Float64:
+        # Solve for the angle, which has no pole, rather than for its tangent.
+        distorted = np.sqrt((xy * xy).sum(-1))
+        theta = np.minimum(distorted, 1.5)
+        for _ in range(50):
+            t2 = theta * theta
+            estimate = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+            slope = 1 + t2 * (
+                3 * self.k1 + t2 * (5 * self.k2 + t2 * (7 * self.k3 + t2 * 9 * self.k4))
+            )
+            with np.errstate(all="ignore"):
+                theta = theta - np.clip((estimate - distorted) / slope, -0.3, 0.3)
+        t2 = theta * theta
+        estimate = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+        converged = (
+            (np.abs(estimate - distorted) < 1e-7) & (theta >= 0) & (theta < np.pi / 2 - 1e-3)
+        )
+        scale = np.where(
+            distorted > 1e-9, np.tan(theta) / np.where(distorted > 1e-9, distorted, 1), 1.0
+        )
+        return np.where(converged[..., None], xy * scale[..., None], np.nan)
+
+
+def _is_mirrored(table: NDArray[np.generic]) -> bool:
+    """Whether rays (H, W, 2) are mirrored, by the sign of their Jacobian."""
+    rays = np.asarray(table, float)
+    by_u = rays[:-1, 1:] - rays[:-1, :-1]
+    by_v = rays[1:, :-1] - rays[:-1, :-1]
+    area = by_u[..., 0] * by_v[..., 1] - by_u[..., 1] * by_v[..., 0]
+    return bool(np.count_nonzero(area < 0) > np.count_nonzero(area > 0))
+
+
+@dataclass(frozen=True)
+class RayTable:
+    """A camera known only by its table of rays, (H, W, 2) x/z and y/z, NaN where unknown.
+
+    Projection iterates from a pinhole fit by Newton's method.
+    """
+
+    table: Float32 = field(repr=False)
+
+    model = "rays"
+
+    def __post_init__(self) -> None:
+        table = np.asarray(self.table)
+        if table.ndim != 3 or table.shape[2] != 2 or min(table.shape[:2]) < 2:
+            raise InputError(f"has shape {table.shape}", where="rays", remedy="pass (H, W, 2)")
+        if np.isfinite(table).all(-1).sum() < 16:
+            raise InputError("contains no finite rays", where="rays")
+        if _is_mirrored(table):
+            raise InputError(
+                "mirror the image: either x/z or y/z runs against the pixels",
+                where="rays",
+                remedy="negate one of the two: x is right and y is down, or both the other way",
+            )
+        object.__setattr__(self, "table", _frozen(np.array(table, np.float32)))
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return int(self.table.shape[1])
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int(self.table.shape[0])
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (
+            isinstance(other, RayTable) and np.array_equal(self.table, other.table, equal_nan=True)
+        )
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        # Equal tables must have equal hashes: -0 equals 0, and all NaN count as equal.
+        return hash((self.table.shape, np.nan_to_num(self.table + np.float32(0)).tobytes()))
+
+    def rays(self) -> Float32:
+        """See `Camera.rays`."""
+        return self.table
+
+    @cached_property
+    def fit(self) -> Pinhole:
+        """Pinhole camera fitted to the table by least squares on pixel positions."""
+        v, u = np.mgrid[0 : self.height, 0 : self.width]
+        ok = np.isfinite(self.table).all(-1)
+        x, y = self.table[ok].astype(float).T
+        fx, cx = np.linalg.lstsq(
+            np.stack([x, np.ones_like(x)], 1), u[ok].astype(float), rcond=None
+        )[0]
+        fy, cy = np.linalg.lstsq(
+            np.stack([y, np.ones_like(y)], 1), v[ok].astype(float), rcond=None
+        )[0]
+        return Pinhole(self.width, self.height, float(fx), float(fy), float(cx), float(cy))
+
+    @cached_property
+    def _filled(self) -> Float64:
+        """Return the table in float64, with holes filled by the pinhole fit."""
+        return np.where(np.isfinite(self.table), self.table, self.fit.rays()).astype(float)
+
+    def project(self, points: ArrayLike) -> Float64:
+        """Project points by Newton's method on the interpolated table; see `Camera.project`."""
+        points = np.asarray(points, float)
+        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+        target = points[..., :2] / z[..., None]
+        uv = self.fit.project(points)
+        limits = np.array([self.width - 1.0, self.height - 1.0])
+        with np.errstate(all="ignore"):  # diverges for points that the camera does not see
+            for _ in range(8):
+                base = np.clip(np.nan_to_num(np.floor(uv)), 0, limits - 1).astype(np.intp)
+                i, j = base[..., 1], base[..., 0]
+                f = uv - base
+                r00, r10 = self._filled[i, j], self._filled[i, j + 1]
+                r01, r11 = self._filled[i + 1, j], self._filled[i + 1, j + 1]
+                fu, fv = f[..., :1], f[..., 1:]
+                along_u = (r10 - r00) * (1 - fv) + (r11 - r01) * fv
+                along_v = (r01 - r00) * (1 - fu) + (r11 - r10) * fu
+                error = (
+                    r00
+                    + (r10 - r00) * fu
+                    + (r01 - r00) * fv
+                    + (r00 - r10 - r01 + r11) * fu * fv
+                    - target
+                )
+                det = along_u[..., 0] * along_v[..., 1] - along_u[..., 1] * along_v[..., 0]
+                du = (along_v[..., 1] * error[..., 0] - along_v[..., 0] * error[..., 1]) / det
+                dv = (along_u[..., 0] * error[..., 1] - along_u[..., 1] * error[..., 0]) / det
+                uv = uv - np.stack([du, dv], -1)
+        return uv
+
+
+MODELS: dict[str, type[Pinhole]] = {
+    "pinhole": Pinhole,
+    "brown": BrownConrady,
+    "rational": Rational,
+    "fisheye": Fisheye,
+}
+
+# Order of camera.json's "distortion" list, for each model.
+DISTORTION_ORDER = {
+    "pinhole": (),
+    "brown": ("k1", "k2", "p1", "p2", "k3"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+
+
+def check_intrinsics(camera: Pinhole) -> None:
+    """Raise InputError if a parameter of the camera is not finite or implausible."""
+    for f in fields(camera):
+        value = getattr(camera, f.name)
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+            raise InputError(f"is {value!r}", where=f"camera {f.name}", remedy="use a number")
+        if not np.isfinite(value):
+            raise InputError(f"is {value}", where=f"camera {f.name}", remedy="use a finite number")
+    if not (2 <= camera.width <= 16384 and 2 <= camera.height <= 16384):
+        raise InputError(
+            f"is {camera.width} x {camera.height}",
+            where="camera width x height",
+            remedy="set the image size in pixels",
+        )
+    if camera.fx <= 0 or camera.fy <= 0:
+        raise InputError(
+            f"is {camera.fx}, {camera.fy}",
+            where="camera fx, fy",
+            remedy="use positive focal lengths in pixels",
+        )
+
+
+def scaled(camera: Pinhole, width: int, height: int) -> Pinhole:
+    """Return the same lens at another resolution (pixel centres at integer coordinates)."""
+    sx, sy = width / camera.width, height / camera.height
+    changes: dict[str, Any] = {
+        "width": width,
+        "height": height,
+        "fx": camera.fx * sx,
+        "fy": camera.fy * sy,
+        "cx": (camera.cx + 0.5) * sx - 0.5,
+        "cy": (camera.cy + 0.5) * sy - 0.5,
+    }
+    return replace(camera, **changes)
+
+
+def _pixel_grid(camera: Pinhole) -> Float64:
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(float)
+    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1)
+
+
+def _tangential(xy: Float64, r2: Float64, p1: float, p2: float) -> Float64:
+    x, y = xy[..., 0], xy[..., 1]
+    return np.stack(
+        [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1
+    )
+
+
+def _frozen(a: Float32) -> Float32:
+    a.flags.writeable = False
+    return a

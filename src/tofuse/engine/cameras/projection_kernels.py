@@ -1,0 +1,118 @@
+"""Projection of a point into a view, and the Jacobian of a point under a perturbation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.compute.jit import kernel
+
+MIN_DEPTH = 0.02  # m; points nearer to a camera are not projected
+
+
+@kernel
+def project_ray(
+    x: float, y: float, lookup: Float32, lookup_frame: Float64
+) -> tuple[float, float, int, int]:
+    """Return the pixel (u, v) of a ray, interpolated in a lookup table, and its lookup cell.
+
+    Parameters
+    ----------
+    x, y
+        Ray coordinates x/z and y/z.
+    lookup
+        (A, B, 2) pixel (u, v) of each node of a regular grid over ray coordinates.
+    lookup_frame
+        (4,) origin and inverse spacing of the grid: x0, y0, 1/dx, 1/dy.
+
+    Returns
+    -------
+    u, v, and column and row of the lookup cell: -1 for rays outside the grid.
+    """
+    fu = (x - lookup_frame[0]) * lookup_frame[2]
+    fv = (y - lookup_frame[1]) * lookup_frame[3]
+    if not (fu >= 0 and fv >= 0 and fu < lookup.shape[1] - 1 and fv < lookup.shape[0] - 1):
+        return 0.0, 0.0, -1, -1
+    i = int(fu)
+    j = int(fv)
+    au = fu - i
+    av = fv - j
+    u = (1 - av) * ((1 - au) * lookup[j, i, 0] + au * lookup[j, i + 1, 0]) + av * (
+        (1 - au) * lookup[j + 1, i, 0] + au * lookup[j + 1, i + 1, 0]
+    )
+    v = (1 - av) * ((1 - au) * lookup[j, i, 1] + au * lookup[j, i + 1, 1]) + av * (
+        (1 - au) * lookup[j + 1, i, 1] + au * lookup[j + 1, i + 1, 1]
+    )
+    return u, v, i, j
+
+
+@kernel
+def in_image(u: float, v: float, cell: int, rows: int, columns: int) -> bool:
+    """Whether the result of `project_ray` lies in an image of `rows` x `columns`."""
+    return cell >= 0 and u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5
+
+
+@kernel
+def nearest_pixel(
+    x: float, y: float, lookup: Float32, lookup_frame: Float64, rows: int, columns: int
+) -> tuple[int, int]:
+    """Return row and column of the pixel that a ray is nearest to; -1 outside the image."""
+    u, v, cell, _ = project_ray(x, y, lookup, lookup_frame)
+    if not in_image(u, v, cell, rows, columns):
+        return -1, -1
+    return int(v + 0.5), int(u + 0.5)
+
+
+@kernel
+def project_rays(
+    x: Float32, y: Float32, lookup: Float32, lookup_frame: Float64, u: Float64, v: Float64
+) -> None:
+    """Project N rays like `project_ray`, in branch-free loops, so that they are vectorised.
+
+    Parameters
+    ----------
+    x, y
+        (N,) ray coordinates.
+    lookup, lookup_frame
+        As for `project_ray`.
+    u, v
+        (N,), are overwritten by the pixels, NaN for rays outside the grid.
+    """
+    table = lookup.reshape(-1)
+    cell = np.empty(len(x), np.int32)
+    last_u, last_v = np.float64(lookup.shape[1] - 1), np.float64(lookup.shape[0] - 1)
+    row = np.int32(2 * lookup.shape[1])
+    for k in range(len(x)):
+        fu = (np.float64(x[k]) - lookup_frame[0]) * lookup_frame[2]
+        fv = (np.float64(y[k]) - lookup_frame[1]) * lookup_frame[3]
+        inside = (fu >= 0) & (fv >= 0) & (fu < last_u) & (fv < last_v)
+        fu = fu if inside else 0.0
+        fv = fv if inside else 0.0
+        i, j = np.int32(fu), np.int32(fv)
+        cell[k] = j * row + 2 * i
+        u[k] = fu - i if inside else np.nan
+        v[k] = fv - j
+    for k in range(len(x)):
+        a = np.uint64(cell[k])
+        b = a + np.uint64(row)
+        au, av = u[k], v[k]
+        u[k] = (1 - av) * ((1 - au) * table[a] + au * table[a + np.uint64(2)]) + av * (
+            (1 - au) * table[b] + au * table[b + np.uint64(2)]
+        )
+        a, b = a + np.uint64(1), b + np.uint64(1)
+        v[k] = (1 - av) * ((1 - au) * table[a] + au * table[a + np.uint64(2)]) + av * (
+            (1 - au) * table[b] + au * table[b + np.uint64(2)]
+        )
+
+
+@kernel
+def jacobian_row(
+    J: Float64, m0: float, m1: float, m2: float, px: float, py: float, pz: float
+) -> None:
+    """Write (m, p x m), the derivative of m . p under a right perturbation, to J[:6]."""
+    J[0] = m0
+    J[1] = m1
+    J[2] = m2
+    J[3] = py * m2 - pz * m1
+    J[4] = pz * m0 - px * m2
+    J[5] = px * m1 - py * m0

@@ -1,0 +1,365 @@
+"""Global registration of two clouds, with a probability of being right.
+
+The clouds are first aligned from the guess. If their agreement makes that pose practically
+certain, it is returned. Else poses are proposed by feature matching (`registration.fpfh`); each is
+aligned and evaluated by the agreement of both clouds (`registration.cloud_agreement`) and by its
+lead over rival poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.geometry import se3
+from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.search.pair_agreement import Agreement
+from tofuse.engine.alignment.base import Registration
+from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
+from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
+from tofuse.engine.clouds.coarse_to_fine import CoarseToFine, spacing
+from tofuse.engine.clouds.robust_motion import are_distinct
+from tofuse.engine.clouds.fpfh import candidates
+from tofuse.engine.clouds.icp import Icp
+from tofuse.engine.search.pose_probability import CERTAIN, CLOUDS, PoseEvidence
+from tofuse.engine.clouds.reduce import extent
+from tofuse.engine.clouds.rejectors import MaxDistance
+from tofuse.engine.clouds.remapping import Remapping
+from tofuse.engine.clouds.selectors import All, Uniform
+from tofuse.engine.clouds.stopping import SmallStep
+from tofuse.engine.clouds.surface_metrics import PointToPlane
+
+# Maximum number of points of each averaged view.
+_POINTS = 10_000
+# Number of proposals that are aligned at full resolution.
+_MAX_REFINED = 8
+# Poses that differ by more resolutions, or rad, are distinct hypotheses.
+_DISTINCT, _DISTINCT_RAD = 4.0, 0.0873
+# A pose near the guess is preferred to one with a lead below this fraction of the points.
+_MIN_LEAD = 0.02
+# Support below which the views are also aligned from the guess from coarse to fine.
+_MIN_SUPPORT = 1 / 3
+# Loss of score by noise when a pose is aligned again.
+_MAX_SCORE_LOSS = 0.02
+# Points used to test whether a rival converges to the best pose.
+_RIVAL_POINTS = 2500
+# Finest resolution, in spacings of this number of points.
+_MIN_SPACING_RATIO, _SPACING_POINTS = 0.5, 5000
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    """A pose T_target_source (4, 4) and its agreement."""
+
+    T_target_source: Float64
+    agreement: Agreement
+    # Start of its alignment; None for proposals.
+    guess: Float64 | None = None
+
+
+# Placeholder for the rival of a pose without one; it has no support.
+_NO_RIVAL = _Pose(np.eye(4), Agreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _CloudViews:
+    """Two clouds averaged to the same resolution."""
+
+    source: Frame
+    target: Frame
+    source_map: CloudMap
+    target_map: CloudMap
+    rng: np.random.Generator
+
+    @classmethod
+    def of(cls, source: Frame, target: Frame, rng: np.random.Generator) -> _CloudViews:
+        size = max(_finest(source), _finest(target))
+        size, data, model = CoarseToFine(points=_POINTS).finest(source, target, size)
+        maps = CloudMap.of(data, size, source), CloudMap.of(model, size, target)
+        return cls(source, target, *maps, rng)
+
+    @property
+    def size(self) -> float:
+        return self.target_map.size
+
+    @property
+    def has_free_space(self) -> bool:
+        """Whether the viewpoint, and so the free space, is known for both views."""
+        return self.source_map.viewpoint is not None and self.target_map.viewpoint is not None
+
+    def evaluated(self, T: Float64) -> _Pose:
+        return _Pose(T, cloud_agreement(self.source_map, self.target_map, T))
+
+    def refined(self, T: Float64) -> _Pose:
+        """Align with a subset of the averaged source's points; T (4, 4) if that scores lower."""
+        initial = self.evaluated(T)
+        try:
+            for icp in _refinement_stages(self.size):
+                T = icp.register(
+                    self.source_map.view, self.target_map.view, T, self.rng
+                ).T_target_source
+        except RegistrationError:
+            return initial
+        aligned = self.evaluated(T)
+        return aligned if aligned.agreement.score >= initial.agreement.score else initial
+
+    def evidence(self, pose: _Pose, lead: float | None = None, degenerate: int = 0) -> PoseEvidence:
+        return PoseEvidence.of(pose.agreement, lead, degenerate, CLOUDS)
+
+    def with_information(self, registration: Registration) -> Registration:
+        """Return a registration with its information matrix."""
+        T, unobservable = registration.T_target_source, registration.unobservable
+        return replace(
+            registration,
+            information=cloud_information(self.source_map, self.target_map, T, unobservable),
+        )
+
+    def are_distinct_poses(self, a: Float64, b: Float64) -> bool:
+        """Whether two poses (4, 4) are distinct hypotheses."""
+        points = self.source_map.view.points.astype(np.float64)
+        limits = {"metres": _DISTINCT * self.size, "rad": _DISTINCT_RAD}
+        return bool(are_distinct(a[None], b, points, **limits)[0])
+
+
+def _finest(view: Frame) -> float:
+    """Return a view's point spacing in m, bounded below by that of some thousand points."""
+    fraction = min(1.0, _SPACING_POINTS / max(len(view), 1))
+    return spacing(view) * max(_MIN_SPACING_RATIO, float(np.sqrt(fraction)))
+
+
+def register_clouds(
+    source: Frame,
+    target: Frame,
+    guess: Float64 | None,
+    rng: np.random.Generator,
+    image_registration: Registration | None = None,
+    *,
+    always_search: bool = False,
+) -> Registration:
+    """Register two clouds, or a cloud and an image.
+
+    Parameters
+    ----------
+    source, target
+        Views; at least one is a cloud.
+    guess
+        (4, 4) T_target_source; the identity unless given.
+    rng
+        Source of the random samples.
+    image_registration
+        Result of the registration as images, if any: an additional proposal.
+    always_search
+        Whether to search even if the pose aligned from the guess is practically certain.
+
+    Returns
+    -------
+    The registration. If the views fit only with the source scaled by a power of ten from 0.001 to
+    1000, the pose is that of the scaled source, not accepted, and `reason` states the scale.
+
+    Raises
+    ------
+    RegistrationError
+        If there are too few points, or no pose has enough correspondences.
+    """
+    power = _scale_exponent(source, target)
+    if power and not always_search:
+        scale = 10.0**power
+        registration = _registered_scaled(source, target, scale, rng)
+        if registration is not None:
+            reason = f"the views fit with the source {scale:g} times as large: check its unit"
+            return replace(registration, believed=False, reason=reason)
+    try:
+        return _registered(
+            source, target, guess, rng, image_registration, always_search=always_search
+        )
+    except RegistrationError as error:
+        if not power:
+            raise
+        raise RegistrationError(
+            f"its extent is about {10.0**-power:g} times that of the target, and it does not fit",
+            where=f"frame {source.index}",
+            remedy="check the units of both clouds",
+        ) from error
+
+
+def _registered(
+    source: Frame,
+    target: Frame,
+    guess: Float64 | None,
+    rng: np.random.Generator,
+    image_registration: Registration | None = None,
+    *,
+    always_search: bool = False,
+) -> Registration:
+    views = _CloudViews.of(source, target, rng)
+    start = np.eye(4) if guess is None else guess
+    local = replace(views.refined(start), guess=start)
+    if views.evidence(local).probability >= CERTAIN and not always_search:
+        registration = _registration(views, local)
+        if (registration.probability or 0.0) >= CERTAIN and not len(registration.unobservable):
+            return views.with_information(registration)
+    poses = (
+        [local]
+        if image_registration is None
+        else [local, views.evaluated(image_registration.T_target_source)]
+    )
+    poses += _proposed(views, start)
+    poses.sort(key=lambda pose: -pose.agreement.score)
+    best = poses[0]
+    if guess is not None:
+        tied = [p for p in poses if p.agreement.score >= best.agreement.score - _MIN_LEAD]
+        best = min(tied, key=lambda p: _pose_distance(p.T_target_source, guess))
+    registration = _registration(views, best, poses)
+    if guess is None or best.guess is not None or not len(registration.unobservable):
+        return views.with_information(registration)
+    # If the poses differ along degenerate directions only, these keep the guess.
+    remapping = Remapping.of(
+        registration.unobservable, views.source_map.view.points.astype(np.float64)
+    )
+    across = remapping.across(se3.inverse(local.T_target_source) @ registration.T_target_source)
+    if views.are_distinct_poses(local.T_target_source, local.T_target_source @ across):
+        return views.with_information(registration)
+    return views.with_information(_registration(views, local, [best]))
+
+
+def _scale_exponent(source: Frame, target: Frame) -> int:
+    """Return log10 of the ratio of the target's extent to the source's, rounded; 0 beyond +-3."""
+    source_extent, target_extent = extent(source.points), extent(target.points)
+    if source_extent == 0 or target_extent == 0:
+        return 0
+    exponent = round(float(np.log10(target_extent / source_extent)))
+    return exponent if abs(exponent) <= 3 else 0
+
+
+def _registered_scaled(
+    source: Frame, target: Frame, scale: float, rng: np.random.Generator
+) -> Registration | None:
+    """Register the scaled source; None if the result is not accepted."""
+    points = source.points * np.float32(scale)
+    scaled = CloudFrame(source.index, source.timestamp, points, origin=scale * source.origin)
+    try:
+        registration = _registered(scaled, target, None, rng)
+    except RegistrationError:
+        return None
+    return registration if registration.believed else None
+
+
+def with_cloud_information(
+    source: Frame, target: Frame, registration: Registration, rng: np.random.Generator
+) -> Registration:
+    """Return a registration of two clouds' images with the information matrix of the clouds.
+
+    Images of clouds have holes, and their noise is unknown.
+    """
+    views = _CloudViews.of(source, target, rng)
+    unobservable = cloud_unobservable(
+        views.source_map, views.target_map, registration.T_target_source
+    )
+    return views.with_information(replace(registration, unobservable=unobservable))
+
+
+def follow_clouds(
+    source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+) -> Registration:
+    """Register two clouds from a guess (4, 4) without a search; see `register_clouds`."""
+    views = _CloudViews.of(source, target, rng)
+    local = replace(views.refined(guess), guess=guess)
+    if views.evidence(local).probability < CERTAIN:
+        coarse = CoarseToFine().register(source, target, guess, rng)
+        alternative = replace(views.evaluated(coarse.T_target_source), guess=guess)
+        local = max(local, alternative, key=lambda pose: pose.agreement.score)
+    return views.with_information(_registration(views, local))
+
+
+def _proposed(views: _CloudViews, start: Float64) -> list[_Pose]:
+    """Return the poses of feature matching, and of coarse-to-fine ICP if they lack support.
+
+    Raises
+    ------
+    RegistrationError
+        If there is no pose.
+    """
+    poses, failure = [], None
+    try:
+        found = candidates(views.source, views.target, signed=views.has_free_space)
+        poses += [views.refined(c.T_target_source) for c in found.poses[:_MAX_REFINED]]
+    except RegistrationError as error:
+        failure = error
+    if any(pose.agreement.support > _MIN_SUPPORT for pose in poses):
+        return poses
+    try:
+        registration = CoarseToFine().register(views.source, views.target, start, views.rng)
+        poses.append(replace(views.evaluated(registration.T_target_source), guess=start))
+    except RegistrationError as error:
+        failure = error
+    if not poses and failure is not None:
+        raise failure
+    return poses
+
+
+def _pose_distance(a: Float64, b: Float64) -> float:
+    return float(np.linalg.norm(se3.log(se3.inverse(a) @ b)))
+
+
+def _refinement_stages(size: float) -> tuple[Icp, ...]:
+    """Return ICP with few iterations, first with a wide reach, then with a narrow one."""
+    wide = Icp(
+        size,
+        source=Uniform(800),
+        target=All(),
+        rejectors=(MaxDistance(4.0),),
+        metric=PointToPlane(loss="tukey"),
+        stopping=SmallStep(1e-2, 8),
+        neighbours=NEIGHBOURS,
+    )
+    return wide, replace(wide, rejectors=(MaxDistance(2.0),), stopping=SmallStep(1e-3, 8))
+
+
+def _rival(views: _CloudViews, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _Pose:
+    """Return the first pose distinct from the best one, whose alignment is T (4, 4).
+
+    With large noise, subsets of the points may converge to different poses, but all points to the
+    same one; so rivals are aligned with more points before they are compared.
+    """
+    averaged = views.source_map.view, views.target_map.view
+    for pose in poses:
+        start = pose.T_target_source
+        if not views.are_distinct_poses(start, best.T_target_source):
+            continue
+        try:
+            converged = CoarseToFine().approximate_pose(views.size, *averaged, start, _RIVAL_POINTS)
+        except RegistrationError:
+            converged = start
+        if views.are_distinct_poses(converged, T):
+            return pose
+    return _NO_RIVAL
+
+
+def _registration(
+    views: _CloudViews, best: _Pose, poses: Sequence[_Pose] | None = None
+) -> Registration:
+    """Align all points from the best pose and evaluate its evidence.
+
+    The rival is one of `poses`, the best first; None if the pose is not compared with others.
+    """
+    T = best.T_target_source
+    averaged = views.source_map.view, views.target_map.view
+    registration = CoarseToFine().at(
+        views.size, *averaged, T, T if best.guess is None else best.guess
+    )
+    pose = views.evaluated(registration.T_target_source)
+    if pose.agreement.score < best.agreement.score - _MAX_SCORE_LOSS:
+        registration = replace(registration, T_target_source=T)
+        pose = best
+    agreement = pose.agreement
+    rival = None if poses is None else _rival(views, poses, best, pose.T_target_source)
+    lead = None if rival is None else agreement.score - max(rival.agreement.score, 0.0)
+    if lead is not None and len(registration.unobservable):
+        lead = min(lead, 0.0)  # poses along these directions fit as well
+    evidence = views.evidence(pose, lead, len(registration.unobservable))
+    runner_up = None if rival is None or rival is _NO_RIVAL else rival.T_target_source
+    return evidence.applied(registration, agreement, runner_up)

@@ -1,0 +1,214 @@
+"""Coarse-to-fine registration of two clouds with automatic parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.clouds.icp import Icp
+from tofuse.engine.clouds.interfaces import Metric
+from tofuse.engine.clouds.pairs import MIN_PAIRS
+from tofuse.engine.clouds.reduce import averaged, extent, reduced
+from tofuse.engine.clouds.rejectors import MaxDistance
+from tofuse.engine.clouds.remapping import Remapping
+from tofuse.engine.clouds.selectors import All, Uniform
+from tofuse.engine.clouds.shape import shape_at
+from tofuse.engine.clouds.stopping import SmallStep
+from tofuse.engine.clouds.surface_metrics import PlaneToPlane
+
+_SPACING_SAMPLE = 5000
+_MIN_LEVEL_POINTS = 60
+_CELLS_PER_EXTENT = 10
+# Median roughness above which normals are unreliable, and number of points of the estimate.
+_MAX_ROUGHNESS, _ROUGHNESS_SAMPLE = 0.25, 1500
+_COARSENING = 1.5
+# Minimum extent of the scene, in resolutions of the finest level.
+_MIN_EXTENT = 10
+
+
+@part("registration", "coarse-to-fine", label="validated")
+@dataclass(frozen=True)
+class CoarseToFine(Bounded, Registrar):
+    """ICP on a pyramid of both views, from coarse to fine.
+
+    A level is a voxel-grid average, whose resolution halves from level to level: coarse levels
+    have a large basin of convergence and little noise. Degenerate directions of the finest level
+    keep the guess.
+
+    Attributes
+    ----------
+    resolution
+        Voxel size of the finest level, m. None: the spacing of 5000 points of each view, more if
+        that leaves more than `points` points, or if noise makes plane fits as thick as wide.
+    points
+        Maximum number of points of the finest level of each view; only if `resolution` is None.
+    metric
+        Error metric of every level.
+    reach
+        Largest distance of a pair, in resolutions of the level.
+    neighbours
+        Points of each plane fit.
+    max_iterations
+        Maximum number of iterations of each level.
+    coarsest
+        Upper limit of the coarsest level's resolution, m, for accurate guesses. None: a tenth of
+        the scene.
+    """
+
+    resolution: Annotated[float | None, Bounds(0, exclusive=True)] = None
+    points: Annotated[int, Bounds(_MIN_LEVEL_POINTS)] = 20000
+    metric: Metric = field(default_factory=lambda: PlaneToPlane(loss="tukey"))
+    reach: float = 3.0
+    neighbours: int = 12
+    max_iterations: int = 40
+    coarsest: Annotated[float | None, Bounds(0, exclusive=True)] = None
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> Registration:
+        """See `Registrar.register`; points, errors and rms are those of the finest level.
+
+        Raises
+        ------
+        RegistrationError
+            If there are too few points, or too few correspond.
+        """
+        for view in (source, target):
+            if len(view) < MIN_PAIRS:
+                raise RegistrationError(
+                    f"has {len(view)} points, {MIN_PAIRS} are needed",
+                    where=f"frame {view.index}",
+                )
+        if self.resolution is None:
+            finest = self.finest(source, target, max(spacing(source), spacing(target)))
+        else:
+            size = self.resolution
+            finest = size, averaged(source, size), averaged(target, size)
+        levels = [finest]
+        max_resolution = extent(finest[2].points) / _CELLS_PER_EXTENT
+        max_resolution = (
+            max_resolution if self.coarsest is None else min(max_resolution, self.coarsest)
+        )
+        while levels[-1][0] * 2 < max_resolution:
+            resolution = 2 * levels[-1][0]
+            coarser = resolution, averaged(finest[1], resolution), averaged(finest[2], resolution)
+            if min(len(coarser[1]), len(coarser[2])) < _MIN_LEVEL_POINTS:
+                break
+            levels.append(coarser)
+        T = guess
+        for resolution, data, model in reversed(levels):
+            is_finest = resolution == finest[0]
+            icp = self._icp(resolution, 1e-3 if is_finest else 1e-2)
+            try:
+                registration = icp.register(data, model, T, rng)
+            except RegistrationError:
+                if is_finest:
+                    raise
+                continue  # too few pairs at this level: a finer one may have enough
+            T = registration.T_target_source
+        return _remapped(registration, icp, data, model, guess, rng)
+
+    def at(
+        self,
+        resolution: float,
+        data: CloudFrame,
+        model: CloudFrame,
+        T_start: Float64,
+        guess: Float64,
+    ) -> Registration:
+        """Register two clouds averaged to a resolution in m, from a start (4, 4).
+
+        Degenerate directions keep the guess (4, 4).
+        """
+        icp, rng = self._icp(resolution, 1e-3), np.random.default_rng(0)  # nothing is drawn
+        return _remapped(icp.register(data, model, T_start, rng), icp, data, model, guess, rng)
+
+    def approximate_pose(
+        self, resolution: float, data: CloudFrame, model: CloudFrame, T_start: Float64, points: int
+    ) -> Float64:
+        """Register about `points` points as `at` does, less accurately; return the pose (4, 4).
+
+        Raises
+        ------
+        RegistrationError
+            If too few points correspond.
+        """
+        icp, rng = self._icp(resolution, 1e-2), np.random.default_rng(0)
+        icp = replace(icp, source=Uniform(points))
+        return icp.register(data, model, T_start, rng).T_target_source
+
+    def _icp(self, resolution: float, epsilon: float) -> Icp:
+        return Icp(
+            resolution,
+            source=All(),
+            target=All(),
+            rejectors=(MaxDistance(self.reach),),
+            metric=self.metric,
+            stopping=SmallStep(epsilon, self.max_iterations),
+            neighbours=self.neighbours,
+        )
+
+    def finest(
+        self, source: Frame, target: Frame, size: float
+    ) -> tuple[float, CloudFrame, CloudFrame]:
+        """Average both views to `size` m, or coarser to limit the number of points and the noise.
+
+        Returns
+        -------
+        The resolution in m, and both averaged views.
+        """
+        size, data, model = reduced(source, target, size, self.points)
+        # Averaging reduces noise, but not true roughness, which keeps the first size.
+        initial = size, data, model
+        while max(self._roughness(data), self._roughness(model)) > _MAX_ROUGHNESS:
+            size *= _COARSENING
+            data, model = averaged(source, size), averaged(target, size)
+            if min(len(data), len(model)) < _MIN_LEVEL_POINTS or size * _MIN_EXTENT > extent(
+                model.points
+            ):
+                return initial
+        return size, data, model
+
+    def _roughness(self, view: CloudFrame) -> float:
+        sampled = np.arange(0, len(view), max(1, len(view) // _ROUGHNESS_SAMPLE))
+        roughness = shape_at(view, sampled, self.neighbours).roughness
+        return float(np.nanmedian(roughness)) if np.isfinite(roughness).any() else 0.0
+
+
+def _remapped(
+    registration: Registration,
+    icp: Icp,
+    data: CloudFrame,
+    model: CloudFrame,
+    guess: Float64,
+    rng: np.random.Generator,
+) -> Registration:
+    """Return the registration with degenerate directions fixed to the guess (4, 4)."""
+    if len(registration.unobservable) == 0:
+        return registration
+    remapping = Remapping.of(registration.unobservable, data.points.astype(np.float64))
+    T = registration.T_target_source
+    T = T @ remapping.along(se3.inverse(T) @ guess)
+    return icp.register(data, model, T, rng, remapping)
+
+
+def spacing(view: Frame) -> float:
+    """Median distance in m between neighbours among 5000 evenly chosen points; 0.01 if too few."""
+    points = view.points[:: max(1, len(view) // _SPACING_SAMPLE)].astype(np.float64)
+    if len(points) < 2:
+        return 0.01
+    _, squared = KdTree(points).neighbours(points, 2)
+    distances: Float64 = np.sqrt(squared[:, 1])
+    positive = distances[distances > 0]
+    return float(np.median(positive)) if len(positive) else 0.01

@@ -1,0 +1,113 @@
+"""Fast point feature histograms, and search for the nearest of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64, Int64
+from tofuse.engine.compute.jit import kernel
+
+
+@kernel
+def nearest_rows(rows: Float32, columns: Float32, out: Int64, start: int, stop: int) -> None:
+    """Write to `out` (n,) the index of the column (d, m) that is nearest to each row (n, d).
+
+    For the rows `start` to `stop`; ties go to the first column. The columns are transposed
+    features, so that the inner loop runs over independent sums.
+    """
+    distance2 = np.empty(columns.shape[1], np.float32)
+    for i in range(start, stop):
+        distance2[:] = 0
+        for k in range(rows.shape[1]):
+            value = rows[i, k]
+            for j in range(columns.shape[1]):
+                difference = value - columns[k, j]
+                distance2[j] += difference * difference
+        nearest = 0
+        for j in range(1, columns.shape[1]):
+            if distance2[j] < distance2[nearest]:
+                nearest = j
+        out[i] = nearest
+
+
+@kernel
+def histograms(
+    points: Float64,
+    normals: Float64,
+    neighbours: Int64,
+    distance2: Float64,
+    radius: float,
+    signed: bool,
+    out: Float64,
+    start: int,
+    stop: int,
+) -> None:
+    """Write the simplified point feature histograms of some points to `out` (n, 3, bins).
+
+    Parameters
+    ----------
+    points, normals
+        (n, 3).
+    neighbours, distance2
+        (n, k) neighbours of each point and their squared distances.
+    radius
+        Neighbours that are further away than this are ignored, m.
+    signed
+        See `fpfh`.
+    """
+    bins = out.shape[2]
+    for i in range(start, stop):
+        count = 0
+        out[i] = 0
+        for a in range(neighbours.shape[1]):
+            j = neighbours[i, a]
+            length = np.sqrt(distance2[i, a])
+            if j == i or length == 0 or length > radius:
+                continue
+            dx, dy, dz = (points[j] - points[i]) / length
+            ux, uy, uz = normals[i]
+            nx, ny, nz = normals[j]
+            vx, vy, vz = uy * dz - uz * dy, uz * dx - ux * dz, ux * dy - uy * dx
+            norm = max(np.sqrt(vx * vx + vy * vy + vz * vz), 1e-12)
+            vx, vy, vz = vx / norm, vy / norm, vz / norm
+            wx, wy, wz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            alpha = vx * nx + vy * ny + vz * nz
+            phi = ux * dx + uy * dy + uz * dz
+            w_dot_n = wx * nx + wy * ny + wz * nz
+            u_dot_n = ux * nx + uy * ny + uz * nz
+            if signed:
+                theta = np.arctan2(w_dot_n, u_dot_n) / np.pi
+            else:
+                alpha, phi = 2 * abs(alpha) - 1, 2 * abs(phi) - 1
+                theta = 4 * np.arctan2(abs(w_dot_n), abs(u_dot_n)) / np.pi - 1
+            count += 1
+            for k, angle in enumerate((alpha, phi, theta)):
+                index = int((angle + 1) / 2 * bins)
+                out[i, k, min(max(index, 0), bins - 1)] += 1
+        if count:
+            out[i] /= count
+
+
+@kernel
+def weighted_means(
+    values: Float64,
+    neighbours: Int64,
+    distance2: Float64,
+    radius: float,
+    out: Float64,
+    start: int,
+    stop: int,
+) -> None:
+    """Write to `out` (n, d) means of the neighbours' values (n, d), weighted by 1 / distance."""
+    for i in range(start, stop):
+        total = 0.0
+        out[i] = 0
+        for a in range(neighbours.shape[1]):
+            j = neighbours[i, a]
+            length = np.sqrt(distance2[i, a])
+            if j == i or length == 0 or length > radius:
+                continue
+            total += 1 / length
+            out[i] += values[j] / length
+        if total > 0:
+            out[i] /= total

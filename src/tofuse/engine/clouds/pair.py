@@ -1,0 +1,149 @@
+"""``tofuse.register``: registration of one pair of views or clouds."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounds
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.blas import one_blas_thread
+from tofuse.engine.parts import check_number
+from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.clouds.any_pair import MIN_POINTS, AnyPair
+from tofuse.engine.alignment.base import Registrar, Registration
+
+# Clouds with a larger distance are in different frames.
+_MAX_FRAME_DISTANCE_M = 1e4
+
+
+def register(
+    source: Frame | ArrayLike,
+    target: Frame | ArrayLike,
+    *,
+    guess: ArrayLike | None = None,
+    method: Registrar | None = None,
+    seed: int = 0,
+) -> Registration:
+    """Register two views, or two (N, 3) clouds in m.
+
+    The views are first aligned from the guess. If their agreement makes that pose practically
+    certain, it is returned, within milliseconds for images. Else poses are searched; the best one
+    is aligned and evaluated by the agreement of both views and by its lead over the best rival. Two
+    images, and clouds detected to be seen from their origin, are searched exhaustively
+    (`registration.search`: rotations up to 63 degrees about the vertical and 52 about any axis,
+    translations up to 0.6 of the median depth). Clouds are also registered by feature matching
+    (`registration.fpfh`), under any rotation.
+
+    Parameters
+    ----------
+    source, target
+        Frames of a recording, or arrays; non-finite points are dropped.
+    guess
+        (4, 4) T_target_source to start from; the identity unless given. Of ambiguous poses of two
+        images the one at the guess is returned.
+    method
+        Registration method; the above unless given.
+    seed
+        Seed of the random selection of points, for methods that use one.
+
+    Returns
+    -------
+    `T_target_source` maps points of the source into the target's frame, m. `believed` states
+    whether the pose is verified, `probability` how probably it is right (images: within 5 % of the
+    depth and 4 degrees; clouds: within 5 % of the extent), and `reason` why it is rejected: too
+    little support or too little lead over `runner_up`, contradiction, degenerate directions.
+    `converged` implies none of that. Degenerate directions (three on a flat wall) are in
+    `unobservable`, and keep the guess. A `method` without verification leaves `believed` None.
+
+    Raises
+    ------
+    InputError
+        If an array has the wrong shape or fewer than ten finite points, or the guess is no rigid
+        motion.
+    RegistrationError
+        If too few points correspond, an image is empty, or the median depths of two images differ
+        more than fourfold.
+    """
+    check_number(seed, Bounds(0), "seed", whole=True)
+    start = None if guess is None else se3.check_pose(guess, where="guess")
+    rng = np.random.default_rng([seed, 0])
+    if isinstance(source, RangeFrame | CloudFrame) or isinstance(target, RangeFrame | CloudFrame):
+        return _registered(_view(source, "source"), _view(target, "target"), start, method, rng)
+    return _register_arrays(_cloud(source, "source"), _cloud(target, "target"), start, method, rng)
+
+
+def _registered(
+    source: Frame,
+    target: Frame,
+    guess: Float64 | None,
+    method: Registrar | None,
+    rng: np.random.Generator,
+) -> Registration:
+    with one_blas_thread():
+        if method is None:
+            return AnyPair().register(source, target, guess, rng)
+        return method.register(source, target, np.eye(4) if guess is None else guess, rng)
+
+
+def _register_arrays(
+    source: Float64,
+    target: Float64,
+    guess: Float64 | None,
+    method: Registrar | None,
+    rng: np.random.Generator,
+) -> Registration:
+    """Register about the target's median: map coordinates exceed the precision of float32.
+
+    A distant source, in a frame of its own, is shifted to its own median.
+    """
+    source_centre, target_centre = np.median(source, 0), np.median(target, 0)
+    source_centre = (
+        source_centre
+        if np.linalg.norm(source_centre - target_centre) > _MAX_FRAME_DISTANCE_M
+        else target_centre
+    )
+    data, model = (
+        CloudFrame(index, 0.0, (points - centre).astype(np.float32), origin=-centre)
+        for index, points, centre in ((1, source, source_centre), (0, target, target_centre))
+    )
+    T_target_model, T_source_data = np.eye(4), np.eye(4)
+    T_target_model[:3, 3], T_source_data[:3, 3] = target_centre, source_centre
+    T_data_source, T_model_target = se3.inverse(T_source_data), se3.inverse(T_target_model)
+    start = None if guess is None else T_model_target @ guess @ T_source_data
+    registration = _registered(data, model, start, method, rng)
+    return registration.between(T_target_model, T_data_source)
+
+
+def _view(view: Frame | ArrayLike, name: str) -> Frame:
+    if isinstance(view, RangeFrame | CloudFrame):
+        return view
+    return CloudFrame.of(_cloud(view, name))
+
+
+def _cloud(points: ArrayLike, name: str) -> Float64:
+    """Return the finite points of an array (n, 3)."""
+    try:
+        array = np.asarray(points)
+    except ValueError as error:
+        raise InputError("is not an array", where=name, remedy="pass (N, 3) numbers") from error
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"is an array of shape {array.shape} and type {array.dtype}",
+            where=name,
+            remedy="pass a frame, or (N, 3) numbers in metres; for a file, tofuse.open(path)[0]",
+        )
+    finite = array[np.isfinite(array).all(1)].astype(np.float64)
+    if len(finite) < MIN_POINTS:
+        raise InputError(
+            f"has {len(finite)} finite points",
+            where=name,
+            remedy=f"use {MIN_POINTS} or more",
+        )
+    if np.abs(finite).max() > se3.MAX_COORDINATE_M:
+        raise InputError(
+            f"has coordinates up to {np.abs(finite).max():.0e} m", where=name, remedy="use metres"
+        )
+    return finite

@@ -1,0 +1,271 @@
+"""Robust estimation of a rigid motion from point pairs with outliers.
+
+Inliers preserve distances, so that they are pairwise compatible. The pairs that share the most
+compatible pairs are grouped (second-order compatibility: Chen et al. 2022, "SC2-PCR"), and each
+group gives a motion. This is deterministic, and one inlier in fifty pairs is enough.
+
+Residuals are normalised by each pair's own standard deviation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from tofuse.engine.arrays import Bool, Float64, Int64
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.geometry import se3
+
+# Number of pairs that determine a motion.
+MIN_PAIRS = 3
+# Inlier threshold of each round of least squares, relative to the final one: wide at first, as the
+# motion of a minimal sample is inaccurate.
+_INLIER_GATES = (2.0, 1.5, 1.0, 1.0, 1.0)
+# Maximum number of distinct motions that are refined before the best is selected.
+_MAX_REFINED = 20
+# Size of the consensus set of a seed (SC2-PCR: its nearest neighbours in compatibility).
+_CONSENSUS_SIZE = 20
+# Maximum number of pairs in the compatibility matrix, whose memory is quadratic.
+_MAX_COMPATIBLE_PAIRS = 2000
+
+
+@dataclass(frozen=True)
+class ConsensusOptions(Bounded):
+    """Options of the consensus search.
+
+    Attributes
+    ----------
+    sigmas
+        Inlier threshold, in standard deviations of the pair.
+    inliers
+        Minimum number of inliers of a motion.
+    seeds
+        Maximum number of seeds of consensus sets.
+    distinct_m, distinct_rad
+        Motions that differ by more are distinct hypotheses.
+    """
+
+    sigmas: Annotated[float, Bounds(0, 1000, exclusive=True)] = 3.0
+    inliers: Annotated[int, Bounds(3, 1_000_000)] = 6
+    seeds: Annotated[int, Bounds(1, 1_000_000)] = 100
+    distinct_m: Annotated[float, Bounds(0, 1000, exclusive=True)] = 0.1
+    distinct_rad: Annotated[float, Bounds(0, 1000, exclusive=True)] = 0.0873
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """m putative point correspondences.
+
+    Attributes
+    ----------
+    source, target
+        (m, 3) points in the frames of the two views, m.
+    variance
+        (m,) variance of the difference of aligned points along each axis, m^2.
+    """
+
+    source: Float64
+    target: Float64
+    variance: Float64
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def select(self, selection: Int64 | Bool) -> Pairs:
+        """Return the pairs selected by a mask (m,) or by positions (k,)."""
+        return Pairs(self.source[selection], self.target[selection], self.variance[selection])
+
+
+Motions = Callable[[Pairs], Float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """A motion and its inliers.
+
+    Attributes
+    ----------
+    T_target_source
+        (4, 4) weighted least squares estimate over the inliers.
+    inliers
+        (m,) inlier mask.
+    score
+        MSAC score: sum over the pairs of their fit, 0 to 1 each.
+    hypotheses
+        Number of hypotheses evaluated.
+    """
+
+    T_target_source: Float64
+    inliers: Bool
+    score: float
+    hypotheses: int
+
+    @property
+    def count(self) -> int:
+        """Number of inliers."""
+        return int(np.count_nonzero(self.inliers))
+
+
+def consensus(
+    pairs: Pairs, options: ConsensusOptions, motions: Motions | None = None
+) -> list[Consensus]:
+    """Return the rigid motions with the largest consensus, distinct ones only, the best first.
+
+    Parameters
+    ----------
+    pairs
+        Putative correspondences.
+    motions
+        Function that returns the motions (k, 4, 4) to choose from; None for those of sets of
+        pairwise compatible pairs.
+
+    Raises
+    ------
+    RegistrationError
+        If no motion has enough inliers.
+    """
+    ranked: list[Consensus] = []
+    if len(pairs) >= options.inliers:
+        found = _compatible_motions(pairs, options) if motions is None else motions(pairs)
+        ranked = [c for c in _ranked(pairs, found, options) if c.count >= options.inliers]
+    if not ranked:
+        raise RegistrationError(
+            f"of {len(pairs)} pairs of points not even {options.inliers} agree on a motion"
+        )
+    return ranked
+
+
+def are_distinct(
+    motions: Float64, T: Float64, points: Float64, *, metres: float, rad: float
+) -> Bool:
+    """Whether each motion differs from another one by more than a distance or an angle, (k,).
+
+    Parameters
+    ----------
+    motions, T
+        (k, 4, 4), and (4, 4).
+    points
+        (n, 3) points that are moved, m.
+    metres
+        Distance at the median of the points.
+    rad
+        Angle between the rotations.
+    """
+    centre = np.median(points, 0)
+    shift = motions[:, :3, :3] @ centre + motions[:, :3, 3] - se3.transform(T, centre[None])
+    angle = se3.angle(se3.inverse(motions) @ T)
+    return (np.linalg.norm(shift, axis=1) > metres) | (angle > rad)
+
+
+def motion_of(pairs: Pairs) -> Float64:
+    """Return the weighted least squares motion (4, 4) (Arun et al. 1987, Umeyama 1991).
+
+    Weights are inverse variances.
+    """
+    weight = 1 / pairs.variance
+    return motions_of(pairs.source[None], pairs.target[None], weight[None])[0]
+
+
+def _compatible_motions(pairs: Pairs, options: ConsensusOptions) -> Float64:
+    """Return the motions (k, 4, 4) of sets of pairwise compatible pairs."""
+    if len(pairs) > _MAX_COMPATIBLE_PAIRS:
+        pairs = pairs.select(np.linspace(0, len(pairs) - 1, _MAX_COMPATIBLE_PAIRS).astype(np.int64))
+    p, q = pairs.source, pairs.target
+    source_distance, target_distance = (cdist(x, x) for x in (p, q))
+    sigma = np.sqrt(pairs.variance[:, None] + pairs.variance)
+    # Coincident points are compatible with the same pairs and don't constrain the rotation.
+    separated = np.minimum(source_distance, target_distance) > 2 * options.sigmas * sigma
+    compatible = (
+        (np.abs(source_distance - target_distance) < options.sigmas * sigma) & separated
+    ).astype(np.float32)
+    second_order = compatible * (compatible @ compatible)
+    seeds = np.argsort(-second_order.sum(1), kind="stable")[: options.seeds]
+    set_size = min(_CONSENSUS_SIZE, len(pairs))
+    motions = []
+    for seed in seeds:
+        row = second_order[seed]
+        nearest = np.argsort(-row, kind="stable")[: set_size - 1]
+        members = np.concatenate([[seed], nearest[row[nearest] > 0]])
+        if len(members) < MIN_PAIRS:
+            continue
+        motions.append(motion_of(pairs.select(members)))
+    return np.stack(motions) if motions else np.zeros((0, 4, 4))
+
+
+def motions_of(p: Float64, q: Float64, weight: Float64) -> Float64:
+    """Return least squares motions (k, 4, 4) of k lists of n pairs (k, n, 3), weights (k, n)."""
+    relative = (weight / weight.sum(1, keepdims=True))[..., None]
+    p0, q0 = (relative * p).sum(1), (relative * q).sum(1)
+    H = np.einsum("kni,knj->kij", relative * (p - p0[:, None]), q - q0[:, None])
+    U, _, Vt = np.linalg.svd(H)
+    mirrored = np.linalg.det(U) * np.linalg.det(Vt) < 0
+    Vt[mirrored, 2] *= -1
+    R = np.einsum("kji,klj->kil", Vt, U)
+    T = np.tile(np.eye(4), (len(p), 1, 1))
+    T[:, :3, :3] = R
+    T[:, :3, 3] = q0 - np.einsum("kij,kj->ki", R, p0)
+    return T
+
+
+def squared_residuals(pairs: Pairs, motions: Float64) -> Float64:
+    """Return the normalised squared residuals (k, m) of motions (k, 4, 4)."""
+    transformed = (
+        np.einsum("kij,mj->kmi", motions[:, :3, :3], pairs.source) + motions[:, None, :3, 3]
+    )
+    return np.asarray(((transformed - pairs.target) ** 2).sum(2) / pairs.variance, np.float64)
+
+
+def _score(squared: Float64, sigmas: float) -> Float64:
+    """Return the MSAC scores (k,) of squared residuals (k, m) (Torr and Zisserman 2000)."""
+    return np.asarray(np.maximum(1 - squared / sigmas**2, 0).sum(-1), np.float64)
+
+
+def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[Consensus]:
+    """Return the distinct motions, the best first, each refined on its inliers."""
+    remaining = np.ones(len(motions), bool)
+    score = (
+        _score(squared_residuals(pairs, motions), options.sigmas) if len(motions) else np.zeros(0)
+    )
+    differ = partial(
+        are_distinct, points=pairs.source, metres=options.distinct_m, rad=options.distinct_rad
+    )
+    refined: list[Consensus] = []
+    order = np.argsort(-score, kind="stable")
+    for k in order:
+        if not remaining[k]:
+            continue
+        remaining &= differ(motions, motions[k])
+        T, inliers = _refined(pairs, motions[k], options.sigmas)
+        refined_score = float(_score(squared_residuals(pairs, T[None]), options.sigmas)[0])
+        refined.append(Consensus(T, inliers, refined_score, len(motions)))
+        if len(refined) == _MAX_REFINED:
+            break
+    distinct: list[Consensus] = []
+    for candidate in sorted(refined, key=lambda c: -c.score):
+        accepted = np.array([c.T_target_source for c in distinct]).reshape(-1, 4, 4)
+        if differ(accepted, candidate.T_target_source).all():
+            distinct.append(candidate)
+    return distinct
+
+
+def _refined(pairs: Pairs, T: Float64, sigmas: float) -> tuple[Float64, Bool]:
+    """Refine T by iterated least squares over its inliers; return the best motion and its mask."""
+    best, best_score = T, -1.0
+    for gate in _INLIER_GATES:
+        squared = squared_residuals(pairs, T[None])[0]
+        score = float(_score(squared, sigmas))
+        if score > best_score:
+            best, best_score = T, score
+        inliers = squared < (gate * sigmas) ** 2
+        if np.count_nonzero(inliers) < MIN_PAIRS:
+            break
+        T = motion_of(pairs.select(inliers))
+    if float(_score(squared_residuals(pairs, T[None])[0], sigmas)) > best_score:
+        best = T
+    return best, squared_residuals(pairs, best[None])[0] < sigmas**2

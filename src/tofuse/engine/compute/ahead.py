@@ -1,0 +1,142 @@
+"""Compilation of kernels ahead of their first call, by other processes during the first run.
+
+The first run on a machine compiles every kernel that it calls. Meanwhile, helper processes compile
+the same kernels in reverse order into the same cache, each starting at a different position in the
+list, and load those that are already cached. The list of kernels and argument types was recorded in
+runs of the default method; `python benchmarks/compilation.py --list` records it again.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from tofuse.engine.compute import jit
+from tofuse.engine.compute.cores import usable_cores
+
+# Helper processes, each of which takes about 0.5 GB of memory; at most half of the cores.
+_MAX_HELPERS = 3
+# Net number of allocated objects after which Python collects garbage during compilation.
+_GC_THRESHOLD = 100_000
+_LIST = Path(__file__).with_name("signatures.txt")
+# Names of element types in the list.
+DTYPES = {
+    "b1": "boolean",
+    "i1": "int8",
+    "i4": "int32",
+    "i8": "int64",
+    "u1": "uint8",
+    "u2": "uint16",
+    "f4": "float32",
+    "f8": "float64",
+    "c16": "complex128",
+}
+
+
+@contextmanager
+def compiling_in_background() -> Iterator[None]:
+    """Compile kernels in other processes during the block, unless they are in the cache.
+
+    The processes are terminated at the end of the block. Kernels that they have not compiled are
+    compiled when called.
+    """
+    with ExitStack() as stack:
+        helpers = list(_start_helpers())
+        if helpers:
+            stack.enter_context(rare_garbage_collection())
+        for helper in helpers:
+            stack.callback(helper.wait)
+            stack.callback(helper.terminate)
+        yield
+
+
+@contextmanager
+def rare_garbage_collection() -> Iterator[None]:
+    """Collect garbage rarely during the block, as the compiler creates many long-lived objects."""
+    thresholds = gc.get_threshold()
+    gc.set_threshold(_GC_THRESHOLD, *thresholds[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+
+
+def _start_helpers() -> Iterator[subprocess.Popen[bytes]]:
+    if compiled_marker().exists():
+        return
+    count = min(usable_cores() // 2, _MAX_HELPERS)
+    for k in range(count):
+        try:
+            yield subprocess.Popen(
+                [sys.executable, "-m", "tofuse.engine.compute.ahead", str(k), str(count)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C is for the run, which terminates this process
+            )
+        except OSError:  # no more processes
+            return
+
+
+def signatures() -> list[tuple[str, tuple[Any, ...]]]:
+    """Return the kernels that runs call and their argument types, in the order of first use."""
+    kernels = []
+    for line in _LIST.read_text(encoding="ascii").splitlines():
+        name, *types = line.split()
+        kernels.append((name, tuple(_type_of(text) for text in types)))
+    return kernels
+
+
+def compile_listed(helper: int = 0, helpers: int = 1) -> None:
+    """Compile all of `signatures` in reverse order, or load them from the cache.
+
+    Each of several `helpers` starts at a different position in the list, and wraps around at its
+    end.
+    """
+    listed = signatures()[::-1]
+    first = len(listed) * helper // helpers
+    for name, types in listed[first:] + listed[:first]:
+        module, function = name.rsplit(".", 1)
+        getattr(import_module(f"tofuse.{module}"), function).compile(types)
+    compiled_marker().touch()
+
+
+def compiled_marker() -> Path:
+    """Return the file that exists once the listed kernels of this installation are in the cache.
+
+    Its name contains what Numba's cache depends on: paths, sizes and times of the source files.
+    """
+    digest = hashlib.sha256()
+    for file in jit.kernel_files():
+        stat = file.stat()
+        digest.update(f"{file} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+    return Path(jit.cache_folder()) / f"compiled-{digest.hexdigest()[:16]}"
+
+
+def _type_of(text: str) -> Any:
+    types: Any = numba.types
+    if match := re.fullmatch(r"(\d+)x(.+)", text):
+        return types.UniTuple(_type_of(match[2]), int(match[1]))
+    if match := re.fullmatch(r"([\w.]+)\.(\w+)\((.+)\)", text):
+        cls = getattr(import_module(f"tofuse.{match[1]}"), match[2])
+        return types.BaseTuple.from_types([_type_of(field) for field in match[3].split(",")], cls)
+    short, _, shape = text.lstrip("!").partition(":")
+    dtype = getattr(types, DTYPES[short])
+    if not shape:
+        return dtype
+    return types.Array(dtype, int(shape[0]), shape[1], readonly=text.startswith("!"))
+
+
+if __name__ == "__main__":
+    with rare_garbage_collection():
+        compile_listed(*map(int, sys.argv[1:]))

@@ -1,0 +1,52 @@
+"""Filter by the camera's confidence map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from tofuse.engine.arrays import Bool
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.filters.base import Filter
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import Frame, RangeFrame
+
+
+@part("filter", "confidence", label="validated")
+@dataclass(frozen=True)
+class Confidence(Bounded, Filter):
+    """Keep points of at least a level of the camera's confidence map (section 2.8).
+
+    The SR4000 gives levels 0 to 7; chapter 4 keeps level 7 only. For cameras with other levels see
+    `on_scale`. Views without a confidence map are unchanged.
+
+    Attributes
+    ----------
+    minimum
+        Lowest level that is kept, 0 to `highest`.
+    highest
+        The camera's highest level, 1 to 255.
+    """
+
+    minimum: Annotated[int, Bounds(0)] = 7
+    highest: Annotated[int, Bounds(1, 255)] = 7
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.minimum > self.highest:
+            raise ValueError(f"minimum must be at most {self.highest}, not {self.minimum}")
+
+    def on_scale(self, highest: int) -> Confidence:
+        """Return the equivalent filter for a camera whose highest level is `highest`."""
+        return Confidence(-(-self.minimum * highest // self.highest), highest)
+
+    def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
+        """See `Filter.mask`."""
+        if not isinstance(frame, RangeFrame) or frame.confidence_image is None:
+            return np.ones(frame.valid.shape, bool)
+        return frame.confidence_image >= self.minimum

@@ -1,0 +1,355 @@
+"""The two kinds of view: a depth image of a camera, and a cloud.
+
+Both implement the `View` protocol, which is all that cloud registration needs. All arrays are
+read-only by convention: methods return new frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Literal, Protocol, Self, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
+from tofuse.engine.bounds import Bounds
+from tofuse.engine.errors import InputError
+from tofuse.engine.cameras.cameras import Camera, points_from_z, range_from_z, unknown_rays, z_from_range
+from tofuse.engine.geometry.se3 import MAX_COORDINATE_M
+from tofuse.engine.parts import check_number
+
+DepthKind = Literal["z", "range"]
+AmplitudeKind = Literal["raw", "range_compensated", "ir"]
+
+SATURATED_AMPLITUDE = 65535.0
+
+
+class View(Protocol):
+    """The common interface of both kinds of view: N points with columns, in the view's frame."""
+
+    @property
+    def index(self) -> int:
+        """Index of the frame in its recording, before any selection."""
+        ...
+
+    @property
+    def timestamp(self) -> float:
+        """Timestamp in s."""
+        ...
+
+    @property
+    def points(self) -> Float32:
+        """(N, 3) valid points in m, camera (or cloud) frame."""
+        ...
+
+    @property
+    def normals(self) -> Float32 | None:
+        """(N, 3) unit normals towards the sensor, NaN where unknown; None if not computed."""
+        ...
+
+    @property
+    def sigma(self) -> Float32 | None:
+        """(N,) standard deviation of the range in m; None if not known."""
+        ...
+
+    @property
+    def amplitude(self) -> Float32 | None:
+        """(N,) amplitude in the recording's counts; None if not recorded."""
+        ...
+
+    @property
+    def color(self) -> UInt8 | None:
+        """(N, 3) uint8 RGB; None if not recorded."""
+        ...
+
+    @property
+    def origin(self) -> Float64:
+        """(3,) position of the sensor in the view's own frame."""
+        ...
+
+    def __len__(self) -> int:
+        """Return the number of valid points."""
+        ...
+
+
+# Names of all images of a `RangeFrame`, which have one size.
+IMAGES = (
+    "depth",
+    "amplitude_image",
+    "confidence_image",
+    "color_image",
+    "sigma_image",
+    "shared_sigma_image",
+    "normal_image",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class RangeFrame:
+    """One image of a depth camera.
+
+    Attributes
+    ----------
+    index
+        Index in the recording, before any selection.
+    timestamp
+        Seconds.
+    camera
+        Rays of the pixels.
+    depth
+        (H, W) float32 in m, 0 where invalid: radial range or z depth, see `depth_kind`.
+    depth_kind
+        "z" or "range".
+    amplitude_image
+        (H, W) float32 in counts, 0 where there is none, `SATURATED_AMPLITUDE` where saturated.
+    confidence_image
+        (H, W) uint8; higher is better.
+    color_image
+        (H, W, 3) uint8 RGB at the pixels of depth.
+    sigma_image
+        (H, W) float32, standard deviation of the range in m.
+    shared_sigma_image
+        (H, W) float32, standard deviation of the range error in m that is correlated between
+        neighbouring pixels, so that it does not average out; in addition to `sigma_image`.
+    normal_image
+        (H, W, 3) float32 unit normals towards the camera, NaN where unknown.
+    amplitude_kind
+        "raw": the received modulated light, which decreases with the square of the range;
+        "range_compensated": multiplied by the square of the range (and divided by the falloff of
+        lens and illumination), which is the albedo times the cosine of incidence; "ir": active
+        brightness by the maker's own mapping, treated as raw.
+    ambiguity_m
+        Range in m after which the phase repeats; None if not known.
+    color_registered
+        Whether the colour of a pixel is that of its point; if not, it is used only for display.
+    """
+
+    index: int
+    timestamp: float
+    camera: Camera
+    depth: Float32
+    depth_kind: DepthKind = "z"
+    amplitude_image: Float32 | None = None
+    confidence_image: UInt8 | None = None
+    color_image: UInt8 | None = None
+    sigma_image: Float32 | None = None
+    normal_image: Float32 | None = None
+    amplitude_kind: AmplitudeKind = "raw"
+    ambiguity_m: float | None = None
+    color_registered: bool = True
+    shared_sigma_image: Float32 | None = None
+
+    def __repr__(self) -> str:
+        size = f"{self.camera.width} x {self.camera.height}"
+        return f"RangeFrame {self.index}: {size} at {self.timestamp:.3f} s, {len(self):,} valid"
+
+    def __post_init__(self) -> None:
+        _check_frame(self)
+        if not isinstance(self.camera, Camera):
+            raise InputError(
+                f"is a {type(self.camera).__name__}, not a camera",
+                where=f"frame {self.index}: camera",
+                remedy="pass a camera, such as tofuse.Pinhole",
+            )
+        for kind, known in (("depth_kind", DepthKind), ("amplitude_kind", AmplitudeKind)):
+            if getattr(self, kind) not in get_args(known):
+                raise InputError(
+                    f"is {getattr(self, kind)!r}",
+                    where=f"frame {self.index}: {kind}",
+                    remedy=f"use one of {', '.join(get_args(known))}",
+                )
+        shape = (self.camera.height, self.camera.width)
+        for name in IMAGES:
+            image = getattr(self, name)
+            if image is None:
+                continue
+            ndim = 3 if name in ("color_image", "normal_image") else 2
+            if (
+                not isinstance(image, np.ndarray)
+                or image.ndim != ndim
+                or image.dtype.kind not in "biuf"
+            ):
+                raise InputError(
+                    f"is a {type(image).__name__}, not an array of numbers with {ndim} axes",
+                    where=f"frame {self.index}: {name}",
+                    remedy="pass a NumPy array",
+                )
+            if image.shape[:2] != shape:
+                raise InputError(
+                    f"{name} is {image.shape[1]} x {image.shape[0]}, the camera "
+                    f"{shape[1]} x {shape[0]}",
+                    where=f"frame {self.index}",
+                    remedy="use the camera of these images",
+                )
+        depth = np.asarray(self.depth, np.float32)
+        # Frames of readers rarely need this copy.
+        valid = (depth >= 0) & (depth < np.inf)
+        if not valid.all():
+            depth = np.where(valid, depth, np.float32(0))
+        object.__setattr__(self, "depth", depth)
+        amplitude = self.amplitude_image
+        if amplitude is not None and np.isinf(amplitude).any():
+            amplitude = np.nan_to_num(amplitude, nan=np.nan, posinf=SATURATED_AMPLITUDE, neginf=0)
+            object.__setattr__(self, "amplitude_image", amplitude)
+
+    @cached_property
+    def valid(self) -> Bool:
+        """(H, W) mask of pixels with a measurement and a known ray."""
+        unknown = unknown_rays(self.camera)
+        return self.depth > 0 if unknown is None else (self.depth > 0) & ~unknown
+
+    @cached_property
+    def z(self) -> Float32:
+        """(H, W) z depth in m, 0 where invalid."""
+        return self.depth if self.depth_kind == "z" else z_from_range(self.camera, self.depth)
+
+    @cached_property
+    def radial_range(self) -> Float32:
+        """(H, W) radial range in m, 0 where invalid."""
+        return self.depth if self.depth_kind == "range" else range_from_z(self.camera, self.depth)
+
+    @cached_property
+    def point_image(self) -> Float32:
+        """(H, W, 3) points in m in the camera frame, the origin where invalid."""
+        return points_from_z(self.camera, self.z)
+
+    @cached_property
+    def points(self) -> Float32:
+        """See `View.points`; in row-major order of the valid pixels."""
+        return self.point_image[self.valid]
+
+    @property
+    def normals(self) -> Float32 | None:
+        """See `View.normals`."""
+        return None if self.normal_image is None else self.normal_image[self.valid]
+
+    @property
+    def sigma(self) -> Float32 | None:
+        """See `View.sigma`."""
+        return None if self.sigma_image is None else self.sigma_image[self.valid]
+
+    @property
+    def amplitude(self) -> Float32 | None:
+        """See `View.amplitude`."""
+        return None if self.amplitude_image is None else self.amplitude_image[self.valid]
+
+    @property
+    def color(self) -> UInt8 | None:
+        """See `View.color`."""
+        return None if self.color_image is None else self.color_image[self.valid]
+
+    @property
+    def origin(self) -> Float64:
+        """See `View.origin`: the optical centre."""
+        return np.zeros(3)
+
+    def __len__(self) -> int:
+        return int(np.count_nonzero(self.valid))
+
+    def keep(self, mask: Bool) -> Self:
+        """Return the frame with every pixel outside the (H, W) mask made invalid."""
+        frame = object.__new__(type(self))
+        # Without the checks of __post_init__, which this frame has passed.
+        for attribute in fields(self):
+            object.__setattr__(frame, attribute.name, getattr(self, attribute.name))
+        object.__setattr__(frame, "depth", np.where(mask, self.depth, np.float32(0)))
+        return frame
+
+
+@dataclass(frozen=True, eq=False)
+class CloudFrame:
+    """A view without a camera model: N points.
+
+    Attributes
+    ----------
+    index, timestamp
+        Frame index in the recording, and s.
+    points
+        (N, 3) m, finite, in the sensor frame.
+    normals
+        (N, 3) unit normals; None where not known.
+    sigma
+        (N,) standard deviation of the range, m; None where not known.
+    amplitude
+        (N,) amplitude or intensity; None where not recorded.
+    color
+        (N, 3) RGB; None where not recorded.
+    origin
+        (3,) position of the sensor in the frame of the points, m.
+    """
+
+    index: int
+    timestamp: float
+    points: Float32
+    normals: Float32 | None = None
+    sigma: Float32 | None = None
+    amplitude: Float32 | None = None
+    color: UInt8 | None = None
+    origin: Float64 = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        _check_frame(self)
+        if np.ndim(self.points) != 2 or np.shape(self.points)[1] != 3:
+            raise InputError(
+                f"points have shape {np.shape(self.points)}",
+                where=f"frame {self.index}",
+                remedy="pass an (N, 3) array",
+            )
+        largest = np.abs(self.points).max(initial=0)
+        if largest > MAX_COORDINATE_M:
+            raise InputError(
+                f"points have coordinates up to {largest:.0e} m",
+                where=f"frame {self.index}",
+                remedy="use metres, and leave out invalid points",
+            )
+
+    @classmethod
+    def of(cls, points: ArrayLike, *, index: int = 0, timestamp: float = 0.0) -> Self:
+        """Make a view of points (N, 3) in m, dropping non-finite ones.
+
+        Parameters
+        ----------
+        points
+            (N, 3) m.
+        index, timestamp
+            Frame index, and s.
+        """
+        array = np.asarray(points)
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
+            raise InputError(
+                f"is an array of shape {array.shape} and type {array.dtype}",
+                where="points",
+                remedy="pass (N, 3) numbers in metres",
+            )
+        array = array[np.isfinite(array).all(1)].astype(np.float32)
+        return cls(index, timestamp, array)
+
+    @property
+    def valid(self) -> Bool:
+        """(N,) mask: all points of a cloud are valid."""
+        return np.ones(len(self.points), bool)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def keep(self, mask: Bool) -> Self:
+        """Return the view with only the points of the (N,) mask."""
+        return replace(
+            self,
+            points=self.points[mask],
+            normals=None if self.normals is None else self.normals[mask],
+            sigma=None if self.sigma is None else self.sigma[mask],
+            amplitude=None if self.amplitude is None else self.amplitude[mask],
+            color=None if self.color is None else self.color[mask],
+        )
+
+
+Frame = RangeFrame | CloudFrame
+
+
+def _check_frame(frame: Frame) -> None:
+    """Raise InputError for an index or a timestamp that no frame can have."""
+    check_number(frame.index, Bounds(), "index of a frame", whole=True)
+    check_number(frame.timestamp, Bounds(), f"frame {frame.index}: timestamp")

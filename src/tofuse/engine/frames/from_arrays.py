@@ -1,0 +1,212 @@
+"""A recording of arrays in memory: `tofuse.from_arrays`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounds
+from tofuse.engine.errors import InputError
+from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable
+from tofuse.engine.geometry.se3 import check_poses
+from tofuse.engine.parts import check_number
+from tofuse.formats.recordings.camera_file import pinhole_values
+from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.formats.recordings.sources import INVALID_DEPTH
+
+# The unit of integer depth for nearly all cameras.
+_MILLIMETRES = 1e-3
+# A larger median of depth can't be in metres.
+_MAX_MEDIAN_M = 200.0
+
+
+def from_arrays(
+    depth: ArrayLike | Sequence[ArrayLike],
+    camera: Camera | ArrayLike,
+    *,
+    color: ArrayLike | Sequence[ArrayLike] | None = None,
+    amplitude: ArrayLike | Sequence[ArrayLike] | None = None,
+    confidence: ArrayLike | Sequence[ArrayLike] | None = None,
+    timestamps: ArrayLike | None = None,
+    reference: ArrayLike | None = None,
+    odometry: ArrayLike | None = None,
+    depth_kind: DepthKind = "z",
+    depth_unit_m: float | None = None,
+    amplitude_kind: AmplitudeKind = "raw",
+) -> Recording:
+    """Return a recording of images in memory.
+
+    Parameters
+    ----------
+    depth
+        (N, H, W), or N images (H, W); 0 or NaN where invalid, in integers also 65535. Floats are in
+        metres and integers in millimetres, unless `depth_unit_m` is given.
+    camera
+        A camera, or the matrix K (3, 3) of a pinhole camera without distortion, in pixels of the
+        depth images.
+    color
+        (N, H, W, 3) uint8 RGB at the pixels of depth.
+    amplitude
+        (N, H, W) counts, of the kind `amplitude_kind`.
+    confidence
+        (N, H, W) uint8, higher is better.
+    timestamps
+        (N,) s, or datetime64; 30 images per second unless given.
+    reference
+        (N, 4, 4) T_world_camera, NaN where unknown; used only for comparison.
+    odometry
+        (N, 4, 4) T_world_camera of odometry, NaN where unknown.
+    depth_kind
+        "z", or "range" along the rays.
+    depth_unit_m
+        Metres per unit of depth.
+    amplitude_kind
+        See `RangeFrame`.
+
+    Raises
+    ------
+    InputError
+        If shapes or types do not fit, or the depth can't be in the assumed unit.
+    """
+    images = _images("depth", depth, None)
+    shape = images[0].shape
+    if len(shape) != 2:
+        raise InputError(f"has images of shape {shape}", where="depth", remedy="pass (N, H, W)")
+    checked_camera = _camera(camera, shape)
+    times = _times(timestamps, len(images))
+    colors = _optional("color", color, images, np.uint8, 3)
+    amplitudes = _optional("amplitude", amplitude, images, np.float32)
+    confidences = _optional("confidence", confidence, images, np.uint8)
+    to_metres = _to_metres(images, depth_unit_m)
+    frames = []
+    for k, image in enumerate(images):
+        metres = to_metres(image)
+        valid = np.isfinite(metres) & (metres > 0)
+        frames.append(
+            RangeFrame(
+                k,
+                float(times[k]),
+                checked_camera,
+                np.where(valid, metres, 0).astype(np.float32),
+                depth_kind,
+                amplitude_image=None if amplitudes is None else amplitudes[k],
+                confidence_image=None if confidences is None else confidences[k],
+                color_image=None if colors is None else colors[k],
+                amplitude_kind=amplitude_kind,
+            )
+        )
+    source = ArraySource(
+        frames,
+        _poses("reference", reference, len(frames)),
+        _poses("odometry", odometry, len(frames)),
+    )
+    return Recording.of(source, "arrays", "arrays")
+
+
+def _images(name: str, values: Any, shape: tuple[int, ...] | None) -> list[NDArray[Any]]:
+    try:
+        images = [np.asarray(image) for image in values]
+    except TypeError as error:
+        raise InputError(
+            "is not an array of images", where=name, remedy="pass (N, H, W)"
+        ) from error
+    if not images:
+        raise InputError("contains no image", where=name)
+    expected = images[0].shape if shape is None else shape
+    for k, image in enumerate(images):
+        if image.dtype.kind not in "iufb" or image.shape != expected:
+            raise InputError(
+                f"image {k} is {image.dtype} of shape {image.shape}, not {expected}", where=name
+            )
+    return images
+
+
+def _optional(
+    name: str,
+    values: Any,
+    images: list[NDArray[Any]],
+    dtype: type[np.generic],
+    channels: int | None = None,
+) -> list[NDArray[Any]] | None:
+    if values is None:
+        return None
+    shape = images[0].shape if channels is None else (*images[0].shape, channels)
+    converted = _images(name, values, shape)
+    if len(converted) != len(images):
+        raise InputError(f"contains {len(converted)} images, and depth {len(images)}", where=name)
+    if dtype is np.uint8 and any(image.dtype != np.uint8 for image in converted):
+        raise InputError(f"is {converted[0].dtype}", where=name, remedy="use uint8, from 0 to 255")
+    return [image.astype(dtype, copy=False) for image in converted]
+
+
+def _to_metres(
+    images: list[NDArray[Any]], unit_m: float | None
+) -> Callable[[NDArray[Any]], Float64]:
+    is_integer = images[0].dtype.kind in "iub"
+    scale = unit_m if unit_m is not None else (_MILLIMETRES if is_integer else 1.0)
+    check_number(scale, Bounds(0, exclusive=True), "depth_unit_m")
+    if unit_m is None and not is_integer:
+        sample = np.concatenate([image[::7, ::7].ravel() for image in images[:8]])
+        sample = sample[np.isfinite(sample) & (sample > 0)]
+        if len(sample) and np.median(sample) > _MAX_MEDIAN_M:
+            raise InputError(
+                f"has a median of {np.median(sample):.4g}, which can't be metres",
+                where="depth",
+                remedy="use depth_unit_m=0.001 if it is in millimetres",
+            )
+
+    def to_metres(image: NDArray[Any]) -> Float64:
+        metres = image.astype(np.float64) * scale
+        return np.where(image == INVALID_DEPTH, 0.0, metres) if is_integer else metres
+
+    return to_metres
+
+
+def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
+    height, width = shape
+    if isinstance(camera, Pinhole | RayTable):
+        if (camera.height, camera.width) != (height, width):
+            raise InputError(
+                f"has {camera.width} x {camera.height} pixels, and depth {width} x {height}",
+                where="camera",
+            )
+        return camera
+    try:
+        K = np.asarray(camera, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            "is neither a camera nor a matrix", where="camera", remedy="pass K (3, 3)"
+        ) from error
+    return Pinhole(width, height, **pinhole_values(K, height, "camera"))
+
+
+def _times(timestamps: ArrayLike | None, count: int) -> Float64:
+    if timestamps is None:
+        return np.arange(count) / 30
+    times = np.asarray(timestamps)
+    times = _seconds(times) if times.dtype.kind in "iufmM" else np.full(count, np.nan)
+    if times.shape != (count,) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise InputError(
+            "must be one finite number for each image, ascending",
+            where="timestamps",
+            remedy="use seconds",
+        )
+    return times
+
+
+def _seconds(times: NDArray[Any]) -> Float64:
+    """Timestamps as numbers; dates and durations in seconds since the epoch, or since zero."""
+    if times.dtype.kind not in "mM":
+        return times.astype(float)
+    missing = np.isnat(times)
+    ns = times.astype(f"{times.dtype.kind}8[ns]").astype(np.int64)
+    return np.where(missing, np.nan, ns // 10**9 + ns % 10**9 / 1e9)
+
+
+def _poses(name: str, values: ArrayLike | None, count: int) -> Float64 | None:
+    return None if values is None else check_poses(values, where=name, count=count)

@@ -1,0 +1,216 @@
+"""The layout of the volume: blocks near surfaces, and regions of them that fit into memory.
+
+The blocks of all views are laid out first, so that their order depends on the surfaces alone. If
+they exceed the memory, they are bisected recursively into boxes, which are fused one at a time. One
+layer of blocks around a box is fused with it: cells of the surface extend into the adjacent block
+and no farther, so the surface of the box's cells is the same as if all blocks were fused jointly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64, Int32, Int64
+from tofuse.engine.fusion.range_view import RangeView
+from tofuse.engine.fusion.stored_views import Views, summaries
+from tofuse.engine.fusion.block_kernels import EDGE, EMPTY, HALF, VOXELS, insert_keys
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.fusion.tsdf_kernels import near_cubes
+
+_CHUNKS = 16
+# Far from surfaces, free space is integrated of at most every 4th view, with a weight of 4, as
+# hundreds of views through the same free space are redundant. The stride grows by 1 per 32 views.
+_MAX_STRIDE, _VIEWS_PER_STRIDE = 4, 32
+# Spacing of samples along a normal: as a fraction of a block's edge, and of an octant's.
+_BLOCK_SPACING, CUBE_SPACING = 0.34, 0.6
+# A smaller truncation would cut off the noise on one side of a surface more than on the other.
+REACH_SIGMAS = 3.0
+# Truncation distance in voxels: trilinear interpolation needs the first, and the second limits the
+# memory for a very noisy sensor.
+_MIN_REACH, _MAX_REACH = 3.0, 8.0
+# Bytes of a voxel besides its colour: distance, weight, views, and the number of its cell.
+_VOXEL_BYTES = 4 + 4 + 2 + 4
+_BLOCK_BYTES = 27 * 4 + 8 * 4 + 3 * 8  # of a block: its neighbours, its octants, its keys
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Blocks that are fused jointly.
+
+    Attributes
+    ----------
+    rows
+        (B,) rows of the layout's keys: those owned, ascending, then the layer around them.
+    owned
+        Number of blocks that the region owns.
+    low, high
+        (3,) corners of the bounding box of all of them, in blocks.
+    """
+
+    rows: Int64
+    owned: int
+    low: Int64
+    high: Int64
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """All blocks near the surfaces of views.
+
+    Attributes
+    ----------
+    voxel_m, reach_m
+        Edge of a voxel, and the truncation distance.
+    keys
+        (B,) of the blocks, ascending.
+    channels
+        3 for colour, 1 for albedo, else 0.
+    free_space_stride
+        Far from surfaces, free space is integrated of every n-th view.
+    """
+
+    voxel_m: float
+    reach_m: float
+    keys: Int64
+    channels: int
+    free_space_stride: int
+
+    @classmethod
+    def of(cls, views: Views, poses: Float64, voxel_m: float) -> Layout:
+        """Lay out the blocks near the surfaces of views at their poses (N, 4, 4)."""
+        view_summaries = summaries(views)
+        noise = [summary.sigma_m for summary in view_summaries if summary.sigma_m > 0]
+        sigma = float(np.median(noise)) if noise else 0.0
+        free_space_stride = int(np.clip(len(views) // _VIEWS_PER_STRIDE, 1, _MAX_STRIDE))
+        reach = voxel_m * float(
+            np.clip(
+                REACH_SIGMAS * sigma / voxel_m,
+                _MIN_REACH,
+                _MAX_REACH,
+            )
+        )
+        keys = _surface_blocks(views, poses, EDGE * voxel_m, reach, free_space_stride)
+        return cls(
+            voxel_m,
+            reach,
+            keys,
+            max((summary.channels for summary in view_summaries), default=0),
+            free_space_stride,
+        )
+
+    @property
+    def block_bytes(self) -> int:
+        """Memory of a block while it is fused."""
+        return VOXELS * (_VOXEL_BYTES + 4 * self.channels) + _BLOCK_BYTES
+
+    def single_region(self) -> Region:
+        """All blocks as a single region."""
+        return Region(
+            np.arange(len(self.keys)), len(self.keys), np.full(3, -HALF), np.full(3, HALF)
+        )
+
+    def regions(self, max_blocks: int) -> list[Region]:
+        """Bisect the blocks into boxes of at most `max_blocks`, the layer around included.
+
+        A box with more is cut into halves of nearly equal numbers of blocks, across its longest
+        side. A single block is not cut, however large the layer around it.
+        """
+        if len(self.keys) <= max_blocks:
+            return [self.single_region()]
+        coordinates = _coordinates(self.keys)
+        boxes = []
+        all_rows = np.arange(len(self.keys))
+        pending = [(all_rows, all_rows)]
+        while pending:
+            owned, candidates = pending.pop()
+            region = _with_layer(owned, candidates, coordinates)
+            if len(region.rows) <= max_blocks or len(owned) == 1:
+                boxes.append(region)
+            else:
+                pending += [(half, region.rows) for half in reversed(_halves(owned, coordinates))]
+        return boxes
+
+
+def _coordinates(keys: Int64) -> Int32:
+    """Return the grid coordinates (B, 3) of blocks by their keys."""
+    return np.stack([((keys >> s) & (2 * HALF - 1)) - HALF for s in (42, 21, 0)], 1).astype(
+        np.int32
+    )
+
+
+def _halves(owned: Int64, coordinates: Int32) -> list[Int64]:
+    """Return the rows of both halves of a box."""
+    box = coordinates[owned]
+    axis = int(np.ptp(box, axis=0).argmax())
+    coordinate = box[:, axis]
+    median = np.median(coordinate)
+    lower = coordinate < median
+    if not lower.any():  # at least half of the blocks are in the first layer
+        lower = coordinate <= median
+    return [owned[lower], owned[~lower]]
+
+
+def _with_layer(owned: Int64, candidates: Int64, coordinates: Int32) -> Region:
+    """Return a box with the layer of blocks around it, taken from the rows `candidates`."""
+    low = coordinates[owned].min(0).astype(np.int64) - 1
+    high = coordinates[owned].max(0).astype(np.int64) + 2
+    in_box = candidates[
+        ((coordinates[candidates] >= low) & (coordinates[candidates] < high)).all(1)
+    ]
+    return Region(np.concatenate([owned, np.setdiff1d(in_box, owned)]), len(owned), low, high)
+
+
+def _surface_blocks(
+    views: Views, poses: Float64, block_m: float, reach_m: float, free_space_stride: int
+) -> Int64:
+    """Return the keys of the blocks near surfaces, ascending."""
+
+    def touched(start: int, stop: int) -> Int64:
+        table, count = np.full(1 << 12, EMPTY, np.int64), 0
+        for k in range(start, stop):
+            keys = cubes_near(
+                views[k], poses[k], block_m, reach_m, _BLOCK_SPACING, k, min(free_space_stride, 2)
+            )
+            table, count = insert_keys(table, count, keys)
+        return table[table != EMPTY]
+
+    if len(views) == 0:
+        return np.zeros(0, np.int64)
+    return np.unique(np.concatenate(run_chunks(touched, len(views), _CHUNKS)))
+
+
+def cubes_near(
+    view: RangeView,
+    T_world_camera: Float64,
+    cube_m: float,
+    reach_m: float,
+    spacing: float,
+    number: int,
+    stride: int,
+) -> Int64:
+    """Return the keys of the cubes near the surface of a view, by every `stride`-th pixel.
+
+    Parameters
+    ----------
+    view, T_world_camera
+        The view and its (4, 4) pose.
+    cube_m, reach_m
+        Edge of the cubes and truncation distance, m.
+    spacing
+        Of samples along a normal, as a fraction of the edge.
+    number
+        Number of the view, which determines its first pixel.
+    stride
+        Every n-th column and row is used.
+    """
+    return near_cubes(
+        view.stored,
+        T_world_camera,
+        cube_m,
+        reach_m,
+        spacing,
+        (number % stride, number // stride % stride),
+        stride,
+    )

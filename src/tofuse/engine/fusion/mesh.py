@@ -1,0 +1,361 @@
+"""A surface of triangles: islands, holes, decimation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, Intp, UInt8
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.export import exchange
+from tofuse.engine.fusion.cloud import Cloud
+from tofuse.engine.fusion.colors import has_color
+from tofuse.engine.fusion.edge_collapse import collapse_edges, with_distinct_corners
+from tofuse.engine.fusion.clustering_kernels import flatten_groups, has_area, number_keys, quadric_sums, union_faces
+
+# Damping of a merged vertex towards the centroid, relative to the planes around it.
+_DAMPING = 0.02
+# Maximum number of triangles from which the mean size is estimated.
+_MAX_SAMPLED = 100_000
+# Maximum number of triangles whose edges are collapsed at a time: about 0.4 GB of memory, which the
+# library keeps.
+_MAX_COLLAPSED = 1_000_000
+# Minimum height of a triangle relative to its longest edge: below it, float32 leaves no normal.
+_MIN_HEIGHT = 1e-6
+# Vertices with a smaller cosine between their normals are on different sides of a thin sheet.
+_MAX_OPPOSITE_COSINE = -0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles in the world frame.
+
+    Attributes
+    ----------
+    vertices
+        (N, 3) float32 in m, relative to `offset`.
+    faces
+        (M, 3) int32 rows of `vertices`, counter-clockwise seen from outside.
+    normals
+        (N, 3) float32 unit normals, outwards.
+    color
+        (N, 3) uint8 RGB (albedo as grey where there is no colour), or None.
+    sigma
+        (N,) float32 standard deviation of each vertex along its normal, m, from the noise of the
+        views; and from the errors of their poses once these are estimated (`pose_errors`).
+    views
+        (N,) int32, number of views that observed each vertex.
+    offset
+        (3,) float64.
+    """
+
+    vertices: Float32
+    faces: Int32
+    normals: Float32
+    color: UInt8 | None
+    sigma: Float32
+    views: Int32
+    offset: Float64
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    def __repr__(self) -> str:
+        return f"Mesh: {len(self):,} vertices, {len(self.faces):,} faces"
+
+    def record(self) -> GeometryRecord:
+        """Return the record for file writers, in the world frame, float64."""
+        points = self.vertices.astype(np.float64) + self.offset
+        return replace(self.local_record(), points=points)
+
+    def local_record(self) -> GeometryRecord:
+        """Return the record relative to `offset`, float32."""
+        scalars = {"views": self.views, "sigma": self.sigma}
+        return GeometryRecord(self.vertices, self.faces, self.normals, self.color, scalars=scalars)
+
+    def save(self, path: str | Path) -> None:
+        """Write the mesh to a path ending in .glb, .gltf, .ply, .obj or .stl."""
+        exchange.save(self.record(), path)
+
+    def to_trimesh(self) -> Any:
+        """Return a `trimesh.Trimesh` in the world frame."""
+        return exchange.to_trimesh(self.record())
+
+    def to_open3d(self) -> Any:
+        """Return an `open3d.geometry.TriangleMesh` in the world frame."""
+        return exchange.to_open3d(self.record())
+
+    def cloud(self) -> Cloud:
+        """Return the vertices as a cloud."""
+        return Cloud(self.vertices, self.normals, self.color, self.views, self.offset, self.sigma)
+
+    def rows(self, faces: Bool) -> Mesh:
+        """Return the mesh of the faces (M,) that are True, without unused vertices."""
+        kept = self.faces[faces]
+        used = np.zeros(len(self), bool)
+        used[kept.ravel()] = True
+        new_row = np.cumsum(used, dtype=np.int32) - 1
+        return self.with_vertices(used, new_row[kept])
+
+    def with_vertices(self, used: Bool | Int32, faces: Int32 | Intp) -> Mesh:
+        """Return the mesh of a subset of the vertices.
+
+        Parameters
+        ----------
+        used
+            Mask (N,) of the vertices, or their rows (K,).
+        faces
+            (M, 3) rows of the subset.
+        """
+        return replace(
+            self,
+            vertices=self.vertices[used],
+            faces=faces.astype(np.int32).reshape(-1, 3),
+            normals=self.normals[used],
+            color=None if self.color is None else self.color[used],
+            sigma=self.sigma[used],
+            views=self.views[used],
+        )
+
+    @property
+    def spacing(self) -> float:
+        """Edge of a square of two triangles of the mean area, m."""
+        return float(np.sqrt(self._double_area))
+
+    @property
+    def _double_area(self) -> float:
+        """Twice the mean area of a triangle, estimated from some of them, m^2; 0 without any."""
+        sampled = self.faces[:: max(1, -(-len(self.faces) // _MAX_SAMPLED))]
+        a, b, c = (self.vertices[sampled[:, k]] for k in range(3))
+        double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        return float(double_area.mean(dtype=float)) if len(sampled) else 0.0
+
+    def without_islands(self, min_vertices: int) -> Mesh:
+        """Return the mesh without connected pieces of fewer than `min_vertices` vertices."""
+        if len(self.faces) == 0:
+            return self.rows(np.zeros(0, bool))
+        piece = np.arange(len(self), dtype=np.int32)
+        union_faces(self.faces, piece)
+        flatten_groups(piece)
+        return self.rows((np.bincount(piece)[piece] >= min_vertices)[self.faces[:, 0]])
+
+    def without_holes(self, max_border_m: float) -> Mesh:
+        """Return the mesh with the holes closed whose border is no longer than `max_border_m`.
+
+        Each gets a new vertex at its centroid, with 0 views, and a `sigma` of the hole's radius.
+        Outer borders are no holes.
+        """
+        half_edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+        border = half_edges[~np.isin(half_edges @ [len(self), 1], half_edges @ [1, len(self)])]
+        vertices: list[tuple[Int64, Float64, float]] = []
+        faces: list[Int64] = []
+        for rim in _loops(border):
+            p = self.vertices[rim].astype(float)
+            length = float(np.linalg.norm(p - np.roll(p, -1, 0), axis=1).sum())
+            centroid = p.mean(0)
+            fan_normal = np.cross(np.roll(p, -1, 0) - centroid, p - centroid).sum(0)
+            if length > max_border_m or fan_normal @ self.normals[rim].sum(0) <= 0:
+                continue
+            apex = np.full(len(rim), len(self) + len(vertices))
+            faces.append(np.stack([np.roll(rim, -1), rim, apex], -1))
+            vertices.append((rim, centroid, length))
+        if not vertices:
+            return self
+        normals = np.array([self.normals[loop].sum(0, dtype=float) for loop, _, _ in vertices])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        color = self.color
+        if color is not None:
+            means = [np.round(color[loop].mean(0)) for loop, _, _ in vertices]
+            color = np.concatenate([color, np.array(means).astype(np.uint8)])
+        radii = [length / (2 * np.pi) for _, _, length in vertices]
+        return replace(
+            self,
+            vertices=np.concatenate(
+                [self.vertices, np.array([m for _, m, _ in vertices], np.float32)]
+            ),
+            faces=np.concatenate([self.faces, *faces]).astype(np.int32),
+            normals=np.concatenate([self.normals, normals.astype(np.float32)]),
+            color=color,
+            sigma=np.concatenate([self.sigma, np.array(radii, np.float32)]),
+            views=np.concatenate([self.views, np.zeros(len(vertices), np.int32)]),
+        )
+
+    def decimated(self, faces: int) -> Mesh:
+        """Return the mesh reduced to at most `faces` triangles by collapsing edges.
+
+        A vertex has the mean normal, colour and variance of the vertices merged into it, and their
+        maximum number of views. Very large meshes are first reduced by `clustered`, which takes
+        less memory; as are those of too many pieces for collapsing edges to suffice.
+        """
+        if len(self.faces) <= faces:
+            return self
+        mesh = self._without_degenerate()
+        if len(mesh.faces) > _MAX_COLLAPSED:
+            mesh = mesh.clustered(max(faces, _MAX_COLLAPSED))._without_degenerate()
+        if len(mesh.faces) <= faces:
+            return mesh
+        group, positions = collapse_edges(mesh.vertices, mesh.faces, faces, mesh.spacing)
+        remaining = with_distinct_corners(group[mesh.faces])
+        if len(remaining) <= faces:
+            reduced = mesh._merge_groups(group, np.bincount(group), remaining, positions)
+        else:
+            reduced = mesh.clustered(faces)
+        return reduced._without_degenerate()
+
+    def _without_degenerate(self) -> Mesh:
+        """Return the mesh of the triangles that have an area and are finite."""
+        valid = np.empty(len(self.faces), bool)
+        has_area(self.vertices, self.faces, _MIN_HEIGHT, valid)
+        return self.rows(valid)
+
+    def clustered(self, faces: int) -> Mesh:
+        """Return the mesh simplified to at most `faces` triangles: faster than `decimated`."""
+        if len(self.faces) <= faces:
+            return self
+        # Two triangles a cell, if it is flat.
+        cell = float(np.sqrt(self._double_area * len(self.faces) / faces))
+        while True:
+            group, count = self._cluster(cell)
+            remaining = with_distinct_corners(group[self.faces])
+            if len(remaining) <= faces:
+                return self._merge_groups(
+                    group, count, remaining, self._optimal_positions(group, count, cell)
+                )
+            # A larger step than a flat surface would need.
+            cell *= float(np.clip((len(remaining) / faces) ** 0.6, 1.02, 2.0))
+
+    def simplified(self, cell_m: float) -> Mesh:
+        """Return the mesh simplified by clustering vertices in the cells of a grid.
+
+        Vertex clustering (Rossignac and Borrel 1993), separately for both sides of thin structures,
+        with the vertex that is closest to the planes of the adjacent triangles (Lindstrom 2000), so
+        that edges and corners stay sharp.
+
+        Parameters
+        ----------
+        cell_m
+            Edge of a cell, m.
+        """
+        if len(self) == 0:
+            return self
+        group, count = self._cluster(cell_m)
+        remaining = with_distinct_corners(group[self.faces])
+        return self._merge_groups(
+            group, count, remaining, self._optimal_positions(group, count, cell_m)
+        )
+
+    def _cluster(self, cell_m: float) -> tuple[Intp, Intp]:
+        """Return the group of each vertex (N,), and the size of each group (G,)."""
+        key = np.zeros(len(self), np.int64)
+        for coordinate in self.vertices.T:  # one axis at a time takes a third of the memory
+            cell = np.floor(coordinate.astype(float) / cell_m).astype(np.int64)
+            cell -= cell.min()
+            key = key * (cell.max() + 1) + cell
+        number = np.empty(len(key), np.int64)
+        first = number_keys(key, number)
+        order = np.argsort(key[first])
+        rank = np.empty(len(order), np.intp)
+        rank[order] = np.arange(len(order))
+        # The sides of a thin sheet stay separate.
+        behind = (
+            np.einsum("ni,ni->n", self.normals, self.normals[first[number]]) < _MAX_OPPOSITE_COSINE
+        )
+        side = 2 * rank[number] + behind
+        count = np.bincount(side, minlength=2 * len(order))
+        return (np.cumsum(count > 0) - 1)[side], count[count > 0]
+
+    def _merge_groups(self, group: Intp, count: Intp, faces: Int32, positions: Float64) -> Mesh:
+        """Return the mesh of groups (N,) of vertices, of sizes (G,), at positions (G, 3), m."""
+        normals = _means(self.normals, group, count)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
+        max_views = np.zeros(len(count), np.int32)
+        np.maximum.at(max_views, group, self.views)
+        merged = Mesh(
+            positions.astype(np.float32),
+            faces,
+            normals.astype(np.float32),
+            self._mean_color(group, len(count)),
+            np.sqrt(_means(self.sigma.astype(float) ** 2, group, count)).astype(np.float32),
+            max_views,
+            self.offset,
+        )
+        return merged.rows(np.ones(len(faces), bool))
+
+    def _mean_color(self, group: Intp, groups: int) -> UInt8 | None:
+        """Return the mean (G, 3) of the colours of each group; black if none has a colour."""
+        if self.color is None:
+            return None
+        colored = has_color(self.color)
+        count = np.maximum(np.bincount(group[colored], minlength=groups), 1)
+        sums = [np.bincount(group[colored], c[colored].astype(float), groups) for c in self.color.T]
+        return np.round(np.stack(sums, -1) / count[:, None]).astype(np.uint8)
+
+    def _optimal_positions(self, group: Intp, count: Intp, cell_m: float) -> Float64:
+        """Return the position (G, 3) of each group by least squares on its triangles' planes.
+
+        Unconstrained directions stay at the centroid; the step is at most half a cell.
+        """
+        centroids = _means(self.vertices, group, count)
+        A = np.zeros((len(centroids), 3, 3))
+        b = np.zeros((len(centroids), 3))
+        quadric_sums(self.vertices, self.faces, group, centroids, A, b)
+        A += np.triu(A, 1).transpose(0, 2, 1)
+        trace = np.maximum(np.trace(A, axis1=1, axis2=2), 1e-12)
+        step = np.linalg.solve(A + _DAMPING * trace[:, None, None] * np.eye(3), b[..., None])[
+            ..., 0
+        ]
+        return centroids + step.clip(-0.5 * cell_m, 0.5 * cell_m)
+
+
+def mesh_of(record: GeometryRecord) -> Mesh:
+    """Return the mesh of a file's record; what it lacks of normals and scalars is zero."""
+    zeros = np.zeros(len(record))
+    faces, normals = record.faces, record.normals
+    return Mesh(
+        record.points.astype(np.float32),
+        np.zeros((0, 3), np.int32) if faces is None else faces,
+        np.zeros((len(record), 3), np.float32) if normals is None else normals,
+        record.color,
+        record.scalars.get("sigma", zeros).astype(np.float32),
+        record.scalars.get("views", zeros).astype(np.int32),
+        np.zeros(3),
+    )
+
+
+def _means(values: NDArray[np.generic], group: Intp, count: Intp) -> Float64:
+    """Return the means (G, ...) of values (N, ...) of groups of sizes (G,)."""
+    columns = values.reshape(len(values), -1).T
+    sums = [np.bincount(group, column.astype(float), len(count)) for column in columns]
+    return np.stack(sums, -1).reshape(-1, *values.shape[1:]) / count.reshape(
+        -1, *(1,) * (values.ndim - 1)
+    )
+
+
+def _loops(edges: Int64) -> list[Int64]:
+    """Return the loops of directed edges (K, 2); several through one vertex are separated."""
+    successors: dict[int, list[int]] = {}
+    for a, b in edges.tolist():
+        successors.setdefault(a, []).append(b)
+    loops = []
+    for start in list(successors):
+        path, position = [start], {start: 0}
+        while path:
+            if not successors.get(path[-1]):
+                del position[path.pop()]
+                continue
+            successor = successors[path[-1]].pop()
+            if successor in position:
+                loop = path[position[successor] :]
+                loops.append(np.array(loop))
+                for vertex in loop[1:]:
+                    del position[vertex]
+                del path[position[successor] + 1 :]
+            else:
+                position[successor] = len(path)
+                path.append(successor)
+    return [loop for loop in loops if len(loop) > 2]

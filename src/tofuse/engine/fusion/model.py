@@ -1,0 +1,170 @@
+"""The model: stored views, fused once poses are final."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.compute.spill import Spill
+from tofuse.engine.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.options import Fusion
+from tofuse.engine.fusion.range_view import RangeView
+from tofuse.engine.fusion.stored_views import StoredClouds, StoredViews
+from tofuse.engine.fusion.tsdf import fitting_voxel, fuse_surface
+from tofuse.engine.refinement.refinement import without_errors
+from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.views.prepared_view import PreparedView
+
+_SKETCH_VIEWS, _SKETCH_PIXELS = 60, 6000  # views in a sketch, and approximate pixels of each
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The model of a run.
+
+    Attributes
+    ----------
+    cloud
+        For range images the vertices of the surface, or without a surface the means of voxels; for
+        clouds the means of voxels.
+    mesh
+        None for clouds: without a camera free space is unknown.
+    """
+
+    cloud: Cloud
+    mesh: Mesh | None
+
+
+class ModelBuilder:
+    """Stores reduced views, and fuses them at their final poses.
+
+    Parameters
+    ----------
+    options
+        How views are fused.
+    spill
+        The store of views; by default a tenth of the memory for voxels, the others on disk.
+    """
+
+    def __init__(self, options: Fusion, spill: Spill[Any] | None = None) -> None:
+        self._options = options
+        if spill is None:
+            spill = Spill(options.memory_mb * 1_000_000 // 10)
+        self._ranges = StoredViews(spill)
+        self._clouds = StoredClouds(spill)
+        self._bytes = 0
+        self._voxel_m = 0.01  # of clouds
+
+    def add(self, frame: Frame, surface: PreparedView | None, max_points: int) -> None:
+        """Store a (filtered) view.
+
+        Parameters
+        ----------
+        frame
+            The filtered view.
+        surface
+            The same image prepared for tracking, if it was.
+        max_points
+            Maximum number of points of a cloud.
+        """
+        if isinstance(frame, CloudFrame):
+            if not len(self._clouds):
+                self._voxel_m = self._options.voxel_m or choose_voxel(frame)
+            self._clouds.add(as_cloud(frame, max_points))
+            return
+        view = RangeView.of(frame, surface)
+        self._ranges.add(view)
+        self._bytes += view.nbytes
+
+    @property
+    def views(self) -> int:
+        """Number of stored views."""
+        return len(self._ranges) + len(self._clouds)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the images of these views, in memory or on disk."""
+        return self._bytes
+
+    def fuse(
+        self,
+        poses: Mapping[int, Float64],
+        advance: Callable[[], None] | None = None,
+        errors: Mapping[str, float] = MappingProxyType({}),
+    ) -> Model:
+        """Make the model.
+
+        Parameters
+        ----------
+        poses
+            T_world_camera (4, 4) by frame index; views of other frames are left out.
+        advance
+            Called after each view.
+        errors
+            Errors of the camera to correct; see `Refinement.errors`.
+        """
+        if len(self._clouds) or not len(self._ranges):
+            clouds = (
+                replace(c, points=without_errors(c.points, errors)) if errors else c
+                for c in self._clouds.of(poses)
+            )
+            return Model(self._average(clouds, poses, self._voxel_m, advance), None)
+        views = self._ranges.of(poses)
+        has_errors = any(errors.values())
+        if has_errors:
+            views = views.corrected(errors)
+        T_world_camera = np.array([poses[summary.index] for summary in views.summaries], float)
+        mesh = fuse_surface(views, T_world_camera, self._options, advance)
+        if len(mesh):
+            model = Model(mesh.cloud(), self._postprocessed(mesh))
+        else:
+            clouds = (view.as_cloud() for view in views)
+            model = Model(self._average(clouds, poses, self._range_voxel), mesh)
+        if has_errors:
+            views.drop()
+        return model
+
+    def _postprocessed(self, mesh: Mesh) -> Mesh:
+        """Return the surface with small holes closed, and decimated."""
+        if self._options.holes_m:
+            mesh = mesh.without_holes(self._options.holes_m)
+        return mesh.decimated(self._options.faces) if self._options.faces else mesh
+
+    def sketch(self, poses: Mapping[int, Float64]) -> Cloud:
+        """Return a cloud at other poses for display, without normals for images.
+
+        It consists of evenly spaced images, and of evenly spaced pixels of each.
+        """
+        if len(self._clouds):
+            return self._average(self._clouds.of(poses), poses, self._voxel_m)
+        ranges = self._ranges.of(poses)
+        sampled = range(0, len(ranges), max(1, -(-len(ranges) // _SKETCH_VIEWS)))
+        voxel = self._range_voxel
+        clouds = (ranges[k].as_cloud(_SKETCH_PIXELS) for k in sampled)
+        return self._average(clouds, poses, voxel, normals=False)
+
+    @property
+    def _range_voxel(self) -> float:
+        return self._options.voxel_m or fitting_voxel(self._ranges)
+
+    def _average(
+        self,
+        views: Iterable[CloudFrame],
+        poses: Mapping[int, Float64],
+        voxel_m: float,
+        advance: Callable[[], None] | None = None,
+        *,
+        normals: bool = True,
+    ) -> Cloud:
+        builder = CloudBuilder(self._options, voxel_m)
+        for view in views:
+            builder.add(view, poses[view.index])
+            if advance is not None:
+                advance()
+        return builder.finish(normals=normals)

@@ -1,0 +1,268 @@
+"""Compact range images, as stored until they are fused at their final poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.engine.arrays import Bool, Float32, Int8, UInt8, UInt16
+from tofuse.engine.cameras.cameras import ray_lengths
+from tofuse.engine.compute.partition import median
+from tofuse.engine.fusion.tsdf_kernels import StoredView, mark_jumps, pack_view, shrink_to_planes
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.views.extended_planes import with_extended_planes
+from tofuse.engine.views.prepared_view import PreparedView, prepare_view
+from tofuse.engine.views.projection import Projection
+from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import dilated
+
+# Weights, in 1/m^2, are stored as logarithms: six steps per octave, from 2^-14 on.
+_STEPS_PER_OCTAVE, _MIN_LOG2 = 6.0, -14.0
+DECODED = np.r_[0.0, 2.0 ** (np.arange(255) / _STEPS_PER_OCTAVE + _MIN_LOG2)].astype(np.float32)
+# Minimum cosine of the incidence: beyond, the footprint of a pixel is too large.
+_MIN_COSINE = 0.1
+# Expected relief of surfaces within a window of a few pixels, as a fraction of the depth.
+_RELIEF = 0.002
+# A depth jump between neighbours exceeds this multiple of sigma.
+_JUMP_SIGMAS = 4.0
+# Weight factor of pixels near a jump: they matter only where nothing else was measured.
+_JUMP_WEIGHT = 0.1
+# A pixel within this many sigmas is on the plane of its neighbours. Next to valid pixels it is
+# restored if a filter removed it from a noisy surface.
+_ON_PLANE_SIGMAS = 3.0
+# Options of planes in addition to those of the tracker: minimum fill of windows, maximum offset.
+_MIN_PLANE_FILL, _MAX_PLANE_OFFSET = 0.4, 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class RangeView:
+    """A range image for fusion, of at most 320 columns and 8 to 10 bytes per pixel.
+
+    Attributes
+    ----------
+    index, timestamp
+        Of the frame.
+    projection
+        Rays of the pixels, and projection of points.
+    z
+        (H, W) uint16, z in counts of `unit` m, 0 where invalid.
+    normals
+        (H, W, 3) int8, 127 times the unit normals away from the camera.
+    strength
+        (H, W) uint8 code of the weight, see `DECODED`; 0 for pixels that are not integrated.
+    intensity
+        (H, W) float16, root of the albedo in the recording's counts times m^2; or (H, W, 3) uint8
+        RGB; None if neither is known.
+    sigma_m
+        Typical standard deviation of z.
+    """
+
+    index: int
+    timestamp: float
+    projection: Projection
+    z: UInt16
+    unit: float
+    normals: Int8
+    strength: UInt8
+    intensity: NDArray[np.float16] | UInt8 | None
+    sigma_m: float
+
+    @classmethod
+    def of(
+        cls,
+        frame: RangeFrame,
+        surface: PreparedView | None = None,
+        options: SurfaceOptions | None = None,
+    ) -> RangeView:
+        """Reduce the valid pixels of a frame.
+
+        A pixel's weight is one over the variance of the distance from its plane: that of its depth
+        times the squared cosine of the incidence. It is 0 next to depth jumps, where pixels mix
+        both sides, unless the pixel is on the plane of its neighbours. Its depth is smoothed
+        towards its plane, the more the noisier it is.
+
+        Parameters
+        ----------
+        frame
+            The filtered frame.
+        surface
+            The same image as prepared for tracking, before filters of the model, if it was.
+        options
+            How it is prepared if not.
+        """
+        options = options or SurfaceOptions()
+        if surface is None:
+            surface = prepare_view(frame, options)
+        surface = with_extended_planes(
+            surface, frame, replace(options, fill=_MIN_PLANE_FILL, offset=_MAX_PLANE_OFFSET)
+        )
+        options = options.for_image(surface.projection.pitch)
+        shape = surface.z.shape
+        smoothed, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        measured, jump = np.empty(shape, bool), np.zeros(shape, np.uint8)
+        shrink_to_planes(
+            surface.z, surface.sigma, surface.planes, surface.plane_variance,
+            _RELIEF, _ON_PLANE_SIGMAS, smoothed, variance, measured,
+        )  # fmt: skip
+        mark_jumps(surface.z, surface.sigma, options.edge_jump, _JUMP_SIGMAS, jump)
+        density = _area_mean(frame.valid.astype(np.float32), shape)
+        # Half of the pixels of a block; of a sparse image, half of what a block usually has.
+        valid = density >= 0.5 * (median(density[density > 0]) if density.any() else 1.0)
+        valid |= measured & dilated(valid.view(np.uint8), 1) & (jump == 0)
+        z = np.where(valid, smoothed, np.float32(0))
+        usable = (z > 0) & (surface.sigma > 0) & ((jump == 0) | (surface.planes[..., 3] > 0))
+        normals = np.empty((*shape, 3), np.int8)
+        weight = np.empty(shape, np.float32)
+        pack_view(
+            surface.planes,
+            surface.rays,
+            surface.projection.lengths2,
+            variance,
+            usable,
+            _MIN_COSINE,
+            normals,
+            weight,
+        )
+        weight[dilated(jump, options.edge_margin)] *= _JUMP_WEIGHT
+        usable = weight > 0
+        max_z = float(z.max(initial=0.0))
+        unit = max(max_z, 1e-3) / 65535
+        return cls(
+            frame.index,
+            frame.timestamp,
+            surface.projection,
+            np.round(z / unit).astype(np.uint16),
+            unit,
+            normals,
+            _weight_codes(weight),
+            _intensity(frame, shape),
+            _typical_sigma(variance, usable),
+        )
+
+    @property
+    def stored(self) -> StoredView:
+        """The view in the format of the kernels."""
+        return StoredView(self.z, self.unit, self.normals, self.strength, self.projection.rays)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the view's own images."""
+        intensity = 0 if self.intensity is None else self.intensity.nbytes
+        return self.z.nbytes + self.normals.nbytes + self.strength.nbytes + intensity
+
+    @property
+    def depth(self) -> float:
+        """Median z in m, of every fourth pixel if any of these is valid; 0 without valid ones."""
+        for step in (2, 1):
+            sampled = self.z[::step, ::step]
+            valid = sampled[sampled > 0]
+            if len(valid):
+                return float(median(valid.astype(np.float32))) * self.unit
+        return 0.0
+
+    @property
+    def pitch(self) -> float:
+        """Typical difference of x/z between neighbouring pixels."""
+        return self.projection.pitch
+
+    @property
+    def channels(self) -> int:
+        """3 for colour, 1 for albedo, else 0."""
+        if self.intensity is None:
+            return 0
+        return 3 if self.intensity.ndim == 3 else 1
+
+    def as_cloud(self, pixels: int | None = None) -> CloudFrame:
+        """Return the valid pixels as a cloud, with amplitude that is not range-compensated.
+
+        Of an image with more than `pixels` pixels every n-th of every n-th row is taken.
+        """
+        valid = (self.z > 0) & np.isfinite(self.projection.rays).all(-1)
+        if pixels is not None:
+            step = max(1, round(np.sqrt(self.z.size / pixels)))
+            sampled = np.zeros_like(valid)
+            sampled[step // 2 :: step, step // 2 :: step] = True
+            valid &= sampled
+        z = self.z[valid].astype(np.float32) * np.float32(self.unit)
+        rays = self.projection.rays[valid]
+        points = np.concatenate([rays * z[:, None], z[:, None]], 1)
+        color = amplitude = None
+        if self.channels == 3:
+            assert self.intensity is not None
+            color = self.intensity[valid].astype(np.uint8)
+        elif self.intensity is not None:
+            squared_range = np.einsum("ni,ni->n", points, points)
+            amplitude = self.intensity[valid].astype(np.float32) ** 2 / np.maximum(
+                squared_range, 1e-6
+            )
+        return CloudFrame(self.index, self.timestamp, points, color=color, amplitude=amplitude)
+
+
+def _typical_sigma(variance: Float32, usable: Bool) -> float:
+    """Return the median sigma of every fourth pixel, or of all if none of these is usable."""
+    for step in (2, 1):
+        sampled = variance[::step, ::step][usable[::step, ::step]]
+        if len(sampled):
+            return float(np.sqrt(median(sampled)))
+    return 0.0
+
+
+def with_camera_correction(
+    views: Iterable[RangeView], errors: Mapping[str, float]
+) -> Iterator[RangeView]:
+    """Yield views corrected for these errors of the camera; see `Refinement.errors`."""
+    focal_factor = 1 + errors.get("focal", 0.0)
+    corrected: dict[int, Projection] = {}  # shared by views, as the original
+    for view in views:
+        projection = view.projection
+        if id(projection) not in corrected:
+            frame = projection.frame * [
+                focal_factor,
+                focal_factor,
+                1 / focal_factor,
+                1 / focal_factor,
+            ]
+            corrected[id(projection)] = Projection(
+                np.asarray(projection.rays * np.float32(focal_factor)), projection.lookup, frame
+            )
+        z = view.z * np.float32(view.unit)
+        z = z * np.float32(1 + errors.get("scale", 0.0)) + np.where(
+            z > 0, np.float32(errors.get("offset", 0.0)) / np.sqrt(projection.lengths2), 0
+        )
+        z = np.maximum(np.nan_to_num(z), 0)
+        unit = max(float(z.max(initial=0.0)), 1e-3) / 65535
+        counts = np.round(z / unit).astype(np.uint16)
+        yield replace(view, z=counts, unit=unit, projection=corrected[id(projection)])
+
+
+def _weight_codes(weight: Float32) -> UInt8:
+    positive = weight > 0
+    code = 1 + np.round(_STEPS_PER_OCTAVE * (np.log2(np.where(positive, weight, 1)) - _MIN_LOG2))
+    return np.where(positive, np.clip(code, 1, 255), 0).astype(np.uint8)
+
+
+def _intensity(frame: RangeFrame, shape: tuple[int, ...]) -> NDArray[np.float16] | UInt8 | None:
+    if frame.color_image is not None:
+        return np.round(_area_mean(frame.color_image.astype(np.float32), shape)).astype(np.uint8)
+    if frame.amplitude_image is None:
+        return None
+    amplitude = frame.amplitude_image
+    if frame.amplitude_kind != "range_compensated":
+        # Compensated for the falloff with the squared range: proportional to the albedo.
+        amplitude = amplitude * np.square(frame.z * ray_lengths(frame.camera))
+    intensity = np.sqrt(np.maximum(_area_mean(np.nan_to_num(amplitude), shape), 0))
+    return np.minimum(intensity, 65000).astype(np.float16)
+
+
+def _area_mean(image: Float32, shape: tuple[int, ...]) -> Float32:
+    """Return means over blocks of pixels, an image of shape (H, W)."""
+    step = image.shape[1] // shape[1]
+    if step == 1:
+        return image
+    cropped = np.ascontiguousarray(image[: step * shape[0], : step * shape[1]])
+    means = cv2.resize(cropped, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
+    return np.asarray(means, np.float32)

@@ -1,0 +1,399 @@
+"""TSDF fusion: truncated signed distances in sparse blocks, and their zero surface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, UInt16
+from tofuse.engine.compute.spill import Spill
+from tofuse.engine.fusion.frusta import Frusta
+from tofuse.engine.fusion.layout import CUBE_SPACING, REACH_SIGMAS, Layout, Region, cubes_near
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.options import Fusion
+from tofuse.engine.fusion.range_view import DECODED, RangeView
+from tofuse.engine.fusion.stitching import Piece, stitch, to_rgb
+from tofuse.engine.fusion.stored_views import Views, summaries
+from tofuse.engine.geometry import se3
+from tofuse.engine.fusion.block_kernels import EDGE, VOXELS, Blocks, index_of, mark_octants, neighbours_of
+from tofuse.engine.fusion.surface_net_kernels import Vertices, make_faces, make_vertices, mark_cells
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.fusion.tsdf_kernels import Batch, Camera, Decoding, apply_free_space, integrate, unpack_view
+
+_CHUNKS = 16
+_BATCH = 16  # views
+# Maximum second difference of the lookup of a distortion-free camera, pixels.
+_MAX_SECOND_DIFFERENCE = 1e-3
+# Number of nodes within which the lookup of any other camera counts as linear.
+_DISTORTED_LINEAR_NODES = 2.0
+_MAX_SIGMA_VOXELS = 2.0  # maximum standard deviation of a surface, voxels
+
+
+def fitting_voxel(views: Views) -> float:
+    """Return a voxel edge in m for the sensor and the scene: 2 mm to 10 cm."""
+    nonempty = [summary for summary in summaries(views) if summary.depth > 0]
+    if not nonempty:
+        return 0.01
+    depth = float(np.median([summary.depth for summary in nonempty]))
+    # Depth noise grows with depth: finer voxels would represent mostly noise.
+    size = max(float(np.median([summary.pitch for summary in nonempty])), 0.004) * depth
+    return float(f"{np.clip(size, 0.002, 0.1):.2g}")
+
+
+@dataclass(eq=False)
+class Volume:
+    """Truncated signed distances to the surfaces of views, in blocks near these surfaces.
+
+    Each view is integrated into the blocks in its frustum. Blocks are distributed among threads,
+    and each is changed by one of them. The values of a block do not depend on which others are in
+    the volume.
+
+    Attributes
+    ----------
+    voxel_m, reach_m
+        Edge of a voxel, and the truncation distance.
+    keys
+        (B,) of the blocks: those the region owns, ascending, then the layer around them.
+    numbers, owned
+        (B,) their numbers among all blocks, and how many of them the region owns.
+    distance, weight, seen, color, free
+        See `tofuse.engine.fusion.block_kernels.Blocks`.
+    free_space_stride, added
+        Stride of views for free space far from surfaces, and the number of views added.
+    """
+
+    voxel_m: float
+    reach_m: float
+    keys: Int64
+    numbers: Int64
+    owned: int
+    distance: Float32
+    weight: Float32
+    seen: UInt16
+    color: Float32
+    free: Float32
+    free_space_stride: int = 1
+    added: int = 0
+
+    @property
+    def blocks(self) -> Blocks:
+        """The blocks in the format of the kernels."""
+        return Blocks(
+            self.keys, self.numbers, self.distance, self.weight, self.seen, self.color, self.free
+        )
+
+    @cached_property
+    def index(self) -> tuple[Int64, Int32]:
+        """Hash table of the rows of blocks by their keys."""
+        return index_of(self.keys)
+
+    @classmethod
+    def of(cls, layout: Layout, region: Region) -> Volume:
+        """Return the empty volume of a region of a layout."""
+        blocks = len(region.rows)
+        return cls(
+            layout.voxel_m,
+            layout.reach_m,
+            layout.keys[region.rows],
+            region.rows,
+            region.owned,
+            np.zeros((blocks, VOXELS), np.float32),
+            np.zeros((blocks, VOXELS), np.float32),
+            np.zeros((blocks, VOXELS), np.uint16),
+            np.zeros((blocks, VOXELS, layout.channels), np.float32),
+            np.zeros((blocks, 8), np.float32),
+            layout.free_space_stride,
+        )
+
+    def add(
+        self,
+        views: Views,
+        poses: Float64,
+        advance: Callable[[], None] | None = None,
+        touching: Bool | None = None,
+    ) -> None:
+        """Integrate views at their poses (N, 4, 4), in order; `advance` is called for each.
+
+        Those that are not `touching` (N,) any block are skipped.
+        """
+        batch: list[RangeView] = []
+        numbers: list[int] = []
+
+        def flush() -> None:
+            if batch:
+                selected = np.array(numbers, np.int64)
+                self._add(batch, poses[selected - self.added], selected)
+            batch.clear()
+            numbers.clear()
+
+        for k in range(len(views)):
+            if touching is None or touching[k]:
+                view = views[k]
+                if batch and (len(batch) == _BATCH or view.projection is not batch[0].projection):
+                    flush()
+                batch.append(view)
+                numbers.append(self.added + k)
+            if advance is not None:
+                advance()
+        flush()
+        self.added += len(views)
+
+    def _add(self, views: Views, poses: Float64, numbers: Int64) -> None:
+        """Integrate a batch of views of one camera; each block is loaded once for all of them.
+
+        `numbers` (N,) are their positions among all views.
+        """
+        if len(self.keys) == 0:
+            return
+        count, (rows, columns) = len(views), views[0].z.shape
+        projection = views[0].projection
+        grid = np.array(projection.lookup.shape[:2]) - 1
+        channels = self.color.shape[2]
+        batch = Batch(
+            numbers,
+            np.array([se3.inverse(T_world_camera) for T_world_camera in poses]),
+            heights=np.empty((count, rows * columns + 1), np.float32),
+            codes=np.empty((count, rows * columns + 1), np.int32),
+            intensity=np.zeros((count, rows * columns, channels), np.float32),
+            cells=np.empty((count, *grid, 3), np.float32),
+            coarse=np.empty((count, *-(-grid // 4), 3), np.float32),
+        )
+        decoding = Decoding(DECODED, _free_space_limits(self.reach_m), self.reach_m)
+
+        def unpack(a: int, b: int) -> None:
+            for s in range(a, b):
+                view = views[s]
+                unpack_view(view.stored, projection.frame, decoding, batch, s)
+                if self.free_space_stride > 1:
+                    number = int(numbers[s])
+                    cubes = cubes_near(
+                        view, poses[s], cube_m, self.reach_m, CUBE_SPACING, number, 2
+                    )
+                    mark_octants(cubes, *self.index, near_surface[s])
+                # Albedo is ignored if other views have colour.
+                if view.intensity is not None and channels == view.channels:
+                    batch.intensity[s] = view.intensity.reshape(-1, channels)
+
+        near_surface = np.zeros((count, len(self.keys)), np.uint8)
+        cube_m = 0.5 * EDGE * self.voxel_m
+        run_chunks(unpack, count, count)
+        nodes = _linear_nodes(projection.lookup)
+        camera = Camera((rows, columns), projection.lookup, projection.frame, nodes)
+        blocks, stride = self.blocks, self.free_space_stride
+        run_chunks(
+            lambda a, b: integrate(
+                blocks, self.voxel_m, batch, camera, decoding, near_surface, stride, a, b
+            ),
+            len(self.keys),
+            _CHUNKS,
+        )
+
+    def surface(self, min_views: int = 1) -> Mesh:
+        """Return the zero surface of the distances, between observed voxels.
+
+        Vertices with a standard deviation above a few voxels are left out, as there the surface is
+        noise. The surface of the blocks that a region owns is a `piece`.
+        """
+        net = self._extract(min_views)
+        points, normals, intensity, sigma, views = net.vertices
+        return Mesh(
+            points.astype(np.float32),
+            net.faces,
+            normals,
+            to_rgb(intensity),
+            sigma,
+            views,
+            np.zeros(3),
+        )
+
+    def piece(self, min_views: int = 1) -> Piece:
+        """Return the surface of the owned blocks, to be stitched to those of other regions."""
+        net = self._extract(min_views)
+        points, normals, intensity, sigma, views = net.vertices
+        block, voxel = np.nonzero(net.cells >= 0)
+        ids = self.numbers[block] * VOXELS + voxel
+        num_owned = int(np.searchsorted(block, self.owned))
+        used = np.zeros(len(ids), bool)
+        used[:num_owned] = True
+        used[net.faces] = True
+        row_of = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        return Piece(
+            ids[used],
+            points[:num_owned].astype(np.float32),
+            normals[:num_owned].copy(),
+            intensity[:num_owned].copy(),
+            sigma[:num_owned].copy(),
+            views[:num_owned].copy(),
+            row_of[net.faces].reshape(-1, 3),
+            self.numbers[: self.owned],
+            net.per_block,
+        )
+
+    def _extract(self, min_views: int) -> _SurfaceNet:
+        """Return the vertices of all cells, and the triangles of the owned blocks."""
+        count, blocks = len(self.keys), self.blocks
+        run_chunks(lambda a, b: apply_free_space(blocks, self.reach_m, a, b), count, _CHUNKS)
+        neighbours = np.empty((count, 27), np.int32)
+        neighbours_of(self.keys, neighbours)
+        cells = np.empty((count, VOXELS), np.int32)
+        counts = np.zeros(count, np.int64)
+        min_weight = 1 / (_MAX_SIGMA_VOXELS * self.voxel_m) ** 2
+        run_chunks(
+            lambda a, b: mark_cells(blocks, neighbours, min_weight, min_views, cells, counts, a, b),
+            count,
+            _CHUNKS,
+        )
+        starts = np.cumsum(counts) - counts
+        total = int(counts.sum())
+        vertices = Vertices(
+            np.empty((total, 3)),
+            np.empty((total, 3), np.float32),
+            np.empty((total, self.color.shape[2]), np.float32),
+            np.empty(total, np.float32),
+            np.empty(total, np.int32),
+        )
+        run_chunks(
+            lambda a, b: make_vertices(
+                blocks, self.voxel_m, neighbours, cells, starts, vertices, a, b
+            ),
+            count,
+            _CHUNKS,
+        )
+        faces, per_block = self._faces(neighbours, cells, starts, vertices.points)
+        return _SurfaceNet(vertices, faces, per_block, cells)
+
+    def _faces(
+        self,
+        neighbours: Int32,
+        cells: Int32,
+        starts: Int64,
+        points: Float64,
+    ) -> tuple[Int32, Int64]:
+        """Return the triangles of the owned blocks, and their number per block."""
+        counts = np.zeros(self.owned, np.int64)
+
+        def run(firsts: Int64, faces: Int32, fill: bool) -> Int32:
+            run_chunks(
+                lambda a, b: make_faces(
+                    neighbours,
+                    self.distance,
+                    cells,
+                    starts,
+                    points,
+                    firsts,
+                    faces,
+                    counts,
+                    fill,
+                    a,
+                    b,
+                ),
+                self.owned,
+                _CHUNKS,
+            )
+            return faces
+
+        run(counts, np.empty((0, 3), np.int32), fill=False)
+        triangles = np.empty((int(counts.sum()), 3), np.int32)
+        return run(np.cumsum(counts) - counts, triangles, fill=True), counts
+
+
+@dataclass(frozen=True, eq=False)
+class _SurfaceNet:
+    """The surface net of a volume: vertices (V,), and faces (M, 3)."""
+
+    vertices: Vertices
+    faces: Int32
+    per_block: Int64  # (owned,) faces of each block
+    cells: Int32  # (B, VOXELS) number of the vertex within its block, or -1
+
+
+def _free_space_limits(reach_m: float) -> Float32:
+    """Return the distance behind its surface up to which a pixel is integrated, m, by weight code.
+
+    (256,) several sigmas: else any noisy pixel that errs to the back would create a separate
+    surface.
+    """
+    sigma = 1 / np.sqrt(np.maximum(DECODED, np.float32(1e-12)))
+    return np.where(DECODED > 0, np.maximum(REACH_SIGMAS * sigma, reach_m), reach_m).astype(
+        np.float32
+    )
+
+
+def _linear_nodes(lookup: Float32) -> float:
+    """Return the number of nodes within which a lookup is linear."""
+    differences = [np.abs(np.diff(lookup, 2, axis)) for axis in (0, 1)]
+    if max(difference.max() for difference in differences) < _MAX_SECOND_DIFFERENCE:
+        return float(np.inf)
+    return _DISTORTED_LINEAR_NODES
+
+
+def fuse_surface(
+    views: Views,
+    poses: Float64,
+    options: Fusion | None = None,
+    advance: Callable[[], None] | None = None,
+) -> Mesh:
+    """Fuse range images at their final poses into one surface.
+
+    Parameters
+    ----------
+    views
+        Of one camera or several.
+    poses
+        (N, 4, 4) T_world_camera.
+    options
+        How they are fused.
+    advance
+        Called after each view.
+
+    Returns
+    -------
+    The surface without islands; without faces if the views contain none. If its voxels exceed the
+    memory of the options, it is fused region by region, with the same result.
+    """
+    options = options or Fusion()
+    layout = Layout.of(views, poses, options.voxel_m or fitting_voxel(views))
+    regions = layout.regions(options.memory_mb * 1_000_000 // layout.block_bytes)
+    if len(regions) == 1:
+        volume = Volume.of(layout, regions[0])
+        volume.add(views, poses, advance)
+        mesh = volume.surface(options.min_views)
+        del volume
+        return mesh.without_islands(options.island)
+    return _fuse_by_regions(layout, regions, views, poses, options, advance)
+
+
+def _fuse_by_regions(
+    layout: Layout,
+    regions: Sequence[Region],
+    views: Views,
+    poses: Float64,
+    options: Fusion,
+    advance: Callable[[], None] | None,
+) -> Mesh:
+    """Fuse the surface region by region, byte-identical to that of a single region."""
+    frusta = Frusta.of(views, poses, _free_space_limits(layout.reach_m))
+    block_m = EDGE * layout.voxel_m
+    done = 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if advance is not None and done % len(regions) == 0:
+            advance()
+
+    store: Spill[Piece] = Spill(0)
+    with closing(store) as pieces:
+        for region in regions:
+            # With a margin of one block, as blocks are tested by their bounding spheres.
+            low, high = np.asarray(region.low - 1, float), np.asarray(region.high + 1, float)
+            touching = frusta.touching(block_m * low, block_m * high)
+            volume = Volume.of(layout, region)
+            volume.add(views, poses, step, touching)
+            pieces.put(volume.piece(options.min_views))
+            del volume
+        return stitch(pieces, len(layout.keys), options.island)

@@ -1,0 +1,281 @@
+"""The pose graph: poses of the cameras, and measurements of their relative poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Protocol
+
+import numpy as np
+
+from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
+from tofuse.engine.alignment.base import Registration
+
+# Squared error of an edge, in units of its information, up to which it may be rounding.
+ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Gravity:
+    """Directions of gravity measured at single poses: weighted edges to the world's vertical.
+
+    Attributes
+    ----------
+    vertices
+        (g,) positions of the poses.
+    directions
+        (g, 3) unit vectors, each in the frame of its camera.
+    sigma
+        (g,) standard deviation of each, rad.
+    world
+        (3,) the same direction in the world, or None if it is to be estimated.
+    gate
+        Squared error, in units of sigma, beyond which a direction has little weight (Geman and
+        McClure), as a moving accelerometer measures more than gravity.
+    """
+
+    vertices: Intp
+    directions: Float64
+    sigma: Float64
+    world: Float64 | None = None
+    gate: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraph:
+    """Poses and measured relative poses, as arrays.
+
+    Attributes
+    ----------
+    ids
+        (N,) ids of the vertices (frame indices), unique.
+    poses
+        (N, 4, 4) T_world_vertex.
+    edges
+        (M, 2) positions in `ids` (not ids) of the ends i, j.
+    measurements
+        (M, 4, 4) measured T_i_j.
+    information
+        (M, 6, 6) information of ``log(Z^-1 T_i^-1 T_j)``, order (tx ty tz rx ry rz), SI units.
+    loop
+        (M,) True for edges that close a loop, False for odometry.
+    gravity
+        Measurements of single poses, or None. g2o files don't contain them.
+    """
+
+    ids: Intp
+    poses: Float64
+    edges: Intp
+    measurements: Float64
+    information: Float64
+    loop: Bool
+    gravity: Gravity | None = None
+
+    def __post_init__(self) -> None:
+        n, m = len(self.ids), len(self.edges)
+        shapes = {
+            "poses": (n, 4, 4),
+            "edges": (m, 2),
+            "measurements": (m, 4, 4),
+            "information": (m, 6, 6),
+            "loop": (m,),
+        }
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise InputError(
+                    f"{name} has shape {getattr(self, name).shape}, not {shape}", where="pose graph"
+                )
+        if self.gravity is not None and not np.isin(self.gravity.vertices, np.arange(n)).all():
+            raise InputError("a direction of gravity names no vertex", where="pose graph")
+        if m and (self.edges.min() < 0 or self.edges.max() >= n):
+            raise InputError("an edge names a vertex that is not there", where="pose graph")
+        if m and (self.edges[:, 0] == self.edges[:, 1]).any():
+            raise InputError("an edge joins a vertex to itself", where="pose graph")
+
+    @classmethod
+    def empty(cls) -> PoseGraph:
+        """Return a graph without vertices."""
+        return cls(
+            np.zeros(0, np.intp),
+            np.zeros((0, 4, 4)),
+            np.zeros((0, 2), np.intp),
+            np.zeros((0, 4, 4)),
+            np.zeros((0, 6, 6)),
+            np.zeros(0, bool),
+        )
+
+    def with_poses(self, poses: Float64) -> PoseGraph:
+        """Return the graph with other poses."""
+        return replace(self, poses=poses)
+
+    def subgraph(self, vertices: Intp, edges: Intp) -> PoseGraph:
+        """Return the subgraph of vertices, and of edges between them.
+
+        Parameters
+        ----------
+        vertices, edges
+            Their positions, ascending.
+        """
+        number = np.full(len(self.ids), -1)
+        number[vertices] = np.arange(len(vertices))
+        gravity = self.gravity
+        if gravity is not None:
+            kept = number[gravity.vertices] >= 0
+            gravity = replace(
+                gravity,
+                vertices=number[gravity.vertices[kept]],
+                directions=gravity.directions[kept],
+                sigma=gravity.sigma[kept],
+            )
+        return PoseGraph(
+            self.ids[vertices],
+            self.poses[vertices],
+            number[self.edges[edges]],
+            self.measurements[edges],
+            self.information[edges],
+            self.loop[edges],
+            gravity if gravity is not None and len(gravity.vertices) else None,
+        )
+
+    def residuals(self) -> Float64:
+        """Return the (M, 6) errors ``log(Z^-1 T_i^-1 T_j)`` of the edges."""
+        i, j = self.edges.T
+        T_i_j = se3.inverse(self.poses[i]) @ self.poses[j]
+        return se3.log(se3.inverse(self.measurements) @ T_i_j)
+
+    def chi2(self, edges: Bool | None = None) -> float:
+        """Return the sum of squared errors, weighted by the information, of all edges or some."""
+        r = self.residuals()
+        squared_errors = np.einsum("mi,mij,mj->m", r, self.information, r)
+        return float(squared_errors.sum() if edges is None else squared_errors[edges].sum())
+
+
+@dataclass(frozen=True)
+class GraphPart:
+    """A connected part of the graph, optimised separately.
+
+    Attributes
+    ----------
+    first
+        Id of its first vertex, which is fixed.
+    vertices, edges
+        Their numbers.
+    before, after
+        The method's objective. If it could not be lowered they are equal, and the poses are those
+        of the input.
+    converged
+        Whether the stopping rule was met.
+    """
+
+    first: int
+    vertices: int
+    edges: int
+    before: float
+    after: float
+    converged: bool
+
+    @property
+    def improved(self) -> bool:
+        """Whether the objective is lower than that of the input."""
+        return self.after < self.before
+
+
+@dataclass(frozen=True, eq=False)
+class Optimisation:
+    """The result of an optimiser.
+
+    Attributes
+    ----------
+    graph
+        The graph with optimised poses; the first vertex is fixed.
+    objective
+        The method's own objective at the start and after every iteration.
+    converged
+        Whether the stopping rule was met within the iterations.
+    weights
+        (M,) final weight of each edge's information, 0 for rejected edges; None if the method is
+        not robust.
+    parts
+        The connected parts of the graph, if the method distinguishes them.
+    """
+
+    graph: PoseGraph
+    objective: tuple[float, ...]
+    converged: bool
+    weights: Float64 | None = None
+    parts: tuple[GraphPart, ...] = ()
+
+    @property
+    def improved(self) -> bool:
+        """Whether the method's objective is lower than that of the input."""
+        if self.parts:
+            return any(part.improved for part in self.parts)
+        return len(self.objective) > 1 and self.objective[-1] < self.objective[0]
+
+
+class Optimiser(Protocol):
+    """A method that distributes the error of the loops over the poses."""
+
+    part_kind: ClassVar[str] = "optimiser"
+
+    def optimise(self, graph: PoseGraph) -> Optimisation:
+        """Return the graph with optimised poses; the first vertex is fixed."""
+        ...
+
+
+@dataclass(frozen=True)
+class LoopRecord:
+    """A candidate for a loop closure, and the decision about it; None where not computed.
+
+    Attributes
+    ----------
+    i, j
+        Frame indices, i < j.
+    accepted
+        Whether it is in the pose graph.
+    reason
+        Reason of the decision; may be empty.
+    overlap
+        Fraction of points with a correspondence, 0 to 1.
+    rms_m
+        Rms distance of the correspondences, m.
+    free_space_violation
+        Fraction of points of one view in the free space of the other, 0 to 1.
+    margin
+        Lead of the pose found by a search over its best rival, as a fraction of the points.
+    """
+
+    i: int
+    j: int
+    accepted: bool
+    reason: str
+    overlap: float | None = None
+    rms_m: float | None = None
+    free_space_violation: float | None = None
+    margin: float | None = None
+
+    @classmethod
+    def of(
+        cls, pair: tuple[int, int], accepted: bool, reason: str, registration: Registration
+    ) -> LoopRecord:
+        """Return the decision on a registration of two views.
+
+        Parameters
+        ----------
+        pair
+            Indices (i, j) of their frames.
+        accepted, reason
+            The decision, and why.
+        registration
+            The registration.
+        """
+        return cls(
+            *pair,
+            accepted,
+            reason,
+            overlap=registration.overlap,
+            rms_m=registration.rms_m if np.isfinite(registration.rms_m) else None,
+            free_space_violation=registration.violation,
+            margin=registration.margin,
+        )

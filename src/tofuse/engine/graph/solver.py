@@ -1,0 +1,123 @@
+"""Least squares over a pose graph, on plain arrays: sparse Levenberg-Marquardt on SE(3).
+
+The objective is the sum over all edges of ``e^T Omega e`` with ``e = log(Z^-1 T_i^-1 T_j)``, with
+an optional robust kernel on loop edges (`tofuse.engine.graph.robust`), and of the errors of gravity at
+single poses. Poses are perturbed on the right. With ``E = exp(e)``::
+
+    log(E exp(xi)) = e + J_r^-1(e) xi,    xi = d_j - Ad(T_j_i) d_i
+
+so the Jacobians are the inverse right Jacobian of SE(3), and that times an adjoint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.graph import robust
+from tofuse.engine.graph.descent import Descent, Problem
+from tofuse.engine.graph.gnc import truncated_least_squares
+from tofuse.engine.graph.graph import Gravity
+from tofuse.engine.graph.robust import Settings
+from tofuse.engine.graph.sparse import Factor, first_of_parts
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Result of the minimisation.
+
+    Attributes
+    ----------
+    poses
+        (n, 4, 4).
+    chi2
+        (m,) squared errors of the edges, weighted by their full information.
+    weights
+        (m,) final weight of each edge, 0 to 1.
+    history
+        The objective at the start and after every step. It falls at every step, unless "truncated"
+        selects among the edges: then it is that of the finally accepted edges, and rejected ones
+        count as an edge at the threshold.
+    converged
+        Whether the stopping rule was met.
+    """
+
+    poses: Float64
+    chi2: Float64
+    weights: Float64
+    history: tuple[float, ...]
+    converged: bool
+    _problem: Problem = field(repr=False)
+
+    def factor(self) -> Factor | None:
+        """Factorise the normal equations at the solution, for covariances; None if singular."""
+        return self._problem.factor(self.poses, self.weights)
+
+
+def solve(
+    poses: Float64,
+    pairs: Intp,
+    measurements: Float64,
+    information: Float64,
+    *,
+    loop: Bool | None = None,
+    fixed: Bool | None = None,
+    gravity: Gravity | None = None,
+    settings: Settings | None = None,
+) -> Solution:
+    """Minimise the objective over the poses, starting from `poses`.
+
+    Parameters
+    ----------
+    poses
+        (n, 4, 4) T_world_k.
+    pairs
+        (m, 2) positions i, j.
+    measurements, information
+        (m, 4, 4) measured T_i_j and (m, 6, 6) information of ``log(Z^-1 T_i^-1 T_j)``.
+    loop
+        (m,) mask of the edges with the robust kernel; none by default.
+    fixed
+        (n,) mask of fixed poses; by default the first of each connected part.
+    gravity
+        Directions of gravity measured at single poses.
+    settings
+        Kernel, thresholds and stopping rule.
+    """
+    settings = settings or Settings()
+    pairs = np.asarray(pairs, np.intp).reshape(-1, 2)
+    loop = np.zeros(len(pairs), bool) if loop is None else np.asarray(loop, bool)
+    fixed = first_of_parts(len(poses), pairs) if fixed is None else np.asarray(fixed, bool)
+    problem = Problem(pairs, measurements, information, fixed, gravity)
+    if settings.robust == "truncated" and loop.any():
+        selection = truncated_least_squares(problem, poses, loop, settings)
+        log = selection.descent.log
+        history = tuple(float(np.minimum(x, selection.limit).sum()) + extra for x, extra in log)
+        return _solution(
+            problem, selection.descent, selection.weights, history, selection.converged
+        )
+    kernel = settings.robust if settings.robust != "truncated" else "none"
+
+    def total(x: Float64) -> Float64:
+        return np.where(loop, robust.cost(kernel, x, settings.gate), x)
+
+    def weights(x: Float64) -> Float64:
+        return np.where(loop, robust.weight(kernel, x, settings.gate), 1.0)
+
+    descent = Descent(problem, problem.start(poses))
+    converged = descent.run(total, weights, settings.tolerance, settings.max_iterations)
+    history = tuple(float(total(x).sum()) + extra for x, extra in descent.log)
+    return _solution(problem, descent, weights(descent.chi2), history, converged)
+
+
+def _solution(
+    problem: Problem,
+    descent: Descent,
+    weights: Float64,
+    history: tuple[float, ...],
+    converged: bool,
+) -> Solution:
+    poses = descent.poses[: len(problem.fixed)]
+    return Solution(poses, descent.chi2, weights, history, converged, problem)

@@ -1,0 +1,224 @@
+"""Adapting a configuration to a recording before its first frame is tracked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from tofuse.engine.sensor.base import Correction
+from tofuse.engine.sensor.noise_correction import Noise
+from tofuse.engine.filters.base import Filter
+from tofuse.engine.filters.confidence import Confidence
+from tofuse.engine.compute.thread_pool import threads as use_threads
+from tofuse.engine.tracking.given import GivenPoses
+from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.alignment.view_options import ViewOptions
+from tofuse.engine.parts import name_of
+from tofuse.engine.mapping.config import Config, check_views, kind_of
+from tofuse.engine.mapping.falloff import RANGE, estimate_falloff
+from tofuse.engine.mapping.progress import Progress, Silent
+from tofuse.engine.mapping.trial import Prepare, trial
+from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.noise.choice import noise_model_for
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.views.prepared_view import RAW_RANGE_FALLOFF
+from tofuse.engine.noise.model import NOISE, NoiseModel
+
+# Number of evenly spaced frames: enough for the background behind an object that turns once.
+_SAMPLE_FRAMES = 30
+
+
+def adapted(
+    config: Config,
+    recording: Recording,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Config:
+    """Return the configuration with all values that depend on the recording filled in.
+
+    These are defaults (`with_recording_defaults`), the parameters that corrections and filters
+    learn from up to 30 frames, and the falloffs of the amplitude and of colour.
+    Corrections on trial are kept only if overlapping views show the error that they correct
+    (`trial`). An adapted configuration is returned unchanged.
+
+    Parameters
+    ----------
+    config
+        The configuration.
+    recording
+        The recording that it is adapted to.
+    threads
+        Number of threads; None: all cores. The result does not depend on it.
+    progress
+        Is notified of corrections that are left out.
+
+    Raises
+    ------
+    InputError
+        If a filter can't learn from the recording, or its noise.json is invalid.
+    """
+    config = with_recording_defaults(config, recording)
+    initial = config
+    filters_learn = any(f.needs_fit for f in (*config.filters, *config.model_filters))
+    # BLAS results depend on its number of threads; those of our kernels don't.
+    with use_threads(threads), threadpool_limits(1):
+        if filters_learn or any(c.needs_fit for c in config.corrections):
+            config = _fitted(config, recording)
+        for item in config.corrections:
+            if item.needs_trial:
+                config = _after_trial(config, item, recording, progress or Silent())
+        left_out = sum(c.disabled for c in config.corrections)
+        if filters_learn and left_out > sum(c.disabled for c in initial.corrections):
+            # Filters must learn from images without the corrections that are left out.
+            filters, model_filters = initial.filters, initial.model_filters
+            config = replace(config, filters=filters, model_filters=model_filters)
+            config = _fitted(config, recording)
+        odometry = config.odometry
+        if isinstance(odometry, Keyframes | GivenPoses):
+            views = _with_falloffs(odometry.views, recording, _preparation(config))
+            config = replace(config, odometry=replace(odometry, views=views))
+    return config
+
+
+def _with_falloffs(views: ViewOptions, recording: Recording, prepare: Prepare) -> ViewOptions:
+    """Return the options with unspecified falloffs of amplitude and colour estimated."""
+    if views.falloff is not None and views.range_falloff is not None:
+        return views
+    frame = recording.first_readable()
+    image = frame if isinstance(frame, RangeFrame) else None
+    amplitude = image is not None and image.amplitude_image is not None
+    falloff, range_falloff = views.falloff, views.range_falloff
+    if range_falloff is None:
+        # Infrared is assumed to be that of a ToF camera, unless the recording shows otherwise.
+        infrared = image is not None and amplitude and image.amplitude_kind == "ir"
+        color = image is not None and not amplitude and image.color_image is not None
+        range_falloff = RAW_RANGE_FALLOFF if infrared else 0.0
+        if infrared or color:
+            surface = replace(views.surface, falloff=falloff or 0.0, range_falloff=range_falloff)
+            range_falloff = max(
+                range_falloff + estimate_falloff(recording, prepare, surface, RANGE), 0.0
+            )
+    if falloff is None:
+        # Colour cameras compensate their vignetting.
+        surface = replace(views.surface, falloff=0.0, range_falloff=range_falloff)
+        falloff = estimate_falloff(recording, prepare, surface) if amplitude else 0.0
+    return replace(views, falloff=falloff, range_falloff=range_falloff)
+
+
+def with_recording_defaults(config: Config, recording: Recording) -> Config:
+    """Return the configuration with the recording's noise model, and its scale of confidence.
+
+    Raises
+    ------
+    InputError
+        If the recording has an invalid noise.json.
+    """
+    corrections = tuple(
+        replace(c, model=_noise_model(recording)) if isinstance(c, Noise) and not c.model else c
+        for c in config.corrections
+    )
+    config = replace(config, corrections=corrections)
+    max_confidence = recording.metadata.get("confidence_max")
+    if not isinstance(max_confidence, int | float) or not 1 <= max_confidence <= 255:
+        return config
+    scaled = (
+        tuple(
+            f.on_scale(round(max_confidence)) if isinstance(f, Confidence) else f for f in filters
+        )
+        for filters in (config.filters, config.model_filters)
+    )
+    filters, model_filters = scaled
+    return replace(config, filters=filters, model_filters=model_filters)
+
+
+def _noise_model(recording: Recording) -> NoiseModel | None:
+    """Return the noise model stated by the recording, or that of its camera family."""
+    model = noise_model_for(recording)
+    return None if model == NOISE["unknown"] else model
+
+
+def _fitted(config: Config, recording: Recording) -> Config:
+    """Return the configuration with its parts fitted to a sample of frames."""
+    frames = recording.readable(_SAMPLE_FRAMES)
+    check_views(config, kind_of(frames[0]) if frames else "range")
+    corrections, frames = _fitted_corrections(config.corrections, frames)
+    filters, frames = _fitted_filters(config.filters, frames)
+    model_filters, _ = _fitted_filters(config.model_filters, frames)
+    return replace(config, corrections=corrections, filters=filters, model_filters=model_filters)
+
+
+def _after_trial(
+    config: Config, item: Correction, recording: Recording, progress: Progress
+) -> Config:
+    """Return the configuration after the trial of a correction."""
+    others = replace(config, corrections=tuple(c for c in config.corrections if c is not item))
+    uncorrected, corrected = _preparation(others), _preparation(config)
+    if _changes(config, recording, uncorrected, corrected):
+        result = trial(recording, uncorrected, corrected)
+        tested = item.after_trial(result.is_significant, result.strength, result.error)
+        if tested.disabled:
+            progress.note(f"correction {name_of(item)} not applied: {result.in_words()}")
+    else:
+        tested = item.after_trial(improves=True)
+    corrections = tuple(tested if c is item else c for c in config.corrections)
+    return replace(config, corrections=corrections)
+
+
+def _changes(
+    config: Config, recording: Recording, uncorrected: Prepare, corrected: Prepare
+) -> bool:
+    """Whether a correction changes the first image of a recording."""
+    frame = recording.first_readable()
+    if frame is None:
+        return False
+    check_views(config, kind_of(frame))
+    if not isinstance(frame, RangeFrame):
+        return False
+    before, after = uncorrected(frame), corrected(frame)
+    assert isinstance(before, RangeFrame)
+    assert isinstance(after, RangeFrame)
+    return not np.array_equal(before.depth, after.depth)
+
+
+def _preparation(config: Config) -> Prepare:
+    """Return the corrections and filters of single frames, without filters over time."""
+    correctors = [correction.start() for correction in config.corrections]
+
+    def prepare(frame: Frame) -> Frame:
+        for corrector in correctors:
+            frame = corrector.apply(frame)
+        for item in config.filters:
+            if item.window == 1:
+                frame = frame.keep(item.mask(frame, ()))
+        return frame
+
+    return prepare
+
+
+def _fitted_corrections(
+    corrections: Sequence[Correction], frames: list[Frame]
+) -> tuple[tuple[Correction, ...], list[Frame]]:
+    """Fit each correction to frames corrected by the preceding ones; and correct the frames."""
+    fitted = []
+    for item in corrections:
+        item = item.fit(frames) if item.needs_fit else item
+        corrector = item.start()
+        frames = [corrector.apply(frame) for frame in frames]
+        fitted.append(item)
+    return tuple(fitted), frames
+
+
+def _fitted_filters(
+    filters: Sequence[Filter], frames: list[Frame]
+) -> tuple[tuple[Filter, ...], list[Frame]]:
+    """Fit each filter to frames filtered by the preceding ones; and filter the frames."""
+    fitted = []
+    for item in filters:
+        item = item.fit(frames) if item.needs_fit else item
+        if item.window == 1:  # a sample has no neighbours in time
+            frames = [frame.keep(item.mask(frame, ())) for frame in frames]
+        fitted.append(item)
+    return tuple(fitted), frames

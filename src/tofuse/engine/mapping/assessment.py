@@ -1,0 +1,292 @@
+"""Accuracy and verdict of a reconstructed part."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.sensor.camera_errors import CameraErrors
+from tofuse.engine.quality.cross_view import CrossViewConsistency, cross_view_consistency
+from tofuse.engine.quality.trajectory import displacement
+from tofuse.engine.fusion.model import Model
+from tofuse.engine.fusion.pose_errors import with_pose_errors
+from tofuse.engine.normal import OF_95_PERCENT
+from tofuse.engine.tracking.given import GivenPoses
+from tofuse.engine.parts import name_of
+from tofuse.engine.quality.checks import Evidence, judge
+from tofuse.engine.mapping.config import Config
+from tofuse.engine.mapping.frame_log import FrameLog
+from tofuse.engine.mapping.observations import Observations
+from tofuse.engine.mapping.stage_results import Optimised, Refined
+from tofuse.engine.mapping.tracked_graph import TrackedGraph
+from tofuse.engine.quality.accuracy import Accuracy, ObservedErrors, accuracy_of, covariances_of
+from tofuse.engine.refinement.calibration_check import CalibrationCheck
+from tofuse.engine.graph.covariances import GraphCovariances
+from tofuse.engine.graph.bridges import cut_edges
+from tofuse.engine.graph.external_sensors import SensorPriors, with_sensors
+from tofuse.engine.graph.graph import LoopRecord, PoseGraph
+from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.refinement.refinement import Refinement
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.quality.types import Component, FrameRecord, Reason, Verdict
+from tofuse.engine.quality.verdict import ranked
+
+
+@dataclass(frozen=True, eq=False)
+class Assessed:
+    """The result of the assessment.
+
+    Attributes
+    ----------
+    verdict, reasons
+        "good", "degraded" or "failed", and why.
+    accuracy
+        Bounds of the pose errors.
+    records
+        Records of all frames, with the covariances of their poses.
+    model
+        The model, whose errors include those of the poses.
+    """
+
+    verdict: Verdict
+    reasons: tuple[Reason, ...]
+    accuracy: Accuracy
+    records: tuple[FrameRecord, ...]
+    model: Model
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """Assesses the reconstruction of one connected part.
+
+    Attributes
+    ----------
+    config
+        The configuration.
+    log
+        The frames of the part.
+    tracked
+        Its pose graph.
+    observations
+        Stored observations.
+    prior_loops
+        Given loops.
+    """
+
+    config: Config
+    log: FrameLog
+    tracked: TrackedGraph
+    observations: Observations
+    prior_loops: Sequence[PriorLoop]
+
+    def run(
+        self,
+        closed: Optimised,
+        refined: Refined,
+        model: Model,
+        components: tuple[Component, ...],
+    ) -> Assessed:
+        """Compare images at the final poses, bound the errors of the poses, and judge.
+
+        Parameters
+        ----------
+        closed, refined
+            Results of the earlier stages.
+        model
+            The fused model.
+        components
+            As in `Reconstruction`.
+        """
+        graph, observations = refined.graph, self.observations
+        loops = tuple(c.record for c in closed.loops)
+        cross_view = self._cross_view(graph)
+        accuracy, covariances = self._accuracy(closed, refined, model, cross_view)
+        if observations.has_covariances:
+            model = self._with_pose_errors(model, graph, covariances)
+        records = self._records(covariances)
+        posed, entries = self.tracked.posed, self.log.entries
+        evidence = Evidence(
+            records=records,
+            registrations=tuple(None if e.step is None else e.step.registration for e in entries),
+            loops=loops,
+            sequential=closed.visual.sequential if self._is_tracked else graph.poses,
+            optimisation=closed.visual.optimisation,
+            cross_view=cross_view,
+            accuracy=accuracy,
+            diagonal_m=model.cloud.diagonal_m,
+            tolerance_m=self.config.tolerance_m,
+            has_covariances=observations.has_covariances,
+            refinement=refined.refinement,
+            given_loops=frozenset((g.i, g.j) for g in self.prior_loops if g.by_user),
+            depths=tuple(
+                d
+                for index, d in observations.depths.items()
+                if d > 0 and index in self.tracked.poses
+            ),
+            ambiguity_m=observations.ambiguity_m,
+            repeated=tuple(self.log.repeated),
+            interruptions=tuple(self.log.interruptions),
+            priors=closed.sensors.records,
+            components=components,
+            moving=tuple(
+                (e.record.index, e.moving_fraction) for e in posed if e.moving_fraction > 0
+            ),
+            doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
+            single_link_frames=single_link_frames(self.tracked, loops),
+        )
+        verdict, reasons = judge(evidence)
+        more = [*self._correction_reasons(), *self._surface_reasons(model)]
+        return Assessed(verdict, ranked([*reasons, *more]), accuracy, records, model)
+
+    @property
+    def _is_tracked(self) -> bool:
+        return not isinstance(self.config.odometry, GivenPoses)
+
+    def _accuracy(
+        self,
+        closed: Optimised,
+        refined: Refined,
+        model: Model,
+        cross_view: CrossViewConsistency | None,
+    ) -> tuple[Accuracy, Float64]:
+        """Return the accuracy of the final poses, and their covariances (P, 6, 6).
+
+        Not assessed if covariances of registrations are unrealistic.
+        """
+        if not self.observations.has_covariances:
+            return Accuracy(), GraphCovariances(closed.optimisation.graph).of_poses
+        refinement = refined.refinement
+        full = images_only = GraphCovariances(self._measured(refined.graph, refinement))
+        if closed.sensors:  # the accuracy uses the images alone where they suffice
+            without_sensors = closed.visual.optimisation.graph
+            if refinement.kept:
+                without_sensors = self.tracked.build(
+                    closed.loops, refinement, confirmed=closed.confirmed
+                )
+            images_only = GraphCovariances(self._measured(without_sensors, refinement))
+        refinement_shift = 0.0, 0.0
+        if self._is_tracked:  # the initial error of given poses is unrelated to the final one
+            refinement_shift = displacement(closed.optimisation.graph.poses, refined.graph.poses)
+        excess_m = 0.0 if cross_view is None else cross_view.excess_m()
+        calibration = self._calibration_error(refinement.calibration_check)
+        observed = ObservedErrors(
+            *refinement_shift, excess_m, *calibration, refinement.split_m, refinement.split_rad
+        )
+        covariances = covariances_of(full, observed)
+        del full  # only one large factor is in memory
+        accuracy = accuracy_of(images_only, observed, model.cloud.diagonal_m)
+        if accuracy.unbounded and closed.sensors.verified:
+            unbounded = set(accuracy.unbounded)
+            bounded = with_sensors(images_only.graph, self._steps_at_degenerate(closed.sensors))
+            accuracy = accuracy_of(GraphCovariances(bounded), observed, model.cloud.diagonal_m)
+            by_odometry = tuple(sorted(unbounded.difference(accuracy.unbounded)))
+            accuracy = replace(accuracy, by_odometry=by_odometry)
+        return accuracy, covariances
+
+    def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
+        return self.tracked.measured(graph, self.observations.views, refinement.non_overlap_edges)
+
+    def _calibration_error(self, check: CalibrationCheck | None) -> tuple[float, float]:
+        """Return the 95 % bound of the pose errors (m, rad) due to the calibration.
+
+        It is the change of the poses under the estimated calibration, or the gap of a loop that a
+        better calibration would close, if larger; plus the uncertainty of corrections.
+        """
+        if check is None:
+            return 0.0, 0.0
+        gap = check.gap.before if check.alarm and check.gap is not None else (0.0, 0.0)
+        errors = [np.maximum(check.moved, gap)]
+        for part in self.config.corrections:
+            if isinstance(part, CameraErrors):
+                sigmas = part.sigmas
+                errors += [
+                    OF_95_PERCENT * sigmas[name] * np.array(motion)
+                    for name, motion in check.motion.items()
+                ]
+        m, rad = np.linalg.norm(errors, axis=0).tolist()
+        return m, rad
+
+    def _steps_at_degenerate(self, sensors: SensorPriors) -> SensorPriors:
+        """Return the odometry steps from and to degenerate frames, and over gaps."""
+        ends = self.tracked.unobservable.keys()
+        gaps = self.tracked.gaps
+        steps = [s for s in sensors.steps if s.i in ends or s.j in ends or (s.i, s.j) in gaps]
+        return SensorPriors(tuple(steps))
+
+    def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
+        """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""
+        frames, rows = self._checked_images(graph)
+        return with_pose_errors(model, frames, graph.poses[rows], covariances[rows])
+
+    def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:
+        """Return the records, with the covariances (P, 6, 6) of the frames of this part."""
+        covariance_of = dict(
+            zip((e.record.index for e in self.tracked.posed), covariances, strict=True)
+        )
+        out = []
+        for entry in self.log.entries:
+            C = covariance_of.get(entry.record.index)
+            finite = C is not None and bool(np.isfinite(C).all())
+            out.append(replace(entry.record, covariance=C) if finite else entry.record)
+        return tuple(out)
+
+    def _cross_view(self, graph: PoseGraph) -> CrossViewConsistency | None:
+        """Compare overlapping images at the final poses."""
+        frames, rows = self._checked_images(graph)
+        return cross_view_consistency(frames, graph.poses[rows]) if len(frames) > 1 else None
+
+    def _checked_images(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
+        """Return the images for the final comparison, and their positions in the graph."""
+        images = (image.get() for image in self.observations.checks)
+        frames = [f for f in images if f.index in self.tracked.poses]
+        row_of = {int(frame): k for k, frame in enumerate(graph.ids)}
+        return frames, np.array([row_of[f.index] for f in frames], np.intp)
+
+    def _correction_reasons(self) -> tuple[Reason, ...]:
+        """Return the reason if a correction was left out."""
+        names = [name_of(c) for c in self.config.corrections if c.disabled]
+        if not names:
+            return ()
+        text = (
+            f"Correction not applied: {' and '.join(names)}. Overlapping views do not clearly show "
+            "the error that it compensates."
+        )
+        return (Reason("correction_left_out", self._whole_recording, text),)
+
+    @property
+    def _whole_recording(self) -> tuple[tuple[int, int], ...]:
+        entries = self.log.entries
+        return ((entries[0].record.index, entries[-1].record.index),)
+
+    def _surface_reasons(self, model: Model) -> tuple[Reason, ...]:
+        """Return the reason if there is no surface."""
+        if model.mesh is not None and len(model.mesh):
+            return ()
+        text = (
+            "No connected surface is left at this resolution (--voxel): mesh.ply and mesh.glb are "
+            "empty."
+        )
+        if model.mesh is None:
+            text = "Clouds without a camera make no surface: there is no mesh.ply and no mesh.glb."
+        return (Reason("no_surface", self._whole_recording, text),)
+
+
+def single_link_frames(tracked: TrackedGraph, loops: Sequence[LoopRecord]) -> tuple[int, ...]:
+    """Return the frames connected to the first one by a single, unconfirmed link."""
+    if not tracked.joins:
+        return ()
+    component_of = {e.record.index: e.step.component for e in tracked.posed if e.step is not None}
+    pairs = [(j.link.i, j.link.j) for j in tracked.joins]
+    # Another registration of the same two views does not confirm it.
+    joined_pairs = {frozenset(pair) for pair in pairs}
+    pairs += [(p.i, p.j) for p in loops if p.accepted and frozenset((p.i, p.j)) not in joined_pairs]
+    edges = [(component_of[i], component_of[j]) for i, j in pairs]
+    first = component_of[tracked.posed[0].record.index]
+    weak_components: set[int] = set()
+    for k, sides in cut_edges(edges).items():
+        if k < len(tracked.joins) and tracked.joins[k].kind == "links":
+            weak_components |= sides[1] if first in sides[0] else sides[0]
+    return tuple(index for index, c in component_of.items() if c in weak_components)

@@ -1,0 +1,273 @@
+"""The back end: from tracked frames in one coordinate frame to a reconstruction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.compute.memory import trim_memory
+from tofuse.engine.fusion.cloud import Cloud
+from tofuse.engine.fusion.model import Model
+from tofuse.engine.mapping.assessment import Assessment
+from tofuse.engine.mapping.config import Config
+from tofuse.engine.mapping.frame_log import FrameLog
+from tofuse.engine.mapping.observations import Observations
+from tofuse.engine.mapping.progress import Progress, Stopwatch
+from tofuse.engine.mapping.stage_results import Optimised, Refined, VisualEvidence
+from tofuse.engine.mapping.tracked_graph import TrackedGraph
+from tofuse.engine.graph.covariances import MIN_WEIGHT, GraphCovariances, accepted_only
+from tofuse.engine.graph.external_sensors import SensorPriors, measure_all, with_sensors
+from tofuse.engine.graph.graph import LoopRecord, Optimisation, PoseGraph
+from tofuse.engine.loops.loops import ClosedLoop, PriorLoop
+from tofuse.engine.loops.merged_components import Join
+from tofuse.engine.loops.neighbour_check import degraded_neighbours
+from tofuse.engine.quality.types import Component, Diagnostics, Reconstruction
+
+# Maximum number of repeated loop searches along a long trajectory.
+_MAX_SEARCHES = 2
+
+
+class BackEnd:
+    """Closes loops, optimises, refines, fuses and judges one connected part of a recording.
+
+    Parameters
+    ----------
+    config
+        The configuration.
+    log
+        The frames of the part.
+    poses
+        (4, 4) T_world_camera by frame index; that of the first frame is the identity.
+    joins
+        Edges between components.
+    prior_loops
+        Given loops.
+    observations
+        Stored observations.
+    progress, watch
+        Receive stages and times.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        log: FrameLog,
+        poses: dict[int, Float64],
+        joins: Sequence[Join],
+        prior_loops: Sequence[PriorLoop],
+        observations: Observations,
+        progress: Progress,
+        watch: Stopwatch,
+    ) -> None:
+        self._config, self._log, self._prior_loops = config, log, prior_loops
+        self._observations, self._progress, self._watch = observations, progress, watch
+        posed = [e for e in log.posed if e.record.index in poses]
+        self._tracked = TrackedGraph(posed, poses, joins)
+
+    def run(self, components: tuple[Component, ...]) -> Reconstruction:
+        """Return the reconstruction."""
+        closed = self._close_loops()
+        trim_memory()
+        refined = self._refine(closed)
+        trim_memory()
+        model, cloud_before = self._fuse(closed, refined)
+        trim_memory()
+        return self._result(closed, refined, model, cloud_before, components)
+
+    def _close_loops(self) -> Optimised:
+        self._progress.stage("closing loops")
+        with self._watch.timing("loops"):
+            tracked = self._tracked.build(())
+            # For the search, assume that motion in degenerate directions may differ from the rest.
+            degenerate = bool(self._tracked.unobservable)
+            conservative = self._tracked.build((), conservative=True) if degenerate else tracked
+            detected = self._observations.loops.finish(
+                self._tracked.poses, _covariances(conservative)
+            )
+            loops = with_joins(detected, self._tracked.joins)
+            del conservative
+            loops = self._repeat_loop_search(loops)
+            graph = self._tracked.build(loops)
+        # Poses before loop closure, without and with external sensors.
+        sequential = aided = graph.poses
+        sensors = SensorPriors()
+        if self._config.priors:
+            sensor_data = self._log.sensor_data(graph.ids.tolist())
+            measured_graph = self._tracked.measured(tracked, self._observations.views)
+            sensors = measure_all(self._config.priors, sensor_data, measured_graph)
+        optimisation = Optimisation(with_sensors(graph, sensors), (), True)
+        confirmed: frozenset[int] = frozenset()
+        if graph.loop.any() or sensors:
+            self._progress.stage("optimising")
+            with self._watch.timing("optimisation"):
+                optimisation, confirmed = self._optimise(graph, loops, sensors)
+                if sensors and graph.loop.any():  # loops are compared with these poses
+                    without_loops = with_sensors(tracked, sensors)
+                    aided = self._config.optimiser.optimise(without_loops).graph.poses
+            loops = _without_rejected(loops, optimisation)
+            optimisation = accepted_only(optimisation)
+        graph = optimisation.graph
+        visual = VisualEvidence(aided, optimisation)
+        if sensors:
+            # The verdict uses the images alone: external sensors can't improve it.
+            images_only = self._tracked.build(loops, confirmed=confirmed).with_poses(graph.poses)
+            visual = VisualEvidence(aided, replace(optimisation, graph=images_only))
+        return Optimised(loops, sequential, optimisation, sensors, visual, confirmed)
+
+    def _optimise(
+        self, graph: PoseGraph, loops: Sequence[ClosedLoop], sensors: SensorPriors
+    ) -> tuple[Optimisation, frozenset[int]]:
+        """Optimise a graph with loops; repeat if neighbouring views become inconsistent.
+
+        Registrations between such views then get their usual uncertainty (`degraded_neighbours`).
+        Also returns the frames of these registrations.
+        """
+        row_of = {int(index): k for k, index in enumerate(graph.ids)}
+        suspects = frozenset(
+            e.record.index
+            for e in self._tracked.posed
+            if e.step is not None and e.step.inflation > 1
+        )
+        confirmed: frozenset[int] = frozenset()
+        while True:
+            optimisation = self._config.optimiser.optimise(with_sensors(graph, sensors))
+            views = self._observations.views.of(row_of) if suspects else []
+            rows = [row_of[v.index] for v in views]
+            before, after = graph.poses[rows], optimisation.graph.poses[rows]
+            worse_pairs = degraded_neighbours(views, before, after, suspects)
+            cleared = suspects.intersection(k for i, j in worse_pairs for k in range(i + 1, j + 1))
+            if not cleared:
+                return optimisation, confirmed
+            confirmed, suspects = confirmed | cleared, suspects - cleared
+            graph = self._tracked.build(loops, confirmed=confirmed)
+
+    def _repeat_loop_search(self, loops: list[ClosedLoop]) -> list[ClosedLoop]:
+        """Search loops again after the detected ones have corrected the poses in between.
+
+        Along a long trajectory the drift exceeds the search range of loops; the poses in its middle
+        are corrected only after its ends are joined.
+        """
+        for _ in range(_MAX_SEARCHES if self._observations.loops.is_long else 0):
+            graph = self._tracked.build(loops)
+            if not graph.loop.any():
+                break
+            graph = accepted_only(self._config.optimiser.optimise(graph)).graph
+            poses = dict(zip(graph.ids.tolist(), graph.poses, strict=True))
+            if not self._observations.loops.candidates_change(poses):
+                break
+            detected = self._observations.loops.finish(poses, _covariances(graph))
+            loops = with_joins(detected, self._tracked.joins)
+        return loops
+
+    def _refine(self, closed: Optimised) -> Refined:
+        graph = closed.optimisation.graph
+        self._progress.stage("refining")
+        with self._watch.timing("refinement"):
+            refinement = self._observations.refiner.finish(
+                graph.ids.tolist(), graph.poses, closed.sensors
+            )
+            if refinement.kept:
+                graph = self._tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
+                graph = with_sensors(graph, closed.sensors)
+        return Refined(graph, refinement)
+
+    def _fuse(self, closed: Optimised, refined: Refined) -> tuple[Model, Cloud | None]:
+        """Return the model, and a cloud at the poses before optimisation if that changed any."""
+        graph, refinement, model = refined.graph, refined.refinement, self._observations.model
+        poses_changed = bool(graph.loop.any()) or refinement.kept or bool(closed.sensors)
+        self._progress.stage("fusing", model.views)
+        with self._watch.timing("fusion"):
+            ids = graph.ids.tolist()
+            fused = model.fuse(
+                dict(zip(ids, graph.poses, strict=True)),
+                self._progress.advance,
+                refinement.errors,
+            )
+            initial_poses = dict(zip(ids, closed.sequential, strict=True))
+            return fused, model.sketch(initial_poses) if poses_changed else None
+
+    def _result(
+        self,
+        closed: Optimised,
+        refined: Refined,
+        model: Model,
+        cloud_before: Cloud | None,
+        components: tuple[Component, ...],
+    ) -> Reconstruction:
+        self._progress.stage("checking")
+        with self._watch.timing("checking"):
+            assessment = Assessment(
+                self._config, self._log, self._tracked, self._observations, self._prior_loops
+            )
+            assessed = assessment.run(closed, refined, model, components)
+        model, entries = assessed.model, self._log.entries
+        return Reconstruction(
+            trajectory=self._scatter(refined.graph.poses),
+            timestamps=np.array([e.record.timestamp for e in entries]),
+            graph=refined.graph,
+            cloud=model.cloud,
+            mesh=model.mesh,
+            diagnostics=Diagnostics(
+                verdict=assessed.verdict,
+                reasons=assessed.reasons,
+                frames=assessed.records,
+                loops=tuple(c.record for c in closed.loops),
+                sequential=self._scatter(closed.sequential),
+                objective=closed.optimisation.objective,
+                removed={},
+                seconds=dict(self._watch.seconds),
+                cloud_before=cloud_before,
+                refinement=refined.refinement,
+                parts=closed.optimisation.parts,
+                priors=closed.sensors.records,
+                accuracy=assessed.accuracy,
+                joins=tuple(self._tracked.joins),
+            ),
+            config=self._config.to_dict(),
+            recording={"path": None, "format": "frames", "frames": len(entries)},
+            seed=0,
+            threads=1,
+            components=components,
+            up=closed.sensors.up(refined.graph),
+        )
+
+    def _scatter(self, poses: Float64) -> Float64:
+        out = np.full((len(self._log.entries), 4, 4), np.nan)
+        out[[e.record.index in self._tracked.poses for e in self._log.entries]] = poses
+        return out
+
+
+def _covariances(graph: PoseGraph) -> dict[int, Float64]:
+    """Return the (6, 6) covariance of each pose by frame index."""
+    return dict(zip(graph.ids.tolist(), GraphCovariances(graph).of_poses, strict=True))
+
+
+def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[ClosedLoop]:
+    """Return the loops and the redundant joins of components, which close loops as well."""
+    closed_pairs = {(c.record.i, c.record.j) for c in loops}
+    redundant = []
+    for join in joins:
+        link = join.link
+        if join.defines_pose or {(link.i, link.j), (link.j, link.i)} & closed_pairs:
+            continue
+        reason = f"joins components, {link.how}"
+        record = LoopRecord.of((link.i, link.j), True, reason, link.registration)
+        redundant.append(ClosedLoop.of(record, link.registration))
+    return [*loops, *redundant]
+
+
+def _without_rejected(loops: Sequence[ClosedLoop], optimisation: Optimisation) -> list[ClosedLoop]:
+    """Return the loops; those that the optimiser left out as contradictory are rejected."""
+    if optimisation.weights is None:
+        return list(loops)
+    weights = iter(optimisation.weights[optimisation.graph.loop])
+    out = []
+    for loop in loops:
+        if loop.T_i_j is not None and next(weights) < MIN_WEIGHT:
+            reason = f"contradicts the rest of the graph ({loop.record.reason})"
+            loop = ClosedLoop(replace(loop.record, accepted=False, reason=reason))
+        out.append(loop)
+    return out

@@ -1,0 +1,210 @@
+"""The configuration of a reconstruction: its parts and their options."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tofuse.engine import parts
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.sensor.base import Correction
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.reading import parse_toml, read_text
+from tofuse.engine.filters.base import Filter
+from tofuse.engine.fusion.options import Fusion
+from tofuse.engine.tracking.base import Odometry
+from tofuse.engine.mapping.budget import voxels_mb
+from tofuse.engine.graph.external_sensors import ExternalSensor
+from tofuse.engine.graph.graph import Optimiser
+from tofuse.engine.loops.joining import Joining
+from tofuse.engine.loops.loops import LoopDetector
+from tofuse.engine.refinement.refinement import NoRefinement, RefinementMethod
+from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.search.search import SearchOptions
+from tofuse.apps.results.run_json import read_run_json
+
+ViewKind = Literal["range", "cloud"]
+
+MIN_MEMORY_MB = 500  # of a run
+
+
+@dataclass(frozen=True)
+class Config(Bounded):
+    """Everything that determines a result, except the recording and the seed.
+
+    Attributes
+    ----------
+    method
+        Name of the configuration that it is based on, for display.
+    filters
+        Applied in this order to every frame.
+    odometry
+        Tracks the camera.
+    loops
+        Detects and verifies loops.
+    optimiser
+        Optimises the pose graph.
+    fusion
+        Makes the model.
+    refinement
+        Optimises all poses jointly, after loops are closed.
+    corrections
+        Applied in this order to every frame, before the filters.
+    model_filters
+        Applied after tracking, to the views of the model: the tracker weights each pixel by its
+        noise and loses accuracy without noisy pixels, which a clean model must leave out.
+    priors
+        External sensors whose measurements are used.
+    search
+        Exhaustive searches for the pose of a view: of lost frames, loops and components.
+    joining
+        Connects components that were tracked separately.
+    self_calibration
+        Whether a recording is reconstructed again with a corrected calibration if it shows an
+        error of its camera.
+    tolerance_m
+        A result is good if the 95 % bound of the poses' rms error is within it, m; None for 0.5 %
+        of the model's diagonal, at least 1 cm.
+    memory_mb
+        Approximate memory of a run; `pipeline.budget` divides it. Data that does not fit is stored
+        on disk.
+    """
+
+    method: str
+    filters: tuple[Filter, ...]
+    odometry: Odometry
+    loops: LoopDetector
+    optimiser: Optimiser
+    fusion: Fusion
+    refinement: RefinementMethod = NoRefinement()  # noqa: RUF009 - immutable
+    corrections: tuple[Correction, ...] = ()
+    model_filters: tuple[Filter, ...] = ()
+    priors: tuple[ExternalSensor, ...] = ()
+    search: SearchOptions = SearchOptions()  # noqa: RUF009 - immutable
+    joining: Joining = Joining()  # noqa: RUF009 - immutable
+    self_calibration: bool = True
+    tolerance_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
+    memory_mb: Annotated[int, Bounds(MIN_MEMORY_MB, 10_000_000)] = 2000
+
+    @property
+    def window(self) -> int:
+        """Number of frames that the filters use, the current one included."""
+        return max([f.window for f in (*self.filters, *self.model_filters)], default=1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data, as in `run.json`."""
+        return dict(parts.to_dict(self))
+
+
+PACKAGES = (
+    "tofuse.engine.sensor",
+    "tofuse.engine.filters",
+    "tofuse.engine.clouds",
+    "tofuse.engine.tracking",
+    "tofuse.engine.graph",
+    "tofuse.lab.methods",
+)
+
+
+def methods() -> dict[str, Callable[[ViewKind], Config]]:
+    """Return the named configurations, `default` first."""
+    from tofuse.engine.mapping import methods as named
+
+    return {"default": named.default, "thesis": named.thesis}
+
+
+def from_method(name: str, kind: ViewKind = "range") -> Config:
+    """Return the configuration of that name for a kind of view; InputError if there is none."""
+    available = methods()
+    if name not in available:
+        raise InputError(f"is {name!r}", where="--method", remedy=f"use one of {list(available)}")
+    return available[name](kind)
+
+
+def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config:
+    """Return the configuration with some options replaced.
+
+    Parameters
+    ----------
+    changes
+        Nested options as in a TOML file. Tables are merged; a table that names another part
+        replaces it completely, and so does a list. `memory_mb` is divided: fusion gets its share,
+        unless the same changes set that.
+    where
+        Names the file in errors.
+
+    Raises
+    ------
+    InputError
+        For an option or part that does not exist, or a value of the wrong type.
+    """
+    for package in PACKAGES:
+        parts.discover(package)
+    merged = _merge(config.to_dict(), _divided(changes))
+    result: Config = parts.from_dict(Config, merged, where=where)
+    return result
+
+
+def read_changes(path: str | Path) -> dict[str, Any]:
+    """Read the options in a TOML file, or the `config` of a `run.json`.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read or is neither.
+    """
+    path = Path(path)
+    if path.suffix == ".json":
+        config = read_run_json(path).get("config")
+        if not isinstance(config, dict):
+            raise InputError("contains no config", where=path, remedy="pass a run.json of tofuse")
+        return config
+    return parse_toml(read_text(path), where=path)
+
+
+def _divided(changes: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Add fusion's share of the requested memory."""
+    megabytes = changes.get("memory_mb")
+    if type(megabytes) is not int:  # not requested, or rejected later
+        return changes
+    part = {"fusion": {"memory_mb": voxels_mb(megabytes)}}
+    return dict(_merge(part, changes))
+
+
+def _merge(base: Any, change: Any) -> Any:
+    if not (isinstance(base, Mapping) and isinstance(change, Mapping)):
+        return change
+    if "part" in change and change["part"] != base.get("part"):
+        return dict(change)
+    return {**base, **{key: _merge(base.get(key), value) for key, value in change.items()}}
+
+
+def kind_of(frame: Frame) -> ViewKind:
+    """Return "range" for an image of a camera, "cloud" for a bare cloud."""
+    return "range" if isinstance(frame, RangeFrame) else "cloud"
+
+
+def check_views(config: Config, kind: ViewKind) -> None:
+    """Raise InputError if a part of the configuration does not support that kind of view.
+
+    Parameters
+    ----------
+    kind
+        "range" for images of a camera, "cloud" for bare clouds.
+    """
+    chosen: tuple[Correction | Filter | Odometry, ...] = (
+        *config.corrections,
+        *config.filters,
+        *config.model_filters,
+        config.odometry,
+    )
+    for part in chosen:
+        if kind not in part.takes:
+            raise InputError(
+                f"{part.part_kind} {parts.name_of(part)!r} takes {sorted(part.takes)} "
+                f"views, and this recording holds {kind} views",
+                where="configuration",
+                remedy="leave that part out with --config, or use another --method",
+            )

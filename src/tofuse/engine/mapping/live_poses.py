@@ -1,0 +1,136 @@
+"""Online poses, with the components connected and the loops closed so far.
+
+A loop takes effect a fixed number of frames after it was searched for.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import job_pool
+from tofuse.engine.tracking.base import Step
+from tofuse.engine.mapping.frame_log import FrameLog, poses_in_world
+from tofuse.engine.mapping.tracked_graph import TrackedGraph
+from tofuse.engine.graph.graph import Optimiser
+from tofuse.engine.loops.loops import ClosedLoop, Loops
+from tofuse.engine.alignment.base import Link
+
+# The loops of a search take effect this number of frames after its start, even if it finished
+# earlier, so that poses are the same on every machine. A slow machine waits for it.
+DELAY = 10
+# The graph is optimised again after this fraction of new frames at the earliest, so that the cost
+# per frame is constant.
+_MIN_NEW_FRACTION = 0.01
+
+
+class LiveLoops:
+    """Searches for loops on another thread.
+
+    Attributes
+    ----------
+    closed
+        Accepted loops that are in effect.
+    """
+
+    def __init__(self, loops: Loops) -> None:
+        self.closed: list[ClosedLoop] = []
+        self._loops = loops
+        self._pool: ThreadPoolExecutor | None = None
+        self._job: Future[list[ClosedLoop]] | None = None
+        self._frames = 0
+        self._due = 0
+
+    def advance(self) -> bool:
+        """Advance by a posed frame, already pushed to the loops; whether new loops closed."""
+        self._frames += 1
+        new_loops: list[ClosedLoop] = []
+        if self._job is not None and self._frames >= self._due:
+            new_loops = [loop for loop in self._job.result() if loop.T_i_j is not None]
+            self.closed += new_loops
+            self._job = None
+        if self._job is None:
+            job = self._loops.detection_job()
+            if job is not None:
+                if self._pool is None:
+                    self._pool = job_pool(1, "tofuse-loops")
+                self._job = self._pool.submit(job)
+                self._due = self._frames + DELAY
+        return bool(new_loops)
+
+    def finish(self) -> None:
+        """Wait for the running search, and end the thread."""
+        if self._pool is not None:
+            self._pool.shutdown()
+        self._pool, self._job = None, None
+
+
+class LivePoses:
+    """Current poses in the frame of the first component.
+
+    At the end of the recording components are joined and loops are closed again.
+    """
+
+    def __init__(self, loops: Loops, optimiser: Optimiser) -> None:
+        self._loops, self._optimiser = LiveLoops(loops), optimiser
+        self._component = 0
+        self._pending = False  # whether there are closed loops that were not yet optimised
+        self._n_new = 0  # frames of this component since the last optimisation
+        self._n_frames = 0  # frames of this component
+        # Poses of the components that are connected to the first one, and the correction of the
+        # current one by loops.
+        self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
+        self._T_closed_tracked = np.eye(4)
+
+    def update(self, step: Step, log: FrameLog) -> None:
+        """Add the next frame; correct this and the following poses if loops have closed."""
+        loops = self.due_loops(step, log)
+        if not loops:
+            return
+        component_log = log.of_component(step.component)
+        poses = poses_in_world(component_log, {step.component: np.eye(4)})
+        tracked = TrackedGraph(component_log.posed, poses, ()).build(loops)
+        optimised = self._optimiser.optimise(tracked).graph
+        self._T_closed_tracked = optimised.poses[-1] @ se3.inverse(tracked.poses[-1])
+
+    def due_loops(self, step: Step, log: FrameLog) -> list[ClosedLoop]:
+        """Add the next frame; return the loops of its component if optimisation is due, else []."""
+        if step.component != self._component:
+            self._component, self._T_closed_tracked = step.component, np.eye(4)
+            self._pending, self._n_new, self._n_frames = False, 0, 0
+        for link in step.links:
+            self._connect(link, log)
+        if step.T_component_camera is None:
+            return []
+        self._n_frames, self._n_new = self._n_frames + 1, self._n_new + 1
+        self._pending |= self._loops.advance()
+        if not self._pending or self._n_new < _MIN_NEW_FRACTION * self._n_frames:
+            return []
+        self._pending, self._n_new = False, 0
+        component_frames = {e.record.index for e in log.of_component(step.component).posed}
+        return [c for c in self._loops.closed if {c.record.i, c.record.j} <= component_frames]
+
+    def pose(self, step: Step) -> Float64 | None:
+        """Return T_world_camera (4, 4); None if lost, or not connected to the first component."""
+        T_world_component = self._T_world_component.get(step.component)
+        if step.T_component_camera is None or T_world_component is None:
+            return None
+        T = T_world_component @ self._T_closed_tracked @ step.T_component_camera
+        return np.asarray(T, np.float64)
+
+    def _connect(self, link: Link, log: FrameLog) -> None:
+        a, b = log.step_of(link.i), log.step_of(link.j)
+        T_world = self._T_world_component
+        if not link.certain or a.component not in T_world or b.component in T_world:
+            return
+        assert a.T_component_camera is not None
+        assert b.T_component_camera is not None
+        T_a_b = a.T_component_camera @ link.T_i_j @ se3.inverse(b.T_component_camera)
+        T_world[b.component] = T_world[a.component] @ T_a_b
+
+    def finish(self) -> None:
+        """Wait for the running search, and end the thread."""
+        self._loops.finish()

@@ -1,0 +1,288 @@
+"""The mapper: takes frames one at a time, returns their poses, and finally the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounds
+from tofuse.engine.errors import InputError
+from tofuse.engine.compute.memory import trim_memory
+from tofuse.engine.compute.thread_pool import serial_chunks, thread_count, threads
+from tofuse.engine.tracking.base import Step, Tracker
+from tofuse.engine.tracking.motion import FrameTime
+from tofuse.engine.parts import check_number
+from tofuse.engine.mapping.assembly import Assembly
+from tofuse.engine.mapping.config import Config, check_views, from_method, kind_of
+from tofuse.engine.mapping.frame_log import FrameLog, FrameSequence, record_of
+from tofuse.engine.mapping.live_poses import LivePoses
+from tofuse.engine.mapping.observations import Observations
+from tofuse.engine.mapping.preparation import FilteredFrame, Preparation, Prepared
+from tofuse.engine.mapping.progress import Progress, Silent, Stopwatch
+from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.stored_views.view_store import PosedView
+from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.quality.types import FrameRecord, Reconstruction
+
+
+class Mapper:
+    """Turns frames into a trajectory and a model, online.
+
+    >>> mapper = Mapper("default")
+    >>> for frame in frames:
+    ...     T_world_camera = mapper.push(frame)   # None where lost
+    >>> result = mapper.finish()
+
+    Parameters
+    ----------
+    config
+        A configuration, or the name of one.
+    seed
+        The result is reproducible for each seed.
+    threads
+        Number of threads; None: all cores. The result does not depend on it.
+    loops
+        Given loops, in frame indices.
+    progress
+        Receives frames and stages.
+    tracker
+        Replaces that of the configuration's odometry.
+    """
+
+    def __init__(
+        self,
+        config: Config | str = "default",
+        *,
+        seed: int = 0,
+        threads: int | None = None,
+        loops: Sequence[PriorLoop] = (),
+        progress: Progress | None = None,
+        tracker: Tracker | None = None,
+    ) -> None:
+        check_number(seed, Bounds(0), "seed", whole=True)
+        self.config = from_method(config) if isinstance(config, str) else config
+        self._method = config if isinstance(config, str) else None
+        self.seed = seed
+        self.threads = threads if threads is not None else thread_count()
+        self.watch = Stopwatch()
+        self._prior_loops = tuple(loops)
+        self._progress = progress or Silent()
+        self._sequence = FrameSequence()
+        self._log = FrameLog()
+        self._finished = False
+        self._start_method(tracker)
+
+    def _start_method(self, tracker: Tracker | None = None) -> None:
+        self._preparation = Preparation(self.config)
+        self._tracker = tracker or self.config.odometry.start(self.seed, self.config.search)
+        self._observations = Observations(self.config, self.seed, self._prior_loops)
+        self._live_poses = LivePoses(self._observations.loops, self.config.optimiser)
+        self._component = 0
+
+    def push(
+        self,
+        frame: Frame,
+        *,
+        T_odometry: Float64 | None = None,
+        gravity: Float64 | None = None,
+        history: Sequence[Frame] | None = None,
+        prepared: Prepared | None = None,
+    ) -> Float64 | None:
+        """Add the next frame.
+
+        Parameters
+        ----------
+        frame
+            Uncorrected and unfiltered. Its `index` must be larger than those before.
+        T_odometry
+            (4, 4) T_world_camera from odometry, in any fixed world frame.
+        gravity
+            (4,) unit vector of gravity in the camera's frame, and its sigma in rad.
+        history
+            Unfiltered frames just before this one, oldest first, for temporal filters; by default
+            the frames pushed before.
+        prepared
+            The result of `prepare` for the frame, if it was called.
+
+        Returns
+        -------
+        Current estimate of T_world_camera (4, 4); None if the frame is lost, or in a component that
+        is not yet connected to the first one. Loops take effect some frames later; `finish` joins
+        components and optimises all poses again.
+
+        Raises
+        ------
+        InputError
+            If the frame is of another kind than those before, or of one that the configuration
+            does not support, or its index is not larger than those before.
+        """
+        self._check(frame)
+        repeated = self._sequence.is_repeated(frame)
+        if repeated:
+            self._log.repeated.append(frame.index)
+        # Chunks run serially while other threads prepare frames; else relocalization uses all.
+        busy = prepared is not None and prepared.filtered is not None
+        with threads(self.threads), serial_chunks(busy):
+            filtered = self._prepare(frame, history, prepared)
+            step = self._track(filtered, T_odometry, repeated)
+            self._store(filtered, step, T_odometry, gravity)
+            with self.watch.timing("loops"):
+                self._live_poses.update(step, self._log)
+            return self._report(filtered, step)
+
+    def _prepare(
+        self, frame: Frame, history: Sequence[Frame] | None, prepared: Prepared | None
+    ) -> FilteredFrame:
+        with self.watch.timing("filters"):
+            T_expected = None
+            if self._log.entries and self._log.entries[-1].has_pose:
+                T_expected = self._tracker.predicted_pose(FrameTime(frame.index, frame.timestamp))
+            return self._preparation.process(frame, T_expected, history, prepared)
+
+    def _track(self, filtered: FilteredFrame, T_odometry: Float64 | None, repeated: bool) -> Step:
+        with self.watch.timing("tracking"):
+            step = self._tracker.push(filtered.for_tracking, T_odometry, filtered.surface)
+        if repeated and step.status == "tracked":
+            reason = f"the same image as frame {self._log.entries[-1].record.index}"
+            step = replace(step, status="predicted", reason=reason)
+        if step.component != self._component:
+            self._component = step.component
+            self._preparation.begin_component()
+        if step.status == "tracked" and step.T_component_camera is not None:
+            self._preparation.add_pose(filtered.for_tracking, step.T_component_camera)
+        return step
+
+    def _store(
+        self,
+        filtered: FilteredFrame,
+        step: Step,
+        T_odometry: Float64 | None,
+        gravity: Float64 | None,
+    ) -> None:
+        self._log.add(record_of(filtered.corrected, step), step, T_odometry, gravity)
+        lost = step.T_component_camera is None
+        if step.moving is not None:
+            filtered = replace(filtered, for_model=filtered.for_model.keep(~step.moving))
+        if not lost:
+            with self.watch.timing("loops"):
+                self._observations.add(filtered, step)
+            with self.watch.timing("fusion"):
+                self._observations.add_to_model(filtered, step)
+        self._observations.sample(filtered, lost=lost)
+
+    def _report(self, filtered: FilteredFrame, step: Step) -> Float64 | None:
+        self._progress.advance(self._log.entries[-1].record)
+        T_world_camera = self._live_poses.pose(step)
+        if T_world_camera is not None:
+            self._progress.placed(filtered.for_model, T_world_camera)
+        return T_world_camera
+
+    def prepare(self, frame: Frame) -> Prepared | None:
+        """Prepare a frame for `push` in advance, as far as that depends on this frame alone.
+
+        May be called by other threads while earlier frames are pushed. The result of `push` does
+        not depend on it.
+        """
+        return self._preparation.prepare_ahead(frame, self._tracker)
+
+    def skip(self, index: int, timestamp: float, reason: str) -> None:
+        """Record that a frame could not be read.
+
+        Parameters
+        ----------
+        index, timestamp
+            Frame index, larger than those before (else InputError), and s.
+        reason
+            Why it could not be read.
+        """
+        self._check_open()
+        self._sequence.check_order(index)
+        self._sequence.accept(index)
+        self._log.add(FrameRecord(index, timestamp, "skipped", reason), None)
+        self._progress.advance(self._log.entries[-1].record)
+
+    def interrupt(self, config: Config | None = None) -> None:
+        """Begin another recording with the next frame: the motion is not continuous.
+
+        Parameters
+        ----------
+        config
+            Provides corrections, filters and odometry of the new recording; None keeps the current
+            ones. Its component numbers must not have been used before.
+        """
+        if self._log.entries:
+            self._log.interruptions.append(len(self._log.entries))
+        self._tracker.interrupt()
+        if config is not None:
+            self._preparation = Preparation(config, self._preparation.counts)
+            self._tracker = config.odometry.start(self.seed, config.search)
+
+    @property
+    def log(self) -> FrameLog:
+        """The log of all frames so far."""
+        return self._log
+
+    @property
+    def views(self) -> Sequence[PosedView[PreparedView]]:
+        """Prepared views of frames with a pose, spaced by motion, in the order of their frames."""
+        return self._observations.views.views
+
+    def finish(self) -> Reconstruction:
+        """Join components, close loops, optimise, refine, fuse and judge.
+
+        Raises
+        ------
+        InputError
+            If no frame has a pose.
+        """
+        self._check_open()
+        self._finished = True
+        self._log.check_posed()
+        self._live_poses.finish()
+        with self.watch.timing("fusion"):
+            self._observations.finish()
+        self._sequence.end()
+        del self._tracker  # its keyframes
+        trim_memory()
+        result = self._assembly().run(self._log)
+        diagnostics = replace(
+            result.diagnostics,
+            removed=self._preparation.counts.fractions,
+            seconds=dict(self.watch.seconds),
+            samples=self._observations.samples.all,
+        )
+        return replace(result, diagnostics=diagnostics)
+
+    def _assembly(self) -> Assembly:
+        return Assembly(
+            self.config,
+            self._observations,
+            self._prior_loops,
+            self._progress,
+            self.watch,
+            self.seed,
+            self.threads,
+        )
+
+    def _check(self, frame: Frame) -> None:
+        self._check_open()
+        if not isinstance(frame, RangeFrame | CloudFrame):
+            raise InputError(
+                f"is a {type(frame).__name__}, not a frame",
+                where="frame",
+                remedy="pass a RangeFrame or a CloudFrame",
+            )
+        self._sequence.check_order(frame.index)
+        kind = kind_of(frame)
+        if self._sequence.check_kind(frame):
+            if self._method is not None and kind == "cloud":
+                self.config = from_method(self._method, kind)
+                self._start_method()
+            check_views(self.config, kind)
+        self._sequence.accept(frame.index, kind)
+
+    def _check_open(self) -> None:
+        if self._finished:
+            raise InputError("is finished", where="mapper", remedy="make a new Mapper")

@@ -1,0 +1,91 @@
+"""The named configurations, each readable from top to bottom."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from tofuse.engine.sensor.multipath_correction import Multipath
+from tofuse.engine.sensor.noise_correction import Noise
+from tofuse.engine.filters.angle import NeighbourhoodAngle
+from tofuse.engine.filters.confidence import Confidence
+from tofuse.engine.filters.neighbours import NeighbourFraction
+from tofuse.engine.sensor.wrapped import Wrapped
+from tofuse.engine.fusion.options import Fusion
+from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.tracking.pairwise import Pairwise
+from tofuse.engine.tracking.sequential import Sequential
+from tofuse.engine.mapping.config import Config, ViewKind
+from tofuse.engine.graph.castellani import Castellani
+from tofuse.engine.graph.external_sensors import GravityEdges
+from tofuse.engine.graph.levenberg import LevenbergMarquardt
+from tofuse.engine.loops.loops import Confirmation
+from tofuse.engine.loops.nearby import Nearby
+from tofuse.engine.refinement.plane_refinement import Planes
+from tofuse.engine.refinement.refinement import Joint
+from tofuse.engine.loops.revisits import Revisits
+from tofuse.engine.clouds.any_pair import AnyPair
+from tofuse.engine.clouds.icp import algorithm_1
+
+
+def thesis(kind: ViewKind) -> Config:
+    """Return the method of the thesis: chapter 3, with the settings of chapter 4.
+
+    Sequential point-to-point ICP on 1000 random points of each frame, started from the previous
+    motion; loops by distance and yaw; Castellani's optimisation.
+    """
+    icp = algorithm_1(resolution=0.01, points=1000)
+    return Config(
+        method="thesis",
+        filters=(Confidence(minimum=7), NeighbourFraction(fraction=0.5, k=3)),
+        odometry=Sequential(registration=icp, guess="previous"),
+        # A wide search, as the trajectory has drifted when a loop closes; a strict verification, as
+        # a wrong loop does more harm than a missing one.
+        loops=Nearby(
+            max_distance_m=1.5,
+            max_yaw_rad=0.8,
+            min_gap=30,
+            per_frame=6,
+            confirmation=Confirmation(min_fraction=0.45),
+        ),
+        optimiser=Castellani(normalisation="thesis"),
+        fusion=Fusion(),
+    )
+
+
+def default(kind: ViewKind) -> Config:
+    """Return the default method of `tofuse run`.
+
+    Range images get a noise model, multipath is compensated if views show it, and images are
+    aligned with keyframes by planes and albedo; views of the model are filtered further. Revisited
+    places close loops, and all views are refined jointly. Clouds are registered in pairs, as far as
+    their poses are accepted, and refined by common planes.
+    """
+    base = replace(thesis(kind), method="default")
+    if kind == "cloud":
+        return replace(
+            base,
+            filters=(),  # the density of a cloud's points shows its viewpoint
+            odometry=Pairwise(),
+            loops=Nearby(
+                max_distance_m=1.5,
+                max_yaw_rad=0.8,
+                min_gap=30,
+                per_frame=6,
+                confirmation=Confirmation(registrations=(AnyPair(),)),
+            ),
+            refinement=Planes(),
+        )
+    return replace(
+        base,
+        corrections=(Noise(), Multipath()),
+        # Pixels of zero confidence are no measurements: phones fill gaps by interpolation.
+        filters=(Confidence(minimum=1),),
+        model_filters=(Wrapped(), Confidence(minimum=3), NeighbourhoodAngle()),
+        odometry=Keyframes(),
+        loops=Revisits(),
+        # Not for clouds: it relies on the covariance of registrations, and ICP's is too small.
+        optimiser=LevenbergMarquardt(),
+        refinement=Joint(),
+        # Odometry only on request: a file next to the images may be of any quality.
+        priors=(GravityEdges(),),
+    )

@@ -1,0 +1,93 @@
+"""Progress of long jobs: stages, steps, notes, and wall times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Protocol
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.frames.frames import Frame
+from tofuse.engine.quality.types import FrameRecord
+
+
+class Progress(Protocol):
+    """Receives the progress of a long job."""
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Begin a stage of `total` steps (None: unknown)."""
+        ...
+
+    def advance(self, record: FrameRecord | None = None) -> None:
+        """Finish one step of the stage; with the record of the frame, if the step is a frame."""
+        ...
+
+    def note(self, text: str) -> None:
+        """Show a message to the user."""
+        ...
+
+    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
+        """Show a frame of the model at its current pose (4, 4)."""
+        ...
+
+
+class Silent:
+    """Ignores all progress."""
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """See `Progress`."""
+
+    def advance(self, record: FrameRecord | None = None) -> None:
+        """See `Progress`."""
+
+    def note(self, text: str) -> None:
+        """See `Progress`."""
+
+    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
+        """See `Progress`."""
+
+
+@dataclass(frozen=True)
+class CombinedProgress:
+    """Forwards progress to two receivers."""
+
+    first: Progress
+    second: Progress
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """See `Progress`."""
+        self.first.stage(name, total)
+        self.second.stage(name, total)
+
+    def advance(self, record: FrameRecord | None = None) -> None:
+        """See `Progress`."""
+        self.first.advance(record)
+        self.second.advance(record)
+
+    def note(self, text: str) -> None:
+        """See `Progress`."""
+        self.first.note(text)
+        self.second.note(text)
+
+    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
+        """See `Progress`."""
+        self.first.placed(frame, T_world_camera)
+        self.second.placed(frame, T_world_camera)
+
+
+@dataclass
+class Stopwatch:
+    """Wall time of each stage in s, summed over its blocks."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def timing(self, stage: str) -> Iterator[None]:
+        """Add the time of the block to the stage."""
+        start = perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + perf_counter() - start

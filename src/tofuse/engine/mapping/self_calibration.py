@@ -1,0 +1,154 @@
+"""Self-calibration: calibration errors that a recording shows are corrected.
+
+Refined views show whether an error of the intrinsics or of the depth distorts the trajectory:
+with a correction, they support each other better, and the drift over a loop is smaller
+(`posegraph.calibration_check`). The recording is then reconstructed again with the correction,
+which is kept only if the error bound of the poses is smaller (`posegraph.accuracy`), although it
+includes the uncertainty of the correction. If neither trajectory is bounded, views must fit better
+before refinement. And the correction must be stable: if a calibration error only happens to explain
+a drift, the corrected views yield an estimate that undoes much of the correction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from tofuse.engine.sensor.camera_errors import FIELDS, CameraErrors
+from tofuse.engine.mapping.config import Config
+from tofuse.engine.mapping.progress import Progress
+from tofuse.engine.refinement.calibration_check import CalibrationCheck
+from tofuse.engine.refinement.calibration_check import in_words as errors_in_words
+from tofuse.engine.quality.accuracy_card import length
+from tofuse.engine.quality.types import Diagnostics, Reason, Reconstruction, SelfCalibration
+from tofuse.engine.quality.verdict import ranked
+
+# The first estimate uses poses that the error has distorted, the second one does not.
+_ROUNDS = 2
+
+Reconstruct = Callable[[Config], Reconstruction]
+
+
+def self_calibrated(
+    initial: Reconstruction, config: Config, reconstruct: Reconstruct, progress: Progress
+) -> Reconstruction:
+    """Reconstruct again with calibration errors corrected, if the views show any.
+
+    Parameters
+    ----------
+    initial
+        The reconstruction without a correction.
+    config
+        Its configuration.
+    reconstruct
+        Reconstructs the recording with a configuration.
+    progress
+        Receives notes.
+    """
+    best, applied = initial, CameraErrors()
+    for _ in range(_ROUNDS):
+        estimate = _estimated_error(best, applied)
+        if estimate is None:
+            break
+        check, error = estimate
+        correction = applied.and_then(error)
+        progress.note(
+            f"views agree better with {in_words(correction)}: reconstructing again with it"
+        )
+        candidate = reconstruct(replace(config, corrections=(correction, *config.corrections)))
+        if not (_is_better(candidate, best) and _is_stable(candidate, check)):
+            progress.note("views do not agree better with it: the calibration stays")
+            break
+        calibration = SelfCalibration(
+            correction.focal,
+            correction.offset_m,
+            correction.center_x,
+            correction.center_y,
+            correction.distortion,
+            {FIELDS[check.best][0]: check.sigmas[check.best]},
+            (_bound(initial), _bound(candidate)),
+        )
+        diagnostics = _with_calibration(candidate, correction, calibration)
+        best = replace(candidate, diagnostics=diagnostics)
+        applied = correction
+    return best
+
+
+def in_words(correction: CameraErrors) -> str:
+    """Describe a correction: "a focal length 4.5 % smaller"."""
+    return " and ".join(errors_in_words({name: e for name, e in correction.errors.items() if e}))
+
+
+def _estimated_error(
+    result: Reconstruction, applied: CameraErrors
+) -> tuple[CalibrationCheck, CameraErrors] | None:
+    """Return the calibration error that fits the views best; None without an alarm.
+
+    After a correction, also the remainder of the same error, even if it is within the tolerance.
+    """
+    check = _check_of(result)
+    if check is None:
+        return None
+    best = check.best
+    remaining = check.improves and best in check.unconfirmed and applied.errors[best]
+    if not (check.alarm or remaining):
+        return None
+    error, sigma = FIELDS[best]
+    try:
+        return check, CameraErrors(**{error: check.errors[best], sigma: check.sigmas[best]})
+    except ValueError:
+        return None  # implausibly large
+
+
+def _is_better(candidate: Reconstruction, current: Reconstruction) -> bool:
+    """Whether the candidate loses no poses, and its error bound is smaller."""
+    if candidate.has_pose.sum() < current.has_pose.sum():
+        return False
+    new, old = _bound(candidate), _bound(current)
+    # If neither is bounded, the support of the views decides.
+    return new < old if np.isfinite([new, old]).any() else _support(candidate) > _support(current)
+
+
+def _is_stable(candidate: Reconstruction, check: CalibrationCheck) -> bool:
+    """Whether the views do not significantly undo the correction that a check proposed."""
+    check_after = _check_of(candidate)
+    remaining = 0.0 if check_after is None else check_after.large.get(check.best, 0.0)
+    return remaining * check.errors[check.best] >= 0
+
+
+def _check_of(result: Reconstruction) -> CalibrationCheck | None:
+    refinement = result.diagnostics.refinement
+    return None if refinement is None else refinement.calibration_check
+
+
+def _bound(result: Reconstruction) -> float:
+    return result.diagnostics.accuracy.position_m
+
+
+def _bound_change(before: float, after: float) -> str:
+    """Describe the change of the bound."""
+    if not np.isfinite([before, after]).all():
+        return ""
+    return f" The bound of the pose error is {length(after)} (95 %) instead of {length(before)}."
+
+
+def _support(result: Reconstruction) -> float:
+    """Return the support of the views before refinement, which may absorb the error."""
+    refinement = result.diagnostics.refinement
+    return refinement.support[0] if refinement is not None else 0.0
+
+
+def _with_calibration(
+    result: Reconstruction, correction: CameraErrors, calibration: SelfCalibration
+) -> Diagnostics:
+    """Return the diagnostics with the self-calibration and its reason."""
+    d = result.diagnostics
+    indices = [f.index for f in d.frames]
+    text = (
+        f"The calibration of the camera was corrected: views agree with {in_words(correction)} "
+        f"than stated.{_bound_change(*calibration.bound_m)}"
+    )
+    reason = Reason("self_calibrated", ((indices[0], indices[-1]),), text)
+    return replace(d, calibrated=calibration, reasons=ranked([*d.reasons, reason]))

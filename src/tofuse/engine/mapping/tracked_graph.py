@@ -1,0 +1,148 @@
+"""The pose graph of one connected part of a recording, from its registrations, joins and loops."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.tracking.prediction import Prediction, degenerate_runs, with_prediction
+from tofuse.engine.mapping.frame_log import Entry
+from tofuse.engine.quality.accuracy import degenerate_directions, without_degenerate
+from tofuse.engine.graph.build import Measured, build_graph
+from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.loops.loops import ClosedLoop
+from tofuse.engine.loops.merged_components import Join
+from tofuse.engine.refinement.refinement import Refinement
+from tofuse.engine.stored_views.view_store import ViewStore
+from tofuse.engine.views.prepared_view import PreparedView
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedGraph:
+    """Builds pose graphs of the frames of one connected part.
+
+    Attributes
+    ----------
+    posed
+        The frames of the part, in order.
+    poses
+        (4, 4) T_world_camera by frame index, as tracked and joined.
+    joins
+        Edges between components.
+    """
+
+    posed: Sequence[Entry]
+    poses: Mapping[int, Float64]
+    joins: Sequence[Join]
+
+    @cached_property
+    def unobservable(self) -> dict[int, Float64]:
+        """The degenerate directions (K, 6) of frames that have any, by index."""
+        return {
+            e.record.index: e.record.unobservable for e in self.posed if len(e.record.unobservable)
+        }
+
+    def build(
+        self,
+        loops: Sequence[ClosedLoop],
+        refinement: Refinement | None = None,
+        *,
+        confirmed: Collection[int] = (),
+        conservative: bool = False,
+    ) -> PoseGraph:
+        """Return the pose graph as tracked and joined, or with the edges of the refinement.
+
+        Parameters
+        ----------
+        loops
+            Closed loops to include.
+        refinement
+            Replaces the poses and edges of the refined views.
+        confirmed
+            Frames whose registrations get their uncertainty without `Step.inflation`.
+        conservative
+            Whether the error of predicted motion grows at the maximum rate (`with_max_growth`).
+        """
+        ids = [e.record.index for e in self.posed]
+        tracked = np.array([self.poses[index] for index in ids])
+        poses = tracked if refinement is None else refinement.poses
+        refined_edges = () if refinement is None else refinement.edges
+        refined_frames = {index for edge in refined_edges for index in (edge.i, edge.j)}
+        position_of = {index: k for k, index in enumerate(ids)}
+        unobservable = [e.record.unobservable for e in self.posed]
+        degenerate_run_of = degenerate_runs(unobservable)
+        prediction = Prediction.of(tracked, unobservable) if degenerate_run_of.any() else None
+        if prediction is not None and conservative:
+            prediction = prediction.with_max_growth()
+        times = {e.record.index: e.record.timestamp for e in self.posed}
+        interval = float(np.median(np.diff(list(times.values())))) if len(times) > 1 else 0.0
+        sequential_edges = []
+        for entry in self.posed:
+            step, index = entry.step, entry.record.index
+            if step is None or step.reference is None or step.registration is None:
+                continue
+            if {step.reference, index} <= refined_frames:
+                continue
+            r = step.registration
+            # The prediction error grows with the square of the elapsed time.
+            n_frames = abs(position_of[index] - position_of[step.reference])
+            elapsed = abs(times[index] - times[step.reference])
+            time_ratio = (
+                max(elapsed / (n_frames * interval), 1.0) if n_frames and interval > 0 else 1.0
+            )
+            information = r.information
+            if index in confirmed:
+                information = information * step.inflation**2
+            if prediction is not None:
+                sigma = prediction.error(int(degenerate_run_of[position_of[index]]), n_frames)
+                predicted_sigma = (sigma[0] * time_ratio**2, sigma[1] * time_ratio**2)
+                information = with_prediction(information, r.unobservable, predicted_sigma)
+            sequential_edges.append(Measured(step.reference, index, r.T_target_source, information))
+        join_edges = [
+            Measured(j.link.i, j.link.j, j.link.T_i_j, j.link.information)
+            for j in self.joins
+            if j.defines_pose and not {j.link.i, j.link.j} <= refined_frames
+        ]
+        loop_edges = [
+            Measured(c.record.i, c.record.j, c.T_i_j, c.information)
+            for c in loops
+            if c.T_i_j is not None and c.information is not None
+        ]
+        return build_graph(ids, poses, [*sequential_edges, *join_edges, *refined_edges], loop_edges)
+
+    def measured(
+        self,
+        graph: PoseGraph,
+        views: ViewStore[PreparedView],
+        non_overlap_edges: Sequence[tuple[int, int]] = (),
+    ) -> PoseGraph:
+        """Return a graph without edges and directions that rest on extrapolated motion alone.
+
+        Parameters
+        ----------
+        graph
+            A graph from `build`.
+        views
+            Prepared views of frames.
+        non_overlap_edges
+            See `degenerate_directions`.
+        """
+        tracked_pairs = {
+            (e.step.reference, e.record.index)
+            for e in self.posed
+            if e.step is not None and e.step.reference is not None
+        }
+        view_by_index = {v.index: v for v in views.of(self.poses)}
+        directions = degenerate_directions(
+            graph, self.unobservable, tracked_pairs, view_by_index, frozenset(non_overlap_edges)
+        )
+        return without_degenerate(graph, directions, self.gaps)
+
+    @property
+    def gaps(self) -> set[tuple[int, int]]:
+        """The frames before and after the gaps that no registration closes."""
+        return {(j.link.i, j.link.j) for j in self.joins if j.kind != "links"}

@@ -1,0 +1,356 @@
+"""Noise models of cameras: the standard deviation of the range of each pixel.
+
+The phase of a modulated camera is the angle of a phasor of amplitude A, whose two components have
+the same noise: shot noise of the signal, which grows as the root of A, and noise that doesn't
+depend on the signal (ambient light, read-out). The ratio of noise and amplitude gives
+
+    sigma_r^2 = floor^2 + shot^2 / A + dark^2 / A^2,    A in raw counts
+
+(Lange 2000, ch. 4; the usual "noise over amplitude" is its last term). On a surface of one albedo
+A falls as 1/r^2, so that sigma grows as r^2 in the dark limit. Cameras that don't give their
+amplitude are described by a table over their levels of confidence, or over the range alone,
+``sigma_r = a + b r^2``, which is also the law of triangulating cameras (Khoshelham 2011).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Protocol, Self
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.atomic import write_text
+from tofuse.formats.files.reading import read_text
+from tofuse.engine.cameras.cameras import Camera, ray_lengths
+from tofuse.engine.noise import noise_kernels as kernels
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.parts import from_dict, to_dict
+
+Law = Literal["range", "amplitude", "confidence", "camera"]
+
+SCHEMA = 1
+_CODES = {
+    "range": kernels.BY_RANGE,
+    "amplitude": kernels.BY_AMPLITUDE,
+    "confidence": kernels.BY_CONFIDENCE,
+    "camera": kernels.BY_CAMERA,
+}
+# Maximum sigma in m; larger values are probably in millimetres.
+_MAX_SIGMA_M = 5.0
+_NO_IMAGE = np.empty((0, 0), np.float32)
+
+
+class NoisyImage(Protocol):
+    """The properties of a range image that determine its noise; a `RangeFrame` has them."""
+
+    @property
+    def camera(self) -> Camera: ...  # noqa: D102
+    @property
+    def depth(self) -> Float32: ...  # noqa: D102
+    @property
+    def depth_kind(self) -> Literal["z", "range"]: ...  # noqa: D102
+    @property
+    def amplitude_image(self) -> Float32 | None: ...  # noqa: D102
+    @property
+    def amplitude_kind(self) -> Literal["raw", "range_compensated", "ir"]: ...  # noqa: D102
+    @property
+    def confidence_image(self) -> UInt8 | None: ...  # noqa: D102
+    @property
+    def sigma_image(self) -> Float32 | None: ...  # noqa: D102
+    @property
+    def normal_image(self) -> Float32 | None: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class AmplitudeLaw(Bounded):
+    """``sigma^2 = floor^2 + shot^2 / A + dark^2 / A^2`` over the raw amplitude A in counts.
+
+    Attributes
+    ----------
+    shot
+        m times the root of a count: shot noise of the signal.
+    dark
+        m times a count: noise that doesn't depend on the signal.
+    floor
+        m: noise that doesn't decrease with the amplitude (rounding, jitter).
+    falloff
+        Exponent of the cosine to the optical axis by which range-compensated amplitude was divided.
+    """
+
+    shot: Annotated[float, Bounds(0)]
+    dark: Annotated[float, Bounds(0)]
+    floor: Annotated[float, Bounds(0, _MAX_SIGMA_M)] = 0.0
+    falloff: Annotated[float, Bounds(0)] = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.shot == 0 and self.dark == 0:
+            raise ValueError("shot and dark are both 0: set at least one")
+
+
+@dataclass(frozen=True)
+class ConfidenceLaw(Bounded):
+    """``sigma = sigma_m[level] * r^power``, with a table over the levels of confidence.
+
+    Attributes
+    ----------
+    sigma_m
+        In m, at 1 m, for the levels 0, 1, ...; must not increase. Higher levels use the last value.
+    power
+        Exponent of the range; 0 if sigma depends on the level only.
+    """
+
+    sigma_m: Annotated[tuple[float, ...], NotEmpty()]
+    power: Annotated[float, Bounds(0, 4)] = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for value in self.sigma_m:
+            if value not in Bounds(0, _MAX_SIGMA_M):
+                raise ValueError(f"sigma_m must be {Bounds(0, _MAX_SIGMA_M)}, not {value!r}")
+        if any(b > a for a, b in zip(self.sigma_m, self.sigma_m[1:], strict=False)):
+            raise ValueError("sigma_m grows with confidence: higher levels must be better")
+
+
+@dataclass(frozen=True)
+class RangeLaw(Bounded):
+    """``sigma = a + b r^2`` over the radial range r; `a` in m, `b` in 1/m."""
+
+    a: Annotated[float, Bounds(0, _MAX_SIGMA_M)]
+    b: Annotated[float, Bounds(0, 1)]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.a == 0 and self.b == 0:
+            raise ValueError("a and b are both 0: set at least one")
+
+
+@dataclass(frozen=True)
+class NoiseModel(Bounded):
+    """Standard deviation of the radial range of one camera, in m.
+
+    A frame with a sigma stated by the camera keeps it. Otherwise the first law applies that the
+    model contains and whose channel the frame has: amplitude, confidence, range.
+
+    Attributes
+    ----------
+    name
+        Of the camera.
+    range
+        Required, for frames with depth only.
+    amplitude, confidence
+        Or None.
+    ceiling_m
+        Sigma of a pixel without signal: the ambiguity range divided by the root of 12. Applies to
+        pixels without amplitude, and to saturated ones.
+    footprint
+        Noise due to the change of range of an oblique surface within a pixel, as a fraction of this
+        change, if the incidence is known; 0.29 for a uniform distribution.
+    """
+
+    name: str
+    range: RangeLaw
+    amplitude: AmplitudeLaw | None = None
+    confidence: ConfidenceLaw | None = None
+    ceiling_m: Annotated[float, Bounds(0, 100, exclusive=True)] = 1.0
+    footprint: Annotated[float, Bounds(0, 1)] = 0.29
+
+    def law(self, frame: NoisyImage) -> Law:
+        """Return the law that applies to a frame; "camera" if it states its own sigma."""
+        if frame.sigma_image is not None:
+            return "camera"
+        if self.amplitude is not None and frame.amplitude_image is not None:
+            return "amplitude"
+        if self.confidence is not None and frame.confidence_image is not None:
+            return "confidence"
+        return "range"
+
+    def sigma(self, frame: NoisyImage, incidence: Float32 | None = None) -> Float32:
+        """Return the standard deviation (H, W) float32 in m of the radial range; 0 where invalid.
+
+        Parameters
+        ----------
+        frame
+            The image.
+        incidence
+            (H, W) cosine between normal and ray, NaN where unknown. By default from the frame's
+            normals; without either, perpendicular incidence is assumed.
+        """
+        law = self.law(frame)
+        channel: Float32 | None = None
+        if law == "camera":
+            channel = frame.sigma_image
+        elif law == "amplitude":
+            channel = frame.amplitude_image
+        elif law == "confidence" and frame.confidence_image is not None:
+            channel = frame.confidence_image.astype(np.float32)
+        cosine = incidence_cosine(frame) if incidence is None else np.asarray(incidence, np.float32)
+        out = np.empty(frame.depth.shape, np.float32)
+        channel_image = _NO_IMAGE if channel is None else np.asarray(channel, np.float32)
+        cosine_image = _NO_IMAGE if cosine is None else cosine
+        depth, rays = np.asarray(frame.depth, np.float32), frame.camera.rays()
+        parameters, levels = self._parameters(), self._levels()
+        code, compensated = _CODES[law], frame.amplitude_kind == "range_compensated"
+
+        def rows(start: int, stop: int) -> None:
+            kernels.range_sigma(
+                depth, frame.depth_kind == "range", rays, code, channel_image, compensated,
+                levels, cosine_image, parameters, start, stop, out,
+            )  # fmt: skip
+
+        run_chunks(rows, len(out))
+        return out
+
+    def sigma_z(self, frame: NoisyImage, incidence: Float32 | None = None) -> Float32:
+        """Return the standard deviation (H, W) float32 in m of the z depth; 0 where invalid.
+
+        The parameters are those of `sigma`.
+        """
+        sigma = self.sigma(frame, incidence)
+        return np.where(sigma > 0, sigma / ray_lengths(frame.camera), np.float32(0))
+
+    def _parameters(self) -> Float64:
+        law = self.amplitude or AmplitudeLaw(1.0, 0.0)
+        power = 0.0 if self.confidence is None else self.confidence.power
+        return np.array(
+            [self.ceiling_m, law.floor, law.shot, law.dark, law.falloff,
+             self.range.a, self.range.b, power, self.footprint]
+        )  # fmt: skip
+
+    def _levels(self) -> Float64:
+        return np.array((0.0,) if self.confidence is None else self.confidence.sigma_m, float)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of noise.json."""
+        out: dict[str, Any] = {"schema": SCHEMA, **to_dict(self)}
+        return {key: value for key, value in out.items() if value is not None}
+
+    @classmethod
+    def from_dict(cls, data: Any, *, where: str = "noise") -> Self:
+        """Build a model from the content of noise.json.
+
+        Raises
+        ------
+        InputError
+            Naming the field, for invalid content.
+        """
+        if not isinstance(data, dict):
+            raise InputError("contains no JSON object", where=where, remedy="write {...}")
+        data = dict(data)
+        schema = data.pop("schema", None)
+        if schema != SCHEMA or isinstance(schema, bool):
+            raise InputError(
+                f"is {schema!r}" if schema is not None else "is missing",
+                where=f"{where}: schema",
+                remedy=f"write {SCHEMA}, the only version there is",
+            )
+        model: Self = from_dict(cls, data, where=where)
+        _check_finite(model, where)
+        return model
+
+    def save(self, path: str | Path) -> None:
+        """Write a noise.json; raise OutputError if that's impossible."""
+        write_text(path, json.dumps(self.to_dict(), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a noise.json.
+
+        Raises
+        ------
+        InputError
+            If it can't be read, or is invalid.
+        """
+        try:
+            data = json.loads(read_text(path, limit=1 << 20))
+        except (ValueError, RecursionError) as error:
+            raise InputError(
+                f"is broken JSON ({error})", where=path, remedy="write it again by `tofuse noise`"
+            ) from error
+        return cls.from_dict(data, where=str(path))
+
+
+def incidence_cosine(frame: NoisyImage) -> Float32 | None:
+    """Return the cosine (H, W) between ray and normal, NaN where unknown; None without normals."""
+    normals = frame.normal_image
+    if normals is None:
+        return None
+    rays = frame.camera.rays()
+    dot = normals[..., 0] * rays[..., 0] + normals[..., 1] * rays[..., 1] + normals[..., 2]
+    return (np.abs(dot) / ray_lengths(frame.camera)).astype(np.float32)
+
+
+def _check_finite(model: Any, where: str) -> None:
+    for field in fields(model):
+        value = getattr(model, field.name)
+        if is_dataclass(value):
+            _check_finite(value, f"{where}.{field.name}")
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"is {value}", where=f"{where}.{field.name}", remedy="use a number")
+
+
+# Noise of each family of cameras. That of the first five follows from their electronics, by
+# `tofuse.lab.simulation.models.noise_of` (a test compares them): the SR4000's is fitted to a real
+# recording, the others have the scale stated by their makers. docs/noise.md states the sources of
+# the other numbers.
+NOISE: dict[str, NoiseModel] = {
+    model.name: model
+    for model in (
+        NoiseModel(
+            "sr4000",
+            RangeLaw(a=0.0021324099655231693, b=0.00382317908289003),
+            AmplitudeLaw(
+                shot=0.15915494309189537,
+                dark=2.3546327036097847,
+                floor=2.8867513459481293e-05,
+                falloff=4.0,
+            ),
+            ConfidenceLaw((0.6, 0.20, 0.13, 0.094, 0.062, 0.041, 0.028, 0.016)),
+            ceiling_m=1.4433756729740645,
+        ),
+        NoiseModel(
+            "kinect2",
+            RangeLaw(a=0.0006945997474067945, b=0.0012238444427074412),
+            AmplitudeLaw(
+                shot=0.05964181449046179, dark=0.975503822378152, floor=5.7735026918962585e-05
+            ),
+            ceiling_m=5.4089142602287374,
+        ),
+        NoiseModel(
+            "azure-nfov",
+            RangeLaw(a=0.0005893874299221687, b=0.0008695790154781212),
+            AmplitudeLaw(
+                shot=0.02385672579618471, dark=0.11476647344371813, floor=0.0002886751345948129
+            ),
+            ceiling_m=2.884754272121993,
+        ),
+        NoiseModel(
+            "pico-flexx",
+            RangeLaw(a=0.002480693695628617, b=0.00658911277394305),
+            AmplitudeLaw(
+                shot=0.05940419769966313, dark=0.5889829590671571, floor=7.216878364870322e-05
+            ),
+            ceiling_m=2.1549459204098556,
+        ),
+        NoiseModel(
+            "ifm-o3r",
+            RangeLaw(a=0.0012030820534330766, b=0.0024885608246149353),
+            AmplitudeLaw(
+                shot=0.05964181449046179, dark=0.7897981570141338, floor=4.4048329863710466e-05
+            ),
+            ceiling_m=4.32713140818299,
+        ),
+        NoiseModel("pico-zense", RangeLaw(0.0, 0.013)),
+        NoiseModel(
+            "iphone", RangeLaw(0.003, 0.0012), confidence=ConfidenceLaw((0.04, 0.015, 0.005), 1.0)
+        ),
+        NoiseModel("kinect1", RangeLaw(0.0005, 0.001425)),
+        NoiseModel("unknown", RangeLaw(0.003, 0.003)),
+    )
+}

@@ -1,0 +1,466 @@
+"""95 % bounds on the errors of the poses, from the recording itself.
+
+The joint covariance of the poses covers noise and the errors that the patches of a view share.
+Three terms are added. The motion of the trajectory in the refinement measures the correlated errors
+of single registrations, and the remaining error is in proportion to it; if halves of the images
+show more than the covariance and this together, they replace both. If poses are wrong, views far
+apart in time that observe the same surface disagree by more than consecutive ones. And a loop that
+another calibration would close, or views that agree better with it, show that this one bends the
+path. The factor for errors that none of these reveals is derived in `docs/uncertainty.md`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import bdtrc, gammaincinv
+
+from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.graph.covariances import GraphCovariances
+from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.stored_views.view_store import PosedView
+from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align, span
+
+_LEVEL = 0.95
+# Evenly spaced poses that the rms is computed from, and the least certain ones in addition.
+_EVENLY_SPACED, _WORST = 50, 10
+# Standard deviations of an unmeasured direction, practically unbounded: m and rad.
+_UNMEASURED_SIGMA = np.array([30.0] * 3 + [10.0] * 3)
+# In a large model, errors of this fraction of its diagonal count as unbounded.
+_UNMEASURED_FRACTION = 0.05
+# Ratio of the total error to that in which views differ: errors of the sensor that all views of a
+# place share are invisible.
+UNOBSERVED_ERROR_FACTOR = 1.6
+# Directions of two frames are distinct above this fraction of the strongest.
+_DISTINCT = 0.1
+_NO_DIRECTIONS = np.zeros((0, 6))
+# Number of pairs over degenerate frames that are aligned again, the shortest first: at the end of a
+# long one the camera came back, which a loop closure verifies.
+_MAX_SPANNING = 2000
+# Probability that a pair without information along a degenerate direction seems to have some.
+_CHANCE_OF_PAIR = 0.05
+# Significance level of the number of such pairs of a view. It admits the only pair of a view.
+_SIGNIFICANCE = 0.05 + 1e-9
+# Near the final pose. A direction with no smaller sigma than the prior is not measured.
+_ALIGNMENT = ProjectiveOptions()
+# Standard deviation, in `UNITS`, that an error along a degenerate direction causes in the others.
+_LEAK = _DISTINCT * _ALIGNMENT.prior_m / UNITS[0]
+
+
+@dataclass(frozen=True)
+class WorstFrame:
+    """The frame whose pose is least certain, and its 95 % bounds: m and rad, inf if unbounded."""
+
+    frame: int
+    position_m: float
+    rotation_rad: float
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """95 % bounds on the errors of the poses.
+
+    Attributes
+    ----------
+    position_m, rotation_rad
+        Of the rms error over the frames, after the best rigid alignment; inf if no measurement
+        bounds some direction.
+    relative
+        `position_m` as a fraction of the model's diagonal.
+    assessed
+        False if nothing was registered, or if registrations don't state their errors; then the
+        bounds are inf.
+    worst
+        The least certain frame; None if nothing was assessed.
+    unbounded
+        Indices of the frames whose pose is unbounded in some direction.
+    by_odometry
+        Indices of the frames whose pose would be unbounded without the recorded odometry.
+    """
+
+    position_m: float = np.inf
+    rotation_rad: float = np.inf
+    relative: float = np.inf
+    assessed: bool = False
+    worst: WorstFrame | None = None
+    unbounded: tuple[int, ...] = ()
+    by_odometry: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class ObservedErrors:
+    """Errors that the recording reveals and the covariance does not include.
+
+    Attributes
+    ----------
+    moved_m, moved_rad
+        Rms by which the refinement moved the poses, after alignment.
+    excess_m
+        Rms by which views far apart in time disagree, beyond consecutive ones.
+    calibration_m, calibration_rad
+        Error of the poses due to the calibration of the camera, 95 %.
+    split_m, split_rad
+        Rms errors by halves of the images, see `split_half`: those of the covariance and those that
+        `moved` stands for.
+    """
+
+    moved_m: float = 0.0
+    moved_rad: float = 0.0
+    excess_m: float = 0.0
+    calibration_m: float = 0.0
+    calibration_rad: float = 0.0
+    split_m: float = 0.0
+    split_rad: float = 0.0
+
+    def missing_in(self, by_covariance: _CovarianceErrors | None) -> Float64:
+        """Return the combined errors (2,) in m and rad that are missing in the covariance.
+
+        Parameters
+        ----------
+        by_covariance
+            Errors by the covariance; None if it bounds nothing.
+        """
+        correlated = np.array([self.moved_m, self.moved_rad])
+        if by_covariance is not None:
+            # As likely to be exceeded as the bounds are.
+            quantile = by_covariance.bounds / np.maximum(by_covariance.rms, 1e-12)
+            split = np.array([self.split_m, self.split_rad]) * quantile
+            missing = np.sqrt(np.maximum(split**2 - by_covariance.bounds**2, 0.0))
+            correlated = np.maximum(correlated, missing)
+        excess = np.array([self.excess_m, 0.0])
+        calibration = np.array([self.calibration_m, self.calibration_rad])
+        return np.asarray(np.sqrt(correlated**2 + excess**2 + calibration**2))
+
+
+@dataclass(frozen=True, eq=False)
+class _CovarianceErrors:
+    """Errors by the covariance alone, in m and rad.
+
+    Attributes
+    ----------
+    positions
+        (m,) positions of the evaluated poses.
+    bounds, rms
+        (2,) 95 % bounds on the rms errors of all poses, and expected rms.
+    single
+        (m, 2) 95 % bounds on the errors of these poses.
+    """
+
+    positions: Intp
+    bounds: Float64
+    rms: Float64
+    single: Float64
+
+    @classmethod
+    def of_graph(
+        cls, covariances: GraphCovariances, extra: Intp | None = None
+    ) -> _CovarianceErrors | None:
+        """Evaluate evenly spaced poses and `extra`; None if the graph does not constrain all poses.
+
+        The rms is that of the evenly spaced ones.
+        """
+        graph = covariances.graph
+        n = len(graph.ids)
+        even = evenly_spaced(np.arange(n), _EVENLY_SPACED)
+        positions = even if extra is None else np.union1d(even, extra)
+        C = covariances.joint(positions) if n > 1 else None
+        if C is None:
+            return None
+        is_even = np.isin(positions, even)
+        results = [_bounds(part, is_even) for part in _aligned(C, graph.poses[positions], is_even)]
+        bounds, rms, single = zip(*results, strict=True)
+        return cls(positions, np.array(bounds), np.array(rms), np.stack(single, 1))
+
+
+def degenerate_directions(
+    graph: PoseGraph,
+    unobservable: Mapping[int, Float64],
+    tracked: Collection[tuple[int, int]],
+    views: Mapping[int, PosedView[PreparedView]],
+    non_overlap_edges: Collection[tuple[int, int]] = (),
+) -> list[Float64]:
+    """Return the degenerate directions of every edge: (k, 6), right perturbations of j.
+
+    Those of the tracker's registrations are known. A pair of the refinement is aligned again if
+    tracking was degenerate in one of its views or between them: after an unnoticed slide along a
+    wall, later views overlap with earlier ones at wrong poses. Among many pairs of a degenerate
+    view, some seem constrained by chance, and a single one would bound all later poses. So the
+    pairs of such a view count as constrained only if they are more than chance explains.
+
+    Parameters
+    ----------
+    graph
+        After refinement.
+    unobservable
+        (k, 6) degenerate directions of frames, by their index: right perturbations, m and rad.
+    tracked
+        Pairs (i, j) that are the registrations of j in tracking.
+    views
+        Prepared views by frame index.
+    non_overlap_edges
+        Pairs (i, j) that do not come from the overlap of the two views: never degenerate.
+    """
+    degenerate = np.array(sorted(unobservable), np.intp)
+    result: list[Float64] = []
+    to_align: list[int] = []  # edges to align again
+    spanning: list[tuple[int, int]] = []  # those over degenerate frames, and their length
+    for (a, b), T_i_j in zip(graph.edges, graph.measurements, strict=True):
+        i, j = int(graph.ids[a]), int(graph.ids[b])
+        if (i, j) in non_overlap_edges:
+            result.append(_NO_DIRECTIONS)
+            continue
+        # A perturbation of i is the opposite one of j, by the adjoint.
+        of_i = unobservable.get(i, _NO_DIRECTIONS) @ se3.adjoint(se3.inverse(T_i_j)).T
+        of_j = unobservable.get(j, _NO_DIRECTIONS)
+        directions = np.concatenate([of_i, of_j])
+        if (i, j) in tracked:
+            directions = directions if len(of_j) else _NO_DIRECTIONS
+        elif i in views and j in views:
+            if len(directions):
+                to_align.append(len(result))
+            elif np.diff(np.searchsorted(degenerate, sorted((i, j)))).any():
+                spanning.append((abs(j - i), len(result)))
+        result.append(directions)
+    to_align += [k for _, k in sorted(spanning)[:_MAX_SPANNING]]
+
+    def work(start: int, stop: int) -> None:
+        for k in to_align[start:stop]:
+            i, j = (views[int(graph.ids[end])].view.without_caches() for end in graph.edges[k])
+            target = [Target(i, np.eye(4))]
+            realigned = align(j, target, graph.measurements[k], _ALIGNMENT).unobservable * UNITS
+            # Directions are known to a few degrees only, and the remainder would look measured: a
+            # degenerate pair is taken to be degenerate in all directions of its views.
+            result[k] = np.concatenate([realigned, result[k]]) if len(realigned) else _NO_DIRECTIONS
+
+    of_views = list(result)
+    run_chunks(work, len(to_align), -(-len(to_align) // 16))
+    aligned = np.array(to_align, np.intp)
+    constrained = np.array([len(result[k]) == 0 for k in to_align], np.bool_)
+    pairs = np.asarray(graph.ids, np.intp)[graph.edges[aligned]]
+    for k in aligned[_constrained_by_chance(pairs, constrained, degenerate)]:
+        result[k] = of_views[k]
+    return result
+
+
+def _constrained_by_chance(pairs: Intp, constrained: Bool, degenerate: Intp) -> Bool:
+    """(n,) whether a pair seems constrained, but a degenerate frame of it has few such pairs.
+
+    Parameters
+    ----------
+    pairs
+        (n, 2) frames.
+    constrained
+        (n,) whether the alignment of a pair has no degenerate direction.
+    degenerate
+        Frames whose tracking is degenerate, ascending.
+    """
+    is_degenerate = np.isin(pairs, degenerate)
+    row = np.searchsorted(degenerate, pairs)
+    count = len(degenerate) + 1
+    n_pairs = np.bincount(row[is_degenerate], minlength=count)
+    n_constrained = np.bincount(row[is_degenerate & constrained[:, None]], minlength=count)
+    # P(X >= n_constrained) of the binomial distribution.
+    chance = np.where(n_constrained > 0, bdtrc(n_constrained - 1, n_pairs, _CHANCE_OF_PAIR), 1.0)
+    found: Bool = constrained & (is_degenerate & (chance > _SIGNIFICANCE)[row]).any(1)
+    return found
+
+
+def without_degenerate(
+    graph: PoseGraph,
+    directions: Sequence[Float64],
+    unmeasured: Collection[tuple[int, int]] = (),
+) -> PoseGraph:
+    """Return the graph without information of its edges along their degenerate directions.
+
+    Information there comes from noise (`uncertainty`) or from the prediction. These directions get
+    practically unbounded variances. They are known to a few degrees only, and differ that much
+    between edges, which together would seem to constrain them. So the error along them, up to the
+    smallest that counts as unbounded, is also part of the error in the other directions. All
+    degenerate pairs of a view share it: their number does not reduce it.
+
+    Parameters
+    ----------
+    graph
+        After refinement.
+    directions
+        Of every edge, see `degenerate_directions`.
+    unmeasured
+        Pairs of frames with only extrapolated motion between them.
+    """
+    information = graph.information.copy()
+    unmeasured_variance = np.diag((_UNMEASURED_SIGMA / UNITS) ** 2)
+    is_degenerate = np.array([len(d) > 0 for d in directions], np.bool_)
+    n_degenerate = np.bincount(graph.edges[is_degenerate].ravel(), minlength=len(graph.ids))
+    for k, ((a, b), degenerate) in enumerate(zip(graph.edges, directions, strict=True)):
+        i, j = int(graph.ids[a]), int(graph.ids[b])
+        if (i, j) in unmeasured or (j, i) in unmeasured:
+            information[k] = np.diag(_UNMEASURED_SIGMA**-2.0)
+            continue
+        if not len(degenerate):
+            continue
+        basis = span(degenerate, _DISTINCT)
+        H = information[k] * np.outer(UNITS, UNITS)
+        scaled = H - H @ basis @ np.linalg.pinv(basis.T @ H @ basis, hermitian=True) @ basis.T @ H
+        unbounded = basis @ np.linalg.inv(basis.T @ unmeasured_variance @ basis) @ basis.T
+        measured = scaled + unbounded
+        leak_variance = _LEAK**2 * max(n_degenerate[a], n_degenerate[b])
+        measured = np.linalg.solve(np.eye(6) + leak_variance * measured, measured)
+        information[k] = 0.5 * (measured + measured.T) / np.outer(UNITS, UNITS)
+    return replace(graph, information=information)
+
+
+def accuracy_of(
+    covariances: GraphCovariances, observed: ObservedErrors, diagonal_m: float
+) -> Accuracy:
+    """Return the bounds on the errors of the poses of a graph.
+
+    Parameters
+    ----------
+    covariances
+        Of a graph after refinement; its information is that of measurements alone, see
+        `without_degenerate`.
+    observed
+        Further errors that the recording reveals.
+    diagonal_m
+        Of the model, m.
+    """
+    graph = covariances.graph
+    if len(graph.ids) < 2:
+        return Accuracy()
+    prior_m, prior_rad = _ALIGNMENT.prior_m, _ALIGNMENT.prior_rad
+    limits = np.array([max(prior_m, _UNMEASURED_FRACTION * diagonal_m), prior_rad])
+    pose_covariances, unbounded = _pose_covariances(covariances, limits)
+    unbounded_frames = tuple(graph.ids[unbounded.any(1)].tolist())
+    variance = np.nan_to_num(np.trace(pose_covariances[:, :3, :3], axis1=1, axis2=2), nan=np.inf)
+    by_covariance = _CovarianceErrors.of_graph(
+        covariances, np.argsort(-variance, kind="stable")[:_WORST]
+    )
+    if by_covariance is None:
+        worst_frame = WorstFrame(
+            unbounded_frames[0] if unbounded_frames else int(graph.ids[-1]), np.inf, np.inf
+        )
+        return Accuracy(assessed=True, worst=worst_frame, unbounded=unbounded_frames)
+    extra = observed.missing_in(by_covariance)
+    rms_bounds = UNOBSERVED_ERROR_FACTOR * np.hypot(by_covariance.bounds, extra)
+    pose_bounds = UNOBSERVED_ERROR_FACTOR * np.hypot(by_covariance.single, extra)
+    pose_bounds = np.where(unbounded[by_covariance.positions], np.inf, pose_bounds)
+    worst_row = int(np.argmax((pose_bounds / limits).max(1)))
+    position, rotation = np.where(unbounded.any(0), np.inf, rms_bounds).tolist()
+    return Accuracy(
+        position,
+        rotation,
+        position / diagonal_m if diagonal_m > 0 else np.inf,
+        True,
+        WorstFrame(
+            int(graph.ids[by_covariance.positions[worst_row]]), *pose_bounds[worst_row].tolist()
+        ),
+        unbounded_frames,
+    )
+
+
+def covariances_of(covariances: GraphCovariances, observed: ObservedErrors) -> Float64:
+    """(N, 6, 6) covariances of single poses relative to the first, as right perturbations.
+
+    NaN where a pose is not connected to the first. An unbounded direction has a sigma of tens of
+    metres.
+    """
+    extra_variance = np.repeat(
+        observed.missing_in(_CovarianceErrors.of_graph(covariances)) ** 2 / 3, 3
+    )
+    C = covariances.of_poses.copy()
+    C[1:] += np.diag(extra_variance)
+    return UNOBSERVED_ERROR_FACTOR**2 * C
+
+
+def _pose_covariances(covariances: GraphCovariances, limits: Float64) -> tuple[Float64, Bool]:
+    """Covariances (N, 6, 6) of the poses, and whether position and rotation are unbounded, (N, 2).
+
+    Relative to the first one, or to another if the first is one of few unbounded ones.
+    """
+    to_first = covariances.of_poses
+    unbounded = _is_unbounded(to_first, limits)
+    if 2 * unbounded.any(1).sum() > len(unbounded):
+        unbounded_rows = np.flatnonzero(unbounded.any(1))
+        to_other = GraphCovariances(
+            covariances.graph, int(unbounded_rows[len(unbounded_rows) // 2])
+        ).of_poses
+        other_unbounded = _is_unbounded(to_other, limits)
+        if other_unbounded.any(1).sum() < unbounded.any(1).sum():
+            return to_other, other_unbounded
+    return to_first, unbounded
+
+
+def _is_unbounded(covariances: Float64, limits: Float64) -> Bool:
+    """(N, 2) whether the largest sigma of position or rotation exceeds the limits."""
+    finite = np.isfinite(covariances).all((1, 2))
+    out = np.ones((len(covariances), 2), np.bool_)
+    C = covariances[finite]
+    for k, part in enumerate((C[:, :3, :3], C[:, 3:, 3:])):
+        out[finite, k] = np.linalg.eigvalsh(part)[:, -1] > limits[k] ** 2
+    return out
+
+
+def _aligned(C: Float64, poses: Float64, chosen: Bool) -> tuple[Float64, Float64]:
+    """Covariances (3m, 3m) of positions and rotations in the world, less a rigid motion of all.
+
+    Parameters
+    ----------
+    C
+        (6m, 6m) of right perturbations.
+    poses
+        (m, 4, 4).
+    chosen
+        (m,) poses that are aligned.
+    """
+    m = len(poses)
+    C = C.reshape(m, 6, m, 6)
+    R, p = poses[:, :3, :3], poses[:, :3, 3]
+    positions, rotations = (
+        np.einsum("iab,ibjc,jdc->iajd", R, C[:, part, :, part], R, optimize=True).reshape(3 * m, -1)
+        for part in (np.s_[:3], np.s_[3:])
+    )
+    rotation = np.tile(np.eye(3), (m, 1, 1))
+    motion = np.concatenate([rotation, -se3.hat(p - p[chosen].mean(0))], 2)
+    return _remove_motion(positions, motion, chosen), _remove_motion(rotations, rotation, chosen)
+
+
+def _remove_motion(C: Float64, motion: Float64, chosen: Bool) -> Float64:
+    """Covariance (3m, 3m) after the best fit of motions (m, 3, k) of the chosen ones is removed."""
+    k = motion.shape[2]
+    flat = motion.reshape(-1, k)
+    chosen_motion = np.where(np.repeat(chosen, 3)[:, None], flat, 0.0)
+    projector = np.eye(len(flat)) - flat @ np.linalg.pinv(chosen_motion, rcond=1e-9)
+    return np.asarray(projector @ C @ projector.T, np.float64)
+
+
+def _bounds(C: Float64, chosen: Bool) -> tuple[float, float, Float64]:
+    """95 % bound of the rms over the chosen ones, its expectation, and bounds of each (m,)."""
+    m, count = len(chosen), int(chosen.sum())
+    rows = np.repeat(chosen, 3)
+    C_chosen = C[np.ix_(rows, rows)]
+    blocks = C.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m), :]
+    return (
+        float(np.sqrt(_quantile(C_chosen) / count)),
+        float(np.sqrt(np.trace(C_chosen) / count)),
+        np.sqrt([_quantile(block) for block in blocks]),
+    )
+
+
+def _quantile(C: Float64) -> float:
+    """95 % quantile of the squared length of a normal vector with this covariance.
+
+    A sum of squares is distributed nearly as a gamma variable of the same mean and variance
+    (Satterthwaite 1946).
+    """
+    mean, variance = float(np.trace(C)), 2 * float((C * C).sum())
+    if mean <= 0 or variance <= 0:
+        return 0.0
+    degrees = 2 * mean**2 / variance
+    chi_squared = 2 * gammaincinv(degrees / 2, _LEVEL)  # scipy.stats takes long to import
+    return float(chi_squared * mean / degrees)

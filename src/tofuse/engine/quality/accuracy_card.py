@@ -1,0 +1,81 @@
+"""The accuracy card: the accuracy of a result in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tofuse.engine.quality.accuracy import Accuracy
+from tofuse.engine.frames.ranges import in_words, runs_of
+from tofuse.engine.quality.types import Reason, Reconstruction
+from tofuse.engine.quality.verdict import ADVICE, ranked
+
+SEPARATOR = " · "
+
+
+def card(result: Reconstruction) -> list[str]:
+    """Return the parts of the line: accuracy, coverage, the weakest frame, how to improve it."""
+    d = result.diagnostics
+    parts = [bound(d.accuracy, result.cloud.diagonal_m)]
+    readable = sum(f.status != "skipped" for f in d.frames)
+    closed = sum(p.accepted for p in d.loops)
+    loops = f", {closed} loop{'' if closed == 1 else 's'}"
+    parts.append(f"{int(result.has_pose.sum())} of {readable} frames{loops}")
+    if weakest := weakest_frame(d.accuracy):
+        parts.append(f"weakest: {weakest}")
+    if d.verdict != "good" and (advice := _advice(d.reasons)):
+        parts.append(f"to improve: {advice[0].lower()}{advice[1:].rstrip('.')}")
+    return parts
+
+
+def _advice(reasons: Sequence[Reason]) -> str:
+    """Return the advice for the most severe reason, or for one that may cause all others."""
+    by_code = {r.code: ADVICE.get(r.code, "") for r in ranked(reasons)}
+    if "faulty_recording" in by_code:
+        return "Correct the input as the inspection proposes."
+    return by_code.get("calibration_alarm") or next(filter(None, by_code.values()), "")
+
+
+def bound(accuracy: Accuracy, diagonal_m: float) -> str:
+    """Return the accuracy of the poses as text: "±24 mm (95 %) over 6.2 m, 0.4 %".
+
+    Parameters
+    ----------
+    accuracy
+        The accuracy.
+    diagonal_m
+        Diagonal of the model, m.
+    """
+    if not accuracy.assessed:
+        return "accuracy not assessed"
+    if not np.isfinite(accuracy.position_m):
+        return f"accuracy not bounded over {_extent(diagonal_m)}"
+    return (
+        f"±{length(accuracy.position_m)} (95 %) over {_extent(diagonal_m)}, "
+        f"{100 * accuracy.relative:.2g} %"
+    )
+
+
+def _extent(metres: float) -> str:
+    """Return the size of a model as text: three digits, and no exponent."""
+    return f"{metres:.0f} m" if metres >= 100 else f"{metres:.3g} m"
+
+
+def weakest_frame(accuracy: Accuracy) -> str:
+    """Return the frames with the largest pose error, and that error; empty if not assessed."""
+    if accuracy.unbounded:
+        ranges = runs_of(
+            range(accuracy.unbounded[0], accuracy.unbounded[-1] + 1), accuracy.unbounded
+        )
+        return f"{in_words(ranges)}, not bounded"
+    if accuracy.worst is None:
+        return ""
+    return f"frame {accuracy.worst.frame}, {length(accuracy.worst.position_m)}"
+
+
+def length(metres: float) -> str:
+    """Return a length as text: "2.3 mm", "24 mm", "1.20 m"."""
+    if metres >= 1:
+        return f"{metres:.2f} m"
+    return f"{metres * 1e3:.0f} mm" if metres >= 0.01 else f"{metres * 1e3:.1f} mm"

@@ -1,0 +1,74 @@
+"""Independent measurements of relative poses from pairs of overlapping views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.quality.accuracy import without_degenerate
+from tofuse.engine.graph.build import Measured, build_graph
+from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.refinement.joint_alignment import spread_evenly
+from tofuse.engine.stored_views.pair_equations import RefineOptions
+from tofuse.engine.stored_views.view_store import PosedView, SampledView, overlaps
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
+from tofuse.engine.alignment.uncertainty import covariance
+
+_ALIGNMENT = ProjectiveOptions()
+# Pairs are selected as in joint refinement.
+_PAIRS = RefineOptions()
+
+
+def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> PoseGraph:
+    """Align every pair of views that overlap, and each view with the one before it.
+
+    The poses only select the pairs and initialise their alignments.
+
+    Parameters
+    ----------
+    views
+        In the order of their frames.
+    poses
+        (N, 4, 4) T_world_camera.
+
+    Returns
+    -------
+    A graph of the frames with these poses, every edge with the covariance of its alignment
+    (`registration.uncertainty`). Degenerate directions of a pair have almost no information.
+    """
+    pairs = _overlapping(views, poses)
+    surfaces = [view.view for view in views]
+    T_i_j = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
+
+    def work(start: int, stop: int) -> list[tuple[Float64, Float64, Float64]]:
+        results = []
+        for (i, j), T in zip(pairs[start:stop].tolist(), T_i_j[start:stop], strict=True):
+            target = [Target(surfaces[i], np.eye(4))]
+            aligned = align(surfaces[j], target, T, _ALIGNMENT)
+            C = covariance(surfaces[j], target, aligned, _ALIGNMENT)
+            results.append((aligned.T_world_source, C, aligned.unobservable * UNITS))
+        return results
+
+    results = [result for chunk in run_chunks(work, len(pairs), 64) for result in chunk]
+    ids = [view.index for view in views]
+    edges = [
+        Measured(ids[i], ids[j], T, np.asarray(np.linalg.inv(C), np.float64))
+        for (i, j), (T, C, _) in zip(pairs.tolist(), results, strict=True)
+    ]
+    return without_degenerate(
+        build_graph(ids, poses, edges), [degenerate for _, _, degenerate in results]
+    )
+
+
+def _overlapping(views: Sequence[PosedView[PreparedView]], poses: Float64) -> Intp:
+    """Return (M, 2) positions i < j of the views that are compared."""
+    sampled = [SampledView.of(view.view, _PAIRS.points) for view in views]
+    pairs = spread_evenly(overlaps(sampled, poses, _PAIRS.overlap)[0], _PAIRS.neighbours)
+    later = np.arange(1, len(views))
+    consecutive = np.stack([later - 1, later], 1)
+    return np.unique(np.concatenate([pairs, consecutive]), axis=0)

@@ -1,0 +1,440 @@
+"""Self-calibration check: whether all views together indicate an error of the camera.
+
+A wrong focal length or principal point, neglected lens distortion or a depth offset bends the
+trajectory, and no single registration reveals it. But where views overlap, and above all where a
+path closes a loop, their residuals can't all be small. So each error is estimated separately, with
+all poses free. An error that makes the views more consistent is a proposal. It is an alarm if it
+exceeds the calibration error of usual cameras, and if it closes a loop that pairwise alignments of
+neighbours leave open.
+
+The focal length stands for other errors too: a constant offset of the depth has much the same
+effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
+
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.refinement.camera_response import response
+from tofuse.engine.refinement.joint_alignment import AlignedViews, Refined, align_views, refine, spread_evenly
+from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap
+from tofuse.engine.stored_views.pair_equations import RefineOptions
+from tofuse.engine.refinement.pose_priors import Priors
+from tofuse.engine.refinement.split_half import aligned_motion
+from tofuse.engine.stored_views.view_store import SampledView
+
+# Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
+# calibrated to better than that. Makers specify depth offsets of up to a centimetre.
+TOLERANCES = {
+    "focal": 0.01,
+    "offset": 0.01,
+    "center_x": 0.01,
+    "center_y": 0.01,
+    "distortion": 0.01,
+}
+# Errors that the drift over a loop can reveal; that by the others resembles any drift.
+_REVEALED_BY_LOOP = ("focal", "offset")
+# Significance of an error in standard deviations of a normal distribution, for an alarm and for a
+# full estimate; and the fraction of the tolerance that one Newton step must reach for the latter.
+_SIGNIFICANT, _LIKELY, _MIN_FIRST_STEP = 4.0, 2.5, 0.2
+# Errors with a larger standard deviation, as a fraction of the tolerance, are not reported.
+_MAX_SIGMA = 0.8
+# Change of the views' support that the sampling of points alone explains.
+_SUPPORT_NOISE = 0.003
+# An error that only the drift over the loop reveals must exceed the tolerance by this factor, with
+# which the search also begins; and the fraction of it that the views must confirm, as they may
+# measure another one.
+_LOOP_FACTOR, _MIN_CONFIRMED = 2.0, 0.5
+# Minimum number of views from which their spread is estimated.
+_MIN_VIEWS = 8
+_DELTA = 1e-3  # error of the camera for numerical differentiation
+_INDEX = {
+    "focal": kernels.FOCAL,
+    "offset": kernels.OFFSET,
+    "center_x": kernels.CENTER_X,
+    "center_y": kernels.CENTER_Y,
+    "distortion": kernels.DISTORTION,
+}
+# This many pairs determine errors that all views share; larger sets are subsampled to about as
+# many, with every n-th point.
+_MAX_PAIRS, _POINT_STRIDE = 500, 3
+
+
+@dataclass(frozen=True)
+class CalibrationCheck:
+    """Evidence of the views for errors of the camera that all of them share.
+
+    Attributes
+    ----------
+    alarm
+        Whether the camera's calibration should be checked.
+    errors, sigmas
+        Separate estimates of each error, as in `Refinement.errors`, and their standard deviations
+        from the spread between views. They are proposals and change nothing. Only significant
+        ones; in case of an alarm, all that the views determine.
+    support
+        Mean support of the views without and with the error `best`, see `joint_alignment.Support`.
+    gap
+        Closure error of the longest loop; None if there is none, or no error is significant.
+    best
+        Name of the largest error when all significant ones are estimated together, relative to
+        its tolerance; empty if no error is significant.
+    focal_sigma
+        Standard deviation of the focal length estimated from the views, as a fraction; None if
+        there are too few views.
+    motion
+        Rms motion (m, rad) of the poses, after alignment, that a unit of each error causes.
+    moved
+        Rms motion (m, rad) of the poses, after alignment, if the likely errors are corrected
+        together, or by the first estimate of an error that the views determine, if larger.
+    significance
+        Number of standard deviations that an estimate must exceed to be significant, see
+        `significance_of`.
+    """
+
+    alarm: bool = False
+    errors: dict[str, float] = field(default_factory=dict)
+    sigmas: dict[str, float] = field(default_factory=dict)
+    support: tuple[float, float] | None = None
+    gap: Gap | None = None
+    best: str = ""
+    focal_sigma: float | None = None
+    motion: dict[str, tuple[float, float]] = field(default_factory=dict)
+    moved: tuple[float, float] = (0.0, 0.0)
+    significance: float = _SIGNIFICANT
+
+    @property
+    def undetermined(self) -> bool:
+        """Whether a wrong focal length would not show in this recording."""
+        return self.focal_sigma is not None and not _determined("focal", self.focal_sigma)
+
+    @property
+    def unconfirmed(self) -> dict[str, float]:
+        """Significant errors without an alarm that may be true.
+
+        Either one of them is large, and no loop confirms or contradicts it, or the views agree
+        better with the smaller ones.
+        """
+        if self.alarm or (self.gap is not None and self.gap.contradicts):
+            return {}
+        if not self.large and not self.improves:
+            return {}
+        return {n: e for n, e in self.errors.items() if abs(e) > self._limit(n)}
+
+    @property
+    def improves(self) -> bool:
+        """Whether the views agree better with the error `best`, not by chance."""
+        return self.support is not None and self.support[1] - self.support[0] > _SUPPORT_NOISE
+
+    @property
+    def large(self) -> dict[str, float]:
+        """Significant errors that exceed the calibration error of usual cameras."""
+        return {n: e for n, e in self.errors.items() if _large(n, e, self._limit(n))}
+
+    def _limit(self, name: str) -> float:
+        return self.significance * self.sigmas.get(name, np.inf)
+
+
+def significance_of(view_count: int) -> float:
+    """Return the number of standard deviations that a significant error must exceed.
+
+    The probability of chance is that of four standard deviations of a normal distribution. Few
+    views determine their own scatter poorly, so that the estimate follows Student's t-distribution.
+    """
+    return -float(stdtrit(max(view_count - 1, 1), ndtr(-_SIGNIFICANT)))
+
+
+def _determined(name: str, sigma: float) -> bool:
+    return sigma < _MAX_SIGMA * TOLERANCES[name]
+
+
+def _large(name: str, error: float, limit: float, factor: float = 1.0) -> bool:
+    """Whether an error exceeds its tolerance, and the limit of significance."""
+    return abs(error) > max(factor * TOLERANCES[name], limit)
+
+
+def check_calibration(
+    views: Sequence[SampledView], refined: Refined, options: RefineOptions, priors: Priors
+) -> CalibrationCheck:
+    """Estimate the errors of the camera from refined views.
+
+    Parameters
+    ----------
+    views, refined, options, priors
+        Of the joint alignment without errors of the camera, see `refine`.
+    """
+    if not len(refined.pairs) or len(views) < _MIN_VIEWS:
+        return CalibrationCheck()
+    first = _FirstEstimates.of(views, refined, options, priors)
+    significance = significance_of(len(views))
+    without_error = CalibrationCheck(
+        focal_sigma=first.sigmas["focal"],
+        motion=first.motion,
+        moved=first.largest_motion,
+        significance=significance,
+    )
+    likely = [name for name in first.determined if first.is_likely(name)]
+    if not likely:
+        return _check_by_loop(views, refined, first, without_error, options)
+    estimator = _Estimator.of(views, refined, options, priors)
+    estimates = {name: estimator.alone(name) for name in likely}
+    joint: Refined | AlignedViews = estimates[likely[0]]
+    if len(likely) > 1:  # errors are correlated: in a joint estimate, the true one remains
+        joint = estimator.together(likely)
+    best_name = max(likely, key=lambda name: abs(joint.errors[_INDEX[name]]) / TOLERANCES[name])
+    best = estimates[best_name]
+    errors = {name: float(e.errors[_INDEX[name]]) for name, e in estimates.items()}
+    limits = {name: significance * first.sigmas[name] for name in errors}
+    large = any(_large(name, error, limits[name]) for name, error in errors.items())
+    certain = abs(errors[best_name]) > limits[best_name]
+    support, with_best = (float(s.of_views(len(views)).mean()) for s in (best.before, best.after))
+    improves = certain and with_best - support > _SUPPORT_NOISE
+    gap = None
+    if large or improves:
+        gap = loop_gap(views, refined, best.poses, best.errors, options)
+    # Multipath has the same effect as a smaller error: views agree better, and a loop closes.
+    alarm = large and improves and gap is not None and gap.closes
+    if alarm:  # alternative explanations
+        for name in first.determined:
+            if name not in errors:
+                errors[name] = float(estimator.alone(name).errors[_INDEX[name]])
+    else:
+        by_loop = _check_by_loop(views, refined, first, without_error, options)
+        if by_loop.alarm:
+            return by_loop
+    position, rotation = aligned_motion(refined.poses, joint.poses)
+    joint_motion = (_rms(position), _rms(rotation))
+    return replace(
+        without_error,
+        alarm=alarm,
+        errors={name: errors[name] for name in _INDEX if name in errors},
+        sigmas={name: first.sigmas[name] for name in _INDEX if name in errors},
+        support=(support, with_best),
+        gap=gap,
+        best=best_name,
+        moved=max(joint_motion, first.largest_motion),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _FirstEstimates:
+    """Estimates of each error alone by one Newton step, by name.
+
+    Attributes
+    ----------
+    errors, sigmas
+        Estimates and standard deviations.
+    motion
+        As in `CalibrationCheck`.
+    """
+
+    errors: dict[str, float]
+    sigmas: dict[str, float]
+    motion: dict[str, tuple[float, float]]
+
+    @classmethod
+    def of(
+        cls, views: Sequence[SampledView], refined: Refined, options: RefineOptions, priors: Priors
+    ) -> _FirstEstimates:
+        """Estimate all errors. The parameters are those of `check_calibration`."""
+        poses, pairs = refined.poses, refined.pairs
+        sensitivity = response(views, poses, pairs, options, priors=priors)
+        errors, sigmas = sensitivity.estimate(), sensitivity.sigma(pairs, len(views))
+        return cls(
+            {name: float(errors[k]) for name, k in _INDEX.items()},
+            {name: float(sigmas[k]) for name, k in _INDEX.items()},
+            {name: _motion(poses, sensitivity.motion[k]) for name, k in _INDEX.items()},
+        )
+
+    @property
+    def determined(self) -> list[str]:
+        """Errors that the views determine."""
+        return [name for name in _INDEX if _determined(name, self.sigmas[name])]
+
+    def is_likely(self, name: str) -> bool:
+        """Whether a full estimate may be significant."""
+        limit = max(_LIKELY * self.sigmas[name], _MIN_FIRST_STEP * TOLERANCES[name])
+        return abs(self.errors[name]) > limit
+
+    @property
+    def largest_motion(self) -> tuple[float, float]:
+        """Largest rms motion (m, rad) of the poses by one of the determined errors."""
+        motions = [
+            (m * abs(self.errors[name]), rad * abs(self.errors[name]))
+            for name, (m, rad) in self.motion.items()
+            if name in self.determined
+        ]
+        return max(motions, default=(0.0, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Estimator:
+    """Estimates errors from refined views: the overlaps are fixed, the poses are free.
+
+    Attributes
+    ----------
+    views, poses, pairs, options, priors
+        As for `refine`; of many pairs, a part. The poses are aligned without an error.
+    """
+
+    views: Sequence[SampledView]
+    poses: Float64
+    pairs: Intp
+    options: RefineOptions
+    priors: Priors
+
+    @classmethod
+    def of(
+        cls, views: Sequence[SampledView], refined: Refined, options: RefineOptions, priors: Priors
+    ) -> _Estimator:
+        """Select the pairs. The parameters are those of `check_calibration`."""
+        pairs, count = refined.pairs, len(refined.pairs)
+        if count > _MAX_PAIRS:
+            views = [v.with_points(np.s_[::_POINT_STRIDE]) for v in views]
+            pairs = spread_evenly(pairs, -(-options.neighbours * _MAX_PAIRS // count))
+        # An estimate of camera errors does not model errors that patches share, so it can't be
+        # compared with the refined poses.
+        coarse_to_fine = replace(options, rounds=COARSE_TO_FINE, shared=0.0)
+        poses = align_views(views, refined.poses, coarse_to_fine, priors=priors, pairs=pairs).poses
+        return cls(views, poses, pairs, coarse_to_fine, priors)
+
+    def alone(self, name: str) -> Refined:
+        """Estimate one error."""
+        return refine(
+            self.views,
+            self.poses,
+            self.options,
+            calibrate=[_INDEX[name]],
+            priors=self.priors,
+            pairs=self.pairs,
+        )
+
+    def together(self, names: Sequence[str]) -> AlignedViews:
+        """Estimate several errors."""
+        return align_views(
+            self.views,
+            self.poses,
+            self.options,
+            calibrate=[_INDEX[name] for name in names],
+            priors=self.priors,
+            pairs=self.pairs,
+        )
+
+
+def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
+    """Combine the checks of the submaps of one recording.
+
+    They share the camera, so a true error is detected in most of them. Of the alarms, that with the
+    median error is returned.
+    """
+    alarms = sorted((s for s in checks if s.alarm), key=lambda s: s.errors.get(s.best, 0.0))
+    if 2 * len(alarms) > len(checks):
+        return alarms[len(alarms) // 2]
+    without_alarm = [s for s in checks if not s.alarm]
+    # One submap that determines the camera represents all of them.
+    without_alarm.sort(key=lambda s: (s.gap is None, s.undetermined))
+    return without_alarm[0] if without_alarm else CalibrationCheck()
+
+
+def _rms(vectors: Float64) -> float:
+    return float(np.sqrt((vectors**2).sum(1).mean()))
+
+
+def _motion(poses: Float64, twists: Float64) -> tuple[float, float]:
+    """Return the rms motion (m, rad) per unit, given small twists (N, 6) per unit."""
+    position, rotation = aligned_motion(poses, poses @ se3.exp(_DELTA * twists))
+    return _rms(position) / _DELTA, _rms(rotation) / _DELTA
+
+
+def _check_by_loop(
+    views: Sequence[SampledView],
+    refined: Refined,
+    first: _FirstEstimates,
+    without_error: CalibrationCheck,
+    options: RefineOptions,
+) -> CalibrationCheck:
+    """Estimate the errors of the camera from the drift over the longest loop alone.
+
+    A large error leaves a gap that a refinement may close by matching wrong surfaces. Then its
+    residuals reveal nothing. Pairwise alignments from the poses before it don't depend on it. But
+    any drift leaves a gap that some error of the camera nearly closes: the views must confirm the
+    error.
+
+    Parameters
+    ----------
+    views, refined, options
+        As for `check_calibration`.
+    first
+        The first estimates.
+    without_error
+        The result if there is no error.
+    """
+    loop = Loop.longest(views, refined, options)
+    if loop is None:
+        return without_error
+    poses = refined.start
+    uncorrected = loop.closure_error(poses, np.zeros(kernels.ERRORS))
+    if not loop.gap(uncorrected, uncorrected).significant:
+        return without_error
+    candidates: dict[str, tuple[float, Gap]] = {}
+    sigmas = first.sigmas
+    for name in (name for name in _REVEALED_BY_LOOP if name in first.determined):
+        step = _LOOP_FACTOR * TOLERANCES[name]
+        error, corrected = loop.closing_error(poses, uncorrected, _INDEX[name], step)
+        gap = loop.gap(uncorrected, corrected)
+        limit = without_error.significance * sigmas[name]
+        if not (gap.closes and _large(name, error, limit, _LOOP_FACTOR)):
+            continue
+        confirmed = loop.error_by_views(poses, _INDEX[name], error)
+        if _large(name, confirmed, limit, _LOOP_FACTOR) and confirmed / error > _MIN_CONFIRMED:
+            candidates[name] = error, gap
+    if not candidates:
+        return without_error
+    best = min(candidates, key=lambda name: candidates[name][1].remaining_m)
+    return replace(
+        without_error,
+        alarm=True,
+        errors={name: error for name, (error, _) in candidates.items()},
+        sigmas={name: sigmas[name] for name in candidates},
+        gap=candidates[best][1],
+        best=best,
+    )
+
+
+def in_words(errors: Mapping[str, float]) -> list[str]:
+    """Describe the correction of each error of the camera, as in `CalibrationCheck`, in words."""
+    words = []
+    if "focal" in errors:
+        change = 1 / (1 + errors["focal"]) - 1
+        more = "larger" if change > 0 else "smaller"
+        words.append(f"a focal length {abs(change):.1%} {more}")
+    if "offset" in errors:
+        more = "longer" if errors["offset"] > 0 else "shorter"
+        words.append(f"ranges {abs(errors['offset']) * 1e3:.0f} mm {more}")
+    for name, (less, more) in {"center_x": ("left", "right"), "center_y": ("up", "down")}.items():
+        if name in errors:
+            # A larger ray coordinate of a pixel is a principal point further left or up.
+            where = less if errors[name] > 0 else more
+            words.append(
+                f"a principal point {abs(errors[name]):.1%} of the focal length further {where}"
+            )
+    if "distortion" in errors:
+        kind = "barrel" if errors["distortion"] > 0 else "pincushion"
+        words.append(f"{abs(errors['distortion']):.1%} more {kind} distortion at 45 degrees")
+    return words
+
+
+def proposal(errors: Mapping[str, float], best: str) -> str:
+    """Describe the corrections of `errors` as alternatives; of more than two, only `best`."""
+    alternatives = in_words(errors)
+    if len(alternatives) < 3 or best not in errors:
+        return " or ".join(alternatives)
+    (text,) = in_words({best: errors[best]})
+    return f"{text} (or other calibration errors with a similar effect)"

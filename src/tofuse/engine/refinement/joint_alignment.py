@@ -1,0 +1,502 @@
+"""Joint alignment of all overlapping views (eq 2.8), and self-calibration.
+
+Every pair of overlapping views gives the normal equations of its relative pose. The adjoint turns
+them into equations in both poses, and one sparse system updates all poses. Correspondences are
+then recomputed, until convergence: the iteration that chapter 8 of the thesis suggests, with
+planes and albedo in place of points. Errors of the camera that all views share can be unknowns of
+the same system.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64, Int64, Intp
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.graph import robust
+from tofuse.engine.graph.descent import vertical
+from tofuse.engine.graph.graph import Gravity
+from tofuse.engine.stored_views.pair_equations import DirectedPairs, RefineOptions, Round, depends_on_patches, directed_pairs, discount_shared, evaluate, rescale, without_exposure
+from tofuse.engine.refinement.pose_priors import DAMPING, WEAK, Priors, weak_prior
+from tofuse.engine.graph.sparse import PairSystem
+from tofuse.engine.stored_views.view_store import SampledView, overlaps
+from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.alignment.projective import UNITS
+
+_ERROR_UNIT = 0.01  # of the camera's errors, for their weak prior and convergence
+# Overlaps are recomputed after a larger motion, in units of 1 cm and 1 degree.
+_MAX_MOTION = 2.0
+# Gauss-Newton iterations of a single pair, and the motion in units of 1 cm and 1 degree below which
+# it has converged: small, as the errors of the pairs of a loop add up.
+_PAIR_ITERATIONS, _PAIR_CONVERGED = 8, 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """Support of each directed pair.
+
+    Attributes
+    ----------
+    target, source
+        (P,) positions of the views.
+    score
+        (P,) sum over its residuals, each from 1 (zero) to 0 (at the robust limit or beyond), minus
+        twice the number of points in free space.
+    terms
+        (P,) number of its residuals.
+    """
+
+    target: Intp
+    source: Intp
+    score: Float64
+    terms: Float64
+
+    def of_views(self, view_count: int) -> Float64:
+        """(N,) support of each of `view_count` views by all overlapping ones, 1 at most."""
+        total, terms = np.zeros(view_count), np.zeros(view_count)
+        for ends in (self.target, self.source):
+            np.add.at(total, ends, self.score)
+            np.add.at(terms, ends, self.terms)
+        return total / np.maximum(terms, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """Result of a joint alignment.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4) T_world_camera; the first has not moved.
+    start
+        (N, 4, 4) poses that the alignment started from.
+    errors
+        (ERRORS,) of the camera, in the order of `kernels.pair_equations`; 0 where not estimated.
+    pairs
+        (M, 2) positions of the overlapping views i < j.
+    moved
+        Largest motion of each iteration, in units of 1 cm and 1 degree.
+    before, after
+        Support at the initial and at the refined poses, with the same sigmas.
+    measured, information
+        (M, 4, 4) T_i_j that minimises the residuals of each pair alone, and (M, 6, 6) information
+        of its right perturbation, from the noise of the views and the errors that patches share.
+    scales
+        (2M, 3) exposure, and factors of the sigmas of distance and albedo, of the pairs (i, j),
+        then of the pairs (j, i).
+    """
+
+    poses: Float64
+    start: Float64
+    errors: Float64
+    pairs: Intp
+    moved: tuple[float, ...]
+    before: Support
+    after: Support
+    measured: Float64
+    information: Float64
+    scales: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """Rigid bodies of views, such as those of a rig's cameras at one instant.
+
+    Attributes
+    ----------
+    body_of_view
+        (N,) number of the body of each view; 0 is that of the first.
+    T_body_view
+        (N, 4, 4) pose of each view in its body.
+    """
+
+    body_of_view: Intp
+    T_body_view: Float64
+
+    def body_poses(self, view_poses: Float64) -> Float64:
+        """(M, 4, 4) T_world_body, by the poses (N, 4, 4) of their first views."""
+        _, first = np.unique(self.body_of_view, return_index=True)
+        return view_poses[first] @ se3.inverse(self.T_body_view[first])
+
+    def view_poses(self, body_poses: Float64) -> Float64:
+        """(N, 4, 4) T_world_view, by the poses (M, 4, 4) of their bodies."""
+        return np.asarray(body_poses[self.body_of_view] @ self.T_body_view, np.float64)
+
+    def across(self, pairs: Intp) -> Intp:
+        """Those of the pairs (M, 2) of views that belong to different bodies."""
+        i, j = self.body_of_view[pairs].T
+        return pairs[i != j]
+
+
+def refine(
+    views: Sequence[SampledView],
+    poses: Float64,
+    options: RefineOptions,
+    *,
+    calibrate: Sequence[int] = (),
+    priors: Priors | None = None,
+    pairs: Intp | None = None,
+    bodies: Bodies | None = None,
+) -> Refined:
+    """Align all views jointly with the views that they overlap with.
+
+    Parameters
+    ----------
+    views
+        N views of one recording.
+    poses
+        (N, 4, 4) initial T_world_camera; the first stays.
+    options
+        See `RefineOptions`.
+    calibrate
+        Errors of the camera to estimate as well, by their number in `kernels.pair_equations`.
+    priors
+        Measurements by other sensors.
+    pairs
+        (M, 2) positions of the views i < j to compare; by default those that overlap, recomputed
+        before a round if views have moved.
+    bodies
+        Views that move rigidly together, if any. `priors` then refers to the bodies.
+    """
+    if bodies is not None:
+        poses = bodies.view_poses(bodies.body_poses(poses))
+    start = poses
+    aligned = align_views(
+        views,
+        poses,
+        options,
+        calibrate=calibrate,
+        priors=priors,
+        pairs=pairs,
+        bodies=bodies,
+    )
+    poses, errors, state, fixed_errors = (
+        aligned.poses,
+        aligned.errors,
+        aligned.state,
+        aligned.fixed_errors,
+    )
+    count = len(state.target) // 2
+    pairs = np.stack([state.target[:count], state.source[:count]], 1)
+    final_round = options.rounds[-1]
+    by_patch = not calibrate and depends_on_patches(state, options)
+    after = _support(
+        views, poses, errors, fixed_errors, state, final_round, options, by_patch=by_patch
+    )
+    if by_patch:
+        discount_shared(views, poses, state, options)
+    measured = _pairwise_measurements(poses, pairs, state)
+    before = _support(
+        views, start, np.zeros_like(errors), fixed_errors, state, final_round, options
+    )
+    scales = np.stack([state.exposure, state.scale_g, state.scale_p], 1)
+    return Refined(poses, start, errors, pairs, aligned.moved, before, after, *measured, scales)
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedViews:
+    """Result of the last iteration.
+
+    Attributes
+    ----------
+    poses, errors
+        (N, 4, 4) T_world_camera and (ERRORS,) errors of the camera.
+    state
+        Residuals and scales of the pairs.
+    fixed_errors
+        (ERRORS,) mask: 0 for the errors that were estimated, else 1.
+    moved
+        Largest motion of a view in each iteration, in units of 1 cm and 1 degree.
+    """
+
+    poses: Float64
+    errors: Float64
+    state: DirectedPairs
+    fixed_errors: Int64
+    moved: tuple[float, ...]
+
+
+def align_views(
+    views: Sequence[SampledView],
+    poses: Float64,
+    options: RefineOptions,
+    *,
+    calibrate: Sequence[int] = (),
+    errors: Float64 | None = None,
+    priors: Priors | None = None,
+    pairs: Intp | None = None,
+    bodies: Bodies | None = None,
+) -> AlignedViews:
+    """Do as `refine` does, without measuring the support and the pairs of the result.
+
+    Gauss-Newton on all residuals, with correspondences recomputed in each iteration. The parameters
+    are those of `refine`.
+    """
+    priors = priors or Priors.none()
+    errors = np.zeros(kernels.ERRORS) if errors is None else errors
+    fixed_errors = np.ones(kernels.ERRORS, np.int64)
+    fixed_errors[list(calibrate)] = 0
+    motions: list[float] = []
+    overlapping = _overlapping(views, poses, options, bodies) if pairs is None else pairs
+    state = directed_pairs(views, overlapping, options)
+    system = _system(state, len(views), priors, bodies)
+    motion_since_overlaps = 0.0
+    for stage in options.rounds:
+        if motion_since_overlaps >= _MAX_MOTION:
+            overlapping = _overlapping(views, poses, options, bodies)
+            state = directed_pairs(views, overlapping, options, state)
+            system = _system(state, len(views), priors, bodies)
+            motion_since_overlaps = 0.0
+        for _ in range(stage.iterations if len(state.target) else 0):
+            is_last = stage is options.rounds[-1] and not calibrate
+            by_patch = is_last and depends_on_patches(state, options)
+            evaluate(views, poses, errors, fixed_errors, state, stage, options, by_patch=by_patch)
+            if by_patch:
+                discount_shared(views, poses, state, options)
+            step, error_step = _solve(poses, state, system, fixed_errors, priors, bodies)
+            poses = _apply_step(poses, step, bodies)
+            errors = errors + error_step
+            rescale(state, stage)
+            motions.append(float(np.abs(step / UNITS).max()))
+            motion_since_overlaps += motions[-1] if pairs is None else 0.0
+            error_change = float(np.abs(error_step).max()) / _ERROR_UNIT
+            if max(motions[-1], error_change) < options.convergence:
+                break
+    return AlignedViews(poses, errors, state, fixed_errors, tuple(motions))
+
+
+def support_of(
+    views: Sequence[SampledView], poses: Float64, refined: Refined, options: RefineOptions
+) -> Support:
+    """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
+    state = directed_pairs(views, refined.pairs, options)
+    state.exposure, state.scale_g, state.scale_p = refined.scales.T.copy()
+    fixed_errors = (refined.errors == 0).astype(np.int64)
+    return _support(views, poses, refined.errors, fixed_errors, state, options.rounds[-1], options)
+
+
+def align_pairs(
+    views: Sequence[SampledView],
+    pairs: Intp,
+    T_i_j: Float64,
+    options: RefineOptions,
+    errors: Float64,
+) -> Float64:
+    """(M, 4, 4) relative poses T_i_j of pairs, each aligned separately.
+
+    Parameters
+    ----------
+    views, options
+        As for `refine`.
+    pairs
+        (M, 2) positions of views.
+    T_i_j
+        (M, 4, 4) initial guesses.
+    errors
+        (ERRORS,) assumed errors of the camera.
+    """
+    count = len(pairs)
+    views = [views[int(k)] for k in pairs.ravel()]
+    ends = np.arange(2 * count).reshape(-1, 2)
+    poses = np.tile(np.eye(4), (2 * count, 1, 1))
+    poses[1::2] = T_i_j
+    state = directed_pairs(views, ends, options)
+    fixed_errors, stage = np.ones(len(errors), np.int64), options.rounds[-1]
+    active = np.arange(count)
+    for _ in range(_PAIR_ITERATIONS):
+        directed = np.concatenate([active, active + count])
+        subset = state.subset(directed)
+        evaluate(views, poses, errors, fixed_errors, subset, stage, options)
+        aligned, _ = _pairwise_measurements(poses, ends[active], subset)
+        rescale(subset, stage)
+        state.put(directed, subset)
+        sources = 2 * active + 1
+        step = se3.log(se3.inverse(poses[sources]) @ aligned) / UNITS
+        poses[sources] = se3.orthonormalise(aligned)
+        active = active[np.abs(step).max(1) >= _PAIR_CONVERGED]
+        if not len(active):
+            break
+    return poses[1::2]
+
+
+def spread_evenly(pairs: Intp, neighbours: int) -> Intp:
+    """At most `neighbours` earlier partners of each view, evenly spread, first and last included.
+
+    `pairs` are (M, 2) positions i < j.
+    """
+    keep = [np.zeros(0, np.intp)]
+    order = np.argsort(pairs[:, 1], kind="stable")
+    _, begin = np.unique(pairs[order, 1], return_index=True)
+    keep += [evenly_spaced(rows, neighbours) for rows in np.split(order, begin[1:])]
+    return pairs[np.concatenate(keep)]
+
+
+def _overlapping(
+    views: Sequence[SampledView], poses: Float64, options: RefineOptions, bodies: Bodies | None
+) -> Intp:
+    """Return the (M, 2) pairs of overlapping views, of different bodies if there are any."""
+    pairs = overlaps(views, poses, options.overlap)[0]
+    if bodies is not None:
+        pairs = bodies.across(pairs)
+    return spread_evenly(pairs, options.neighbours)
+
+
+def _apply_step(poses: Float64, step: Float64, bodies: Bodies | None) -> Float64:
+    """Apply a step to the views, or to their bodies; the first stays."""
+    current = poses if bodies is None else bodies.body_poses(poses)
+    updated = se3.orthonormalise(current @ se3.exp(step))
+    updated[0] = current[0]
+    return updated if bodies is None else bodies.view_poses(updated)
+
+
+def _support(
+    views: Sequence[SampledView],
+    poses: Float64,
+    errors: Float64,
+    fixed_errors: Int64,
+    state: DirectedPairs,
+    stage: Round,
+    options: RefineOptions,
+    *,
+    by_patch: bool = False,
+) -> Support:
+    evaluate(views, poses, errors, fixed_errors, state, stage, options, by_patch=by_patch)
+    score = state.rows[:, kernels.SUPPORT] - 2 * state.rows[:, kernels.IN_FRONT]
+    # A copy, as a view would keep the equations of all pairs in memory.
+    return Support(state.target, state.source, score, state.rows[:, kernels.TERMS].copy())
+
+
+def _pairwise_measurements(
+    poses: Float64, pairs: Intp, state: DirectedPairs
+) -> tuple[Float64, Float64]:
+    """Measurement T_i_j of each pair alone, and its information."""
+    H, g = without_exposure(state)
+    H, g = H[:, :6, :6], g[:, :6]
+    count = len(pairs)
+    T_i_j = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
+    # A perturbation of T_i_j is the opposite one of T_j_i, in the other frame.
+    A = -se3.adjoint(T_i_j)
+    At = np.swapaxes(A, 1, 2)
+    H = H[:count] + At @ H[count:] @ A
+    g = g[:count] + (At @ g[count:, :, None])[..., 0]
+    scaled = H * np.outer(UNITS, UNITS) + WEAK * np.eye(6)
+    step = -np.linalg.solve(scaled, (g * UNITS)[..., None])[..., 0] * UNITS
+    return T_i_j @ se3.exp(step), scaled / np.outer(UNITS, UNITS)
+
+
+def _system(
+    state: DirectedPairs, view_count: int, priors: Priors, bodies: Bodies | None = None
+) -> PairSystem:
+    """Return the sparse system of all views, or of their bodies."""
+    ends = np.stack([state.target, state.source], 1)
+    if bodies is None:
+        return priors.system(view_count, ends)
+    return priors.system(int(bodies.body_of_view.max()) + 1, bodies.body_of_view[ends])
+
+
+def _solve(
+    poses: Float64,
+    state: DirectedPairs,
+    system: PairSystem,
+    fixed_errors: Int64,
+    priors: Priors,
+    bodies: Bodies | None = None,
+) -> tuple[Float64, Float64]:
+    """One Gauss-Newton step: (N, 6) right perturbations of views or bodies, and of the errors."""
+    H, g = without_exposure(state)
+    if bodies is not None:
+        # A perturbation of the body is one of its view, by the adjoint.
+        A = np.tile(np.eye(H.shape[1]), (len(H), 1, 1))
+        A[:, :6, :6] = se3.adjoint(se3.inverse(bodies.T_body_view[state.source]))
+        At = np.swapaxes(A, 1, 2)
+        H, g = At @ H @ A, (At @ g[..., None])[..., 0]
+        poses = bodies.body_poses(poses)
+    error_columns = 6 + np.flatnonzero(fixed_errors == 0)
+    n, prior_count = len(poses), len(priors.pairs)
+    i, j = system.pairs.T
+    T_i_j = se3.inverse(poses[i]) @ poses[j]
+    prior_H, prior_g = priors.equations(T_i_j[len(H) :])
+    unary = weak_prior(n)
+    shared = _SharedUnknowns(
+        [
+            system.gradient(np.concatenate([H[:, :6, k], np.zeros((prior_count, 6))]), T_i_j)
+            for k in error_columns
+        ],
+        H[:, error_columns[:, None], error_columns].sum(0),
+        g[:, error_columns].sum(0),
+    )
+    damping = WEAK / _ERROR_UNIT**2 + DAMPING * shared.H.diagonal()
+    if priors.gravity is not None:
+        damping = np.append(damping, np.zeros(2))
+        _add_gravity(poses, priors.gravity, unary, shared, system)
+    matrix, gradient = system.relative(
+        np.concatenate([H[:, :6, :6], prior_H]), np.concatenate([g[:, :6], prior_g]), T_i_j, unary
+    )
+    factor = system.factor(matrix, gradient, DAMPING)
+    assert factor is not None, "every pose has a prior, so the system is not singular"
+    # Schur complement: the shared unknowns have a small dense system.
+    coupling, schur, reduced_gradient = shared.coupling, shared.H, shared.g
+    step = _checked(factor.step())
+    response = np.zeros((len(coupling), n, 6))
+    for k, column in enumerate(coupling):
+        response[k] = _checked(factor.solve(column))
+        reduced_gradient[k] += column.ravel() @ step[system.free].ravel()
+    for k, column in enumerate(coupling):
+        schur[k] += response[:, system.free].reshape(len(coupling), -1) @ column.ravel()
+    schur[np.diag_indices(len(coupling))] += damping
+    shared_step = -np.linalg.solve(schur, reduced_gradient)
+    errors = np.zeros(kernels.ERRORS)
+    errors[error_columns - 6] = shared_step[: len(error_columns)]
+    return step + np.tensordot(shared_step, response, 1), errors
+
+
+@dataclass(eq=False)
+class _SharedUnknowns:
+    """Normal equations of unknowns that all poses share: coupling with poses, block, gradient."""
+
+    coupling: list[Float64]
+    H: Float64
+    g: Float64
+
+
+def _add_gravity(
+    poses: Float64,
+    gravity: Gravity,
+    unary: tuple[Float64, Float64],
+    shared: _SharedUnknowns,
+    system: PairSystem,
+) -> None:
+    """Add gravity's equations of single poses, and of the world's vertical, which they share."""
+    vertices, d = gravity.vertices, gravity.directions
+    R = poses[vertices, :3, :3]
+    observed = (R @ d[..., None])[..., 0]
+    down = vertical(observed, gravity)
+    down /= np.linalg.norm(down)
+    tangent = np.linalg.svd(down[None])[2][1:].T  # (3, 2) tangent directions
+    e = observed - down
+    weight = 1 / gravity.sigma**2
+    if np.isfinite(gravity.gate):
+        weight = weight * robust.weight("geman-mcclure", (e * e).sum(1) * weight, gravity.gate)
+    J = -R @ se3.hat(d)
+    Jt = weight[:, None, None] * np.swapaxes(J, 1, 2)
+    np.add.at(unary[0][:, 3:, 3:], vertices, Jt @ J)
+    np.add.at(unary[1][:, 3:], vertices, (Jt @ e[..., None])[..., 0])
+    coupling = np.zeros((2, len(poses), 6))
+    for k in range(2):
+        np.add.at(coupling[k][:, 3:], vertices, -Jt @ tangent[:, k])
+    shared.coupling += [column[system.free] for column in coupling]
+    count = len(shared.H)
+    H = np.zeros((count + 2, count + 2))
+    H[:count, :count] = shared.H
+    H[count:, count:] = weight.sum() * np.eye(2)
+    shared.H = H
+    shared.g = np.append(shared.g, -tangent.T @ (weight[:, None] * e).sum(0))
+
+
+def _checked(step: Float64 | None) -> Float64:
+    assert step is not None, "the system is finite"
+    return step

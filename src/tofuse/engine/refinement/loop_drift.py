@@ -1,0 +1,234 @@
+"""Loops of consecutive views: the drift over them, without and with errors of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.refinement.joint_alignment import Refined, align_pairs, align_views
+from tofuse.engine.stored_views.pair_equations import RefineOptions, Round
+from tofuse.engine.stored_views.view_store import SampledView
+
+# Iterations of an estimate of camera errors, which may be far from the initial poses.
+COARSE_TO_FINE = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(12, 0.0, 0.0))
+# A loop is closed if its error is below this, m and rad.
+_MAX_CLOSURE_ERROR = (0.01, np.radians(0.5))
+# Secant steps to the error that closes a loop: their maximum number; and the change at convergence,
+# and an implausible error, relative to the first one.
+_MAX_SECANT_STEPS, _CONVERGENCE, _IMPLAUSIBLE = 4, 0.05, 10.0
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A loop of views of which consecutive ones overlap, and the two ends too.
+
+    `before` and `after` are its closure errors (m, rad) by pairwise alignments, without and with
+    the estimated errors of the camera, and `change` is the motion from one to the other. `depth` is
+    that of the views, m.
+    """
+
+    i: int
+    j: int
+    before: tuple[float, float]
+    after: tuple[float, float]
+    depth: float = 0.0
+    change: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def remaining_m(self) -> float:
+        """Distance by which `after` moves points at the views' depth, m."""
+        return self._apparent_m(*self.after)
+
+    def _apparent_m(self, m: float, rad: float) -> float:
+        return m + self.depth * rad
+
+    @property
+    def closes(self) -> bool:
+        """Whether the estimated errors explain it: one part is halved, the other is not larger.
+
+        Or points at the views' depth move by less than half the distance. A gap of less than a
+        centimetre and half a degree is not significant, as not every error bends every path.
+        """
+        apparent = self._apparent_m(*self.before)
+        limit = self._apparent_m(*_MAX_CLOSURE_ERROR)
+        if self.depth and self.remaining_m < 0.5 * apparent and apparent > limit:
+            return True
+        parts = list(zip(self.before, self.after, _MAX_CLOSURE_ERROR, strict=True))
+        if any(b > max(a, limit) for a, b, limit in parts):
+            return False
+        return all(a < limit for a, _, limit in parts) or any(b < 0.5 * a for a, b, _ in parts)
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is more than noise."""
+        return any(a >= limit for a, limit in zip(self.before, _MAX_CLOSURE_ERROR, strict=True))
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the estimated errors change it much without closing it, or widen it.
+
+        Errors of the camera hardly change the gap of a short loop, which does not reveal them.
+        """
+        before = self._apparent_m(*self.before)
+        changes = self._apparent_m(*self.change) > 0.5 * before
+        widens = self.remaining_m > before + self._apparent_m(*_MAX_CLOSURE_ERROR)
+        return self.significant and not self.closes and (changes or widens)
+
+
+def loop_gap(
+    views: Sequence[SampledView],
+    refined: Refined,
+    poses: Float64,
+    errors: Float64,
+    options: RefineOptions,
+) -> Gap | None:
+    """Closure errors of the longest loop, without and with errors of the camera; None without one.
+
+    Parameters
+    ----------
+    views, options
+        As for `refine`.
+    refined
+        Result without errors of the camera.
+    poses, errors
+        (N, 4, 4) and (ERRORS,) result with them.
+    """
+    loop = Loop.longest(views, refined, options)
+    if loop is None:
+        return None
+    without = loop.closure_error(refined.poses, np.zeros(kernels.ERRORS))
+    return loop.gap(without, loop.closure_error(poses, errors))
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A chain of overlapping consecutive views i to j, of which the ends overlap too."""
+
+    views: Sequence[SampledView]
+    i: int
+    j: int
+    options: RefineOptions
+
+    @classmethod
+    def longest(
+        cls, views: Sequence[SampledView], refined: Refined, options: RefineOptions
+    ) -> Loop | None:
+        """Return the longest loop of refined views; None if there is none."""
+        ends = longest_loop(refined.pairs)
+        return None if ends is None else cls(views, *ends, options)
+
+    @property
+    def depth(self) -> float:
+        """Median depth of the two ends, m."""
+        return 0.5 * (self.views[self.i].depth + self.views[self.j].depth)
+
+    def closure_error(self, poses: Float64, errors: Float64) -> Float64:
+        """Return the motion (4, 4) by which chained pairwise alignments fail to close the loop.
+
+        Parameters
+        ----------
+        poses
+            (N, 4, 4) T_world_camera, where the alignments start.
+        errors
+            (ERRORS,) assumed errors of the camera.
+        """
+        return self.align_chain(poses, errors)[0]
+
+    def align_chain(self, poses: Float64, errors: Float64) -> tuple[Float64, Float64]:
+        """Return `closure_error`, and the chain's poses (j - i + 1, 4, 4) relative to its first."""
+        i, j = self.i, self.j
+        chain = np.stack([np.arange(i, j), np.arange(i + 1, j + 1)], 1)
+        pairs = np.concatenate([chain, [[i, j]]])
+        T = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
+        T = align_pairs(self.views, pairs, T, self.options, errors)
+        chained = [np.eye(4)]
+        for step in T[:-1]:
+            chained.append(chained[-1] @ step)
+        return np.asarray(se3.inverse(T[-1]) @ chained[-1], np.float64), np.array(chained)
+
+    def error_by_views(self, poses: Float64, error_index: int, error: float) -> float:
+        """Return an error of the camera as all views of the loop estimate it, starting from one.
+
+        A true error is confirmed, even if residuals at a wrong one are small. An error that only
+        closes the gap differs from the one that the views measure.
+
+        Parameters
+        ----------
+        poses
+            As for `closure_error`.
+        error_index, error
+            Index of the error, and its initial value.
+        """
+        errors = np.zeros(kernels.ERRORS)
+        errors[error_index] = error
+        chain = self.align_chain(poses, errors)[1]
+        options = replace(self.options, rounds=COARSE_TO_FINE)
+        views = self.views[self.i : self.j + 1]
+        aligned = align_views(views, chain, options, calibrate=[error_index], errors=errors)
+        return float(aligned.errors[error_index])
+
+    def gap(self, before: Float64, after: Float64) -> Gap:
+        """Return the gap, given `closure_error` without and with errors of the camera."""
+        first, last = (self.views[k].index for k in (self.i, self.j))
+        change = se3.inverse(before) @ after
+        return Gap(first, last, _norms(before), _norms(after), self.depth, _norms(change))
+
+    def closing_error(
+        self, poses: Float64, uncorrected: Float64, error_index: int, step: float
+    ) -> tuple[float, Float64]:
+        """Return the error of the camera that closes the loop best, and `closure_error` with it.
+
+        Gauss-Newton on the gap at the views' depth, with derivatives by secants.
+
+        Parameters
+        ----------
+        poses
+            As for `closure_error`.
+        uncorrected
+            (4, 4) `closure_error` without errors of the camera.
+        error_index
+            Index of the error.
+        step
+            First secant step.
+        """
+        scale = np.r_[np.full(3, 1 / self.depth), np.ones(3)]
+        errors = np.zeros(kernels.ERRORS)
+        previous_error, residual = 0.0, se3.log(uncorrected) * scale
+        error = step
+        for _ in range(_MAX_SECANT_STEPS):
+            errors[error_index] = error
+            closure = self.closure_error(poses, errors)
+            previous_residual, residual = residual, se3.log(closure) * scale
+            slope = (residual - previous_residual) / (error - previous_error)
+            previous_error = error
+            error -= float(slope @ residual) / max(float(slope @ slope), 1e-12)
+            if (
+                abs(error - previous_error) < _CONVERGENCE * step
+                or abs(error) > _IMPLAUSIBLE * step
+            ):
+                break
+        return previous_error, closure
+
+
+def _norms(T: Float64) -> tuple[float, float]:
+    return float(np.linalg.norm(T[:3, 3])), float(se3.angle(T))
+
+
+def longest_loop(pairs: Intp) -> tuple[int, int] | None:
+    """The pair (i, j) furthest apart in time between which all consecutive views overlap."""
+    if not len(pairs):
+        return None
+    overlapping = np.zeros(int(pairs.max()) + 1, bool)
+    overlapping[pairs[pairs[:, 1] == pairs[:, 0] + 1, 0]] = True
+    breaks = np.concatenate([[0], np.cumsum(~overlapping)])
+    i, j = pairs.T
+    unbroken = (breaks[j] == breaks[i]) & (j > i + 1)
+    if not unbroken.any():
+        return None
+    k = int(np.argmax(np.where(unbroken, j - i, -1)))
+    return int(i[k]), int(j[k])

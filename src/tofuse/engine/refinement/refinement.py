@@ -1,0 +1,489 @@
+"""Refinement as a part: selection of views, acceptance of the result, and poses of other frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Annotated, ClassVar, Literal, Protocol
+
+import numpy as np
+
+from tofuse.engine.arrays import Bool, Float32, Float64, Intp
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.compute.spill import Spill
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.parts import part
+from tofuse.engine.graph.build import Measured
+from tofuse.engine.refinement.calibration_check import CalibrationCheck, check_calibration, combine_checks
+from tofuse.engine.graph.external_sensors import SensorPriors
+from tofuse.engine.refinement.joint_alignment import Refined, refine
+from tofuse.engine.refinement.loop_drift import loop_gap
+from tofuse.engine.stored_views.pair_equations import RefineOptions
+from tofuse.engine.refinement.pose_priors import Priors
+from tofuse.engine.refinement.split_half import split_half_errors
+from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps, support_fell
+from tofuse.engine.stored_views.view_store import CoarseView, PosedView, SampledView, Spilled, SpilledCoarseView, ViewStore, sampled_points
+from tofuse.engine.frames.frames import Frame
+from tofuse.engine.views.prepared_view import PreparedView
+
+CameraError = Literal["offset", "scale", "focal"]
+
+# Neighbouring pixels have correlated noise: this many have the information of one.
+_CORRELATED_PIXELS = 5.0
+# Maximum decrease of the support of a view that keeps its refined pose: about that by chance.
+MAX_LOSS = 0.03
+_ERROR_INDEX: dict[CameraError, int] = {
+    "offset": kernels.OFFSET,
+    "scale": kernels.SCALE,
+    "focal": kernels.FOCAL,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """Result of the refinement of a trajectory.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4) T_world_camera; the first has not moved.
+    kept
+        Whether it is accepted: only if the views support each other better. If their support is
+        the same but for chance, the poses stay, but the measurements are used.
+    views, pairs
+        Numbers of views and of pairs that were compared.
+    moved_m, moved_rad
+        Largest motions of a view.
+    support
+        Mean support of the views, up to 1, before and after: see `joint_alignment.Support`.
+    errors
+        Estimated errors of the camera by name: corrections of the range (m), of the depth
+        (fraction) and of the width of the rays (fraction).
+    edges
+        Measurement of each pair alone, by frame indices; none unless kept.
+    calibration_check
+        Evidence for errors of the camera, if it was computed.
+    non_overlap_edges
+        Pairs (i, j) of edges that do not come from the overlap of the two views.
+    split_m, split_rad
+        Rms errors of the poses by halves of the images (`split_half`); 0 unless kept.
+    """
+
+    poses: Float64
+    kept: bool = False
+    views: int = 0
+    pairs: int = 0
+    moved_m: float = 0.0
+    moved_rad: float = 0.0
+    support: tuple[float, float] = (0.0, 0.0)
+    errors: dict[str, float] = field(default_factory=dict)
+    edges: tuple[Measured, ...] = ()
+    calibration_check: CalibrationCheck | None = None
+    non_overlap_edges: tuple[tuple[int, int], ...] = ()
+    split_m: float = 0.0
+    split_rad: float = 0.0
+
+
+class Refiner(Protocol):
+    """State of a refinement of one recording.
+
+    Attributes
+    ----------
+    needs_points
+        Whether it needs the points of frames, not only prepared views.
+    """
+
+    needs_points: ClassVar[bool] = True
+
+    def push(self, view: Frame, T_component_camera: Float64) -> None:
+        """Add the next frame that has a pose, if `needs_points` is set."""
+        ...
+
+    def finish(
+        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+    ) -> Refinement:
+        """Refine the poses of all frames.
+
+        Parameters
+        ----------
+        ids
+            (N,) frame indices, ascending.
+        poses
+            (N, 4, 4) T_world_camera.
+        measured
+            Measurements by external sensors.
+        """
+        ...
+
+
+class RefinementMethod(Protocol):
+    """A method that refines poses after loop closure."""
+
+    part_kind: ClassVar[str] = "refinement"
+
+    def start(self, views: ViewStore[PreparedView]) -> Refiner:
+        """Begin a new recording; prepared views are added to `views` as they come."""
+        ...
+
+
+@part("refinement", "none")
+@dataclass(frozen=True)
+class NoRefinement(RefinementMethod):
+    """Leaves the poses as they are after the optimisation."""
+
+    def start(self, views: ViewStore[PreparedView]) -> Refiner:
+        """See `RefinementMethod.start`."""
+        return _Idle()
+
+
+class _Idle(Refiner):
+    needs_points: ClassVar[bool] = False
+
+    def push(self, view: Frame, T_component_camera: Float64) -> None:
+        """See `Refiner.push`: views are not needed."""
+
+    def finish(
+        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+    ) -> Refinement:
+        """See `Refiner.finish`."""
+        return Refinement(poses)
+
+
+@dataclass(frozen=True, eq=False)
+class AlreadyRefined(RefinementMethod):
+    """Keeps poses that were refined before, with the measurements of that refinement.
+
+    Attributes
+    ----------
+    measured, non_overlap_edges
+        By frame indices: measurements of pairs of views, and other edges.
+    """
+
+    measured: tuple[Measured, ...]
+    non_overlap_edges: tuple[Measured, ...]
+
+    def start(self, views: ViewStore[PreparedView]) -> Refiner:
+        """See `RefinementMethod.start`."""
+        return _AlreadyRefined(self)
+
+
+class _AlreadyRefined(_Idle):
+    def __init__(self, previous: AlreadyRefined) -> None:
+        self._previous = previous
+
+    def finish(
+        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+    ) -> Refinement:
+        """See `Refiner.finish`."""
+        posed = set(ids)
+        edges = (*self._previous.measured, *self._previous.non_overlap_edges)
+        return Refinement(
+            poses,
+            kept=True,
+            edges=tuple(e for e in edges if {e.i, e.j} <= posed),
+            non_overlap_edges=tuple((e.i, e.j) for e in self._previous.non_overlap_edges),
+        )
+
+
+@part("refinement", "joint")
+@dataclass(frozen=True)
+class Joint(Bounded, RefinementMethod):
+    """Joint alignment of all overlapping views (eq 2.8), see `refine`.
+
+    Views are spaced by the motion of the camera (`ViewStore`); frames in between follow them. The
+    result is accepted only if the views support each other at least as well as before, and views
+    that lose support keep their pose relative to their neighbours.
+
+    Attributes
+    ----------
+    calibrate
+        Errors of the camera to estimate as well: "offset", "scale", "focal".
+    neighbours
+        Maximum number of earlier views that each one is compared with.
+    submap
+        Largest number of views that are refined together; more are divided, see `submaps`.
+    """
+
+    calibrate: tuple[CameraError, ...] = ()
+    neighbours: Annotated[int, Bounds(1)] = 10
+    submap: Annotated[int, Bounds(10, 100_000)] = 300
+
+    @property
+    def alignment(self) -> RefineOptions:
+        """Options of the joint alignment."""
+        return RefineOptions(neighbours=self.neighbours)
+
+    def start(self, views: ViewStore[PreparedView]) -> Refiner:
+        """See `RefinementMethod.start`."""
+        return _Joint(self, views)
+
+
+class _Joint(Refiner):
+    needs_points: ClassVar[bool] = False
+
+    def __init__(self, options: Joint, views: ViewStore[PreparedView]) -> None:
+        self._options = options
+        self._store = views
+
+    def push(self, view: Frame, T_component_camera: Float64) -> None:
+        """See `Refiner.push`. The views are in the store."""
+
+    def finish(
+        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+    ) -> Refinement:
+        """See `Refiner.finish`."""
+        options = self._options
+        row = {int(index): k for k, index in enumerate(ids)}
+        posed = self._store.of(row)
+        positions = np.array([row[p.index] for p in posed], np.intp)
+        if len(posed) < 2:
+            return Refinement(poses, views=len(posed))
+        before = poses[positions]
+        refine_views = _refine_jointly if len(posed) <= options.submap else _refine_in_submaps
+        refined, evidence = refine_views(
+            options, posed, before, measured or SensorPriors(), self._store
+        )
+        support = refined.before.of_views(len(posed)), refined.after.of_views(len(posed))
+        mean = float(support[0].mean()), float(support[1].mean())
+        unchanged = Refinement(poses, False, len(posed), len(refined.pairs), support=mean)
+        gain = support[1] - support[0]
+        if not len(refined.pairs):
+            return unchanged
+        if support_fell(gain):  # the camera may be the cause
+            return replace(unchanged, calibration_check=evidence.calibration())
+        after = with_unsupported_views_fixed(before, refined.poses, gain < -MAX_LOSS)
+        if mean[1] < mean[0]:
+            # The poses were already at the optimum; the measurements give their covariances.
+            after = before
+        split_m, split_rad = evidence.split()
+        return replace(
+            accepted_with(unchanged, positions, after),
+            calibration_check=evidence.calibration(),
+            split_m=split_m,
+            split_rad=split_rad,
+            errors={name: float(refined.errors[_ERROR_INDEX[name]]) for name in options.calibrate},
+            edges=pairwise_measurements([p.index for p in posed], refined),
+        )
+
+
+@dataclass(frozen=True)
+class _Checks:
+    """Evidence of refined views: errors of the camera, and (m, rad) of the poses by halves."""
+
+    calibration: Callable[[], CalibrationCheck]
+    split: Callable[[], tuple[float, float]]
+
+
+def _refine_jointly(
+    options: Joint,
+    posed: Sequence[PosedView[PreparedView]],
+    poses: Float64,
+    measured: SensorPriors,
+    _: ViewStore[PreparedView],
+) -> tuple[Refined, _Checks]:
+    """Refine all views at once."""
+    views = [_sampled(p, options) for p in posed]
+    priors = _priors([p.index for p in posed], measured)
+    error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
+    refined = refine(views, poses, options.alignment, calibrate=error_indices, priors=priors)
+    all_views = RefinedSubmap(views, np.arange(len(views)), refined, priors)
+    return refined, _Checks(
+        lambda: _calibration_check(all_views, options),
+        lambda: _split_half_errors(all_views, options),
+    )
+
+
+def _refine_in_submaps(
+    options: Joint,
+    posed: Sequence[PosedView[PreparedView]],
+    poses: Float64,
+    measured: SensorPriors,
+    store: ViewStore[PreparedView],
+) -> tuple[Refined, _Checks]:
+    """Refine submap by submap."""
+    ids = [p.index for p in posed]
+    refined, parts = refine_submaps(
+        [_coarse(p, options, store.coarse) for p in posed],
+        poses,
+        options.alignment,
+        options.submap,
+        lambda subset: [_sampled(posed[k], options) for k in subset],
+        lambda subset: _priors(ids if subset is None else [ids[k] for k in subset], measured),
+        partial(_evaluate, options=options),
+        [_ERROR_INDEX[name] for name in options.calibrate],
+    )
+    checks, splits = [check for check, _ in parts], [split for _, split in parts]
+    return refined, _Checks(lambda: combine_checks(checks), lambda: _mean_errors(splits))
+
+
+def _evaluate(
+    submap: RefinedSubmap, options: Joint
+) -> tuple[CalibrationCheck, tuple[float, float]]:
+    """Evaluate a submap while its views are in memory."""
+    return _calibration_check(submap, options), _split_half_errors(submap, options)
+
+
+def _split_half_errors(submap: RefinedSubmap, options: Joint) -> tuple[float, float]:
+    error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
+    return split_half_errors(
+        submap.views, submap.refined, options.alignment, submap.priors, error_indices
+    )
+
+
+def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Root mean squares of errors (m, rad); 0 without any."""
+    m, rad = np.sqrt((np.reshape(errors, (-1, 2)) ** 2).sum(0) / max(len(errors), 1)).tolist()
+    return m, rad
+
+
+def _coarse(
+    posed: PosedView[PreparedView], options: Joint, spill: Spill[CoarseView]
+) -> SpilledCoarseView:
+    surface = _surface(posed)
+    coarse = CoarseView.of(surface, sampled_points(surface, options.alignment.points))
+    return SpilledCoarseView(coarse.centroid, Spilled(coarse, spill))
+
+
+def _surface(posed: PosedView[PreparedView]) -> PreparedView:
+    return posed.view.with_pixel_variance().without_caches()
+
+
+def _sampled(posed: PosedView[PreparedView], options: Joint) -> SampledView:
+    return SampledView.of(_surface(posed), options.alignment.points)
+
+
+def _calibration_check(submap: RefinedSubmap, options: Joint) -> CalibrationCheck:
+    """Check the calibration by refined views; with estimated errors only the loop's gap."""
+    refined = submap.refined
+    if not options.calibrate:
+        return check_calibration(submap.views, refined, options.alignment, submap.priors)
+    gap = loop_gap(submap.views, refined, refined.poses, refined.errors, options.alignment)
+    return CalibrationCheck(gap=gap)
+
+
+def pairwise_measurements(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:
+    """Return the measurements of single pairs, with reduced information.
+
+    All pairs of a view share its errors, so the information is divided by their number.
+
+    Parameters
+    ----------
+    ids
+        Frame indices of the views.
+    refined
+        Result of their joint alignment.
+    """
+    pairs = refined.pairs
+    partners = np.bincount(pairs.ravel(), minlength=len(ids))
+    divisors = _CORRELATED_PIXELS * 0.5 * partners[pairs].sum(1)
+    return tuple(
+        Measured(ids[i], ids[j], T, H / divisor)
+        for (i, j), T, H, divisor in zip(
+            pairs, refined.measured, refined.information, divisors, strict=True
+        )
+    )
+
+
+def _priors(ids: Sequence[int], measured: SensorPriors) -> Priors:
+    """Measurements of external sensors as priors on the views, scaled to the pixels' noise."""
+    position = {index: k for k, index in enumerate(ids)}
+    steps = measured.between(ids)
+    m = len(steps)
+    gravity = measured.gravity_of(ids)
+    if gravity is not None:
+        gravity = replace(
+            gravity,
+            sigma=gravity.sigma / np.sqrt(_CORRELATED_PIXELS),
+            gate=gravity.gate * _CORRELATED_PIXELS,
+        )
+    return Priors(
+        np.array([(position[s.i], position[s.j]) for s in steps], np.intp).reshape(m, 2),
+        np.array([s.T_i_j for s in steps]).reshape(m, 4, 4),
+        np.array([s.information * _CORRELATED_PIXELS for s in steps]).reshape(m, 6, 6),
+        gravity,
+    )
+
+
+def with_unsupported_views_fixed(before: Float64, after: Float64, lost: Bool) -> Float64:
+    """Return the refined poses, with views that lost support fixed to their nearest neighbour.
+
+    Parameters
+    ----------
+    before, after
+        (N, 4, 4) poses before and after the refinement.
+    lost
+        (N,) mask of the views that lost support.
+    """
+    out = after.copy()
+    supported = np.flatnonzero(~lost)
+    for k in np.flatnonzero(lost) if len(supported) else ():
+        nearest = supported[np.argmin(np.abs(supported - k))]
+        out[k] = out[nearest] @ se3.inverse(before[nearest]) @ before[k]
+    return se3.inverse(out[0]) @ out if lost[0] else out
+
+
+def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:
+    """Correct points for errors of the camera.
+
+    Parameters
+    ----------
+    points
+        (N, 3) m, in the camera's frame.
+    errors
+        As in `Refinement.errors`.
+    """
+    p = points.astype(np.float64)
+    length = np.linalg.norm(p, axis=1, keepdims=True)
+    corrected = p * (
+        1 + errors.get("offset", 0.0) / np.maximum(length, 1e-9) + errors.get("scale", 0.0)
+    )
+    corrected[:, :2] += errors.get("focal", 0.0) * p[:, :2]
+    return corrected.astype(np.float32)
+
+
+def accepted_with(unchanged: Refinement, positions: Intp, after: Float64) -> Refinement:
+    """Return the accepted refinement in which the poses at `positions` become `after`.
+
+    Parameters
+    ----------
+    unchanged
+        The refinement as if it were rejected.
+    positions
+        (M,) ascending positions of the refined views.
+    after
+        (M, 4, 4) T_world_camera.
+    """
+    motion = se3.log(se3.inverse(unchanged.poses[positions]) @ after)
+    return replace(
+        unchanged,
+        poses=propagate_poses(unchanged.poses, positions, after),
+        kept=True,
+        moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
+        moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
+    )
+
+
+def propagate_poses(poses: Float64, positions: Intp, after: Float64) -> Float64:
+    """Propagate refined poses to all frames.
+
+    Each frame keeps its motion relative to the views before and after it, interpolated between the
+    two by its position between them.
+
+    Parameters
+    ----------
+    poses
+        (N, 4, 4) of all frames, before.
+    positions
+        (M,) ascending positions of the refined poses.
+    after
+        (M, 4, 4) refined poses.
+    """
+    frames = np.arange(len(poses))
+    following = np.clip(np.searchsorted(positions, frames), 0, len(positions) - 1)
+    preceding = np.clip(np.searchsorted(positions, frames, side="right") - 1, 0, len(positions) - 1)
+    relative = [after[k] @ se3.inverse(poses[positions[k]]) @ poses for k in (preceding, following)]
+    gap = positions[following] - positions[preceding]
+    fraction = np.where(gap > 0, (frames - positions[preceding]) / np.maximum(gap, 1), 0.0)
+    return se3.interpolate(relative[0], relative[1], fraction)

@@ -1,0 +1,254 @@
+"""Agreement of two range images at a pose: support and free-space violations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.geometry import se3
+from tofuse.engine.search import search_kernels as kernels
+from tofuse.engine.compute.partition import median
+from tofuse.engine.search.search_kernels import ViewPoints
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.normal import MEDIAN_OF_NORMAL
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.search.view_points import sampled_points
+
+# Smallest difference between the scores of different poses, as a fraction of the points.
+MIN_LEAD = 0.03
+_CHUNK_POINTS = 6000
+_CLASH_RATIO = 2.0  # relative to the neutral difference in log albedo
+_NEIGHBOURS = np.ones((5, 5), np.uint8)
+# Prior standard deviation of an unknown exponent of the falloff (natural vignetting is the fourth
+# power), number of points that share an albedo error, and trimmed least-squares iterations.
+_FALLOFF_SIGMA, _CORRELATED_POINTS, _ITERATIONS = 4.0, 100, 4
+
+
+@dataclass(frozen=True)
+class AgreementOptions:
+    """Options of the comparison of two images.
+
+    Attributes
+    ----------
+    points
+        Approximate number of points of each image that are projected into the other.
+    sigmas, floor_m, floor_fraction
+        Distance tolerance of a supporting point: standard deviations of both images, plus metres,
+        plus a fraction of its depth, for systematic errors of the sensor.
+    max_angle
+        Largest angle between the normals of surfaces that support each other, rad.
+    albedo
+        Difference in log albedo, less the exposure, at which a point on the surface counts neither
+        for nor against the pose; beyond twice this value it is a clash.
+    violation_weight, clash_weight
+        Weight of a point in free space, and maximum weight of one on a surface of another albedo,
+        relative to a supporting point.
+    """
+
+    points: int = 2500
+    sigmas: float = 2.0
+    floor_m: float = 0.01
+    floor_fraction: float = 0.01
+    max_angle: float = 0.7
+    albedo: float = 0.1
+    violation_weight: float = 2.0
+    clash_weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of two images at a pose, over both directions.
+
+    Attributes
+    ----------
+    overlap
+        Fraction of the points that project onto a surface of the other image.
+    support
+        Fraction of the points on the other image's surface with the same albedo.
+    violation
+        Fraction of the points in front of it, in the other camera's free space.
+    clash
+        Fraction of the points on the surface with another albedo: no support.
+    rms_m
+        RMS distance of the points on the surface from it, m; inf without any.
+    points
+        Number of compared points of both images.
+    score
+        Mean over the points of 1 - (albedo difference / `albedo`)^2, at least the negative clash
+        weight, on the surface, and of the negative violation weight in free space. Albedo
+        distinguishes geometrically ambiguous poses. Occluded points and points out of view count 0.
+    falloff
+        Exponent of the cosine to the optical axis by which both views' albedo still falls off, if
+        that was unknown: the one at which they fit best after compensation.
+    """
+
+    overlap: float
+    support: float
+    violation: float
+    clash: float
+    rms_m: float
+    points: int
+    score: float
+    falloff: float = 0.0
+
+    @property
+    def contradiction(self) -> float:
+        """Violations and clashes, as a fraction of the points that project onto a surface."""
+        return (self.violation + self.clash) / max(self.overlap, 1e-9)
+
+
+def agreement(
+    source: PreparedView,
+    target: PreparedView,
+    T_target_source: Float64,
+    options: AgreementOptions | None = None,
+) -> Agreement:
+    """Return the agreement of two images at a pose.
+
+    Parameters
+    ----------
+    source, target
+        Prepared views.
+    T_target_source
+        (4, 4) maps points of the source into the target.
+    """
+    return Comparison.of(source, target, options).at(T_target_source)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two views prepared for evaluation at many poses.
+
+    Attributes
+    ----------
+    directions
+        Points of one view, the view that they are projected into and its `nearest_depth`: from
+        source to target, and from target to source.
+    """
+
+    directions: tuple[
+        tuple[ViewPoints, PreparedView, Float32], tuple[ViewPoints, PreparedView, Float32]
+    ]
+    options: AgreementOptions
+
+    @property
+    def unknown_falloff(self) -> bool:
+        """Whether both views' amplitude falls off towards the corners by an unknown exponent."""
+        return all(view.unknown_falloff for _, view, _ in self.directions)
+
+    @classmethod
+    def of(
+        cls, source: PreparedView, target: PreparedView, options: AgreementOptions | None = None
+    ) -> Comparison:
+        """Prepare two views."""
+        options = AgreementOptions() if options is None else options
+        forward = sampled_points(source, options.points), target, nearest_depth(target)
+        backward = sampled_points(target, options.points), source, nearest_depth(source)
+        return cls((forward, backward), options)
+
+    def at(self, T_target_source: Float64) -> Agreement:
+        """Return the agreement at a pose (4, 4); see `agreement`."""
+        options = self.options
+        T = np.ascontiguousarray(T_target_source, np.float64)
+        total = np.zeros(kernels.AGREEMENT_SIZE)
+        count = 0
+        differences = []
+        # The signs of the differences change with the direction.
+        for (points, view, nearest), pose, sign in zip(
+            self.directions, (T, se3.inverse(T)), (1, -1), strict=True
+        ):
+            count += len(points.points)
+            log_albedos = np.empty((2, len(points.points)), np.float32)
+            pose = np.ascontiguousarray(pose)
+            total += _one_direction(points, view, nearest, pose, options, log_albedos)
+            differences.append(sign * log_albedos[:, np.isfinite(log_albedos[0])])
+        on_surface, violation = total[kernels.SUPPORT], total[kernels.VIOLATION]
+        albedo_ratio, slants = np.hstack(differences)
+        clash, consistent, falloff = 0, float(on_surface), 0.0
+        if len(albedo_ratio):
+            if self.unknown_falloff:
+                falloff = _falloff(albedo_ratio, slants, options.albedo)
+                albedo_ratio = albedo_ratio + np.float32(falloff) * slants
+            # Exposure is the median difference.
+            ratio = np.abs(albedo_ratio - np.float32(median(albedo_ratio))) / np.float32(
+                options.albedo
+            )
+            clash = int(np.count_nonzero(ratio > _CLASH_RATIO))
+            consistent -= float(
+                np.minimum(ratio**2, 1 + options.clash_weight).sum(dtype=np.float64)
+            )
+        per_point = 1 / max(count, 1)
+        return Agreement(
+            overlap=float(total[kernels.COMPARED] * per_point),
+            support=float((on_surface - clash) * per_point),
+            violation=float(violation * per_point),
+            clash=float(clash * per_point),
+            rms_m=float(np.sqrt(total[kernels.SQUARES_M] / on_surface)) if on_surface else np.inf,
+            points=count,
+            score=float(per_point * (consistent - options.violation_weight * violation)),
+            falloff=falloff,
+        )
+
+
+def nearest_depth(view: PreparedView) -> Float32:
+    """Return the minimum z (H, W) in m over the neighbours of each valid pixel, else 0.
+
+    It allows for mixed pixels, which are common among pixels without a plane.
+    """
+    nearest = cv2.erode(np.where(view.z > 0, view.z, np.float32(np.inf)), _NEIGHBOURS)
+    return np.where(view.z > 0, nearest, np.float32(0)).astype(np.float32)
+
+
+def _falloff(albedo_ratio: Float32, slants: Float32, albedo: float) -> float:
+    """Return the exponent at which differences in log albedo (n,) have the least spread.
+
+    Like the exposure, it is estimated anew at every pose, by trimmed least squares: otherwise the
+    falloff, a pattern that is fixed to the camera, contradicts every motion.
+
+    Parameters
+    ----------
+    slants
+        (n,) see `measure_agreement`.
+    albedo
+        Tolerance of the differences.
+    """
+    exponent = 0.0
+    ridge = _CORRELATED_POINTS * (albedo / _FALLOFF_SIGMA) ** 2
+    inliers = np.ones(len(albedo_ratio), bool)
+    for _ in range(_ITERATIONS):
+        x, y = slants[inliers].astype(np.float64), albedo_ratio[inliers].astype(np.float64)
+        x -= x.mean()
+        exponent = -float(x @ (y - y.mean())) / (float(x @ x) + ridge)
+        residual = albedo_ratio + np.float32(exponent) * slants
+        residual = np.abs(residual - np.float32(median(residual[inliers])))
+        inliers = residual <= 3 / MEDIAN_OF_NORMAL * np.float32(median(residual[inliers]))
+    return exponent
+
+
+def _one_direction(
+    points: ViewPoints,
+    view: PreparedView,
+    nearest: Float32,
+    T: Float64,
+    options: AgreementOptions,
+    log_albedos: Float32,
+) -> Float64:
+    grid = view.projection
+    image = kernels.Image(
+        view.planes, view.plane_variance, view.albedo, nearest, grid.lookup, grid.frame
+    )
+    tolerance = kernels.Tolerance(
+        options.sigmas, options.floor_m, options.floor_fraction, float(np.cos(options.max_angle))
+    )
+
+    def work(a: int, b: int) -> Float64:
+        return kernels.measure_agreement(
+            points, image, T, tolerance, log_albedos[0], log_albedos[1], a, b
+        )
+
+    n = len(points.points)
+    parts = run_chunks(work, n, max(1, n // _CHUNK_POINTS))
+    return np.asarray(sum(parts, np.zeros(kernels.AGREEMENT_SIZE)))

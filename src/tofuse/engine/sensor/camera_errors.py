@@ -1,0 +1,149 @@
+"""Correct known errors of a camera: its intrinsics, and an offset of its ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.sensor.base import Correction, Corrector
+from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable, ray_lengths
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import Frame, RangeFrame
+
+# Options of each error and of its standard deviation, by the names of the calibration check.
+FIELDS = {
+    "focal": ("focal", "focal_sigma"),
+    "offset": ("offset_m", "offset_sigma_m"),
+    "center_x": ("center_x", "center_x_sigma"),
+    "center_y": ("center_y", "center_y_sigma"),
+    "distortion": ("distortion", "distortion_sigma"),
+}
+
+
+@part("correction", "camera-errors")
+@dataclass(frozen=True)
+class CameraErrors(Bounded, Correction):
+    """Correct focal length, principal point, radial distortion and range offset of a camera.
+
+    Attributes
+    ----------
+    focal
+        Relative correction of the ray coordinates: the true focal length is 1 / (1 + focal) of the
+        stated one.
+    offset_m
+        Added to all ranges, m.
+    center_x, center_y
+        Added to the ray coordinates x / z and y / z: by so many true focal lengths the true
+        principal point is further left and up.
+    distortion
+        Times the squared distance from the axis, a relative correction of the ray coordinates too.
+    focal_sigma, offset_sigma_m, center_x_sigma, center_y_sigma, distortion_sigma
+        Standard deviations of these, which the stated accuracy of poses includes.
+    """
+
+    # Larger values indicate a wrong camera, not an error.
+    focal: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
+    offset_m: Annotated[float, Bounds(-1, 1)] = 0.0
+    center_x: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
+    center_y: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
+    distortion: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
+    focal_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
+    offset_sigma_m: Annotated[float, Bounds(0, 1)] = 0.0
+    center_x_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
+    center_y_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
+    distortion_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def start(self) -> Corrector:
+        """See `Correction.start`."""
+        return _Corrector(self)
+
+    def and_then(self, other: CameraErrors) -> CameraErrors:
+        """Return the composition of this correction with `other`, to first order.
+
+        The standard deviations are those of the last estimate of each error.
+        """
+        return CameraErrors(
+            self.focal + other.focal + self.focal * other.focal,
+            self.offset_m + other.offset_m,
+            self.center_x * (1 + other.focal) + other.center_x,
+            self.center_y * (1 + other.focal) + other.center_y,
+            self.distortion + other.distortion,
+            **{
+                sigma: getattr(other if getattr(other, error) else self, sigma)
+                for error, sigma in FIELDS.values()
+            },
+        )
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """The errors by name, as in `FIELDS`."""
+        return {name: getattr(self, error) for name, (error, _) in FIELDS.items()}
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Their standard deviations by name."""
+        return {name: getattr(self, sigma) for name, (_, sigma) in FIELDS.items()}
+
+    @classmethod
+    def made_with(cls, config: Mapping[str, Any]) -> tuple[Corrector, ...]:
+        """Return the camera corrections in a result's configuration (plain data).
+
+        They are the only corrections that change the rays of pixels.
+        """
+        return tuple(
+            cls(
+                item["focal"],
+                item["offset_m"],
+                item.get("center_x", 0.0),
+                item.get("center_y", 0.0),
+                item.get("distortion", 0.0),
+            ).start()
+            for item in config.get("corrections", ())
+            if item["part"] == "camera-errors"
+        )
+
+    def camera(self, stated: Camera) -> Camera:
+        """Return the true camera."""
+        if isinstance(stated, Pinhole) and not self.distortion:
+            fx, fy = stated.fx / (1 + self.focal), stated.fy / (1 + self.focal)
+            cx, cy = stated.cx - self.center_x * fx, stated.cy - self.center_y * fy
+            return replace(stated, fx=fx, fy=fy, cx=cx, cy=cy)
+        rays = np.asarray(stated.rays(), np.float64)
+        scale = 1 + self.focal + self.distortion * (rays**2).sum(-1, keepdims=True)
+        return RayTable((rays * scale + [self.center_x, self.center_y]).astype(np.float32))
+
+
+@dataclass(eq=False)
+class _Corrector(Corrector):
+    options: CameraErrors
+    # The last camera as stated and as it is: frames share theirs, and what is worked out for it.
+    _cameras: tuple[Camera, Camera] | None = None
+
+    def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
+        """See `Corrector.apply`; clouds have no camera."""
+        if not isinstance(frame, RangeFrame):
+            return frame
+        options = self.options
+        if options.focal or options.center_x or options.center_y or options.distortion:
+            cameras = self._cameras
+            if cameras is None or cameras[0] != frame.camera:
+                cameras = self._cameras = (frame.camera, options.camera(frame.camera))
+            frame = replace(frame, camera=cameras[1])
+        if options.offset_m:
+            # What is valid stays valid.
+            least = np.float32(1e-3)
+            longer = np.maximum(frame.radial_range + np.float32(options.offset_m), least)
+            if frame.depth_kind == "z":
+                longer /= ray_lengths(frame.camera).astype(np.float32)
+            frame = replace(frame, depth=np.where(frame.depth > 0, longer, np.float32(0)))
+        return frame
+
+    def is_independent(self, frame: Frame) -> bool:
+        """See `Corrector.is_independent`."""
+        return True

@@ -1,0 +1,573 @@
+"""Normal equations of a pair of views: relative pose, exposure, and systematic camera errors.
+
+As in `alignment`, source points are compared with plane and log albedo of the target pixel that
+they project to. Every pair has its own system, whose unknowns also include errors that all views of
+a camera share. With p a source point, q = T p, m = R^T n the target's normal in the source's frame,
+and b(p) the displacement of p by an error of size 1, the distance changes by m . b(p) - n . b(q).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tofuse.engine.arrays import Bool, Float32, Float64, Int64
+from tofuse.engine.views import residual_kernels as pose_sums
+from tofuse.engine.compute import tukey_kernels as tukey
+from tofuse.engine.views.residual_kernels import ALBEDO, ALBEDO_SLOPE, BINS, CHI2, DISTANCE, FREE_SPACE, HAS_PLANE, INLIERS, IS_INLIER, JACOBIAN, LANES, NORMAL, PLANE, POINT, POINT_ALBEDO, POINT_ALBEDO_SLOPE, ROWS, SIGMA, SQRT_WEIGHT, STAT, VARIANCE, WEIGHTED_RESIDUAL, XN, YN, Residuals, TargetImage, Z, add_products, compare_albedos, compare_planes, histogram_bin, load_block, project_block, transform_block
+from tofuse.engine.compute.jit import kernel
+from tofuse.engine.cameras.projection_kernels import MIN_DEPTH, jacobian_row, nearest_pixel
+
+# Camera errors, in the order of the unknowns.
+OFFSET = 0  # to be added to the range, m
+SCALE = 1  # relative, to be added to the depth
+FOCAL = 2  # relative, to be added to the ray coordinates; measured depth is kept, z or radial
+CENTER_X = 3  # to be added to the ray coordinate x / z: principal point over focal length
+CENTER_Y = 4  # to be added to y / z
+DISTORTION = 5  # relative, times x^2 + y^2 of the ray coordinates, to be added to these
+ERRORS = 6
+
+EXPOSURE = 6  # index of the exposure among the unknowns
+UNKNOWNS = 7 + ERRORS
+
+# Layout of the row of a pair.
+PRODUCTS = 0  # upper triangle over the unknowns
+GRADIENT = UNKNOWNS * (UNKNOWNS + 1) // 2
+COMPARED = GRADIENT + UNKNOWNS  # points that project to a target pixel with a plane
+IN_FRONT = COMPARED + 1  # points in free space of the target
+WEIGHT_P = IN_FRONT + 1  # sums of robust weights and weighted squares of log albedo residuals
+SQUARES_P = WEIGHT_P + 1
+TERMS = SQUARES_P + 1  # number of residuals of both terms
+SUPPORT = TERMS + 1  # sum of (1 - robust cost) of the residuals (Tukey's biweight)
+HISTOGRAM = SUPPORT + 1  # as in `alignment`
+SIZE = HISTOGRAM + BINS
+
+_EPSILON = 1e-6  # m or m^2, instead of 0 in a denominator
+
+# Layout of the sums of a patch: of w, w r and w J.
+PATCH_WEIGHT = 0
+PATCH_RESIDUAL = 1
+PATCH_RESPONSE = 2
+PATCH_SIZE = 8
+
+
+class CameraErrors(NamedTuple):
+    """Systematic errors of the cameras of a pair.
+
+    Attributes
+    ----------
+    errors
+        (ERRORS,) assumed errors, by which points and planes are displaced.
+    known
+        (ERRORS,) non-zero for errors that are not estimated.
+    radial_source, radial_target
+        Whether the cameras measure radial range, not z.
+    """
+
+    errors: Float64
+    known: Int64
+    radial_source: bool
+    radial_target: bool
+
+
+class SourcePoints(NamedTuple):
+    """Points of N views, which are compared with other views.
+
+    Attributes
+    ----------
+    points
+        (M, POINT_SIZE), see `alignment`.
+    patches
+        (M,) patch of the image that each point belongs to, see `shared_error`; (0,) if no sums over
+        patches are computed.
+    begin, end
+        (N,) first row of the points of each view, and the row after the last.
+    measures_range
+        (N,) whether the camera of each view measures radial range, not z.
+    """
+
+    points: Float32
+    patches: Int64
+    begin: Int64
+    end: Int64
+    measures_range: Bool
+
+
+class PairResiduals(NamedTuple):
+    """`Residuals` of K pairs, each with its own exposure and scales.
+
+    Attributes
+    ----------
+    exposure, scale_g, scale_p
+        (K,) each.
+    inflation, robust, min_cosine
+        Of all pairs.
+    """
+
+    exposure: Float64
+    scale_g: Float64
+    scale_p: Float64
+    inflation: float
+    robust: float
+    min_cosine: float
+
+
+@kernel
+def displacement(B: Float64, x: float, y: float, z: float, radial: bool) -> None:
+    """Write to B (ERRORS, 3) the displacements of the point (x, y, z) by camera errors of size 1.
+
+    `radial`: whether the camera measures the distance along the ray, not z.
+    """
+    lateral2 = x * x + y * y
+    r2 = lateral2 + z * z
+    r = np.sqrt(r2)
+    B[OFFSET, 0] = x / r
+    B[OFFSET, 1] = y / r
+    B[OFFSET, 2] = z / r
+    B[SCALE, 0] = x
+    B[SCALE, 1] = y
+    B[SCALE, 2] = z
+    shortening = lateral2 / r2 if radial else 0.0
+    B[FOCAL, 0] = x - shortening * x
+    B[FOCAL, 1] = y - shortening * y
+    B[FOCAL, 2] = -shortening * z
+    for p, lateral in ((CENTER_X, x), (CENTER_Y, y)):
+        shortening = lateral * z / r2 if radial else 0.0
+        B[p, 0] = -shortening * x
+        B[p, 1] = -shortening * y
+        B[p, 2] = -shortening * z
+    B[CENTER_X, 0] += z
+    B[CENTER_Y, 1] += z
+    rho2 = lateral2 / max(z * z, _EPSILON)
+    for axis in range(3):
+        B[DISTORTION, axis] = rho2 * B[FOCAL, axis]
+
+
+@kernel
+def _calibration_equations(
+    points: Float32,
+    target: TargetImage,
+    T: Float64,
+    residuals: Residuals,
+    camera: CameraErrors,
+    out: Float64,
+) -> None:
+    """Add the normal equations of one pair, with camera errors among the unknowns."""
+    errors, known, radial_source, radial_target = camera
+    unknowns = UNKNOWNS
+    while unknowns > 7 and known[unknowns - 8]:
+        unknowns -= 1
+    estimated = unknowns - 7
+    exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
+    image, lookup, lookup_frame = target
+    rows, columns = image.shape[0], image.shape[1]
+    J = np.zeros(UNKNOWNS)
+    Bp = np.zeros((ERRORS, 3))
+    Bq = np.zeros((ERRORS, 3))
+    A = np.zeros((UNKNOWNS, UNKNOWNS))
+    g = np.zeros(UNKNOWNS)
+    limit2 = robust * robust
+    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    for k in range(points.shape[0]):
+        point = points[k]
+        px = np.float64(point[POINT])
+        py = np.float64(point[POINT + 1])
+        pz = np.float64(point[POINT + 2])
+        displacement(Bp, px, py, pz, radial_source)
+        for p in range(ERRORS):
+            px += errors[p] * Bp[p, 0]
+            py += errors[p] * Bp[p, 1]
+            pz += errors[p] * Bp[p, 2]
+        z = r20 * px + r21 * py + r22 * pz + t2
+        if z <= MIN_DEPTH:
+            continue
+        x = r00 * px + r01 * py + r02 * pz + t0
+        y = r10 * px + r11 * py + r12 * pz + t1
+        # Project with the corrected intrinsics of the target.
+        xn, yn = x / z - errors[CENTER_X], y / z - errors[CENTER_Y]
+        rho2 = xn * xn + yn * yn
+        ray_scale = 1.0 + errors[FOCAL] + errors[DISTORTION] * rho2
+        xn, yn = xn / ray_scale, yn / ray_scale
+        i, j = nearest_pixel(xn, yn, lookup, lookup_frame, rows, columns)
+        if i < 0:
+            continue
+        pixel = image[i, j]
+        distance = np.float64(pixel[DISTANCE])
+        if distance == 0:
+            continue
+        out[COMPARED] += 1
+        out[TERMS] += 1
+        n0 = np.float64(pixel[PLANE])
+        n1 = np.float64(pixel[PLANE + 1])
+        n2 = np.float64(pixel[PLANE + 2])
+        height = n0 * x + n1 * y + n2 * z
+        r = height - distance
+        displacement(Bq, x, y, z, radial_target)
+        for p in range(ERRORS):
+            r -= errors[p] * (n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2])
+        source_sigma = (height - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(point[SIGMA])
+        raw_variance = source_sigma * source_sigma + np.float64(pixel[VARIANCE])
+        variance = raw_variance * scale_g * scale_g + inflation * inflation
+        r2 = r * r
+        out[HISTOGRAM + histogram_bin(r2 / raw_variance)] += 1
+        e2 = r2 / variance / limit2
+        if e2 >= 1:
+            if r < 0 and e2 > FREE_SPACE:
+                out[IN_FRONT] += 1
+            continue
+        m0 = r00 * n0 + r10 * n1 + r20 * n2
+        m1 = r01 * n0 + r11 * n1 + r21 * n2
+        m2 = r02 * n0 + r12 * n1 + r22 * n2
+        s0 = np.float64(point[NORMAL])
+        s1 = np.float64(point[NORMAL + 1])
+        s2 = np.float64(point[NORMAL + 2])
+        if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
+            continue
+        weight = tukey.weight(e2)
+        out[SUPPORT] += tukey.support(weight)
+        # Mean of both views' normals, which halves the effect of either's noise.
+        m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
+        jacobian_row(J, m0, m1, m2, px, py, pz)
+        J[EXPOSURE] = 0.0
+        # The same mean for the camera errors: otherwise the difference between the normals, which
+        # the pose cannot explain, would be attributed to them.
+        n0 = r00 * m0 + r01 * m1 + r02 * m2
+        n1 = r10 * m0 + r11 * m1 + r12 * m2
+        n2 = r20 * m0 + r21 * m1 + r22 * m2
+        for p in range(estimated):
+            J[7 + p] = (m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]) - (
+                n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2]
+            )
+            if known[p]:
+                J[7 + p] = 0.0
+        _add_residual(A, g, J, r, weight / variance, unknowns)
+
+        tx = np.float64(pixel[ALBEDO_SLOPE])
+        source_albedo = np.float64(point[POINT_ALBEDO])
+        if scale_p <= 0 or np.isnan(tx) or np.isnan(source_albedo):
+            continue
+        ty = np.float64(pixel[ALBEDO_SLOPE + 1])
+        r = np.float64(pixel[ALBEDO]) + tx * xn + ty * yn - source_albedo - exposure
+        out[TERMS] += 1
+        r2 = r * r
+        e2 = r2 / (scale_p * scale_p) / limit2
+        if e2 >= 1:
+            continue
+        weight = tukey.weight(e2)
+        out[WEIGHT_P] += weight
+        out[SQUARES_P] += weight * r2
+        out[SUPPORT] += tukey.support(weight)
+        # Gradient with respect to the transformed point, rotated back into the source frame.
+        d0 = tx / (z * ray_scale)
+        d1 = ty / (z * ray_scale)
+        d2 = -(tx * xn + ty * yn) / z
+        m0 = r00 * d0 + r10 * d1 + r20 * d2
+        m1 = r01 * d0 + r11 * d1 + r21 * d2
+        m2 = r02 * d0 + r12 * d1 + r22 * d2
+        s0 = np.float64(point[POINT_ALBEDO_SLOPE])
+        s1 = np.float64(point[POINT_ALBEDO_SLOPE + 1])
+        s2 = np.float64(point[POINT_ALBEDO_SLOPE + 2])
+        m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
+        jacobian_row(J, m0, m1, m2, px, py, pz)
+        J[EXPOSURE] = -1.0
+        for p in range(estimated):
+            J[7 + p] = 0.0 if known[p] else m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]
+        # Only errors of the intrinsics affect the rays of the target's pixels.
+        d0 = r00 * m0 + r01 * m1 + r02 * m2
+        d1 = r10 * m0 + r11 * m1 + r12 * m2
+        if estimated > FOCAL and not known[FOCAL]:
+            J[7 + FOCAL] -= d0 * (x - errors[CENTER_X] * z) + d1 * (y - errors[CENTER_Y] * z)
+        if estimated > CENTER_X and not known[CENTER_X]:
+            J[7 + CENTER_X] -= d0 * z
+        if estimated > CENTER_Y and not known[CENTER_Y]:
+            J[7 + CENTER_Y] -= d1 * z
+        if estimated > DISTORTION and not known[DISTORTION]:
+            J[7 + DISTORTION] -= rho2 * z * (d0 * xn + d1 * yn)
+        _add_residual(A, g, J, r, weight / (scale_p * scale_p), unknowns)
+    q = PRODUCTS
+    for p in range(UNKNOWNS):
+        out[GRADIENT + p] = g[p]
+        for o in range(p, UNKNOWNS):
+            out[q] = A[p, o]
+            q += 1
+
+
+@kernel
+def target_equations(
+    sources: SourcePoints,
+    views: Int64,
+    target: TargetImage,
+    T: Float64,
+    residuals: PairResiduals,
+    errors: Float64,
+    known: Int64,
+    radial_target: bool,
+    out: Float64,
+    sums: Float64,
+) -> None:
+    """Sum the normal equations of the K pairs of one target.
+
+    Parameters
+    ----------
+    sources, views
+        Points of all views, and the (K,) indices of those that are compared with the target.
+    target
+        The target.
+    T
+        (K, 4, 4) T_target_source.
+    residuals
+        Of these pairs.
+    errors, known, radial_target
+        As in `CameraErrors`.
+    out
+        (K, SIZE), is overwritten.
+    sums
+        (K, patches, PATCH_SIZE), is overwritten by the sums of the distances' equations over each
+        patch. With 0 patches, or if camera errors are estimated, they are not computed.
+    """
+    exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
+    out[:] = 0.0
+    sums[:] = 0.0
+    for k in range(len(views)):
+        view = views[k]
+        begin, end = sources.begin[view], sources.end[view]
+        points = sources.points[begin:end]
+        pair = Residuals(exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine)
+        camera = CameraErrors(errors, known, sources.measures_range[view], radial_target)
+        if known.all():
+            patches = sources.patches[begin:end]
+            _pose_equations(points, patches, target, T[k], pair, camera, out[k], sums[k])
+        else:
+            _calibration_equations(points, target, T[k], pair, camera, out[k])
+
+
+@kernel
+def _pose_equations(
+    points: Float32,
+    patches: Int64,
+    target: TargetImage,
+    T: Float64,
+    residuals: Residuals,
+    camera: CameraErrors,
+    out: Float64,
+    sums: Float64,
+) -> None:
+    """Add those with known camera errors, vectorised in blocks as in `alignment`."""
+    errors, _, radial_source, radial_target = camera
+    has_errors = (errors != 0).any()
+    exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
+    image, lookup, lookup_frame = target
+    block = np.zeros(ROWS * LANES, np.float32)
+    # Products of the rows of J and r, followed by counts and sums over columns.
+    products, support = 36, 36 + pose_sums.SQUARES_G - INLIERS
+    total = np.zeros((36 + pose_sums.COUNT_P + 1 - INLIERS, LANES))
+    for first in range(0, len(points), LANES):
+        count = min(LANES, len(points) - first)
+        load_block(block, points[first : first + count])
+        if has_errors:
+            _correct_points(block, errors, radial_source)
+        transform_block(block, T)
+        if has_errors:
+            _distort_projection(block, errors, radial_target)
+        project_block(block, count, image, lookup, lookup_frame)
+        compare_planes(block, T, scale_g, inflation, robust, min_cosine)
+        for k in range(count):
+            if block[HAS_PLANE * LANES + k] > 0:
+                out[COMPARED] += 1
+                out[HISTOGRAM + histogram_bin(block[CHI2 * LANES + k])] += 1
+        if len(sums) > 0:
+            _add_patches(sums, block, patches[first : first + count])
+        add_products(total, block, 8)
+        _add_support(total[support], block, pose_sums.WEIGHT_G)
+        if scale_p > 0:
+            compare_albedos(block, T, exposure, scale_p, robust)
+            add_products(total, block, 8)
+            _add_support(total[support], block, pose_sums.WEIGHT_P)
+        for statistic in (
+            pose_sums.IN_FRONT,
+            pose_sums.WEIGHT_P,
+            pose_sums.SQUARES_P,
+            pose_sums.COUNT_P,
+        ):
+            index = statistic - INLIERS
+            column = total[products + index]
+            row = block[(STAT + index) * LANES : (STAT + index + 1) * LANES]
+            for k in range(LANES):
+                column[k] += row[k]
+    width = LANES
+    while width > 1:
+        width //= 2
+        for q in range(len(total)):
+            low, high = total[q, :width], total[q, width:]
+            for k in range(width):
+                low[k] += high[k]
+    q, index = 0, PRODUCTS
+    for p in range(8):
+        for o in range(p, 8):
+            if p < 7 and o < 7:
+                out[index] = total[q, 0]
+                index += 1
+            elif p < 7:
+                out[GRADIENT + p] = total[q, 0]
+            q += 1
+        index += ERRORS  # products with the camera errors remain 0
+    out[IN_FRONT] = total[products + pose_sums.IN_FRONT - INLIERS, 0]
+    out[WEIGHT_P] = total[products + pose_sums.WEIGHT_P - INLIERS, 0]
+    out[SQUARES_P] = total[products + pose_sums.SQUARES_P - INLIERS, 0]
+    out[TERMS] = out[COMPARED] + total[products + pose_sums.COUNT_P - INLIERS, 0]
+    out[SUPPORT] = total[support, 0]
+
+
+@kernel
+def _correct_points(block: Float32, errors: Float64, radial: bool) -> None:
+    """Displace the points of a block by camera errors, see `displacement`."""
+    x = block[POINT * LANES : (POINT + 1) * LANES]
+    y = block[(POINT + 1) * LANES : (POINT + 2) * LANES]
+    z = block[(POINT + 2) * LANES : (POINT + 3) * LANES]
+    for k in range(LANES):
+        lateral2 = x[k] * x[k] + y[k] * y[k]
+        r2 = max(lateral2 + z[k] * z[k], _EPSILON)  # columns without a point may be 0
+        ray_scale_error = errors[FOCAL] + errors[DISTORTION] * lateral2 / max(z[k] * z[k], _EPSILON)
+        shortening = 0.0
+        if radial:
+            center_term = errors[CENTER_X] * x[k] + errors[CENTER_Y] * y[k]
+            shortening = (ray_scale_error * lateral2 + center_term * z[k]) / r2
+        depth_scale = 1 + errors[OFFSET] / np.sqrt(r2) + errors[SCALE] - shortening
+        x[k] = x[k] * (depth_scale + ray_scale_error) + errors[CENTER_X] * z[k]
+        y[k] = y[k] * (depth_scale + ray_scale_error) + errors[CENTER_Y] * z[k]
+        z[k] *= depth_scale
+
+
+@kernel
+def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
+    """Move the transformed points of a block to where the erroneous target would measure them.
+
+    To first order in the errors this is the inverse of `_correct_points`.
+    """
+    xn = block[XN * LANES : (XN + 1) * LANES]
+    yn = block[YN * LANES : (YN + 1) * LANES]
+    z = block[Z * LANES : (Z + 1) * LANES]
+    for k in range(LANES):
+        if not z[k] > MIN_DEPTH:  # it is not projected
+            continue
+        lateral2 = xn[k] * xn[k] + yn[k] * yn[k]
+        r2 = lateral2 + 1
+        ray_scale_error = errors[FOCAL] + errors[DISTORTION] * lateral2
+        shortening = 0.0
+        if radial:
+            center_term = errors[CENTER_X] * xn[k] + errors[CENTER_Y] * yn[k]
+            shortening = (ray_scale_error * lateral2 + center_term) / r2
+        depth_scale = 1 - errors[OFFSET] / (np.sqrt(r2) * z[k]) - errors[SCALE] + shortening
+        xn[k] = (xn[k] - errors[CENTER_X]) / (1 + ray_scale_error)
+        yn[k] = (yn[k] - errors[CENTER_Y]) / (1 + ray_scale_error)
+        z[k] *= depth_scale
+
+
+@kernel
+def _add_patches(sums: Float64, block: Float32, patches: Int64) -> None:
+    """Add the weighted residuals and Jacobians of the distances of a block to their patches."""
+    for k in range(len(patches)):
+        if block[IS_INLIER * LANES + k] > 0:
+            sqrt_weight = np.float64(block[SQRT_WEIGHT * LANES + k])
+            patch = sums[patches[k]]
+            patch[PATCH_WEIGHT] += sqrt_weight * sqrt_weight
+            patch[PATCH_RESIDUAL] += sqrt_weight * block[WEIGHTED_RESIDUAL * LANES + k]
+            for p in range(6):
+                patch[PATCH_RESPONSE + p] += sqrt_weight * block[(JACOBIAN + p) * LANES + k]
+
+
+@kernel
+def _add_support(total: Float64, block: Float32, statistic: int) -> None:
+    """Add the support of the residuals whose robust weights are in a statistic."""
+    index = STAT + statistic - INLIERS
+    row = block[index * LANES : (index + 1) * LANES]
+    for k in range(LANES):
+        total[k] += tukey.support(row[k])
+
+
+@kernel
+def _add_residual(
+    A: Float64, g: Float64, J: Float64, r: float, weight: float, unknowns: int
+) -> None:
+    """Add w J J^T to the upper triangle of A, and w r J to g."""
+    for p in range(unknowns):
+        weighted = weight * J[p]
+        g[p] += weighted * r
+        for o in range(p, unknowns):
+            A[p, o] += weighted * J[o]
+
+
+@kernel
+def overlaps(
+    points: Float32,
+    starts: Int64,
+    sources: Int64,
+    target: TargetImage,
+    T_target_world: Float64,
+    T_world_source: Float64,
+    tolerance: float,
+    min_cosine: float,
+    min_overlap: float,
+    out: Float64,
+) -> None:
+    """Write to `out` (S,) the fraction of each source view's points that the target sees as well.
+
+    Parameters
+    ----------
+    points, starts
+        (M, POINT_SIZE) points of all views; those of view k are from starts[k] to starts[k + 1].
+    sources
+        (S,) indices of the source views.
+    target
+        The view that they are compared with.
+    T_target_world, T_world_source
+        (4, 4) of the target, and (N, 4, 4) of all views.
+    tolerance, min_cosine
+        Both see a point if its distance from the target's plane is below this fraction of the
+        plane's distance, and the normals' cosine is above `min_cosine`.
+    min_overlap
+        Smaller fractions are reported as 0.
+    """
+    image, lookup, lookup_frame = target
+    rows, columns = image.shape[0], image.shape[1]
+    T = np.empty((3, 4))
+    for s in range(len(sources)):
+        pose = T_world_source[sources[s]]
+        for a in range(3):
+            for b in range(4):
+                T[a, b] = T_target_world[a, 3] if b == 3 else 0.0
+                for c in range(3):
+                    T[a, b] += T_target_world[a, c] * pose[c, b]
+        start, stop = starts[sources[s]], starts[sources[s] + 1]
+        # With more unseen points than this, the overlap is certainly too small.
+        max_unseen = (stop - start) - min_overlap * (stop - start) + 1e-9
+        shared = 0
+        for k in range(start, stop):
+            if k - start - shared > max_unseen:
+                break
+            px, py, pz = points[k, POINT], points[k, POINT + 1], points[k, POINT + 2]
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            if z <= MIN_DEPTH:
+                continue
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            i, j = nearest_pixel(x / z, y / z, lookup, lookup_frame, rows, columns)
+            if i < 0:
+                continue
+            pixel = image[i, j]
+            n0, n1, n2, distance = pixel[PLANE], pixel[PLANE + 1], pixel[PLANE + 2], pixel[DISTANCE]
+            if distance == 0 or abs(n0 * x + n1 * y + n2 * z - distance) > tolerance * z:
+                continue
+            nx, ny, nz = points[k, NORMAL], points[k, NORMAL + 1], points[k, NORMAL + 2]
+            cosine = (
+                n0 * (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz)
+                + n1 * (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz)
+                + n2 * (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz)
+            )
+            if cosine >= min_cosine:
+                shared += 1
+        fraction = shared / max(stop - start, 1)
+        out[s] = fraction if fraction >= min_overlap else 0.0

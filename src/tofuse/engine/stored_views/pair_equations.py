@@ -1,0 +1,315 @@
+"""Normal equations of pairs of overlapping views, with correspondences found by projection.
+
+Every pair is compared in both directions. The unknowns of a directed pair are its relative pose,
+errors that the camera has in all views, and the exposure, which is eliminated. The sigmas of a
+pair are estimated from its residuals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64, Int64, Intp
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.alignment import step_kernels as steps
+from tofuse.engine.views.residual_kernels import POINT_SIZE
+from tofuse.engine.stored_views.shared_error_kernels import marginalise_shared_errors
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.stored_views import shared_error
+from tofuse.engine.stored_views.view_store import SampledView
+
+_PAIRS_A_CHUNK = 8
+# Approximate number of pairs from which the disagreement of patches is estimated.
+_PAIRS_SAMPLED = 200
+# Residuals that an estimate of scale needs.
+_MIN_COMPARED = 50
+_UPPER = np.triu_indices(kernels.UNKNOWNS)
+
+
+@dataclass(frozen=True)
+class Round:
+    """Iterations with the same noise inflation: as in `registration.projective.Level`."""
+
+    iterations: int
+    inflation_m: float
+    photometric_inflation: float
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """Options of the joint alignment.
+
+    Attributes
+    ----------
+    rounds
+        From coarse to fine. Before each, overlaps are recomputed if any view has moved by more
+        than about 2 cm or 2 degrees.
+    overlap
+        Smallest overlap of a pair, as a fraction of the views.
+    neighbours
+        Largest number of earlier partners of each view, spread evenly over those that overlap.
+    points
+        Approximate number of points of each view.
+    robust, max_angle, photometric, max_sigma_m
+        As in `ProjectiveOptions`.
+    convergence
+        Iterations end when no view moves by more, in units of 1 cm and 1 degree, and no error of
+        the camera changes by more, in units of 1 % and 1 cm.
+    shared
+        Depth errors that the pixels of a patch share, as a multiple of the disagreement of the
+        patches; 0: none. Only in the last round, between views with albedo, and where no error of
+        the camera is estimated. See `shared_error`.
+    """
+
+    rounds: tuple[Round, ...] = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(5, 0.0, 0.0))
+    overlap: float = 0.3
+    neighbours: int = 10
+    points: int = 1500
+    robust: float = 3.5
+    max_angle: float = 0.7
+    photometric: bool = True
+    max_sigma_m: float = 0.02
+    convergence: float = 0.02
+    shared: float = 1.0
+
+
+@dataclass(eq=False)
+class DirectedPairs:
+    """Directed pairs, the scales of each, and its latest normal equations.
+
+    Attributes
+    ----------
+    target, source
+        (P,) positions of the views.
+    exposure, scale_g, scale_p
+        (P,) exposure, and factors of the sigmas of distance and of albedo; a `scale_p` of 0 means
+        that the albedo is not compared.
+    max_scale
+        (P,) largest `scale_g`.
+    sources
+        Points of all views.
+    rows
+        (P, SIZE) sums of each pair, in the order of `kernels.pair_equations`.
+    sums
+        (P, PATCHES, PATCH_SIZE) the same sums for each patch of the target; empty unless needed.
+    """
+
+    target: Intp
+    source: Intp
+    exposure: Float64
+    scale_g: Float64
+    scale_p: Float64
+    max_scale: Float64
+    sources: kernels.SourcePoints
+    rows: Float64 = field(default_factory=lambda: np.zeros((0, kernels.SIZE)))
+    sums: Float64 = field(default_factory=lambda: np.zeros((0, 0, kernels.PATCH_SIZE)))
+
+    def subset(self, which: Intp) -> DirectedPairs:
+        """Return a subset of the pairs, without their normal equations."""
+        exposure, scale_g, scale_p = (column[which] for column in self._scales())
+        return DirectedPairs(
+            self.target[which],
+            self.source[which],
+            exposure,
+            scale_g,
+            scale_p,
+            self.max_scale[which],
+            self.sources,
+        )
+
+    def put(self, which: Intp, subset: DirectedPairs) -> None:
+        """Copy the exposure and scales of a subset into these pairs."""
+        for scale, updated in zip(self._scales(), subset._scales(), strict=True):
+            scale[which] = updated
+
+    def _scales(self) -> tuple[Float64, Float64, Float64]:
+        return self.exposure, self.scale_g, self.scale_p
+
+
+def directed_pairs(
+    views: Sequence[SampledView],
+    pairs: Intp,
+    options: RefineOptions,
+    previous: DirectedPairs | None = None,
+) -> DirectedPairs:
+    """Return both directions of each pair (M, 2), with the scales in `previous`, if any.
+
+    `views` (N,) and `options` are as for `joint_alignment.refine`.
+    """
+    target = np.concatenate([pairs[:, 0], pairs[:, 1]])
+    source = np.concatenate([pairs[:, 1], pairs[:, 0]])
+    n = len(target)
+    max_scale = np.maximum(3.0, options.max_sigma_m / np.array([v.sigma for v in views]))
+    initial = np.zeros(n), np.ones(n), np.full(n, 0.1)
+    photometric = np.array([v.has_albedo for v in views]) & options.photometric
+    sources = _sources(views, by_patch=options.shared > 0 and bool(photometric.any()))
+    state = DirectedPairs(target, source, *initial, max_scale[source], sources)
+    state.scale_p[~(photometric[target] & photometric[source])] = 0.0
+    if previous is None:
+        return state
+    row = {ts: k for k, ts in enumerate(zip(previous.target, previous.source, strict=True))}
+    old_row = np.array([row.get(ts, -1) for ts in zip(target, source, strict=True)], np.intp)
+    for name in ("exposure", "scale_g", "scale_p"):
+        getattr(state, name)[old_row >= 0] = getattr(previous, name)[old_row[old_row >= 0]]
+    return state
+
+
+def _sources(views: Sequence[SampledView], *, by_patch: bool) -> kernels.SourcePoints:
+    """Concatenated points of all views; a view that occurs several times is stored once."""
+    unique = {id(v): v for v in views}
+    row = {key: k for k, key in enumerate(unique)}
+    row_of_view = np.array([row[id(v)] for v in views], np.intp)
+    points = [np.zeros((0, POINT_SIZE), np.float32), *(v.points for v in unique.values())]
+    patches = [v.patches for v in unique.values()] if by_patch else []
+    offsets = np.cumsum([len(p) for p in points])
+    return kernels.SourcePoints(
+        np.concatenate(points),
+        np.concatenate([np.zeros(0, np.int64), *patches]),
+        offsets[row_of_view],
+        offsets[row_of_view + 1],
+        np.array([v.measures_range for v in views], np.bool_),
+    )
+
+
+def evaluate(
+    views: Sequence[SampledView],
+    poses: Float64,
+    errors: Float64,
+    fixed_errors: Int64,
+    state: DirectedPairs,
+    stage: Round,
+    options: RefineOptions,
+    *,
+    by_patch: bool = False,
+) -> None:
+    """Sum the normal equations of every directed pair into `state`.
+
+    Parameters
+    ----------
+    views
+        N views.
+    poses
+        (N, 4, 4) T_world_camera.
+    errors, fixed_errors
+        (ERRORS,) errors of the camera, and mask: 0 for those that are estimated, else 1.
+    state
+        Pairs and their scales; `rows` and `sums` are replaced.
+    stage, options
+        Noise inflation, and limits of the residuals.
+    by_patch
+        Whether to sum over patches as well, for `discount_shared`.
+    """
+    T_target_source = se3.inverse(poses[state.target]) @ poses[state.source]
+    rows = np.empty((len(state.target), kernels.SIZE))
+    sums = np.empty((len(rows), shared_error.PATCHES if by_patch else 0, kernels.PATCH_SIZE))
+    cosine = float(np.cos(options.max_angle))
+    # All sources of a target in succession, so that it stays in the cache.
+    order = np.argsort(state.target, kind="stable")
+    targets, begin = np.unique(state.target[order], return_index=True)
+    end = np.append(begin[1:], len(order))
+
+    def work(a: int, b: int) -> None:
+        for k in range(a, b):
+            pairs = order[begin[k] : end[k]]
+            target = views[targets[k]]
+            pair_rows = np.empty((len(pairs), kernels.SIZE))
+            patch_sums = np.empty((len(pairs), *sums.shape[1:]))
+            kernels.target_equations(
+                state.sources,
+                state.source[pairs],
+                target.target_image,
+                T_target_source[pairs],
+                kernels.PairResiduals(
+                    state.exposure[pairs],
+                    state.scale_g[pairs],
+                    state.scale_p[pairs],
+                    stage.inflation_m,
+                    options.robust,
+                    cosine,
+                ),
+                errors,
+                fixed_errors,
+                target.measures_range,
+                pair_rows,
+                patch_sums,
+            )
+            rows[pairs], sums[pairs] = pair_rows, patch_sums
+
+    run_chunks(work, len(targets), -(-len(rows) // _PAIRS_A_CHUNK))
+    state.rows, state.sums = rows, sums
+
+
+def depends_on_patches(state: DirectedPairs, options: RefineOptions) -> bool:
+    """Return whether errors that patches share are modelled.
+
+    Only if there are photometric residuals: without them no more accurate residuals remain.
+    """
+    return options.shared > 0 and bool((state.scale_p > 0).any())
+
+
+def discount_shared(
+    views: Sequence[SampledView], poses: Float64, state: DirectedPairs, options: RefineOptions
+) -> None:
+    """Remove the contribution of depth errors that patches share from the normal equations.
+
+    `poses` (N, 4, 4) are those of the last `evaluate` with `by_patch`. See `shared_error`.
+    """
+    photometric = np.flatnonzero(state.scale_p > 0)
+    T = se3.inverse(poses[state.target[photometric]]) @ poses[state.source[photometric]]
+    depth = np.array([v.depth for v in views])[state.target[photometric]]
+    growth = shared_error.growth(depth, se3.angle(T), np.linalg.norm(T[:, :3, 3], axis=1))
+    # Views of one recording come from one camera: their patches are correlated in the same way.
+    correlation = shared_error.patch_correlation(views[0].shape)
+    sampled_rows = np.arange(0, len(photometric), -(-len(photometric) // _PAIRS_SAMPLED))
+    sampled = photometric[sampled_rows]
+    disagreement = shared_error.disagreement(state.sums[sampled], state.rows[sampled], correlation)
+    variance = options.shared**2 * disagreement.variance(growth[sampled_rows]) * growth
+    if not variance.any():
+        return
+
+    def work(a: int, b: int) -> None:
+        marginalise_shared_errors(
+            state.sums, correlation, variance[a:b], photometric[a:b], state.rows
+        )
+
+    run_chunks(work, len(photometric), -(-len(photometric) // _PAIRS_A_CHUNK))
+
+
+def without_exposure(state: DirectedPairs) -> tuple[Float64, Float64]:
+    """Return normal equations of each pair without its exposure, which is eliminated and updated.
+
+    Returns
+    -------
+    (P, 6 + ERRORS, 6 + ERRORS) matrices and (P, 6 + ERRORS) gradients, of the right perturbation
+    of T_target_source and the errors of the camera.
+    """
+    m, e = len(state.target), kernels.EXPOSURE
+    H = np.zeros((m, kernels.UNKNOWNS, kernels.UNKNOWNS))
+    H[:, _UPPER[0], _UPPER[1]] = state.rows[:, kernels.PRODUCTS : kernels.GRADIENT]
+    H[:, _UPPER[1], _UPPER[0]] = state.rows[:, kernels.PRODUCTS : kernels.GRADIENT]
+    g = state.rows[:, kernels.GRADIENT : kernels.GRADIENT + kernels.UNKNOWNS]
+    pivot = np.maximum(H[:, e, e], 1e-9)
+    state.exposure -= np.clip(g[:, e] / pivot, -0.3, 0.3)
+    kept = np.delete(np.arange(kernels.UNKNOWNS), e)
+    ratio = H[:, kept, e] / pivot[:, None]
+    return (
+        H[:, kept[:, None], kept] - ratio[:, :, None] * H[:, None, e, kept],
+        g[:, kept] - ratio * g[:, [e]],
+    )
+
+
+def rescale(state: DirectedPairs, stage: Round) -> None:
+    """Estimate the sigmas of each pair from its residuals, as the tracker does."""
+    counts = np.ascontiguousarray(state.rows[:, kernels.HISTOGRAM :])
+    enough = counts.sum(1) >= _MIN_COMPARED
+    distance_scale = np.array([steps.scale_of_distances(row) for row in counts[enough]])
+    state.scale_g[enough] = np.clip(distance_scale, 0.7, state.max_scale[enough])
+    weight = state.rows[:, kernels.WEIGHT_P]
+    albedo_scale = np.sqrt(state.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9) / 0.72)
+    used = (weight > 0) & (state.scale_p > 0)
+    scale = np.clip(np.hypot(albedo_scale, stage.photometric_inflation), 0.005, 0.5)
+    state.scale_p[used] = scale[used]

@@ -1,0 +1,324 @@
+"""Pose hypotheses: alignments with the last keyframe and the last frame, the likeliest first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
+from tofuse.engine.tracking.keyframe_map import Keyframe
+from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.tracking.motion import FrameTime
+from tofuse.engine.tracking.moving_objects import MIN_MOVING_FRACTION, Moving, without_pixels
+from tofuse.engine.tracking.tracker_state import TrackerState
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.alignment.projective import Aligned, Level, ProjectiveOptions, Target, align
+from tofuse.engine.search.verification import PATIENT, FitQuality, comparable
+
+# Minimum score of a rotated start relative to the unrotated one: a flat wall fits under any.
+_MIN_ROTATED_SCORE_RATIO = 1.03
+# A nearly aligned view needs a few more iterations, at the resolution of tracking.
+_CONVERGENCE_LEVELS = (Level(4, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0))
+# Every n-th frame is segmented, and any with an indication of moving objects: an unusual fit, more
+# than this fraction of points in free space, or objects in the frame before.
+_SEGMENT_EVERY, _MAX_IN_FRONT = 4, 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A keyframe, and its view without moved objects as the target of alignments."""
+
+    keyframe: Keyframe
+    target: Target
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """An alignment of the view with a keyframe, and its comparison with usual alignments.
+
+    Attributes
+    ----------
+    view
+        The view as it was aligned: without moving objects.
+    predicted
+        Whether it started at the predicted pose.
+    note
+        Unusual origin of the alignment, in words; may be empty.
+    fit
+        Comparison with usual alignments.
+    """
+
+    aligned: Aligned
+    view: PreparedView
+    reference: Reference
+    predicted: bool
+    note: str
+    fit: FitQuality
+
+    @property
+    def keyframe(self) -> Keyframe:
+        """The keyframe that the view was aligned with."""
+        return self.reference.keyframe
+
+    @property
+    def T_component_camera(self) -> Float64:
+        """(4, 4) pose of the view."""
+        return self.aligned.T_world_source
+
+    @property
+    def T_keyframe_camera(self) -> Float64:
+        """(4, 4) pose of the view in the frame of the keyframe."""
+        T = se3.inverse(self.keyframe.T_component_camera) @ self.T_component_camera
+        return np.asarray(T, np.float64)
+
+
+class Hypotheses:
+    """The hypotheses of one view, with and without moving objects, evaluated lazily and cached.
+
+    Parameters
+    ----------
+    view, now
+        The view, and when it was taken.
+    state
+        Of the tracker; only `segment` changes it.
+    options
+        Where alignments start, and how views are aligned.
+
+    Attributes
+    ----------
+    static_view
+        The view without the objects that moved before.
+    references
+        To align with, the likeliest first.
+    T_predicted
+        (4, 4) predicted pose; None without a prediction.
+    T_last
+        (4, 4) pose of the last frame.
+    """
+
+    def __init__(
+        self, view: PreparedView, now: FrameTime, state: TrackerState, options: Keyframes
+    ) -> None:
+        self.view, self.now, self.state = view, now, state
+        self._options = options.views.alignment
+        self.T_last = np.eye(4) if state.last is None else state.last.T_component_camera
+        self.references = self._make_references()
+        # The pose that degenerate directions keep.
+        self._T_smoothed: Float64 | None = None
+        self.T_predicted: Float64 | None = None
+        if options.guess == "previous":
+            self.T_predicted = state.motion.predicted_pose(now)
+            self._T_smoothed = state.motion.smoothed_pose(now)
+        elif options.guess == "odometry":
+            self.T_predicted = state.motion.odometry_pose()
+        self.static_view = view
+        if state.objects.in_last_view:
+            T = self.T_last if self.T_predicted is None else self.T_predicted
+            self.static_view = without_pixels(view, state.objects.predicted_mask(T, view))
+        self._pending = self._generate()
+        self._evaluated: list[Hypothesis] = []
+        self._static: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
+
+    def __iter__(self) -> Iterator[Hypothesis]:
+        yield from self._evaluated
+        for hypothesis in self._pending:
+            self._evaluated.append(hypothesis)
+            yield hypothesis
+
+    @property
+    def first_rejection(self) -> str:
+        """The reason why the likeliest hypothesis was rejected, in words."""
+        for hypothesis in self._evaluated:
+            if hypothesis.fit.reason:
+                return hypothesis.fit.reason
+        return "it is far from the predicted pose" if self._evaluated else ""
+
+    def realigned(
+        self, T: Float64, view: PreparedView, reference: Reference, *, predicted: bool
+    ) -> Hypothesis:
+        """Realign from a pose T (4, 4), with other pixels of the view or the reference."""
+        aligned = self._align(view, reference, T, self._options)
+        return self._hypothesis(aligned, view, reference, "", predicted=predicted)
+
+    def converged(self, hypothesis: Hypothesis) -> Hypothesis:
+        """Iterate a hypothesis to convergence, for which the default levels may not suffice."""
+        if hypothesis.aligned.converged:
+            return hypothesis
+        view, r, T = hypothesis.view, hypothesis.reference, hypothesis.T_component_camera
+        prior = T if self._T_smoothed is None or not hypothesis.predicted else self._T_smoothed
+        options = replace(self._options, levels=_CONVERGENCE_LEVELS)
+        aligned = self._align(view, r, prior, options, start=T)
+        refined = self._hypothesis(
+            aligned, view, r, hypothesis.note, predicted=hypothesis.predicted
+        )
+        return refined if aligned.score >= hypothesis.aligned.score else hypothesis
+
+    def static(self, hypothesis: Hypothesis) -> tuple[Hypothesis, ...]:
+        """Return the same alignment without moving objects, if its pose is that of the camera.
+
+        A moving object may fill so much of the view that the alignment follows it: then the
+        predicted pose is the better start. Where objects begin to move, the camera itself may have
+        jumped instead; so a search must not confirm that.
+        """
+        if hypothesis not in self._static:
+            poses = [hypothesis.T_component_camera]
+            if hypothesis.predicted and self.T_predicted is not None:
+                poses.insert(0, self.T_predicted)
+            self._static[hypothesis] = tuple(self._generate_static(hypothesis, poses))
+        return self._static[hypothesis]
+
+    def segment(self, hypothesis: Hypothesis) -> tuple[Hypothesis, Moving | None]:
+        """Segment moving objects where there may be any, and realign the rest of the view.
+
+        Returns
+        -------
+        The accepted hypothesis, realigned if enough moves; and the segmentation, if any.
+        """
+        view, aligned, objects = self.view, hypothesis.aligned, self.state.objects
+        suspected = hypothesis.view is not self.static_view
+        is_due = (
+            objects.in_last_view
+            or suspected
+            or not hypothesis.fit.is_usual
+            or aligned.in_front > _MAX_IN_FRONT * aligned.compared
+            or view.index % _SEGMENT_EVERY == 0
+        )
+        if not is_due:
+            return hypothesis, None
+        keyframe, T = hypothesis.keyframe, hypothesis.T_component_camera
+        moving = self._moving(T, keyframe, suspected=suspected)
+        excluded = np.count_nonzero(view.planes[..., 3]) - np.count_nonzero(
+            hypothesis.view.planes[..., 3]
+        )
+        if moving.reliable and moving.fraction - excluded / view.pixels > MIN_MOVING_FRACTION:
+            static = self._without_moving(moving, T, hypothesis)
+            if static.fit.is_usual or not hypothesis.fit.is_usual:
+                hypothesis = static
+                moving = self._moving(static.T_component_camera, keyframe, suspected=suspected)
+        objects.update(moving)
+        return hypothesis, moving
+
+    def _make_references(self) -> list[Reference]:
+        """Return the newest keyframe and the last frame, without moved objects."""
+        last = self.state.last
+        if last is None:
+            return []
+        keyframes = [self.state.keyframes.newest]
+        if last.view.index != keyframes[0].view.index:
+            keyframes.append(last)
+        references = []
+        for keyframe in keyframes:
+            if not comparable(self.view.depth, keyframe.depth):
+                continue
+            target, mask = keyframe.target, self.state.objects.reference_mask(keyframe.view)
+            if mask.any():
+                view = without_pixels(keyframe.view, mask)
+                target = Target(view, se3.inverse(keyframe.T_component_camera))
+            references.append(Reference(keyframe, target))
+        return references
+
+    def _generate(self) -> Iterator[Hypothesis]:
+        T_predicted, view = self.T_predicted, self.static_view
+        if T_predicted is not None:
+            prior = T_predicted if self._T_smoothed is None else self._T_smoothed
+            for r in self.references:
+                aligned = self._align(view, r, prior, self._options, start=T_predicted)
+                yield self._hypothesis(aligned, view, r, "", predicted=True)
+        reason = "no prediction" if T_predicted is None else "the prediction did not fit"
+        for r in self.references:
+            aligned, start = self._from_best_rotation(r)
+            yield self._hypothesis(
+                aligned, view, r, f"{reason}: aligned from {start}", predicted=False
+            )
+
+    def _generate_static(
+        self, hypothesis: Hypothesis, poses: list[Float64]
+    ) -> Iterator[Hypothesis]:
+        """Realign from poses (4, 4), without the objects that move if the camera is there."""
+        keyframe = hypothesis.keyframe
+        for T in poses:
+            moving = self._moving(T, keyframe, suspected=True)
+            if not moving.reliable or moving.fraction <= MIN_MOVING_FRACTION:
+                continue
+            static = self._without_moving(moving, T, hypothesis)
+            if self.state.objects.in_last_view:
+                yield static
+                continue
+            T_static = static.T_keyframe_camera
+            if self.state.relocalizer.confirms(self.view, keyframe, T_static) is not False:
+                yield static
+
+    def _moving(self, T: Float64, keyframe: Keyframe, *, suspected: bool) -> Moving:
+        """Segment the objects that move relative to a keyframe if the pose is T (4, 4)."""
+        return self.state.objects.compare(
+            self.view, T, keyframe.view, keyframe.T_component_camera, suspected=suspected
+        )
+
+    def _without_moving(self, moving: Moving, T: Float64, hypothesis: Hypothesis) -> Hypothesis:
+        """Realign a hypothesis from T (4, 4), without moving objects."""
+        k = hypothesis.keyframe
+        target = Target(moving.applied_to_reference(k.view), se3.inverse(k.T_component_camera))
+        view = moving.applied(self.view)
+        return self.realigned(T, view, Reference(k, target), predicted=hypothesis.predicted)
+
+    def _hypothesis(
+        self,
+        aligned: Aligned,
+        view: PreparedView,
+        reference: Reference,
+        note: str,
+        *,
+        predicted: bool,
+    ) -> Hypothesis:
+        fit = self.state.fit_statistics.assess(aligned)
+        return Hypothesis(aligned, view, reference, predicted, note, fit)
+
+    def _from_best_rotation(self, reference: Reference) -> tuple[Aligned, str]:
+        """Align from the last pose, or its rotation that fits best; and name the start."""
+        view = self.static_view
+        coarse = replace(self._options, levels=PATIENT[:1])
+        motions = _rotation_candidates(view)
+        unrotated, *rotated = [
+            self._align(view, reference, self.T_last @ motion, coarse) for motion in motions
+        ]
+        best = max(range(len(rotated)), key=lambda k: rotated[k].score)
+        rotates = rotated[best].score > _MIN_ROTATED_SCORE_RATIO * unrotated.score
+        best_aligned, name = (
+            (rotated[best], "a rotation") if rotates else (unrotated, "the last pose")
+        )
+        if rotates:
+            name += f" by {np.degrees(se3.angle(motions[1 + best])):.0f} degrees"
+        # Without a prediction, weakly constrained directions follow the data.
+        options = replace(self._options, levels=PATIENT, common_tilt=0.0, common_slope=0.0)
+        prior = best_aligned.T_world_source if rotates else self.T_last
+        start = best_aligned.T_world_source
+        return self._align(view, reference, prior, options, start=start), name
+
+    def _align(
+        self,
+        view: PreparedView,
+        reference: Reference,
+        T: Float64,
+        options: ProjectiveOptions,
+        *,
+        start: Float64 | None = None,
+    ) -> Aligned:
+        scale = self.state.fit_statistics.noise_scale
+        return align(view, [reference.target], T, options, start=start, usual_scale=scale)
+
+
+def _rotation_candidates(view: PreparedView) -> list[Float64]:
+    """Return motions (4, 4) to try: none, and rotations about the camera and the scene."""
+    centre = np.eye(4)
+    centre[2, 3] = view.depth
+    motions = [np.eye(4)]
+    for angle in np.radians([-12, -6, 6, 12]):
+        for axis in (3, 4):
+            twist = np.zeros(6)
+            twist[axis] = angle
+            rotation = se3.exp(twist)
+            motions += [rotation, centre @ rotation @ se3.inverse(centre)]
+    return motions

@@ -1,0 +1,231 @@
+"""Odometry with wide baselines: each view is registered to an earlier one, and verified."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.geometry import se3
+from tofuse.engine.tracking.base import Odometry, Step, Tracker
+from tofuse.engine.tracking.motion import FrameTime, MotionModel
+from tofuse.engine.tracking.sequential import SEED_STAGE
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import Frame
+from tofuse.engine.clouds.any_pair import AnyPair
+from tofuse.engine.alignment.base import PROBABLE, Link, Registration
+from tofuse.engine.search.pose_probability import CERTAIN
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.clouds.reduce import extent
+from tofuse.engine.search.search import SearchOptions
+
+# The prediction replaces the search once it has agreed with 2 of the last 3 searches.
+_MIN_CONFIRMED = 2
+# Poses that differ by less than this fraction of the extent are the same.
+_MAX_DIFFERENCE = 0.03
+
+
+@part("odometry", "pairwise")
+@dataclass(frozen=True)
+class Pairwise(Bounded, Odometry):
+    """Registers each view to the one before; where that is not accepted, to earlier ones.
+
+    Once the predicted motion has agreed with searches, it replaces them as long as the views agree
+    there; degenerate directions follow the motion. For unordered views, or wide baselines, each
+    pair is searched.
+
+    A view whose best pose is not accepted, but more probable than not, keeps it and is marked as
+    doubtful. Else it begins a component of its own; accepted registrations to views of other
+    components become links.
+
+    Attributes
+    ----------
+    registration
+        Registers one pair, and states whether the pose is accepted.
+    references
+        Maximum number of earlier views that a view is registered to, the last one first.
+    minimum_points
+        Points that a view must have.
+    probable
+        Minimum probability of a pose that is not accepted, but kept.
+    """
+
+    registration: AnyPair = field(default_factory=AnyPair)
+    references: Annotated[int, Bounds(1)] = 6
+    minimum_points: Annotated[int, Bounds(1)] = 10
+    probable: Annotated[float, Bounds(0, 1)] = PROBABLE
+
+    @property
+    def takes(self) -> frozenset[str]:
+        """Kinds of view it works on: those of the registration."""
+        return self.registration.takes
+
+    def start(self, seed: int, search: SearchOptions | None = None) -> Tracker:
+        """See `Odometry.start`."""
+        return _PairwiseTracker(self, seed)
+
+
+@dataclass(frozen=True, eq=False)
+class _PosedView:
+    """A view with a pose."""
+
+    frame: Frame
+    T_component_view: Float64
+    component: int
+
+
+class _PairwiseTracker(Tracker):
+    def __init__(self, options: Pairwise, seed: int) -> None:
+        self._options = options
+        self._seed = seed
+        self._posed: deque[_PosedView] = deque(maxlen=options.references)
+        self._component = -1
+        self._connected = True  # whether links join the component to an earlier one
+        self._motion = MotionModel()
+        self._degenerate = False  # whether some direction of the last motion was degenerate
+        self._local_registration = replace(options.registration, search=False)
+        # Whether predicted poses of the last views agreed with searches.
+        self._motion_confirmed: deque[bool] = deque(maxlen=_MIN_CONFIRMED + 1)
+
+    def interrupt(self) -> None:
+        """See `Tracker.interrupt`."""
+        self._motion.interrupt()
+        self._motion_confirmed.clear()
+
+    def push(
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
+    ) -> Step:
+        """See `Tracker.push`; raises nothing for frames without points."""
+        min_points = self._options.minimum_points
+        if len(frame) < min_points:
+            self._motion.interrupt()
+            return Step("lost", f"{len(frame)} valid points, {min_points} are needed", None)
+        references = [p for p in reversed(self._posed) if p.component == self._component]
+        local = self._by_prediction(frame, references[0]) if references else None
+        confirmed = sum(self._motion_confirmed) >= _MIN_CONFIRMED
+        if confirmed and local is not None and local.needs_no_search:
+            return self._continue_component(frame, local)
+        doubtful: list[_Registered] = []
+        for reference in references:
+            registered = self._by_search(frame, reference)
+            if registered is not None and registered.accepted:
+                if reference is references[0]:
+                    self._motion_confirmed.append(
+                        local is not None and local.agrees(registered, frame.points)
+                    )
+                return self._continue_component(frame, registered)
+            if registered is not None:
+                doubtful.append(registered)
+        links = self._links(frame)
+        # The latest views overlap most with this one.
+        probable = [r for r in doubtful if r.probability >= self._options.probable]
+        if probable and not links:
+            return self._continue_component(frame, probable[0])
+        return self._begin_component(frame, links, doubtful[0] if doubtful else None)
+
+    def _by_prediction(self, frame: Frame, last: _PosedView) -> _Registered | None:
+        """Register to the last view from the predicted pose.
+
+        Along a direction that is degenerate for many views, the noise of single motions would
+        accumulate.
+        """
+        now = _moment(frame)
+        T = (
+            self._motion.smoothed_pose(now)
+            if self._degenerate
+            else self._motion.predicted_pose(now)
+        )
+        guess = np.eye(4) if T is None else se3.inverse(last.T_component_view) @ T
+        return self._registered(frame, last, guess, self._local_registration)
+
+    def _by_search(self, frame: Frame, reference: _PosedView) -> _Registered | None:
+        """Register to an earlier view by a global search."""
+        return self._registered(frame, reference, None, self._options.registration)
+
+    def _registered(
+        self, frame: Frame, reference: _PosedView, guess: Float64 | None, method: AnyPair
+    ) -> _Registered | None:
+        rng = np.random.default_rng([self._seed, SEED_STAGE, frame.index, reference.frame.index])
+        try:
+            return _Registered(reference, method.register(frame, reference.frame, guess, rng))
+        except RegistrationError:
+            return None
+
+    def _continue_component(self, frame: Frame, registered: _Registered) -> Step:
+        """Take the pose of a registration to a view of the present component."""
+        reference, registration = registered.reference, registered.registration
+        T = se3.orthonormalise(reference.T_component_view @ registration.T_target_source)
+        self._motion.update(T, _moment(frame))
+        self._degenerate = len(registration.unobservable) > 0
+        links = () if self._connected else self._links(frame)
+        self._connected |= bool(links)
+        self._posed.append(_PosedView(frame, T, self._component))
+        return Step(
+            "tracked",
+            "" if registered.accepted else registration.reason,
+            T,
+            reference.frame.index,
+            registration,
+            component=self._component,
+            links=links,
+            doubtful=not registered.accepted,
+        )
+
+    def _begin_component(
+        self, frame: Frame, links: tuple[Link, ...], rejected: _Registered | None
+    ) -> Step:
+        self._component += 1
+        self._connected = self._component == 0 or bool(links)
+        self._motion.interrupt()
+        self._motion.update(np.eye(4), _moment(frame))
+        self._posed.append(_PosedView(frame, np.eye(4), self._component))
+        reason = "" if rejected is None else f"not connected: {rejected.registration.reason}"
+        return Step("tracked", reason, np.eye(4), component=self._component, links=links)
+
+    def _links(self, frame: Frame) -> tuple[Link, ...]:
+        """Return the registration to the last view of another component, if it is accepted."""
+        others = [p for p in self._posed if p.component != self._component]
+        registered = self._by_search(frame, others[-1]) if others else None
+        return (registered.link(frame),) if registered is not None and registered.accepted else ()
+
+
+def _moment(frame: Frame) -> FrameTime:
+    return FrameTime(frame.index, frame.timestamp)
+
+
+@dataclass(frozen=True, eq=False)
+class _Registered:
+    """A registration to an earlier view."""
+
+    reference: _PosedView
+    registration: Registration
+
+    @property
+    def accepted(self) -> bool:
+        return bool(self.registration.believed)
+
+    @property
+    def needs_no_search(self) -> bool:
+        """Whether a pose is accepted and certain or degenerate, so that no search is needed."""
+        certain = self.probability >= CERTAIN or len(self.registration.unobservable) > 0
+        return self.accepted and certain
+
+    def agrees(self, other: _Registered, points: Float32) -> bool:
+        """Whether both map points (n, 3) to the same place, relative to their extent."""
+        T, T_other = (r.registration.T_target_source for r in (self, other))
+        difference = se3.transform(T, points) - se3.transform(T_other, points)
+        rms = np.sqrt((difference**2).sum(1).mean())
+        return bool(rms <= _MAX_DIFFERENCE * extent(points))
+
+    @property
+    def probability(self) -> float:
+        return self.registration.probability or 0.0
+
+    def link(self, frame: Frame) -> Link:
+        r = self.registration
+        return Link(self.reference.frame.index, frame.index, r, self.accepted, r.how)

@@ -1,0 +1,151 @@
+"""Uncertainty of the motion prediction, which alone constrains degenerate directions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.geometry import se3
+from tofuse.engine.alignment.projective import UNITS, span
+
+# Constrained dimensions that an rms needs; with fewer, sigma is a fraction of the typical motion.
+_MIN_CONSTRAINED = 30.0
+_MOTION_FRACTION = 0.5
+# Smallest sigma of a prediction, in units of 1 cm and 1 degree.
+_MIN_SIGMA = 0.1
+# Directions of several frames are distinct above this fraction of the largest singular value.
+_DISTINCT = 0.3
+# Number of frames over which the growth of the error is estimated, and the candidates of its power:
+# from that of independent steps to that of a velocity that follows a random walk. The error of a
+# smooth motion grows faster over some frames, but its velocity stays bounded.
+_AHEAD = 8
+_POWERS = np.linspace(0.0, 2.0, 41)
+# If it can't be estimated from the recording.
+_DEFAULT_POWER = 2.0
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Error model of the constant-velocity prediction in a recording.
+
+    Along a direction that is degenerate for n frames the camera is extrapolated. The variance of
+    the position grows as the sum of k^power over the frames k = 1 to n: a power of 0 is that of
+    independent steps, about 1 that of a constant velocity error, and 2 that of a velocity that
+    follows a random walk.
+
+    Attributes
+    ----------
+    sigma
+        Rms error of one prediction along each axis: m and rad.
+    power
+        Power of the growth, of translation and of rotation.
+    """
+
+    sigma: tuple[float, float]
+    power: tuple[float, float] = (_DEFAULT_POWER, _DEFAULT_POWER)
+
+    @classmethod
+    def of(cls, poses: Float64, unobservable: Sequence[Float64]) -> Prediction:
+        """Estimate it from the constrained motions of a recording.
+
+        If too few directions were constrained, sigma is half of the typical motion.
+
+        Parameters
+        ----------
+        poses
+            (N, 4, 4) T_world_camera of consecutive frames.
+        unobservable
+            (k, 6) degenerate directions of each frame, m and rad.
+        """
+        if len(poses) < 3:
+            return cls((0.1, 0.1))
+        motions = se3.inverse(poses[:-1]) @ poses[1:]
+        typical = np.sqrt((se3.log(motions) / UNITS).reshape(-1, 2, 3) ** 2).mean((0, 2))
+        rms, enough = _errors(poses, motions, unobservable, 1)
+        sigma = np.maximum(np.where(enough, rms, _MOTION_FRACTION * typical), _MIN_SIGMA)
+        power = (_DEFAULT_POWER, _DEFAULT_POWER)
+        if len(poses) > _AHEAD + 1:
+            rms_ahead, enough_ahead = _errors(poses, motions, unobservable, _AHEAD)
+            ratio = np.divide(rms_ahead, rms, out=np.ones(2), where=rms > 0)
+            k = np.arange(1, _AHEAD + 1)[:, None]
+            exponent = np.interp(ratio**2, (k**_POWERS).sum(0), _POWERS)
+            exponent = np.where(enough & enough_ahead & (rms > 0), exponent, _DEFAULT_POWER)
+            power = (float(exponent[0]), float(exponent[1]))
+        return cls((float(sigma[0] * UNITS[0]), float(sigma[1] * UNITS[3])), power)
+
+    def with_max_growth(self) -> Prediction:
+        """Return the model whose velocity error follows a random walk."""
+        return replace(self, power=(_DEFAULT_POWER, _DEFAULT_POWER))
+
+    def error(self, run: int, frames: int) -> tuple[float, float]:
+        """Return sigma of a motion along a degenerate axis, m and rad.
+
+        Parameters
+        ----------
+        run
+            Number of consecutive frames, up to the last of the motion, in which some direction was
+            degenerate.
+        frames
+            Number of frames that the motion spans.
+        """
+        first = max(run - frames, 0)
+        k = np.arange(first + 1, max(run, first + frames) + 1, dtype=float)
+        (a, b), (p, q) = self.sigma, self.power
+        return float(a * np.sqrt((k**p).sum())), float(b * np.sqrt((k**q).sum()))
+
+
+def _errors(
+    poses: Float64, motions: Float64, unobservable: Sequence[Float64], ahead: int
+) -> tuple[Float64, Bool]:
+    """Return rms errors of the extrapolation by `ahead` frames, of translation and rotation; (2,).
+
+    In `UNITS`, over constrained directions; and whether there were enough of them, (2,).
+    """
+    last = len(poses) - ahead
+    extrapolated = np.linalg.matrix_power(motions[: last - 1], ahead)
+    errors = se3.log(se3.inverse(poses[1:last] @ extrapolated) @ poses[1 + ahead :]) / UNITS
+    squares, dimensions = np.zeros(2), np.zeros(2)
+    for i, error in enumerate(errors, 1):
+        projector = np.eye(6)
+        degenerate = np.concatenate([np.zeros((0, 6)), *unobservable[i : i + ahead + 1]])
+        if len(degenerate):
+            basis = span(degenerate, _DISTINCT)
+            projector -= basis @ basis.T
+        constrained = projector @ error
+        t, r = constrained[:3], constrained[3:]
+        squares += [t @ t, r @ r]
+        dimensions += [np.trace(projector[:3, :3]), np.trace(projector[3:, 3:])]
+    return np.sqrt(squares / np.maximum(dimensions, 1)), dimensions >= _MIN_CONSTRAINED
+
+
+def degenerate_runs(unobservable: Sequence[Float64]) -> Intp:
+    """Return for how many consecutive frames, up to each, some direction was degenerate; (N,)."""
+    weak = np.array([len(u) > 0 for u in unobservable], np.intp)
+    count = np.cumsum(weak)
+    last_constrained = np.maximum.accumulate(np.where(weak == 0, count, 0))
+    return np.asarray(count - last_constrained, np.intp)
+
+
+def with_prediction(
+    information: Float64, unobservable: Float64, sigma: tuple[float, float]
+) -> Float64:
+    """Add the information of the prediction in degenerate directions to that of a registration.
+
+    Parameters
+    ----------
+    information
+        (6, 6) of the registration.
+    unobservable
+        (k, 6) degenerate unit directions, m and rad.
+    sigma
+        Of the prediction, m and rad.
+    """
+    if not len(unobservable):
+        return information
+    basis, _ = np.linalg.qr((unobservable / UNITS).T)
+    variance = (np.repeat(sigma, 3) / UNITS) ** 2
+    prior_information = basis @ np.linalg.inv(basis.T @ (variance[:, None] * basis)) @ basis.T
+    return np.asarray(information + prior_information / np.outer(UNITS, UNITS), np.float64)

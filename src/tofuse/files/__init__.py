@@ -1,1 +1,0 @@
-"""File formats: geometry, trajectories, images and tables; atomic writes."""

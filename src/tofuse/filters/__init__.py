@@ -1,1 +1,0 @@
-"""Filters: each computes a mask of the points of a view to keep (section 2.8)."""

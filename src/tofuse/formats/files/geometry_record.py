@@ -1,0 +1,108 @@
+"""The common content of the file formats of meshes and point clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.engine.arrays import Float32, Int32, UInt8
+from tofuse.engine.errors import InputError
+
+_AMPLITUDES = (
+    "amplitude",
+    "intensity",
+    "i",
+    "scalar_amplitude",
+    "scalar_intensity",
+    "scalar_Intensity",
+)
+
+
+def stacked(columns: dict[str, NDArray[Any]], names: Sequence[str]) -> NDArray[np.floating]:
+    """Remove named columns (N,), and return them as (N, C) float32 or float64."""
+    removed = [columns.pop(name) for name in names]
+    dtype = np.result_type(np.float32, *(column.dtype for column in removed))
+    with np.errstate(invalid="ignore"):  # damaged data can contain signalling NaNs
+        return np.stack(removed, -1).astype(dtype, copy=False)
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryRecord:
+    """A mesh or a point cloud as files store it. Each format stores the fields that it supports.
+
+    Attributes
+    ----------
+    points
+        (N, 3) in m, float32 or float64.
+    faces
+        (M, 3) int32 vertex indices, counter-clockwise from outside; None for a cloud.
+    normals
+        (N, 3) unit normals.
+    color
+        (N, 3) uint8 sRGB.
+    uv
+        (N, 2) texture coordinates, 0 to 1, from the upper left corner of the texture.
+    texture
+        Content of a PNG or JPEG file.
+    scalars
+        Further columns by name, (N,); (N, C) where a PCD field has several values.
+    comments
+        Comment lines of a PLY header.
+    """
+
+    points: NDArray[np.floating]
+    faces: Int32 | None = None
+    normals: NDArray[np.floating] | None = None
+    color: UInt8 | None = None
+    uv: NDArray[np.floating] | None = None
+    texture: bytes | None = None
+    scalars: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    comments: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def amplitude(self) -> Float32 | None:
+        """(N,) float32: the scalar that is named like an amplitude or intensity, or None."""
+        for name in _AMPLITUDES:
+            if name in self.scalars and self.scalars[name].ndim == 1:
+                return self.scalars[name].astype(np.float32)
+        return None
+
+    def check(self, path: str | Path) -> None:
+        """Check that all columns belong to the same points, and the faces to them.
+
+        Raises
+        ------
+        InputError
+            If they do not; it names `path`.
+        """
+        n = len(self.points)
+        columns = {"normals": (self.normals, 3), "color": (self.color, 3), "uv": (self.uv, 2)}
+        shapes: list[tuple[str, NDArray[Any], tuple[int, ...]]] = [("points", self.points, (n, 3))]
+        shapes += [
+            (k, values, (n, width)) for k, (values, width) in columns.items() if values is not None
+        ]
+        shapes += [(name, values, (n,)) for name, values in self.scalars.items()]
+        for name, values, shape in shapes:
+            if np.shape(values) != shape:
+                raise InputError(
+                    f"{name} of shape {np.shape(values)} for {n} points",
+                    where=path,
+                    remedy=f"pass an array of shape {shape}",
+                )
+        faces = self.faces
+        if faces is None:
+            return
+        if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and faces.max() >= n):
+            raise InputError(
+                f"faces of shape {faces.shape} don't fit {n} points",
+                where=path,
+                remedy="pass (M, 3) vertex indices",
+            )

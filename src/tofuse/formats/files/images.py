@@ -1,0 +1,333 @@
+"""PNG, JPEG and raw images, checked before they are decoded.
+
+OpenCV fills the missing part of a truncated file with zeros or grey, reports it at most on stderr,
+and allocates any size that a header declares. So the structure of a file is checked first.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.engine.arrays import UInt8
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.atomic import write_bytes
+from tofuse.formats.files.reading import read_bytes, read_head
+
+MAX_PIXELS = 1 << 26  # 8192 x 8192: far beyond any depth camera, and 400 MB of colour
+MAX_IMAGE_BYTES = 1 << 29
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
+_NOT_SOF = {0xC4, 0xC8, 0xCC}
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """The size and type of an image, as its header declares them."""
+
+    format: str
+    width: int
+    height: int
+    channels: int
+    bits: int
+
+    def __str__(self) -> str:
+        return f"{self.width} x {self.height}, {self.channels} x {self.bits} bits"
+
+
+def read_header(path: str | Path) -> ImageHeader:
+    """Read size and type of a PNG or JPEG without decoding it.
+
+    Raises
+    ------
+    InputError
+        If it is neither, is cut off within its header, or declares an absurd size.
+    """
+    head = read_head(path, 64)
+    return _header(head if head.startswith(_PNG) else read_bytes(path, limit=MAX_IMAGE_BYTES), path)
+
+
+def _header(data: bytes, path: str | Path) -> ImageHeader:
+    if data.startswith(_PNG):
+        header = _png_header(data, path)
+    elif data.startswith(b"\xff\xd8"):
+        header = _jpeg_header(data, path)
+    else:
+        problem = "is empty" if not data else "is neither a PNG nor a JPEG image"
+        raise InputError(problem, where=path, remedy="check the file")
+    check_pixels(header.width, header.height, path)
+    return header
+
+
+def check_pixels(width: int, height: int, path: str | Path) -> None:
+    """Raise InputError, naming `path`, unless an image may have this size."""
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+        raise InputError(
+            f"declares {width} x {height} pixels",
+            where=path,
+            remedy=f"use an image of 1 to {MAX_PIXELS} pixels",
+        )
+
+
+def check_camera_size(
+    width: int, height: int, size: tuple[int, int] | None, path: str | Path
+) -> None:
+    """Raise InputError, naming `path`, unless an image has the size of its camera, if known."""
+    if size is not None and (width, height) != size:
+        raise InputError(
+            f"is {width} x {height} pixels, the camera {size[0]} x {size[1]}",
+            where=path,
+            remedy="use the camera description of these images",
+        )
+
+
+def _png_header(data: bytes, path: str | Path) -> ImageHeader:
+    if len(data) < 33 or data[12:16] != b"IHDR":
+        raise InputError("is cut off within its header", where=path, remedy="copy the file again")
+    width, height, bits, color = struct.unpack(">IIBB", data[16:26])
+    if color not in _PNG_CHANNELS:
+        raise InputError("is a damaged PNG (no such colour type)", where=path)
+    return ImageHeader("png", width, height, _PNG_CHANNELS[color], bits)
+
+
+def _jpeg_header(data: bytes, path: str | Path) -> ImageHeader:
+    offset = 2
+    while offset + 9 < len(data):
+        if data[offset] != 0xFF:
+            break
+        marker = data[offset + 1]
+        if marker == 0xFF:
+            offset += 1
+            continue
+        (length,) = struct.unpack(">H", data[offset + 2 : offset + 4])
+        if 0xC0 <= marker <= 0xCF and marker not in _NOT_SOF:
+            bits, height, width, channels = struct.unpack(">BHHB", data[offset + 4 : offset + 10])
+            return ImageHeader("jpeg", width, height, channels, bits)
+        offset += 2 + length
+    raise InputError("is a damaged or cut off JPEG", where=path, remedy="copy the file again")
+
+
+def _check_complete(data: bytes, path: str | Path) -> None:
+    """Raise InputError unless a PNG has all its chunks, each with its checksum."""
+    view = memoryview(data)
+    offset = len(_PNG)
+    while offset + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, offset)
+        end = offset + 12 + length
+        if end > len(data):
+            break
+        (checksum,) = struct.unpack_from(">I", data, end - 4)
+        if zlib.crc32(view[offset + 4 : end - 4]) != checksum:
+            raise InputError("is damaged (wrong checksum of a PNG chunk)", where=path)
+        if data[offset + 4 : offset + 8] == b"IEND":
+            return
+        offset = end
+    raise InputError("is cut off before its end", where=path, remedy="copy the file again")
+
+
+def check_first_size(files: Sequence[Path], size: tuple[int, int], where: str, remedy: str) -> None:
+    """Compare the size of the first readable image with (width, height), stated by `where`.
+
+    Raises
+    ------
+    InputError
+        If they differ. Errors of a file are raised when it is read.
+    """
+    for path in files[:5]:
+        try:
+            header = read_header(path)
+        except InputError:
+            continue
+        if (header.width, header.height) != size:
+            raise InputError(
+                f"is {header.width} x {header.height} pixels, {where} {size[0]} x {size[1]}",
+                where=path,
+                remedy=remedy,
+            )
+        return
+
+
+def first_size(files: Sequence[Path]) -> tuple[int, int]:
+    """Return (width, height) of the first image with a readable header."""
+    first_error: InputError | None = None
+    for path in files:
+        try:
+            header = read_header(path)
+        except InputError as error:
+            first_error = first_error or error
+            continue
+        return header.width, header.height
+    raise first_error or InputError("has no images", where="depth", remedy="check the recording")
+
+
+def read_image(
+    path: str | Path, *, size: tuple[int, int] | None = None, dtype: str | None = None
+) -> NDArray[Any]:
+    """Read a PNG or JPEG as it is stored: (H, W) grey, or (H, W, 3) RGB; uint8 or uint16.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size
+        Expected (width, height).
+    dtype
+        Expected type of its single channel, "uint8" or "uint16" (depth, amplitude, confidence).
+
+    Raises
+    ------
+    InputError
+        If it can't be read, is cut off or damaged, or isn't of that size and type.
+    """
+    return parse_image(read_bytes(path, limit=MAX_IMAGE_BYTES), path, size=size, dtype=dtype)
+
+
+def parse_image(
+    data: bytes,
+    path: str | Path,
+    *,
+    size: tuple[int, int] | None = None,
+    dtype: str | None = None,
+) -> NDArray[Any]:
+    """Decode a PNG or JPEG in memory; `path` names it in errors. See `read_image`."""
+    header = _header(data, path)
+    check_camera_size(header.width, header.height, size, path)
+    if dtype is not None and (header.channels != 1 or f"uint{header.bits}" != dtype):
+        raise InputError(
+            f"has {header.channels} channels of {header.bits} bits",
+            where=path,
+            remedy=f"store one channel of {dtype}",
+        )
+    if header.format == "png":
+        _check_complete(data, path)
+    elif data.rfind(b"\xff\xd9") < 0:
+        raise InputError("is cut off before its end", where=path, remedy="copy the file again")
+    return _decode(data, header, path)
+
+
+def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
+    import cv2
+
+    grey = header.channels < 3
+    # The EXIF orientation of a phone would rotate the image relative to its depth.
+    flags = cv2.IMREAD_IGNORE_ORIENTATION | (
+        cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+        if grey
+        else cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+    )
+    image = decoded(data, flags, (header.height, header.width), path)
+    return image if grey else np.ascontiguousarray(image[..., ::-1])
+
+
+def decoded(data: bytes, flags: int, shape: tuple[int, int], path: str | Path) -> NDArray[Any]:
+    """Decode an image by OpenCV with its `flags`.
+
+    Raises
+    ------
+    InputError
+        Naming `path`, if that fails, or the image has another (height, width).
+    """
+    import cv2
+
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        image = None
+    if image is None or image.shape[:2] != shape:
+        raise InputError("can't be decoded", where=path, remedy="copy the file again")
+    return image
+
+
+def read_color(path: str | Path) -> UInt8:
+    """Read a PNG or JPEG as (H, W, 3) uint8 RGB; grey is replicated, 16 bits are reduced to 8."""
+    return as_color(read_image(path))
+
+
+def as_color(image: NDArray[Any]) -> UInt8:
+    """Return an image of `read_image` as (H, W, 3) uint8 RGB."""
+    if image.dtype == np.uint16:
+        image = (image.astype(np.uint16) >> 8).astype(np.uint8)
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, axis=2)
+    return image.astype(np.uint8, copy=False)
+
+
+def read_raw(path: str | Path, dtype: str, size: tuple[int, int], remedy: str) -> NDArray[Any]:
+    """Read a file that consists of the pixels of one image, (H, W, ...).
+
+    Parameters
+    ----------
+    path
+        The file.
+    dtype
+        NumPy's name of the type of a pixel; "3<f4" are three channels of float32.
+    size
+        (width, height).
+    remedy
+        The remedy if the file has another size.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, or has another size.
+    """
+    data = read_bytes(path, limit=MAX_IMAGE_BYTES)
+    pixel, (width, height) = np.dtype(dtype), size
+    if len(data) != pixel.itemsize * width * height:
+        raise InputError(
+            f"has {len(data)} bytes, not {pixel.itemsize} for each of {width} x {height} pixels",
+            where=path,
+            remedy=remedy,
+        )
+    return np.frombuffer(data, pixel).reshape(height, width, *pixel.shape)
+
+
+def png_bytes(image: NDArray[np.generic]) -> bytes:
+    """Encode (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB, as PNG."""
+    import cv2
+
+    image = np.asarray(image)
+    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
+        raise InputError(
+            f"is an array of shape {image.shape} and type {image.dtype}",
+            where="image",
+            remedy="pass (H, W) uint8 or uint16, or (H, W, 3) uint8",
+        )
+    if image.ndim == 3:
+        image = np.ascontiguousarray(image[..., ::-1])
+    pixels: NDArray[Any] = image
+    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not ok:
+        raise InputError(f"of shape {image.shape} can't be encoded as PNG", where="image")
+    return bytes(data)
+
+
+def jpeg_bytes(image: UInt8, quality: int = 92) -> bytes:
+    """Encode (H, W, 3) uint8 RGB as JPEG."""
+    import cv2
+
+    pixels: NDArray[Any] = np.ascontiguousarray(np.asarray(image, np.uint8)[..., ::-1])
+    ok, data = cv2.imencode(
+        ".jpg",
+        pixels,
+        [
+            *(cv2.IMWRITE_JPEG_QUALITY, quality),
+            *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+        ],
+    )
+    if not ok:
+        raise InputError(f"of shape {image.shape} can't be encoded as JPEG", where="image")
+    return bytes(data)
+
+
+def write_png(path: str | Path, image: NDArray[np.generic]) -> None:
+    """Write (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB; see `replacing` for errors."""
+    write_bytes(path, png_bytes(image))

@@ -1,0 +1,266 @@
+"""Reading external files and folders."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import os
+import re
+import struct
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tofuse.engine.errors import InputError
+
+MAX_TEXT_BYTES = 256 << 20
+MAX_BYTES = 4 << 30
+_MAX_DOTS = 1000  # on a line of TOML
+# Errors that malformed data cause in code that parses it.
+_MALFORMED = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    RecursionError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
+
+_REASONS = {
+    errno.ENOENT: ("doesn't exist", "check the path"),
+    errno.EACCES: ("may not be read (permission denied)", "change its permissions"),
+    errno.EPERM: ("may not be read (permission denied)", "change its permissions"),
+    errno.ELOOP: ("is a link that leads back to itself", "replace the link"),
+    errno.EISDIR: ("is a folder", "pass a file"),
+    errno.ENOTDIR: ("is inside something that is not a folder", "check the path"),
+    errno.ENAMETOOLONG: ("has too long a name", "check the path"),
+}
+
+
+def input_error(error: OSError, path: str | Path) -> InputError:
+    """Return the error that `path` can't be read, with reason and remedy."""
+    problem, remedy = _REASONS.get(
+        error.errno or 0, (f"can't be read ({error.strerror or error})", "check the file")
+    )
+    return InputError(problem, where=path, remedy=remedy)
+
+
+def path_of(value: object, name: str, remedy: str) -> Path:
+    """Return an argument of the user as a path.
+
+    Parameters
+    ----------
+    value
+        The argument.
+    name
+        Its name.
+    remedy
+        What to pass instead.
+
+    Raises
+    ------
+    InputError
+        If it is no path.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(f"is a {type(value).__name__}, not a path", where=name, remedy=remedy)
+    return Path(value)
+
+
+def required_package(name: str, extra: str | None, where: str | Path) -> Any:
+    """Import a package that only some functions need.
+
+    Parameters
+    ----------
+    name
+        The package.
+    extra
+        The extra of tofuse that installs it; None if there is none.
+    where
+        What needs it, for the error.
+
+    Raises
+    ------
+    InputError
+        With the command that installs it.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        remedy = f"pip install {name}" if extra is None else f"pip install 'tofuse[{extra}]'"
+        raise InputError(f"needs the package {name}", where=where, remedy=remedy) from error
+
+
+def read_bytes(path: str | Path, *, limit: int = MAX_BYTES) -> bytes:
+    """Return the content of a file of at most `limit` bytes.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, is not a regular file, or is larger.
+    """
+    path = Path(path)
+    try:
+        if path.exists() and not path.is_file():
+            kind = "a folder" if path.is_dir() else "not a regular file"
+            raise InputError(f"is {kind}", where=path, remedy="pass a file")
+        size = path.stat().st_size
+        if size > limit:
+            raise InputError(
+                f"has {size >> 20} MiB, more than the limit of {limit >> 20} MiB",
+                where=path,
+                remedy="check that it is the file you meant",
+            )
+        return path.read_bytes()
+    except OSError as error:
+        raise input_error(error, path) from error
+    except ValueError as error:  # a NUL in the name
+        raise InputError(f"is not a path ({error})", where=repr(str(path))) from error
+
+
+def read_head(path: str | Path, size: int) -> bytes:
+    """Return the first `size` bytes of a file, fewer if it is shorter; errors as `read_bytes`."""
+    path = Path(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError("is not a regular file", where=path, remedy="pass a file")
+        with path.open("rb") as file:
+            return file.read(size)
+    except OSError as error:
+        raise input_error(error, path) from error
+
+
+@contextmanager
+def damage_reported(path: str | Path, kind: str) -> Iterator[None]:
+    """Turn errors of a block that parses a file written by tofuse into InputError.
+
+    Parameters
+    ----------
+    path
+        The file.
+    kind
+        Kind of file, for the message, such as "a run.json".
+    """
+    try:
+        yield
+    except _MALFORMED as error:
+        raise InputError(
+            f"is damaged, or not {kind} written by tofuse ({type(error).__name__}: {error})",
+            where=path,
+            remedy="copy the whole folder again, or create it again",
+        ) from error
+
+
+def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, format_name: str) -> Any:
+    """Parse external JSON or TOML.
+
+    Parameters
+    ----------
+    parse
+        Function from text to data, such as `json.loads`.
+    text
+        The text.
+    where
+        Its source, for errors.
+    format_name
+        Its format, for errors.
+
+    Raises
+    ------
+    InputError
+        If it is invalid or too deeply nested.
+    """
+    try:
+        return parse(text)
+    except RecursionError as error:
+        raise InputError(f"is not {format_name} (nested too deeply)", where=where) from error
+    except ValueError as error:
+        raise InputError(f"is not {format_name} ({error})", where=where) from error
+
+
+def parse_toml(text: str, *, where: str | Path) -> dict[str, Any]:
+    """Return the data of an external TOML text; errors as `parsed`.
+
+    The time of tomllib for a dotted key grows with the square of the number of its parts.
+    """
+    if any(line.count(".") > _MAX_DOTS for line in text.split("\n")):
+        raise InputError("is not TOML (nested too deeply)", where=where)
+    data: dict[str, Any] = parsed(tomllib.loads, text, where=where, format_name="TOML")
+    return data
+
+
+def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES) -> str:
+    """Return the content of a UTF-8 file (a byte order mark is dropped); errors as `read_bytes`."""
+    try:
+        return read_bytes(path, limit=limit).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"is not text (byte {error.start} is not UTF-8)",
+            where=path,
+            remedy="check that it is the file you meant",
+        ) from error
+
+
+def name_order(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key by name, with runs of digits compared as numbers: frame9 before frame10."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [(0, int(p), p) if p[:1].isdecimal() else (1, 0, p) for p in parts]
+
+
+def list_folder(path: str | Path) -> list[Path]:
+    """Return the visible entries of a folder in name order, see `name_order`.
+
+    Raises
+    ------
+    InputError
+        If it can't be listed.
+    """
+    try:
+        return sorted(
+            (p for p in Path(path).iterdir() if not p.name.startswith(".")), key=name_order
+        )
+    except OSError as error:
+        raise input_error(error, path) from error
+
+
+def files_with(path: str | Path, *suffixes: str) -> list[Path]:
+    """Return the entries of a folder with one of the suffixes (any case), in name order.
+
+    Including non-files and dangling links: each stands for an unreadable frame, without which all
+    later ones would be assigned wrong times.
+    """
+    return [p for p in list_folder(path) if p.suffix.lower() in suffixes]
+
+
+def files_named(path: Path, matches: Callable[[str], object]) -> list[Path]:
+    """Return the files in a folder whose name `matches`; none if it is not a folder."""
+    if not is_folder(path):
+        return []
+    try:
+        return [p for p in list_folder(path) if matches(p.name) and is_file(p)]
+    except InputError:
+        return []
+
+
+def if_file(path: Path) -> Path | None:
+    """Return the path if it is an accessible file, else None."""
+    return path if is_file(path) else None
+
+
+def is_file(path: Path) -> bool:
+    """Whether `path` is an accessible file."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Whether `path` is an accessible folder."""
+    try:
+        return path.is_dir()
+    except OSError:
+        return False

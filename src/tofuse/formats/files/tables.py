@@ -1,0 +1,105 @@
+"""Tables of numbers in text files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.atomic import write_text
+from tofuse.formats.files.reading import read_text
+
+
+def parse_numbers(text: str, path: str | Path, *, skip: int = 0) -> Float64:
+    """Parse rows of numbers, (N, C).
+
+    Separators are blanks, commas and semicolons; '#' starts a comment.
+
+    Parameters
+    ----------
+    text
+        The text; empty lines are skipped.
+    path
+        Names the file in errors.
+    skip
+        Number of leading lines to skip.
+
+    Raises
+    ------
+    InputError
+        If a cell is not a number, or rows have different lengths.
+    """
+    text = text.replace(",", " ").replace(";", " ")
+    if "\0" in text:
+        raise InputError("is not text", where=path, remedy="check the file")
+    lines = text.splitlines()[skip:]
+    if "#" in text:
+        lines = [line.split("#", 1)[0] for line in lines]
+    lines = [line for line in lines if line.strip()]
+    if not lines:
+        return np.zeros((0, 0))
+    try:
+        return np.loadtxt(lines, ndmin=2)
+    except (ValueError, OverflowError) as error:
+        reason = str(error).split("; use", 1)[0].removesuffix(".")
+        raise InputError(
+            f"is not a table of numbers ({reason})", where=path, remedy="check the file"
+        ) from error
+
+
+def read_numbers(path: str | Path) -> Float64:
+    """Read a file of rows of numbers, (N, C); see `parse_numbers`."""
+    return parse_numbers(read_text(path), path)
+
+
+def read_columns(path: str | Path) -> dict[str, Float64]:
+    """Read a CSV file with a header line: (N,) numbers by column name.
+
+    Empty cells are NaN.
+
+    Raises
+    ------
+    InputError
+        If there is no header, a name is repeated, or a row has another length.
+    """
+    rows = [line.split(",") for line in read_text(path).splitlines() if line.strip()]
+    if not rows:
+        raise InputError("is empty", where=path, remedy="write a line of column names first")
+    names = [name.strip().lstrip("#").strip() for name in rows[0]]
+    if len(set(names)) != len(names) or "" in names:
+        raise InputError(
+            f"has the column names {names}", where=path, remedy="name each column once"
+        )
+    values = np.empty((len(rows) - 1, len(names)))
+    for k, row in enumerate(rows[1:]):
+        if len(row) != len(names):
+            raise InputError(
+                f"has {len(row)} cells in row {k + 1} and {len(names)} column names",
+                where=path,
+                remedy="add a cell for each column to each row",
+            )
+        try:
+            values[k] = [float(cell) if cell.strip() else np.nan for cell in row]
+        except ValueError as error:
+            raise InputError(f"row {k + 1}: {error}", where=path, remedy="use numbers") from error
+    return {name: values[:, k] for k, name in enumerate(names)}
+
+
+def write_columns(path: str | Path, columns: Mapping[str, NDArray[np.generic]]) -> None:
+    """Write (N,) columns as `read_columns` reads them, every number in full precision."""
+    names = list(columns)
+    arrays = [np.asarray(columns[name], float) for name in names]
+    if len({a.shape for a in arrays}) > 1 or any(a.ndim != 1 for a in arrays):
+        raise InputError("columns have different lengths", where=path)
+    lines = [",".join(names)]
+    lines += [",".join(exact(v) for v in row) for row in zip(*arrays, strict=True)]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def exact(value: float) -> str:
+    """Shortest text that reads back as the same float64; -0.0 is written 0.0."""
+    return repr(float(value) + 0.0)

@@ -1,0 +1,207 @@
+"""Trajectories in the TUM format: timestamp tx ty tz qx qy qz qw, one pose a line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.atomic import write_text
+from tofuse.formats.files.reading import read_text
+from tofuse.formats.files.tables import exact
+from tofuse.engine.geometry.quaternion import from_matrix, length, to_pose
+from tofuse.engine.geometry.se3 import MAX_COORDINATE_M
+
+ASSOCIATION_LIMIT_S = 0.02
+
+
+def read_tum(path: str | Path) -> tuple[Float64, Float64]:
+    """Read a trajectory.
+
+    Returns
+    -------
+    (N,) timestamps in s and (N, 4, 4) T_world_camera, in file order. Comments after '#' and empty
+    lines are skipped, and so are poses of NaN only; quaternions are normalised.
+
+    Raises
+    ------
+    InputError
+        Naming file and line, if a line isn't 8 numbers, or its pose can't be used.
+    """
+    rows: list[list[float]] = []
+    numbers: list[int] = []
+    for number, cells in rows_of(read_text(path)):
+        where = f"{path}, line {number}"
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError as error:
+            raise InputError(str(error), where=where, remedy=_TUM) from error
+        if len(row) != 8:
+            raise InputError(f"has {len(row)} numbers", where=where, remedy=_TUM)
+        if not np.isfinite(row[0]):
+            raise InputError("has a timestamp that is not finite", where=where, remedy=_TUM)
+        rows.append(row)
+        numbers.append(number)
+    table = np.array(rows, float).reshape(-1, 8)
+    poses = poses_of_rows(table[:, 4:], table[:, 1:4], path, numbers)
+    known = np.isfinite(poses[:, 0, 0])
+    return table[known, 0], poses[known]
+
+
+_TUM = "write 'timestamp tx ty tz qx qy qz qw'"
+
+
+def rows_of(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield number and cells of each line that is neither empty nor a comment ('#')."""
+    for number, line in enumerate(text.splitlines(), 1):
+        cells = line.split("#", 1)[0].replace(",", " ").split()
+        if cells:
+            yield number, cells
+
+
+def poses_of_rows(q_xyzw: Float64, t: Float64, path: str | Path, numbers: Sequence[int]) -> Float64:
+    """Return poses (N, 4, 4) of rows of a file; NaN for rows without any finite number.
+
+    Parameters
+    ----------
+    q_xyzw, t
+        (N, 4) quaternions and (N, 3) translations in m.
+    path, numbers
+        The file and the line of each row, for errors.
+
+    Raises
+    ------
+    InputError
+        If only some numbers of a row are finite, a quaternion is not of unit length, or a
+        coordinate is implausibly large.
+    """
+    finite = np.isfinite(np.column_stack([q_xyzw, t]))
+    unknown = ~finite.any(1)  # programs write NaN where tracking failed
+    for bad, problem, remedy in (
+        (
+            ~finite.all(1) & ~unknown,
+            "contains a number that is not finite",
+            "write NaN for the whole pose, or remove it",
+        ),
+        (
+            ~unknown & (np.abs(length(q_xyzw) - 1) > 0.1),
+            "contains a quaternion that is not of unit length",
+            "normalise it",
+        ),
+        (
+            ~unknown & (np.abs(t) > MAX_COORDINATE_M).any(1),
+            f"contains a coordinate beyond {MAX_COORDINATE_M:.0e} m",
+            "use metres, or remove the pose",
+        ),
+    ):
+        if bad.any():
+            line = numbers[int(np.argmax(bad))]
+            raise InputError(problem, where=f"{path}, line {line}", remedy=remedy)
+    poses = np.full((len(t), 4, 4), np.nan)
+    poses[~unknown] = to_pose(q_xyzw[~unknown], t[~unknown])
+    return poses
+
+
+def write_tum(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) -> None:
+    """Write (N,) timestamps in s and (N, 4, 4) T_world_camera; poses that are NaN are skipped.
+
+    Every number is the shortest text that reads back as the same float64.
+    """
+    write_text(path, tum_text(timestamps, poses))
+
+
+def tum_text(timestamps: ArrayLike, poses: ArrayLike) -> str:
+    """Return the text that `write_tum` writes."""
+    times = np.asarray(timestamps, float)
+    T = np.asarray(poses, float)
+    if T.shape != (len(times), 4, 4):
+        raise InputError(
+            f"{times.shape} timestamps and poses of shape {T.shape}",
+            where="trajectory",
+            remedy="pass (N,) and (N, 4, 4)",
+        )
+    finite = np.isfinite(T).all((1, 2))
+    times, T = times[finite], T[finite]
+    if not len(times):
+        return ""
+    table = np.column_stack([times, T[:, :3, 3], from_matrix(T[:, :3, :3])])
+    return "".join(" ".join(exact(v) for v in row) + "\n" for row in table)
+
+
+def write_kitti(path: str | Path, poses: ArrayLike) -> None:
+    """Write (N, 4, 4) T_world_camera in KITTI's odometry format: the upper 3 x 4, row by row.
+
+    The format has no timestamps and no gaps: poses that are NaN are skipped.
+    """
+    T = _finite_poses(poses)
+    rows = T[:, :3].reshape(-1, 12).tolist()
+    write_text(path, "".join(" ".join(exact(v) for v in row) + "\n" for row in rows))
+
+
+def write_log(path: str | Path, poses: ArrayLike, numbers: ArrayLike) -> None:
+    """Write (N, 4, 4) T_world_camera as an Open3D trajectory; poses that are NaN are skipped.
+
+    Parameters
+    ----------
+    numbers
+        (N,) frame numbers: each pose has a line `n n n+1` before its matrix.
+    """
+    finite = np.isfinite(np.asarray(poses, float)).all((1, 2))
+    lines = []
+    for n, T in zip(
+        np.asarray(numbers)[finite].tolist(), _finite_poses(poses).tolist(), strict=True
+    ):
+        lines += [f"{n} {n} {n + 1}", *(" ".join(exact(v) for v in row) for row in T)]
+    write_text(path, "".join(f"{line}\n" for line in lines))
+
+
+def _finite_poses(poses: ArrayLike) -> Float64:
+    T = np.asarray(poses, float)
+    return np.asarray(T[np.isfinite(T).all((1, 2))], np.float64)
+
+
+def associate(
+    timestamps: ArrayLike,
+    others: ArrayLike,
+    *,
+    limit: float = ASSOCIATION_LIMIT_S,
+    exclusive: bool = True,
+) -> Intp:
+    """Return for each of (N,) timestamps the index of the nearest of (M,) others, or -1.
+
+    Both are in s, in any order. Matches are within `limit` seconds (inclusive, plus a nanosecond);
+    if `exclusive`, each of the others is matched at most once, to the nearest timestamp.
+    """
+    times, others = np.asarray(timestamps, float), np.asarray(others, float)
+    index = np.full(len(times), -1, np.intp)
+    if not len(times) or not len(others):
+        return index
+    order = np.argsort(others, kind="stable")
+    ordered = others[order]
+    after = np.clip(np.searchsorted(ordered, times), 0, len(ordered) - 1)
+    before = np.maximum(after - 1, 0)
+    is_before = np.abs(ordered[before] - times) <= np.abs(ordered[after] - times)
+    best = np.where(is_before, before, after)
+    gap = np.abs(ordered[best] - times)
+    # In order of the gap, so that conflicts are won by the nearer one.
+    matched = np.zeros(len(ordered), bool)
+    for k in np.argsort(gap, kind="stable"):
+        if gap[k] <= limit + 1e-9 and not matched[best[k]]:
+            matched[best[k]] = exclusive
+            index[k] = order[best[k]]
+    return index
+
+
+def associated_poses(timestamps: ArrayLike, others: ArrayLike, poses: ArrayLike) -> Float64:
+    """Return poses (N, 4, 4) at timestamps (N,), matched to (M,) others with (M, 4, 4) poses.
+
+    Timestamps without a match have NaN; see `associate`.
+    """
+    index = associate(timestamps, others)
+    out = np.full((len(index), 4, 4), np.nan)
+    out[index >= 0] = np.asarray(poses, float)[index[index >= 0]]
+    return out

@@ -1,0 +1,233 @@
+"""Readers of clouds: PLY, PCD (organised ones become images), plain text, and slam6D scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.pcd import Pcd, read_pcd
+from tofuse.formats.files.reading import read_text
+from tofuse.formats.files.tables import parse_numbers, read_numbers
+from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.parts import part
+from tofuse.formats.recordings.cloud_sequence import CloudFileSource, required_files, sniff_clouds
+from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.formats.recordings.organised import SAMPLES, common_camera, find_raster, organised_frame
+from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.formats.recordings.sources import cloud_frame, ply_frame, poses_from_files, to_float32
+
+
+@part("reader", "ply", label="validated")
+class PlyClouds(Reader):
+    """A .ply file, or a folder of them; metres."""
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        return sniff_clouds(path, ".ply")
+
+    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
+        """See `Reader.open`."""
+        refuse_camera(options, "ply")
+        return CloudFileSource(path, required_files(path, ".ply"), ply_frame, ply_frame)
+
+
+@part("reader", "pcd", label="validated")
+class PcdClouds(Reader):
+    """A .pcd file, or a folder of them; metres."""
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        return sniff_clouds(path, ".pcd")
+
+    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
+        """See `Reader.open`."""
+        refuse_camera(options, "pcd")
+        files = required_files(path, ".pcd")
+        camera = _camera(files)
+        if camera is None:
+            return CloudFileSource(path, files, pcd_cloud, pcd_cloud)
+        source = CloudFileSource(
+            path, files, lambda file, index, time: pcd_image(file, index, time, camera)
+        )
+        source.metadata["depth_kind"] = "z"
+        return source
+
+
+def pcd_cloud(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
+    """Read a file as a cloud, minus `shift` (3,) in m; its viewpoint is the sensor's position."""
+    pcd = read_pcd(path)
+    cloud = pcd.cloud
+    return cloud_frame(
+        index,
+        timestamp,
+        cloud.points,
+        cloud.normals,
+        amplitude=cloud.amplitude,
+        color=cloud.color,
+        origin=pcd.viewpoint[:3],
+        shift=shift,
+    )
+
+
+def pcd_image(path: Path, index: int, timestamp: float, camera: Camera) -> Frame:
+    """Read an organised file as an image of `camera`; see `organised_frame`."""
+    pcd = read_pcd(path)
+    return organised_frame(
+        _image(pcd),
+        camera,
+        index,
+        timestamp,
+        path,
+        amplitude=pcd.cloud.amplitude,
+        color=pcd.cloud.color,
+        normals=pcd.cloud.normals,
+    )
+
+
+def _camera(files: list[Path]) -> Camera | None:
+    """Return the camera of organised files, from up to `SAMPLES` readable ones; or None."""
+    step = max(1, len(files) // SAMPLES)
+    images: list[Float32] = []
+    for file in files[::step][:SAMPLES]:
+        try:
+            pcd = read_pcd(file)
+        except InputError:
+            continue
+        if not pcd.organised or pcd.viewpoint[:3].any():
+            return None
+        images.append(_image(pcd))
+        points = images[-1].reshape(-1, 3)
+        if find_raster(points, pcd.width) is None and find_raster(points, pcd.height) is not None:
+            raise InputError(
+                f"has WIDTH {pcd.width} and HEIGHT {pcd.height}, but rows of {pcd.height} points",
+                where=file,
+                remedy="swap WIDTH and HEIGHT",
+            )
+    return common_camera(images)
+
+
+def _image(pcd: Pcd) -> Float32:
+    return to_float32(pcd.cloud.points).reshape(pcd.height, pcd.width, 3)
+
+
+_SUFFIXES = (".xyz", ".xyzn", ".xyzrgb")
+
+
+@part("reader", "xyz")
+class XyzClouds(Reader):
+    """A .xyz, .xyzn or .xyzrgb file, or a folder of them; metres.
+
+    The fourth column of four is an amplitude. Columns four to six are normals in .xyzn, and where
+    all have length 1; colours in .xyzrgb (0 to 1), and where all are integers up to 255. Other
+    columns are ignored.
+    """
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        return sniff_clouds(path, *_SUFFIXES)
+
+    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
+        """See `Reader.open`."""
+        refuse_camera(options, "xyz")
+        return CloudFileSource(path, required_files(path, *_SUFFIXES), xyz_frame, xyz_frame)
+
+
+def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
+    """Read one file; `shift` (3,) in m is subtracted from the coordinates."""
+    table = read_numbers(path)
+    if table.shape[1] < 3:
+        raise InputError(f"has {table.shape[1]} numbers per line", where=path, remedy="write x y z")
+    points = _float32(table[:, :3]) if shift is None else table[:, :3]
+    amplitude = normals = color = None
+    if table.shape[1] == 4:
+        amplitude = _float32(table[:, 3])
+    elif table.shape[1] >= 6:
+        columns = table[:, 3:6]
+        if path.suffix.lower() == ".xyzrgb":
+            color = np.clip(np.rint(np.nan_to_num(columns) * 255), 0, 255).astype(np.uint8)
+        elif path.suffix.lower() == ".xyzn" or _are_unit(columns):
+            normals = _float32(columns)
+        elif ((columns >= 0) & (columns <= 255) & (columns == np.rint(columns))).all():
+            color = columns.astype(np.uint8)
+    return cloud_frame(
+        index, timestamp, points, normals, amplitude=amplitude, color=color, shift=shift
+    )
+
+
+def _float32(values: Float64) -> Float32:
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
+
+
+def _are_unit(vectors: Float64) -> bool:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool((np.abs(np.sqrt((vectors**2).sum(1)) - 1) < 1e-3).all())
+
+
+# x right, y up, z forward, left-handed, cm; negating y gives the camera's convention.
+FLIP = np.diag([1.0, -1.0, 1.0])
+CENTIMETRE = 0.01
+
+
+@part("reader", "slam6d", label="validated")
+class Slam6d(Reader):
+    """A folder of scanNNN.3d with scanNNN.pose."""
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        return sniff_clouds(path, ".3d")
+
+    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
+        """See `Reader.open`."""
+        refuse_camera(options, "slam6d")
+        files = required_files(path, ".3d")
+        source = CloudFileSource(path, files, scan_frame)
+        poses = poses_from_files(source, [file.with_suffix(".pose") for file in files], read_pose)
+        if poses is not None:
+            source.odometry = poses
+            if source.reference is None:
+                source.reference = poses
+                source.warnings.append(
+                    "the .pose files are the robot's odometry: a reference, but not ground truth"
+                )
+        return source
+
+
+def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
+    """Read one scan: lines of x y z [reflectance ...], optionally after a line with their count."""
+    text = read_text(path)
+    first = text.split("\n", 1)[0].split()
+    table = parse_numbers(text, path, skip=int(len(first) == 1))
+    if table.shape[1] < 3:
+        raise InputError(f"has {table.shape[1]} numbers per line", where=path)
+    with np.errstate(over="ignore"):
+        points = (table[:, :3] * np.diag(FLIP) * CENTIMETRE).astype(np.float32)
+    # The scanner writes (0, 0, 0) for missing measurements.
+    points[(points == 0).all(1)] = np.nan
+    amplitude = table[:, 3].astype(np.float32) if table.shape[1] == 4 else None
+    return cloud_frame(index, timestamp, points, amplitude=amplitude)
+
+
+def read_pose(path: Path) -> Float64:
+    """Return T_world_scan (4, 4) of a .pose: cm and Euler angles in degrees, left-handed."""
+    numbers = read_numbers(path).ravel()
+    if len(numbers) != 6 or not np.isfinite(numbers).all():
+        raise InputError(
+            f"has {len(numbers)} numbers", where=path, remedy="write x y z and three angles"
+        )
+    (sx, sy, sz), (cx, cy, cz) = np.sin(np.radians(numbers[3:])), np.cos(np.radians(numbers[3:]))
+    # Rx Ry Rz, as EulerToMatrix4 of 3DTK.
+    R = np.array(
+        [
+            [cy * cz, -cy * sz, sy],
+            [sx * sy * cz + cx * sz, -sx * sy * sz + cx * cz, -sx * cy],
+            [-cx * sy * cz + sx * sz, cx * sy * sz + sx * cz, cx * cy],
+        ]
+    )
+    T = np.eye(4)
+    T[:3, :3] = FLIP @ R @ FLIP
+    T[:3, 3] = FLIP @ numbers[:3] * CENTIMETRE
+    return T

@@ -1,0 +1,84 @@
+"""Reader of Android's DEPTH16: 13 bits of depth and 3 of confidence (ARCore and others)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tofuse.formats.files.images import read_color, read_raw
+from tofuse.formats.files.reading import files_named, if_file, is_file
+from tofuse.engine.parts import part
+from tofuse.formats.recordings.camera_file import camera_file_of
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.phones import resized
+from tofuse.formats.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
+from tofuse.formats.recordings.sources import FileSource
+
+_SUFFIXES = ("_depth16.bin", ".depth16")
+_BITS = 13
+CONFIDENCE_MAX = 7.0
+
+
+@part("reader", "depth16", label="experimental")
+class Depth16(Reader):
+    """Folders of *_depth16.bin or *.depth16, with the camera in a camera.json."""
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        files = _files(path)
+        if not files:
+            return None
+        evidence = f"{len(files)} DEPTH16 images"
+        if is_file(path / "camera.json"):
+            return Sniff(1.0, f"{evidence} and camera.json")
+        remedy = "use --format depth16 with --camera: size and lens are not in such files"
+        return Sniff(UNCERTAIN, evidence, remedy)
+
+    def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
+        """See `Reader.open`."""
+        files = required(_files(path), "*_depth16.bin or *.depth16", path)
+        camera = camera_file_of(path, options.camera, "neither size nor lens")
+        return Depth16Source(files, camera)
+
+
+class Depth16Source(FileSource):
+    """Depth with confidence, and colour if there is an image of the same name."""
+
+    concurrent = True
+
+    def __init__(self, files: list[Path], camera: Path) -> None:
+        description = self.use_camera(camera)
+        super().__init__(np.arange(len(files)) / (description.frame_rate_hz or 1.0))
+        self.files = files
+        self.color = [_color(file) for file in files]
+        self.metadata |= description.metadata
+        self.metadata |= {"depth_unit_m": self.unit, "confidence_max": CONFIDENCE_MAX}
+        self.note_missing_color(self.color)
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        size = (self.camera.width, self.camera.height)
+        remedy = "pass the camera of these images with --camera"
+        samples = read_raw(self.files[index], "<u2", size, remedy)
+        counts = samples & ((1 << _BITS) - 1)
+        depth = counts.astype(np.float32) * np.float32(self.unit)
+        # 0 means unknown and counts as full confidence; 1 is 0 %, 7 is 6/7.
+        level = (samples >> _BITS).astype(np.uint8)
+        confidence = np.where(level == 0, np.uint8(CONFIDENCE_MAX), level - np.uint8(1))
+        color = self.color[index]
+        return self.image(
+            index,
+            depth,
+            confidence_image=confidence.astype(np.uint8),
+            color_image=None if color is None else resized(read_color(color), size, color),
+        )
+
+
+def _files(path: Path) -> list[Path]:
+    return files_named(path, lambda name: name.lower().endswith(_SUFFIXES))
+
+
+def _color(file: Path) -> Path | None:
+    suffix = next(suffix for suffix in _SUFFIXES if file.name.lower().endswith(suffix))
+    return if_file(file.with_name(f"{file.name[: -len(suffix)]}_image.jpg"))

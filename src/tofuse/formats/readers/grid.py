@@ -1,0 +1,244 @@
+"""Reader of organised clouds (one point per pixel), as exported by ToF viewers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, UInt8
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.pcd import read_pcd
+from tofuse.formats.files.ply import read_ply
+from tofuse.formats.files.reading import is_file, is_folder, read_text
+from tofuse.formats.files.tables import parse_numbers
+from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.geometry.se3 import MAX_COORDINATE_M
+from tofuse.engine.parts import part
+from tofuse.formats.recordings.cloud_sequence import CloudFileSource, required_files
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.organised import SAMPLES, Raster, common_camera, find_raster, organised_frame, ray_origin_offset
+from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, files_at, refuse_camera
+from tofuse.formats.recordings.sources import to_float32
+
+_SUFFIXES = (".ply", ".csv", ".pcd")
+_AMPLITUDES = ("intensity", "amplitude", "i")
+MAX_POINTS = 1 << 22
+# Mean distances of ToF cameras are below 50 m and above 50 mm.
+MM_FROM = 50.0
+# Unorganised points: largest distance from the pixel's ray (px), and min fraction within it.
+_MAX_RAY_DISTANCE_PX, _MIN_ON_RAYS = 0.3, 0.8
+
+
+@part("reader", "grid")
+class Grid(Reader):
+    """A folder of .ply, .csv or .pcd files with one point per pixel, row-major; m or mm."""
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        try:
+            files = files_at(path, *_SUFFIXES)
+            if not files or (is_folder(path) and is_file(path / "run.json")):
+                return None
+            status = files[0].stat()
+            raster = _first_raster(files[0], status.st_mtime_ns, status.st_size)
+        except (InputError, OSError):
+            return None
+        if raster is None:
+            return None
+        return Sniff(1.0, f"{len(files)} clouds of {raster.width} x {raster.height} pixels")
+
+    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
+        """See `Reader.open`."""
+        refuse_camera(options, "grid")
+        files = required_files(path, *_SUFFIXES)
+        step = max(1, len(files) // SAMPLES)
+        images: list[Float32] = []
+        raster: Raster | None = None
+        for file in files[::step][:SAMPLES]:
+            try:
+                cells = read_cells(file)
+            except InputError:
+                continue
+            raster = raster or cells.raster()
+            if raster is not None and len(cells.points) == raster.width * raster.height:
+                images.append(raster.image(cells.points))
+        if raster is None or not images:
+            raise _not_organised(path)
+        scale = 1e-3 if _median_z(images[0]) > MM_FROM else 1.0
+        images = [image * np.float32(scale) for image in images]
+        offset, camera = 0.0, common_camera(images)
+        if camera is None:
+            offset = ray_origin_offset(images)
+            camera = common_camera([_shifted(image, offset) for image in images])
+        if camera is None:
+            raise _not_organised(path)
+        frames = _Frames(raster, camera, scale, offset)
+        source = CloudFileSource(path, files, frames.load)
+        source.metadata |= {"depth_kind": "z"}
+        if offset:
+            source.warnings.append(
+                f"the origin is {1000 * offset:.1f} mm in front of the camera's centre of "
+                "projection; points are shifted to the centre"
+            )
+        if raster.reversed_axes:
+            source.warnings.append(f"{raster.reversed_axes} against the pixels, and reversed")
+        return source
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Points (N, 3) in the file's unit, amplitude (N,), colour (N, 3), and the width, if stated."""
+
+    points: Float32
+    amplitude: Float32 | None = None
+    color: UInt8 | None = None
+    width: int | None = None
+
+    def raster(self) -> Raster | None:
+        """See `find_raster`."""
+        return find_raster(self.points, self.width) if len(self.points) <= MAX_POINTS else None
+
+
+def read_cells(path: Path) -> Cells:
+    """Read a file, with NaN for invalid points; raise InputError if it can't be read."""
+    cells = _read(path)
+    plausible = np.asarray((np.abs(cells.points) < MAX_COORDINATE_M).all(1))
+    return replace(cells, points=np.where(plausible[:, None], cells.points, np.float32(np.nan)))
+
+
+def _read(path: Path) -> Cells:
+    suffix = path.suffix.lower()
+    if suffix == ".pcd":
+        pcd = read_pcd(path)
+        return _cells(pcd.cloud, pcd.width if pcd.organised else None)
+    if suffix == ".ply":
+        ply = read_ply(path)
+        declared = dict(line.split(None, 1) for line in ply.comments if len(line.split()) == 2)
+        width = declared.get("num_cols", "")
+        return _cells(ply, int(width) if width.isdecimal() else None)
+    return _read_csv(path)
+
+
+def _cells(cloud: GeometryRecord, width: int | None) -> Cells:
+    return Cells(to_float32(cloud.points), cloud.amplitude, cloud.color, width)
+
+
+def _read_csv(path: Path) -> Cells:
+    text = read_text(path)
+    head = text[: text.find("\n")].lower().replace(";", ",").replace("\t", ",")
+    names = [cell.strip(' "#').split("[")[0].split("(")[0].strip() for cell in head.split(",")]
+    has_header = {"x", "y", "z"} <= set(names)
+    table = parse_numbers(text, path, skip=int(has_header))
+    if table.ndim != 2 or table.shape[1] < 3:
+        raise InputError("has no x, y and z per line", where=path, remedy="export x, y, z")
+    columns = {n: k for k, n in enumerate(names) if k < table.shape[1]} if has_header else {}
+    indices = [columns.get(name, k) for k, name in enumerate("xyz")]
+    column = next((columns[name] for name in _AMPLITUDES if name in columns), None)
+    if not has_header and table.shape[1] == 4:
+        column = 3
+    with np.errstate(over="ignore"):
+        points = to_float32(table[:, indices])
+        amplitude = None if column is None else to_float32(table[:, column])
+    return Cells(points, amplitude)
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """Converts the points of each file to an image."""
+
+    raster: Raster
+    camera: Camera
+    scale: float
+    offset: float
+
+    def load(self, path: Path, index: int, timestamp: float) -> RangeFrame:
+        cells = read_cells(path)
+        complete = len(cells.points) == self.raster.width * self.raster.height
+        points = self.raster.image(cells.points) if complete else cells.points
+        points = _shifted(points * np.float32(self.scale), self.offset)
+        if not complete:
+            points, cells = self._to_pixels(points, cells, path)
+        return organised_frame(
+            points,
+            self.camera,
+            index,
+            timestamp,
+            path,
+            amplitude=cells.amplitude,
+            color=cells.color,
+        )
+
+    def _to_pixels(self, points: Float32, cells: Cells, path: Path) -> tuple[Float32, Cells]:
+        """Assign points (n, 3), of a file without invalid ones, to pixels by their rays."""
+        from scipy.spatial import cKDTree
+
+        rays = self.camera.rays().reshape(-1, 2)
+        has_ray = np.flatnonzero(np.isfinite(rays).all(-1))
+        measured = np.flatnonzero(np.isfinite(points).all(-1) & (points[:, 2] > 0))
+        distance, nearest = cKDTree(rays[has_ray]).query(
+            points[measured, :2] / points[measured, 2:]
+        )
+        count = self.raster.width * self.raster.height
+        step = float(np.ptp(rays[has_ray], axis=0).max()) / max(
+            self.raster.width, self.raster.height
+        )
+        # Pixels without a measurement in the sampled files have no ray.
+        on_ray = distance < _MAX_RAY_DISTANCE_PX * step
+        pixel, measured = has_ray[nearest[on_ray]], measured[on_ray]
+        if (
+            len(points) > count
+            or len(np.unique(pixel)) < len(pixel)
+            or np.count_nonzero(on_ray) < _MIN_ON_RAYS * len(on_ray)
+        ):
+            raise InputError(
+                f"has {len(points)} points, not {self.raster.width} x {self.raster.height}, and "
+                "they are not on the rays of the previous files",
+                where=path,
+                remedy="export all points, including invalid ones",
+            )
+        image = np.full((count, 3), np.nan, np.float32)
+        image[pixel] = points[measured]
+        columns: dict[str, Any] = {}
+        for name in ("amplitude", "color"):
+            values = getattr(cells, name)
+            if values is not None:
+                columns[name] = np.zeros((count, *values.shape[1:]), values.dtype)
+                columns[name][pixel] = values[measured]
+        shape = (self.raster.height, self.raster.width, 3)
+        return image.reshape(shape), Cells(image, **columns)
+
+
+def _shifted(points: Float32, offset: float) -> Float32:
+    """Points (..., 3) relative to an origin `offset` metres farther back; keeps invalid ones."""
+    z = np.where(points[..., 2] > 0, points[..., 2] + np.float32(offset), points[..., 2])
+    return np.concatenate([points[..., :2], z[..., None]], axis=-1)
+
+
+def _median_z(image: Float32) -> float:
+    z = image[..., 2]
+    z = z[np.isfinite(z) & (z > 0)]
+    return float(np.median(z)) if len(z) else 0.0
+
+
+def _not_organised(path: Path) -> InputError:
+    return InputError(
+        "doesn't contain one point per pixel of a camera",
+        where=path,
+        remedy="export all points, including invalid ones, or use --format ply, pcd or xyz",
+    )
+
+
+@lru_cache(maxsize=4)
+def _first_raster(file: Path, changed_ns: int, size: int) -> Raster | None:
+    """The raster of a file's points; None if there is none, or if the reader pcd applies."""
+    cells = read_cells(file)
+    raster = cells.raster()
+    if raster is None:
+        return None
+    applies = file.suffix.lower() != ".pcd" or _median_z(raster.image(cells.points)) > MM_FROM
+    return raster if applies else None

@@ -1,0 +1,215 @@
+"""Reader of HoloLens 2 research mode recordings by Microsoft's sample StreamRecorder."""
+
+from __future__ import annotations
+
+import re
+import tarfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.images import read_raw
+from tofuse.formats.files.pgm import parse_pgm
+from tofuse.formats.files.reading import input_error, is_file, is_folder, list_folder
+from tofuse.formats.files.tables import read_numbers
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.parts import part
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.phones import POSES_BY
+from tofuse.formats.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
+from tofuse.formats.recordings.sources import FileSource, depth_from_counts, poses_of, read_matrix_pose, read_part
+
+# The streams by preference, with their ambiguity range in m.
+_STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
+_NAME = re.compile(r"(?:.*/)?([0-9]{1,19})(_ab)?\.pgm", re.IGNORECASE)
+_TICKS = 1e7  # per second
+_MAX_BYTES = 1 << 24
+_REMEDY = "copy the recording again"
+
+
+@part("reader", "hololens2", label="experimental")
+class HoloLens2(Reader):
+    """Folders with 'Depth Long Throw_lut.bin' and .tar, or those of 'Depth AHaT'."""
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        streams = _streams(path)
+        return Sniff(1.0, f"{streams[0]}_lut.bin") if streams else None
+
+    def open(self, path: Path, options: ReaderOptions) -> HoloLens2Source:
+        """See `Reader.open`."""
+        refuse_camera(options, "hololens2", PER_FRAME)
+        streams = _streams(path)
+        if not streams:
+            raise InputError(
+                "has no 'Depth Long Throw_lut.bin' with images", where=path, remedy=_REMEDY
+            )
+        source = HoloLens2Source(path, streams[0])
+        if len(streams) > 1:
+            source.warnings.append(f"{streams[1]} is ignored: {streams[0]} reaches farther")
+        return source
+
+
+class HoloLens2Source(FileSource):
+    """Radial range in mm with active brightness, and the headset's poses as reference."""
+
+    concurrent = True
+    kind = "range"
+    amplitude_kind = "ir"
+
+    def __init__(self, folder: Path, stream: str) -> None:
+        self.images, complete = _images(folder, stream)
+        self.ticks = sorted(tick for tick, bright in self.images if not bright)
+        if not self.ticks:
+            raise InputError("contains no images", where=folder / f"{stream}.tar", remedy=_REMEDY)
+        super().__init__(np.array(self.ticks, float) / _TICKS)
+        if not complete:
+            archive = folder / f"{stream}.tar"
+            self.warnings.append(f"{archive} is cut off or damaged: its end is left out")
+        self.ambiguity_m = _STREAMS[stream]
+        self.metadata |= {
+            "sensor": f"HoloLens 2, {stream} (ToF)",
+            "depth_kind": "range",
+            "depth_unit_m": 0.001,
+            POSES_BY: "HoloLens",
+        }
+        if self.ambiguity_m is not None:
+            self.metadata["ambiguity_m"] = self.ambiguity_m
+        self.camera = RayTable(_rays(folder / f"{stream}_lut.bin", self._size()))
+        self._read_poses(folder, stream)
+
+    def _size(self) -> tuple[int, int]:
+        """(height, width) of the first image that can be read."""
+        first_error: InputError | None = None
+        for tick in self.ticks:
+            try:
+                height, width = self._image(tick, bright=False).shape
+            except InputError as error:
+                first_error = first_error or error
+                continue
+            return height, width
+        assert first_error is not None
+        raise first_error
+
+    def _read_poses(self, folder: Path, stream: str) -> None:
+        """Read T_world_rig of each frame, and the pose of the camera in the rig."""
+        extrinsics, trajectory = (
+            folder / f"{stream}_extrinsics.txt",
+            folder / f"{stream}_rig2world.txt",
+        )
+        if not is_file(extrinsics) or not is_file(trajectory):
+            missing = trajectory if is_file(extrinsics) else extrinsics
+            self.warnings.append(f"{missing.name} is missing: there are no reference poses")
+            return
+        try:
+            T_camera_rig = read_matrix_pose(read_numbers(extrinsics).reshape(4, 4), str(extrinsics))
+            table = read_numbers(trajectory)
+            if table.shape[-1] != 17:
+                raise InputError("has no rows of 17 numbers", where=trajectory, remedy=_REMEDY)
+        except (InputError, ValueError) as error:
+            self.warnings.append(f"no reference poses: {error}")
+            return
+        # Ticks have more digits than float64.
+        row_ticks = np.where(np.isfinite(table[:, 0]), table[:, 0], -1).astype(float)
+        order = np.argsort(row_ticks, kind="stable")
+        nearest = np.searchsorted(row_ticks[order], np.array(self.ticks, float) - 64)
+
+        def pose(item: tuple[int, int]) -> Float64 | None:
+            tick, position = item
+            if position == len(row_ticks) or abs(row_ticks[order[position]] - tick) > 64:
+                return None
+            row = order[position]
+            table_of_row = table[row, 1:].reshape(4, 4)
+            T_world_rig = read_matrix_pose(table_of_row, f"{trajectory}, row {row}")
+            return T_world_rig @ se3.inverse(T_camera_rig)
+
+        self.reference = poses_of(self, zip(self.ticks, nearest.tolist(), strict=True), pose)
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        tick = self.ticks[index]
+        depth = self._image(tick, bright=False)
+        bright = self._image(tick, bright=True) if (tick, True) in self.images else None
+        for image in (depth, bright):
+            if image is not None and image.shape != (self.camera.height, self.camera.width):
+                raise InputError(
+                    f"is {image.shape[1]} x {image.shape[0]} pixels, the first image "
+                    f"{self.camera.width} x {self.camera.height}",
+                    where=f"{tick}.pgm",
+                    remedy=_REMEDY,
+                )
+        amplitude = None if bright is None else bright.astype(np.float32)
+        return self.image(index, depth_from_counts(depth, self.unit), amplitude_image=amplitude)
+
+    def _image(self, tick: int, *, bright: bool) -> NDArray[np.generic]:
+        path, begin, size = self.images[tick, bright]
+        where = f"{path}: {tick}{'_ab' if bright else ''}.pgm"
+        if size > _MAX_BYTES:
+            raise InputError("is too large", where=where, remedy=_REMEDY)
+        image = parse_pgm(read_part(path, begin, size), where)
+        if image.dtype != np.uint16 or min(image.shape) < 2:
+            raise InputError("is not a 16-bit image", where=where, remedy=_REMEDY)
+        return image
+
+
+def _streams(path: Path) -> list[str]:
+    """The depth streams with a lens and images."""
+    if not is_folder(path):
+        return []
+    return [
+        name
+        for name in _STREAMS
+        if is_file(path / f"{name}_lut.bin")
+        and (is_file(path / f"{name}.tar") or is_folder(path / name))
+    ]
+
+
+# Location of an image (file, offset, size), keyed by (time, is amplitude).
+_Images = dict[tuple[int, bool], tuple[Path, int, int]]
+
+
+def _images(folder: Path, stream: str) -> tuple[_Images, bool]:
+    """All images of a stream: from its folder if extracted, else from its archive.
+
+    Also whether the archive is complete: it ends with blocks of zeros.
+    """
+    images: _Images = {}
+    if is_folder(folder / stream):
+        for path in list_folder(folder / stream):
+            match = _NAME.fullmatch(path.name)
+            if match and is_file(path):
+                images[int(match[1]), match[2] is not None] = (path, 0, path.stat().st_size)
+    path = folder / f"{stream}.tar"
+    if images or not is_file(path):
+        return images, True
+    try:
+        with tarfile.open(path, "r:") as archive:
+            for member in archive:
+                match = _NAME.fullmatch(member.name)
+                if match and member.isfile():
+                    location = (path, member.offset_data, member.size)
+                    images[int(match[1]), match[2] is not None] = location
+            end = archive.offset
+        with path.open("rb") as file:
+            file.seek(end)
+            complete = file.read(tarfile.BLOCKSIZE) == bytes(tarfile.BLOCKSIZE)
+    except OSError as error:
+        raise input_error(error, path) from error
+    except (tarfile.TarError, ValueError, EOFError) as error:
+        if not images:
+            raise InputError("is a damaged archive", where=path, remedy=_REMEDY) from error
+        complete = False
+    return images, complete
+
+
+def _rays(path: Path, shape: tuple[int, int]) -> Float32:
+    """Rays (H, W, 2) from a table of unit vectors; NaN where undefined."""
+    table = read_raw(path, "3<f4", (shape[1], shape[0]), _REMEDY).astype(float)
+    with np.errstate(all="ignore"):
+        rays = table[..., :2] / table[..., 2:]
+        valid = np.isfinite(rays).all(-1) & (table[..., 2] > 0) & (np.abs(rays) < 1e4).all(-1)
+    return np.where(valid[..., None], rays, np.nan).astype(np.float32)

@@ -1,0 +1,345 @@
+"""The native recording: a folder of PNG images (or PLY clouds), described by a camera.json."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.images import check_first_size, read_color, read_image
+from tofuse.formats.files.reading import files_with, is_file, is_folder, list_folder, read_text
+from tofuse.formats.files.tables import read_columns
+from tofuse.engine.cameras.cameras import Camera, Pinhole, range_from_z, z_from_range
+from tofuse.engine.parts import part
+from tofuse.formats.recordings.camera_file import CameraFile, checked_lens, load_camera, read_camera_file, read_rays
+from tofuse.formats.recordings.correction_file import corrected_depth, read_correction
+from tofuse.engine.frames.frames import Frame
+from tofuse.formats.recordings.imu import gravity_at
+from tofuse.formats.recordings.native import LENS_COLUMNS
+from tofuse.formats.recordings.reader import CERTAIN, UNCERTAIN, Reader, ReaderOptions, Sniff, required
+from tofuse.formats.recordings.sources import FileSource, cameras_of, depth_from_counts, ply_frame, sampled_color
+from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.engine.sensor.frequencies import DISAGREEMENT, SPEED_OF_LIGHT, combined
+
+_IMAGES = (".png", ".jpg", ".jpeg")
+
+
+class NativeSource(FileSource):
+    """A native folder.
+
+    Attributes
+    ----------
+    camera
+        The camera of all frames; None for clouds.
+    description
+        Content of camera.json.
+    imu
+        Columns of imu.csv by name, or None.
+    frame_columns
+        Columns of frames.csv by name, each (N,), or None.
+
+    Raises
+    ------
+    InputError
+        Naming file and field, if the folder isn't complete and consistent.
+    """
+
+    concurrent = True
+
+    def __init__(self, folder: Path, camera_file: Path | None = None) -> None:
+        self.folder = folder
+        self.is_clouds = not is_folder(folder / "depth") and is_folder(folder / "cloud")
+        name, suffixes = ("cloud", (".ply",)) if self.is_clouds else ("depth", (".png",))
+        remedy = "check that the recording is complete"
+        files = files_with(folder / name, *suffixes)
+        self.files = required(files, f"{suffixes[0]} files", folder / name, remedy)
+        self.description, self.camera = self._read_camera(camera_file)
+        self.unit, self.kind = self.description.depth_unit_m, self.description.depth_kind
+        self.amplitude_kind = self.description.amplitude_kind or "raw"
+        self.ambiguity_m = self.description.ambiguity_m
+        rate = self.description.frame_rate_hz
+        super().__init__(np.arange(len(self.files)) / (rate or 1.0))
+        self.read_sidecars(folder)
+        self.amplitude = self._channel_files("amplitude", ".png")
+        self.confidence = self._channel_files("confidence", ".png")
+        self.color = self._channel_files("color", *_IMAGES)
+        self.sigma = self._channel_files("sigma", ".png")
+        self.rays = self._channel_files("rays", ".npy")
+        self.by_frequency = self._frequencies()
+        if camera_file is not None:
+            self.rays = []  # the camera passed by the user applies to all frames
+        self.correction = self._read_correction()
+        self.imu = self._read_table("imu.csv")
+        self.frame_columns = self._read_table("frames.csv", rows=len(self.files))
+        self.cameras = self._frame_lenses() if camera_file is None else []
+        if self.sigma and self.description.sigma_unit_m is None:
+            raise InputError(
+                "is missing, and there is sigma/",
+                where=f"{self.folder / 'camera.json'}: sigma_unit_m",
+                remedy="set the metres per count of sigma",
+            )
+        self._read_gravity()
+        self._check_sizes()
+        self._fill_metadata()
+
+    def load(self, index: int) -> Frame:
+        """See `FileSource.load`."""
+        timestamp = float(self.timestamps[index])
+        if self.camera is None:
+            return ply_frame(self.files[index], index, timestamp)
+        camera = self._camera_of(index, self.camera)
+        if self.by_frequency:
+            depth = self._unwrapped_depth(index, camera)
+        else:
+            depth = depth_from_counts(self._read(self.files, index, "uint16"), self.unit)
+        if self.correction is not None:
+            depth = corrected_depth(self.correction, camera, depth, self.kind)
+        images: dict[str, Any] = {"camera": camera}
+        if self.color:
+            path, frame = self.color[index], self.image(index, depth, camera=camera)
+            images["color_image"] = sampled_color(
+                frame, read_color(path), self.description.color, path
+            )
+        if self.amplitude:
+            counts = self._read(self.amplitude, index, "uint16")
+            images["amplitude_image"] = counts.astype(np.float32)
+        if self.confidence:
+            images["confidence_image"] = self._read(self.confidence, index, "uint8")
+        if self.sigma:
+            counts = self._read(self.sigma, index, "uint16").astype(np.float32)
+            images["sigma_image"] = counts * np.float32(self.description.sigma_unit_m or 0)
+        return self.image(
+            index, depth, color_registered=self.description.color_registered, **images
+        )
+
+    def _read(self, files: list[Path], index: int, dtype: str) -> NDArray[Any]:
+        """The counts (H, W) in a file of a channel."""
+        assert self.camera is not None
+        size = (self.camera.width, self.camera.height)
+        return read_image(files[index], size=size, dtype=dtype).astype(dtype, copy=False)
+
+    def _camera_of(self, index: int, camera: Camera) -> Camera:
+        """Return the camera of a frame: its own, if the recording has one per frame."""
+        if self.cameras:
+            lens = self.cameras[index]
+            if isinstance(lens, InputError):
+                raise lens
+            return lens
+        if not self.rays:
+            return camera
+        table = read_rays(self.rays[index])
+        if (table.width, table.height) != (camera.width, camera.height):
+            raise InputError(
+                f"is {table.width} x {table.height}, the images {camera.width} x {camera.height}",
+                where=self.rays[index],
+                remedy="use the table of this frame",
+            )
+        return table
+
+    def _frame_lenses(self) -> list[Pinhole | InputError]:
+        """The lens of each frame, if frames.csv contains fx, fy, cx and cy."""
+        columns, camera = self.frame_columns, self.camera
+        if (
+            columns is None
+            or not isinstance(camera, Pinhole)
+            or not set(LENS_COLUMNS) <= set(columns)
+        ):
+            return []
+        path, size = self.folder / "frames.csv", (camera.width, camera.height)
+        common = {f.name: getattr(camera, f.name) for f in fields(camera)[2:]}
+        rows = enumerate(zip(*(columns[name].tolist() for name in LENS_COLUMNS), strict=True), 1)
+        lenses: dict[tuple[float, ...], Pinhole] = {}
+
+        def lens(numbered: tuple[int, tuple[float, ...]]) -> Pinhole:
+            k, row = numbered
+            if row not in lenses:  # frames with the same lens share it
+                values = common | dict(zip(LENS_COLUMNS, row, strict=True))
+                lenses[row] = checked_lens(type(camera), size, values, f"{path}, row {k}")
+            return lenses[row]
+
+        return cameras_of(rows, lens)
+
+    def _read_camera(self, camera_file: Path | None) -> tuple[CameraFile, Camera | None]:
+        path = self.folder / "camera.json"
+        if not self.is_clouds:
+            return load_camera(camera_file or path)
+        if camera_file is not None:
+            raise InputError(
+                "does not apply to a recording of clouds", where="--camera", remedy="leave it out"
+            )
+        if is_file(path):
+            return read_camera_file(path, clouds=True), None
+        return CameraFile(None, None), None
+
+    def _channel_files(self, name: str, *suffixes: str) -> list[Path]:
+        folder = self.folder / name
+        if self.is_clouds or not is_folder(folder):
+            return []
+        files = files_with(folder, *suffixes)
+        if len(files) != len(self.files):
+            raise self._count_error(folder, f"{len(files)} images")
+        if [f.stem for f in files] != [f.stem for f in self.files]:
+            self.warnings.append(f"{folder}: names differ from those in depth/; paired in order")
+        return files
+
+    def _frequencies(self) -> dict[float, list[Path]]:
+        """The depth images by modulation frequency in Hz, if several were recorded separately."""
+        folder = self.folder / "frequencies"
+        if self.is_clouds or not is_folder(folder):
+            return {}
+        images: dict[float, list[Path]] = {}
+        for subfolder in list_folder(folder):
+            try:
+                hertz = float(subfolder.name)
+            except ValueError:
+                hertz = math.nan
+            if not 1e5 <= hertz <= 1e10 or not is_folder(subfolder):
+                raise InputError(
+                    "isn't a frequency",
+                    where=subfolder,
+                    remedy="name the folder in Hz, as 30000000",
+                )
+            images[hertz] = files_with(subfolder, ".png")
+            if len(images[hertz]) != len(self.files):
+                raise self._count_error(subfolder, f"{len(images[hertz])} images")
+        if len(images) == 1:
+            raise InputError(
+                "has only one frequency", where=folder, remedy="use two or more, or remove it"
+            )
+        return images
+
+    def _unwrapped_depth(self, index: int, camera: Camera) -> Float32:
+        """Depth unwrapped with all frequencies; 0 where they are inconsistent."""
+        kind = self.kind
+        periods = [SPEED_OF_LIGHT / (2 * hertz) for hertz in self.by_frequency]
+        ranges = []
+        for files in self.by_frequency.values():
+            depth = depth_from_counts(self._read(files, index, "uint16"), self.unit)
+            ranges.append(depth if kind == "range" else range_from_z(camera, depth))
+        radial, disagreement = combined(ranges, periods)
+        consistent = np.where(disagreement < DISAGREEMENT * min(periods), radial, np.float32(0))
+        return consistent if kind == "range" else z_from_range(camera, consistent)
+
+    def _read_correction(self) -> DepthCorrection | None:
+        path = self.folder / "correction.npz"
+        if self.camera is None or not is_file(path):
+            return None
+        correction = read_correction(path)
+        try:
+            correction.correct(np.ones((self.camera.height, self.camera.width), np.float32))
+        except InputError as error:
+            raise InputError(error.problem, where=path, remedy=error.remedy) from error
+        return correction
+
+    def _read_table(self, name: str, rows: int | None = None) -> dict[str, Float64] | None:
+        path = self.folder / name
+        if not is_file(path):
+            return None
+        columns = read_columns(path)
+        length = len(next(iter(columns.values())))
+        if rows is not None and length != rows:
+            raise self._count_error(path, f"{length} rows")
+        return columns
+
+    def _read_gravity(self) -> None:
+        if self.imu is None:
+            return
+        self.gravity = gravity_at(self.timestamps, self.imu)
+        path = self.folder / "imu.csv"
+        if self.gravity is None:
+            self.warnings.append(
+                f"{path}: has no columns timestamp, ax, ay, az, so gravity is unknown"
+            )
+        elif not np.isfinite(self.gravity).any():
+            self.warnings.append(
+                f"{path}: has no samples other than zero near the time of any frame"
+            )
+
+    def _count_error(self, where: Path, count: str) -> InputError:
+        return InputError(
+            f"has {count}, {self.files[0].parent.name}/ has {len(self.files)} files",
+            where=where,
+            remedy="make the counts agree, or remove it",
+        )
+
+    def _check_sizes(self) -> None:
+        """Compare the size in camera.json with the first readable header of each channel."""
+        if self.camera is None:
+            return
+        size, where = (self.camera.width, self.camera.height), "camera.json states"
+        remedy = "use the camera.json of these images"
+        for channel in (self.files, self.amplitude, self.confidence, self.sigma):
+            check_first_size(channel, size, where, remedy)
+        color = self.description.color
+        if color is None:
+            remedy += '; or describe its camera by "color" in camera.json'
+        else:
+            size = (color.camera.width, color.camera.height)
+        check_first_size(self.color, size, where, remedy)
+
+    def _fill_metadata(self) -> None:
+        description = self.description
+        if description.unknown:
+            self.warnings.append(
+                f"{self.folder / 'camera.json'}: unknown fields ignored: "
+                f"{', '.join(description.unknown)}"
+            )
+        self.metadata |= description.stated(
+            "sensor", "frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"
+        )
+        if self.camera is not None:
+            self.metadata["depth_unit_m"] = description.depth_unit_m
+            self.metadata["depth_kind"] = description.depth_kind
+            self.metadata["corrected"] = self.correction is not None
+            if self.sigma:
+                self.metadata["sigma_unit_m"] = description.sigma_unit_m
+        if is_folder(self.folder / "truth"):
+            self.metadata["truth"] = str(self.folder / "truth")
+
+
+@part("reader", "native", label="validated")
+class Native(Reader):
+    """Folders with a camera.json and depth/ (PNG) or cloud/ (PLY)."""
+
+    joinable = True
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        if not is_folder(path):
+            return None
+        images = next((n for n in ("depth", "cloud") if is_folder(path / n)), None)
+        if is_file(path / "camera.json"):
+            try:
+                text = read_text(path / "camera.json")
+            except InputError:
+                text = ""
+            if "intrinsic_matrix" in text and '"schema"' not in text:
+                return None
+            if images is None:
+                return Sniff(CERTAIN, "a camera.json but neither depth/ nor cloud/")
+            return Sniff(1.0, f"camera.json and {images}/")
+        if images == "depth":
+            return Sniff(
+                UNCERTAIN,
+                "depth/ but no camera.json",
+                "write one (docs/formats.md), or use --format native --camera camera.json",
+            )
+        return Sniff(CERTAIN, "cloud/") if images == "cloud" else None
+
+    def open(self, path: Path, options: ReaderOptions) -> NativeSource:
+        """See `Reader.open`."""
+        if not is_folder(path):
+            raise InputError("is not a folder", where=path, remedy="pass the recording's folder")
+        if not is_folder(path / "depth") and not is_folder(path / "cloud"):
+            raise InputError(
+                "has neither depth/ nor cloud/",
+                where=path,
+                remedy="check that the recording is complete",
+            )
+        return NativeSource(path, options.camera)

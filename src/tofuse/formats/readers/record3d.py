@@ -1,0 +1,272 @@
+"""Reader of Record3D's exports (iPhone and iPad): the EXR + JPG folder, and .r3d files."""
+
+from __future__ import annotations
+
+import json
+import re
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.exr import parse_exr
+from tofuse.formats.files.images import as_color, parse_image
+from tofuse.formats.files.lzfse import lzfse_decompress
+from tofuse.formats.files.reading import files_named, input_error, is_file, is_folder, read_bytes, required_package
+from tofuse.engine.geometry import quaternion
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.parts import part
+from tofuse.formats.recordings.camera_file import image_size, number_in, numbers_in, read_json
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.phones import ARKIT_AXES, CONFIDENCE_MAX, POSES_BY, SENSOR, lens, resized
+from tofuse.formats.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, begins_with, file_of, refuse_camera, required
+from tofuse.formats.recordings.sources import FileSource, depth_from_numbers
+
+MAX_MEMBER_BYTES = 1 << 26
+_MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")
+_EXR = re.compile(r"([0-9]{1,9})\.exr", re.IGNORECASE)
+_REMEDY = "export the recording again"
+
+
+@part("reader", "record3d", label="validated")
+class Record3D(Reader):
+    """Folders with metadata.json, depth/*.exr and rgb/*.jpg; or .r3d files."""
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        if is_folder(path):
+            if is_file(path / "metadata.json") and _numbered(path / "depth", _EXR):
+                return Sniff(1.0, "metadata.json and depth/*.exr")
+            return None
+        matches = begins_with(file_of(path, ".r3d"), b"PK\x03\x04")
+        return Sniff(1.0, "a .r3d archive") if matches else None
+
+    def open(self, path: Path, options: ReaderOptions) -> Record3DSource:
+        """See `Reader.open`."""
+        refuse_camera(options, "record3d", PER_FRAME)
+        return Record3DSource(_Folder(path) if is_folder(path) else _Archive(path))
+
+
+class Record3DSource(FileSource):
+    """Frames of one lens with ARKit's poses; colour is registered after downscaling."""
+
+    def __init__(self, store: _Folder | _Archive) -> None:
+        self.store = store
+        metadata = _Metadata(store.metadata(), store.where)
+        self.size = metadata.depth_size(store.default_size)
+        self.camera = metadata.lens(self.size)
+        times = metadata.times()
+        numbers = np.array(store.numbers)
+        # Poses and timestamps cover all frames; an export may contain a subset.
+        if times is None or numbers.max() >= len(times):
+            rate = metadata.frame_rate()
+            times = np.arange(numbers.max() + 1) / rate
+            has_times = False
+        else:
+            has_times = True
+        super().__init__(times[numbers])
+        if not has_times:
+            self.warnings.append(
+                f"{store.where}: no timestamps for all frames: assumed to be evenly spaced"
+            )
+        poses = metadata.poses()
+        if poses is not None:
+            inside = numbers < len(poses)
+            self.reference = np.full((len(numbers), 4, 4), np.nan)
+            self.reference[inside] = poses[numbers[inside]]
+        self.metadata |= {"sensor": SENSOR, "depth_kind": "z", POSES_BY: "ARKit"}
+        if store.has_confidence:
+            self.metadata["confidence_max"] = CONFIDENCE_MAX
+        else:
+            self.warnings.append("the export contains no confidence")
+
+    def full_resolution_color(self, index: int) -> UInt8 | None:
+        """See `FileSource.full_resolution_color`."""
+        color = self.store.color(self.store.numbers[index])
+        return None if color is None else as_color(parse_image(*color))
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        number = self.store.numbers[index]
+        depth = self.store.depth(number, self.size)
+        color = self.store.color(number)
+        if color is not None:
+            color = resized(as_color(parse_image(*color)), self.size, color[1])
+        confidence = self.store.confidence(number, self.size)
+        return self.image(index, depth, confidence_image=confidence, color_image=color)
+
+
+class _Folder:
+    """The EXR + JPG export."""
+
+    has_confidence = False
+    default_size: tuple[int, int] | None = None
+
+    def __init__(self, path: Path) -> None:
+        self.where = path / "metadata.json"
+        self.path = path
+        self.files = _numbered(path / "depth", _EXR)
+        self.numbers = required(sorted(self.files), ".exr files", path / "depth", _REMEDY)
+
+    def metadata(self) -> dict[str, Any]:
+        return read_json(self.where)
+
+    def depth(self, number: int, size: tuple[int, int]) -> Float32:
+        path = self.files[number]
+        channels = parse_exr(read_bytes(path, limit=MAX_MEMBER_BYTES), path)
+        # A grey image has one channel, of any name.
+        depth = next((channels[n] for n in ("R", "Z", "Y") if n in channels), None)
+        if depth is None:
+            depth = next(iter(channels.values()))
+        return _checked(depth, size, path)
+
+    def confidence(self, number: int, size: tuple[int, int]) -> None:
+        return None
+
+    def color(self, number: int) -> tuple[bytes, Path] | None:
+        for suffix in (".jpg", ".png"):
+            path = self.path / "rgb" / f"{number}{suffix}"
+            if is_file(path):
+                return read_bytes(path, limit=MAX_MEMBER_BYTES), path
+        return None
+
+
+class _Archive:
+    """A .r3d file: a ZIP archive of `metadata` and, for each frame, rgbd/N.depth, .conf, .jpg."""
+
+    default_size = (192, 256)
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.where = Path(f"{path}: metadata")
+        required_package("lzfse", "phones", path)
+        try:
+            self.archive = zipfile.ZipFile(path)
+            self.names = set(self.archive.namelist())
+        except OSError as error:
+            raise input_error(error, path) from error
+        except (zipfile.BadZipFile, ValueError, NotImplementedError, RuntimeError) as error:
+            raise InputError(
+                f"is a damaged archive ({error})", where=path, remedy="copy the file again"
+            ) from error
+        matches = (_MEMBER.fullmatch(name) for name in self.names)
+        self.numbers = sorted({int(m.group(1)) for m in matches if m})
+        if not self.numbers:
+            raise InputError("contains no rgbd/*.depth", where=path, remedy="export it again")
+        self.has_confidence = f"rgbd/{self.numbers[0]}.conf" in self.names
+
+    def metadata(self) -> dict[str, Any]:
+        try:
+            data = json.loads(self._member("metadata"))
+        except (ValueError, RecursionError) as error:
+            raise InputError("is invalid JSON", where=self.where, remedy="export again") from error
+        if not isinstance(data, dict):
+            raise InputError("is not a JSON object", where=self.where, remedy="export it again")
+        return data
+
+    def depth(self, number: int, size: tuple[int, int]) -> Float32:
+        name = f"rgbd/{number}.depth"
+        raw = self._unpacked(name, 4 * size[0] * size[1])
+        return _checked(
+            np.frombuffer(raw, "<f4").reshape(size[1], size[0]), size, f"{self.path}: {name}"
+        )
+
+    def confidence(self, number: int, size: tuple[int, int]) -> UInt8 | None:
+        name = f"rgbd/{number}.conf"
+        if name not in self.names:
+            return None
+        raw = self._unpacked(name, size[0] * size[1])
+        return np.frombuffer(raw, np.uint8).reshape(size[1], size[0])
+
+    def color(self, number: int) -> tuple[bytes, Path] | None:
+        name = f"rgbd/{number}.jpg"
+        if name not in self.names:
+            return None
+        return self._member(name), Path(f"{self.path}: {name}")
+
+    def _unpacked(self, name: str, size: int) -> bytes:
+        return lzfse_decompress(self._member(name), size, f"{self.path}: {name}")
+
+    def _member(self, name: str) -> bytes:
+        where = f"{self.path}: {name}"
+        try:
+            with self.archive.open(name) as file:
+                data = file.read(MAX_MEMBER_BYTES + 1)
+        except KeyError as error:
+            raise InputError("is missing", where=where, remedy="export it again") from error
+        except OSError as error:
+            raise input_error(error, where) from error
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            ValueError,
+            NotImplementedError,
+            RuntimeError,
+            EOFError,
+        ) as error:
+            raise InputError("is damaged", where=where, remedy="copy the file again") from error
+        if len(data) > MAX_MEMBER_BYTES:
+            raise InputError("is too large", where=where, remedy="check the file")
+        return data
+
+
+class _Metadata:
+    """Checked access to Record3D's metadata."""
+
+    def __init__(self, data: dict[str, Any], where: Path) -> None:
+        self.data, self.where = data, where
+
+    def depth_size(self, default: tuple[int, int] | None) -> tuple[int, int]:
+        """Return (width, height) of depth; `default` for older versions, which don't state it."""
+        if default is not None and not ("dw" in self.data and "dh" in self.data):
+            return default
+        return image_size(self._number("dw"), self._number("dh"), f"{self.where}: dw")
+
+    def lens(self, size: tuple[int, int]) -> Pinhole:
+        K = numbers_in(self.data, "K", self.where, (3, 3), _REMEDY).T
+        full_size = image_size(self._number("w"), self._number("h"), f"{self.where}: w")
+        return lens(K, full_size, size, f"{self.where}: K")
+
+    def frame_rate(self) -> float:
+        rate = self._number("fps", 60.0)
+        return rate if 0.01 <= rate <= 1e4 else 60.0
+
+    def times(self) -> Float64 | None:
+        """Return the timestamps in s of all frames, or None if they aren't given."""
+        if "frameTimestamps" not in self.data:
+            return None
+        times = numbers_in(self.data, "frameTimestamps", self.where, (-1,), _REMEDY)
+        return times if len(times) else None
+
+    def poses(self) -> Float64 | None:
+        """T_world_camera (N, 4, 4) of all frames, NaN where tracking was lost; or None."""
+        if "poses" not in self.data:
+            return None
+        table = numbers_in(self.data, "poses", self.where, (-1, 7), _REMEDY, finite=False)
+        norms = quaternion.length(table[:, :4])
+        valid = (np.abs(norms - 1) < 0.01) & (np.abs(table[:, 4:]) < 1e6).all(1)
+        poses = np.full((len(table), 4, 4), np.nan)
+        poses[valid] = quaternion.to_pose(table[valid, :4], table[valid, 4:])
+        return poses @ ARKIT_AXES
+
+    def _number(self, field: str, default: float | None = None) -> float:
+        return number_in(self.data, field, self.where, default, _REMEDY)
+
+
+def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
+    return {int(file.stem): file for file in files_named(folder, pattern.fullmatch)}
+
+
+def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float32:
+    """Return depth (H, W) in m; non-finite and implausible values become 0."""
+    if depth.shape != (size[1], size[0]):
+        raise InputError(
+            f"is {depth.shape[1]} x {depth.shape[0]} pixels, metadata states {size[0]} x {size[1]}",
+            where=where,
+            remedy="export the recording again",
+        )
+    return depth_from_numbers(depth, 1.0)

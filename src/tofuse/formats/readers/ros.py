@@ -1,0 +1,308 @@
+"""Reader of ROS 1 bags, ROS 2 bags and MCAP files, by the package rosbags."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float32, UInt8
+from tofuse.engine.errors import InputError
+from tofuse.engine.cameras.cameras import Camera, Pinhole
+from tofuse.engine.parts import part
+from tofuse.formats.recordings.bags import COLORS, ENCODINGS, GREY, MAX_GAP_S, REMEDY, BagSource, Track, Transforms, bag_kind, cloud, color_image, decompressed, decompressed_color, frame_name, image, lens
+from tofuse.formats.recordings.camera_file import ColorCamera, check_size
+from tofuse.engine.frames.frames import Frame
+from tofuse.formats.recordings.organised import SAMPLES, common_camera, organised_frame
+from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff
+from tofuse.formats.recordings.sources import cloud_frame, depth_from_numbers, library_errors
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
+_AMPLITUDE_KEYWORDS = ("/ir/", "/infra", "amplitude", "intensity", "reflec")
+_COLOR_KEYWORDS = ("color", "colour", "rgb")
+# Prefix of drifting odometry frames; frames above them are corrected.
+_ODOMETRY = "odom"
+
+
+@part("reader", "ros")
+class Ros(Reader):
+    """A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag, with depth images or clouds."""
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        kind = bag_kind(path)
+        if kind is None:
+            return None
+        return Sniff(0.95, "metadata.yaml and a bag" if kind == "folder" else "a bag")
+
+    def open(self, path: Path, options: ReaderOptions) -> RosSource:
+        """See `Reader.open`."""
+        return RosSource(path, options)
+
+
+class RosSource(BagSource):
+    """Messages of the chosen topic, or of the one most likely to contain depth.
+
+    Attributes
+    ----------
+    raster
+        The camera of clouds that are images of one; else None.
+    """
+
+    unit = 0.001  # integer depth is in mm by convention (REP 118)
+    raster: Camera | None = None
+
+    def find_streams(self, options: ReaderOptions) -> None:
+        """See `BagSource.find_streams`."""
+        self.connection = self._choose(options.topic)
+        self.depth = Track(self.bag, self.connection)
+        if not len(self.depth):
+            raise InputError(f"has no message of {self.connection.topic}", where=self.path)
+        self.set_timestamps()
+        transforms = self._transforms()
+        if self.connection.msgtype != CLOUD:
+            self._read_camera(options)
+            self.amplitude = self._find_amplitude()
+            self._find_color(transforms)
+            self.metadata["depth_kind"] = self.kind
+            if self.connection.msgtype == IMAGE:
+                kind = np.dtype(ENCODINGS[self._encoding(self.connection)]).kind
+                self.metadata["depth_unit_m"] = self._unit(kind)
+        else:
+            if options.camera is not None:
+                raise InputError(
+                    "does not apply to clouds", where="--camera", remedy="leave it out"
+                )
+            self.raster = self._organised()
+        self._read_poses(transforms)
+        self.metadata |= {"topic": self.connection.topic}
+        others = sorted({c.topic for c in self._candidates()} - {self.connection.topic})
+        if others and options.topic is None:
+            self.warnings.append(
+                f"the topic {self.connection.topic} is read; others are {', '.join(others)}:"
+                " choose with --topic"
+            )
+
+    def where(self, index: int) -> str:
+        """See `BagSource.where`."""
+        return f"{self.path}: {self.connection.topic}, message {index}"
+
+    def read_frame(self, index: int, where: str) -> Frame:
+        """See `BagSource.read_frame`."""
+        if self.connection.msgtype != CLOUD:
+            return super().read_frame(index, where)
+        content, time = cloud(self.depth.message(index), where), float(self.timestamps[index])
+        if self.raster is None:
+            return cloud_frame(index, time, content.points, amplitude=content.amplitude)
+        points = content.points.reshape(content.height, content.width, 3)
+        return organised_frame(points, self.raster, index, time, where, amplitude=content.amplitude)
+
+    def read_depth(self, index: int, where: str) -> Float32:
+        """See `BagSource.read_depth`."""
+        decode = decompressed if self.connection.msgtype == COMPRESSED else image
+        counts = decode(self.depth.message(index), where)
+        check_size(counts, self.camera, where)
+        return depth_from_numbers(counts, self._unit(counts.dtype.kind))
+
+    def read_color(self, track: Track, index: int, where: str) -> UInt8:
+        """See `BagSource.read_color`."""
+        decode = decompressed_color if track.connection.msgtype == COMPRESSED else color_image
+        return decode(track.message(index), where)
+
+    def _candidates(self) -> list[Any]:
+        """The connections that may contain depth, most likely first."""
+        return sorted(
+            (c for c in self.bag.connections if _rank(c) is not None),
+            key=lambda c: (_rank(c), c.topic),
+        )
+
+    def _choose(self, topic: str | None) -> Any:
+        topics = ", ".join(sorted({c.topic for c in self.bag.connections}))
+        if topic is not None:
+            for connection in self.bag.connections:
+                if connection.topic == topic and connection.msgtype in (IMAGE, COMPRESSED, CLOUD):
+                    return connection
+            raise InputError(
+                f"has no images or clouds at {topic} (there are: {topics[:300] or 'none'})",
+                where=self.path,
+                remedy="choose one of these with --topic",
+            )
+        for connection in self._candidates():
+            if connection.msgtype != IMAGE or self._encoding(connection) in ENCODINGS:
+                return connection
+        raise InputError(
+            f"has no topic of depth images or clouds (there are: {topics[:300] or 'none'})",
+            where=self.path,
+            remedy="record 16UC1 or 32FC1 images with camera_info, or PointCloud2",
+        )
+
+    def _encoding(self, connection: Any) -> str:
+        for _, _, raw in self.bag.messages(connections=[connection]):
+            return str(self.bag.deserialize(raw, connection.msgtype).encoding)
+        return ""
+
+    def _read_camera(self, options: ReaderOptions) -> None:
+        if options.camera is not None:
+            self.use_camera(options.camera)
+            self.color_camera = None  # the bag's own is found below
+            return
+        infos = [c for c in self.bag.connections if c.msgtype == INFO]
+        adjacent = self._camera_infos(self.connection)
+        candidates = (
+            adjacent or [c for c in infos if "depth" in c.topic] or infos[: len(infos) == 1]
+        )
+        if not candidates:
+            raise InputError(
+                f"has no CameraInfo for {self.connection.topic}",
+                where=self.path,
+                remedy="pass the depth camera with --camera camera.json",
+            )
+        self.camera = self._lens_of(candidates[0])
+
+    def _camera_infos(self, connection: Any) -> list[Any]:
+        """The CameraInfo connections in the namespace of an image connection."""
+        folder = connection.topic.rsplit("/", 1)[0]
+        return [
+            c
+            for c in self.bag.connections
+            if c.msgtype == INFO and c.topic.rsplit("/", 1)[0] in (folder, folder.rsplit("/", 1)[0])
+        ]
+
+    def _transforms(self) -> Transforms:
+        try:
+            with library_errors(self.path, REMEDY):
+                return Transforms.read(self.bag)
+        except InputError as error:
+            self.warnings.append(f"tf is ignored: {error}")
+            return Transforms({})
+
+    def _frame_of(self, track: Track) -> str:
+        """Name of the tf frame of the messages."""
+        return frame_name(track.message(0).header.frame_id)
+
+    def _read_poses(self, transforms: Transforms) -> None:
+        """Read the poses of the depth camera from tf."""
+        if not transforms:
+            return
+        try:
+            with library_errors(self.where(0), REMEDY):
+                frame = self._frame_of(self.depth)
+        except InputError as error:  # affects only this frame
+            self.warnings.append(f"tf is ignored: {error}")
+            return
+        ancestors = transforms.ancestors(frame)
+        odometry = next((name for name in ancestors if _ODOMETRY in name.lower()), None)
+        if odometry is not None and transforms.moves(odometry, frame):
+            poses = transforms.poses(odometry, frame, self.timestamps)
+            if np.isfinite(poses).any():
+                self.odometry = poses
+        if ancestors[-1] != odometry and transforms.moves(ancestors[-1], frame):
+            poses = transforms.poses(ancestors[-1], frame, self.timestamps)
+            if np.isfinite(poses).any():
+                self.reference = poses
+
+    def _find_color(self, transforms: Transforms) -> None:
+        """Find a colour camera with known intrinsics and pose relative to depth."""
+        missing: list[str] = []
+        for connection in sorted(self.bag.connections, key=lambda c: (c.msgtype, c.topic)):
+            if not self._is_color(connection) or not len(track := Track(self.bag, connection)):
+                continue
+            try:
+                with library_errors(self.path, REMEDY):
+                    found = self._relate_color(track, transforms)
+            except InputError as error:
+                missing.append(f"{connection.topic} ({error.problem})")
+                continue
+            if found:
+                self.metadata["color_topic"] = connection.topic
+                return
+            missing.append(connection.topic)
+        if missing:
+            self.warnings.append(
+                f"colour is ignored: the relation of {missing[0]} to depth is not in the bag "
+                "(its camera_info, and tf_static between the two cameras)"
+            )
+
+    def _relate_color(self, track: Track, transforms: Transforms) -> bool:
+        """Use a colour camera, if its intrinsics and pose relative to depth are known."""
+        topic = track.connection.topic
+        first = self.read_color(track, 0, f"{self.path}: {topic}")
+        depth_frame, color_frame = self._frame_of(self.depth), self._frame_of(track)
+        registered = _rank(self.connection) == 1  # depth is registered to colour
+        same_size = first.shape[:2] == (self.camera.height, self.camera.width)
+        T = transforms.static_transform(color_frame, depth_frame)
+        infos = self._camera_infos(track.connection)
+        if not (same_size and (registered or depth_frame == color_frame)):
+            if T is None or not infos:
+                return False
+            self.color_camera = ColorCamera(self._lens_of(infos[0]), T)
+        self.color = track
+        return True
+
+    def _is_color(self, connection: Any) -> bool:
+        topic = connection.topic.lower()
+        if "depth" in topic or not any(keyword in topic for keyword in _COLOR_KEYWORDS):
+            return False
+        if connection.msgtype == COMPRESSED:
+            return True
+        return connection.msgtype == IMAGE and self._encoding(connection).lower() in COLORS
+
+    def _lens_of(self, info: Any) -> Pinhole:
+        where = f"{self.path}: {info.topic}"
+        for _, _, raw in self.bag.messages(connections=[info]):
+            return lens(self.bag.deserialize(raw, info.msgtype), where)
+        raise InputError("has no message", where=where, remedy="use --camera camera.json")
+
+    def _find_amplitude(self) -> Track | None:
+        """The amplitude track of the same sensor: its images match the depth's size and times."""
+        for connection in sorted(self.bag.connections, key=lambda c: c.topic):
+            is_named = any(keyword in connection.topic.lower() for keyword in _AMPLITUDE_KEYWORDS)
+            if connection.msgtype != IMAGE or connection.topic == self.connection.topic:
+                continue
+            if not is_named or self._encoding(connection) not in GREY:
+                continue
+            track = Track(self.bag, connection)
+            first = track.message(0)
+            if (first.height, first.width) != (self.camera.height, self.camera.width):
+                continue
+            has_match = [track.nearest(t, MAX_GAP_S) is not None for t in self.timestamps]
+            if sum(has_match) > 0.5 * len(has_match):
+                self.metadata["amplitude_topic"] = connection.topic
+                return track
+        return None
+
+    def _unit(self, kind: str) -> float:
+        """Metres per count; floats are always in metres."""
+        return self.unit if kind == "u" else 1.0
+
+    def _organised(self) -> Camera | None:
+        """The camera of organised clouds, if they are in x right, y down, z forward; else None."""
+        images = []
+        step = max(1, len(self.depth) // SAMPLES)
+        for k in range(0, len(self.depth), step)[:SAMPLES]:
+            try:
+                content = cloud(self.depth.message(k), self.where(k))
+            except InputError:
+                continue
+            if min(content.width, content.height) < 2:
+                return None
+            images.append(content.points.reshape(content.height, content.width, 3))
+        return common_camera(images)
+
+
+def _rank(connection: Any) -> int | None:
+    """The rank of a topic as a source of depth, 0 is best; None if it can't be one."""
+    topic, kind = connection.topic.lower(), connection.msgtype
+    if kind == IMAGE and "depth" in topic:
+        # Depth in its own frame is preferred to depth registered to another camera.
+        registered = any(
+            keyword in topic for keyword in ("align", "regist", "_to_", "color", "rgb")
+        )
+        return 1 if registered else 0
+    if kind == COMPRESSED and topic.endswith("compresseddepth"):
+        return 2
+    if kind == IMAGE and any(keyword in topic for keyword in ("distance", "range")):
+        return 3
+    return 4 if kind == CLOUD else None

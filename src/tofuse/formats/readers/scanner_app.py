@@ -1,0 +1,104 @@
+"""Reader of the "all data" export of 3d Scanner App (iPhone and iPad)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.images import first_size
+from tofuse.formats.files.reading import files_named, if_file, is_file
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.parts import part
+from tofuse.formats.recordings.camera_file import numbers_in, read_json
+from tofuse.formats.recordings.phones import IMAGE_SIZE, PhoneSource, arkit_pose, lens
+from tofuse.formats.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera, required
+from tofuse.formats.recordings.sources import interpolated, poses_of
+
+_DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
+_REMEDY = "export the recording again"
+
+
+@part("reader", "3dscannerapp", label="validated")
+class ScannerApp(Reader):
+    """Folders of depth_NNNNN.png, conf_NNNNN.png, frame_NNNNN.json and some .jpg."""
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        files = files_named(path, _DEPTH.fullmatch)
+        if any(is_file(_file_of_frame(file, "frame", ".json")) for file in files[:9]):
+            return Sniff(1.0, f"{len(files)} depth_*.png with frame_*.json")
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> PhoneSource:
+        """See `Reader.open`."""
+        refuse_camera(options, "3dscannerapp", PER_FRAME)
+        files = files_named(path, _DEPTH.fullmatch)
+        required(files, "depth_*.png", path, "export with all data")
+        size = first_size(files)
+        source = PhoneSource(
+            files,
+            np.full(len(files), np.nan),
+            confidence=[if_file(_file_of_frame(file, "conf", ".png")) for file in files],
+            color=[if_file(_file_of_frame(file, "frame", ".jpg")) for file in files],
+        )
+        entries: list[_FrameMetadata | None] = []
+        for k, file in enumerate(files):
+            entry = None
+            try:
+                metadata = _FrameMetadata.read(_file_of_frame(file, "frame", ".json"))
+                source.timestamps[k] = metadata.time
+                source.cameras.append(metadata.lens(size))
+                entry = metadata
+            except InputError as error:
+                # Only this frame is unusable without its camera.
+                source.cameras.append(error)
+            entries.append(entry)
+        if not np.isfinite(source.timestamps).any():
+            raise next(c for c in source.cameras if isinstance(c, InputError))
+        source.timestamps = interpolated(source.timestamps)
+        source.reference = poses_of(
+            source, entries, lambda entry: None if entry is None else entry.pose()
+        )
+        return source
+
+
+@dataclass(frozen=True)
+class _FrameMetadata:
+    """The content of a frame_NNNNN.json."""
+
+    path: Path
+    data: dict[str, Any]
+    time: float
+
+    @classmethod
+    def read(cls, path: Path) -> _FrameMetadata:
+        data = read_json(path)
+        return cls(path, data, float(numbers_in(data, "time", path, (1,), _REMEDY)[0]))
+
+    def lens(self, size: tuple[int, int]) -> Pinhole:
+        K = numbers_in(self.data, "intrinsics", self.path, (3, 3), _REMEDY)
+        image = IMAGE_SIZE
+        if "projectionMatrix" in self.data:
+            # Its diagonal is 2 * focal length / image size.
+            P = numbers_in(self.data, "projectionMatrix", self.path, (4, 4), _REMEDY)
+            with np.errstate(all="ignore"):
+                width, height = 2 * np.diag(K)[:2] / np.diag(P)[:2]
+            if 100 < width < 16384 and 100 < height < 16384:
+                image = (round(float(width)), round(float(height)))
+        return lens(K, image, size, f"{self.path}: intrinsics")
+
+    def pose(self) -> Float64 | None:
+        if "cameraPoseARFrame" not in self.data:
+            return None
+        table = numbers_in(self.data, "cameraPoseARFrame", self.path, (4, 4), _REMEDY, finite=False)
+        return arkit_pose(table, f"{self.path}: cameraPoseARFrame")
+
+
+def _file_of_frame(file: Path, name: str, suffix: str) -> Path:
+    return file.with_name(f"{name}_{file.stem.split('_', 1)[1]}{suffix}")

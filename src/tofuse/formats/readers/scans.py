@@ -1,0 +1,252 @@
+"""Readers of scans: LAS and LAZ by laspy, E57 by pye57 (the extra `scan`)."""
+
+from __future__ import annotations
+
+import os
+import struct
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.reading import read_head, required_package
+from tofuse.engine.geometry.quaternion import to_pose
+from tofuse.engine.parts import part
+from tofuse.formats.recordings.cloud_sequence import CloudFileSource, find_shift, map_shift, note_shift, required_files, sniff_clouds
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, begins_with, file_of, refuse_camera, required_file
+from tofuse.formats.recordings.sources import FileSource, cloud_frame, library_errors, poses_of, read_matrix_pose
+
+MAX_POINTS = 100_000_000
+_E57 = b"ASTM-E57"
+_MAX_COMPRESSION = 1000  # of LAZ; scans reach 4 to 15
+_COPY = "copy the file again, or export it again"
+
+
+@part("reader", "las")
+class LasScans(Reader):
+    """A .las or .laz file, or a folder of them; metres."""
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        return sniff_clouds(path, ".las", ".laz")
+
+    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
+        """See `Reader.open`."""
+        refuse_camera(options, "las")
+        files = required_files(path, ".las", ".laz")
+        shift = _shift(files[0])
+        source = CloudFileSource(path, files, lambda f, k, t: _las_frame(f, k, t, shift))
+        note_shift(source, path, shift)
+        return source
+
+
+def _las_header(path: Path) -> Any:
+    import laspy
+
+    head = read_head(path, 375)
+    if head[:4] != b"LASF":
+        raise InputError("isn't a LAS file", where=path, remedy="check the file")
+    _check_records(head, path)
+    with library_errors(path, _COPY), laspy.open(path) as file:
+        header = file.header
+    count, size = int(header.point_count), int(header.point_format.size)
+    file_size = path.stat().st_size
+    compressed = bool(getattr(header, "are_points_compressed", False))
+    if count > MAX_POINTS or count * size > file_size * (_MAX_COMPRESSION if compressed else 1):
+        raise InputError(
+            f"point count: {count} points don't fit into {file_size} bytes",
+            where=path,
+            remedy=_COPY,
+        )
+    if compressed and count:
+        with library_errors(path, _COPY):
+            _check_chunks(path, header)
+    return header
+
+
+def _check_records(head: bytes, path: Path) -> None:
+    """Reject a record count that exceeds the file size: laspy tries to read each record."""
+    count = int.from_bytes(head[100:104], "little")
+    extended = int.from_bytes(head[243:247], "little") if head[25:26] >= b"\x04" else 0
+    if 54 * count + 60 * extended > path.stat().st_size:  # header sizes in bytes
+        raise InputError(
+            f"header: {count + extended} variable-length records don't fit into the file",
+            where=path,
+            remedy=_COPY,
+        )
+
+
+def _check_chunks(path: Path, header: Any) -> None:
+    """Reject a chunk table that is inconsistent with the file.
+
+    lazrs allocates the declared size, and aborts the process if that fails. The table
+    consists of its version, the number of chunks and their compressed sizes. Its offset precedes
+    the chunks or, if unknown at that time, is in the last 8 bytes (specification of LASzip 2.2).
+    """
+    import lazrs
+
+    size, start = path.stat().st_size, int(header.offset_to_point_data)
+    layout = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+    if layout.item_size() != header.point_format.size:
+        raise InputError(
+            f"LASzip record: a point has {layout.item_size()} bytes, in the header"
+            f" {header.point_format.size}",
+            where=path,
+            remedy=_COPY,
+        )
+    with path.open("rb") as file:
+        file.seek(start)
+        (table,) = struct.unpack("<q", file.read(8))
+        if table <= start:
+            file.seek(-8, os.SEEK_END)
+            (table,) = struct.unpack("<q", file.read(8))
+        if not start + 8 <= table <= size - 8:
+            raise InputError(
+                f"chunk table: offset {table} is outside the point data", where=path, remedy=_COPY
+            )
+        file.seek(table)
+        _, count = struct.unpack("<II", file.read(8))
+        # Each chunk begins with an uncompressed point.
+        if count * layout.item_size() > table - start:
+            raise InputError(
+                f"chunk table: {count} chunks don't fit into {table - start} bytes",
+                where=path,
+                remedy=_COPY,
+            )
+        file.seek(start)
+        chunks = lazrs.read_chunk_table(file, layout)
+    points, compressed = (sum(column) for column in zip(*chunks, strict=True)) if chunks else (0, 0)
+    if compressed > table - start or points < header.point_count:
+        raise InputError(
+            f"chunk table: {points} points in {compressed} bytes, while the file has"
+            f" {header.point_count} in {table - start}",
+            where=path,
+            remedy=_COPY,
+        )
+
+
+def _shift(path: Path) -> Float64:
+    """The offset (3,) subtracted from map coordinates so that float32 suffices."""
+    header = _las_header(path)
+    low, high = np.asarray(header.mins, float), np.asarray(header.maxs, float)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return np.zeros(3)
+    return map_shift(low, high)
+
+
+def read_las(path: Path) -> Any:
+    """Return the `laspy.LasData` of a file, whose header is checked first.
+
+    Raises
+    ------
+    InputError
+        If it is damaged.
+    """
+    import laspy
+
+    _las_header(path)
+    with library_errors(path, _COPY):
+        return laspy.read(path)
+
+
+def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> CloudFrame:
+    points = read_las(path)
+    with library_errors(path, _COPY):
+        xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1)
+        names = set(points.point_format.dimension_names)
+        amplitude = np.asarray(points["intensity"], np.float32)
+        color = None
+        if {"red", "green", "blue"} <= names:
+            values = np.stack([np.asarray(points[c]) for c in ("red", "green", "blue")], 1)
+            # The standard uses 16 bits; many programs write 8-bit values.
+            color = (values >> 8 if values.max(initial=0) > 255 else values).astype(np.uint8)
+    return cloud_frame(
+        index,
+        timestamp,
+        xyz,
+        amplitude=amplitude if amplitude.any() else None,
+        color=color if color is not None and color.any() else None,
+        shift=shift,
+    )
+
+
+@part("reader", "e57")
+class E57Scans(Reader):
+    """A .e57 file: one view per scan, in the scanner's frame; its poses as reference."""
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        return Sniff(1.0, "an E57 file") if begins_with(file_of(path, ".e57"), _E57) else None
+
+    def open(self, path: Path, options: ReaderOptions) -> E57Source:
+        """See `Reader.open`."""
+        refuse_camera(options, "e57")
+        return E57Source(required_file(path, ".e57"))
+
+
+class E57Source(FileSource):
+    """Scans of a file, read on demand."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if read_head(path, 8) != _E57:
+            raise InputError("isn't an E57 file", where=path, remedy="check the file")
+        self._pye57 = required_package("pye57", "scan", path)
+        with library_errors(path, _COPY), closing(self._pye57.E57(str(path))) as file:
+            headers = [file.get_header(k) for k in range(file.scan_count)]
+            self.counts = [int(header.point_count) for header in headers]
+            poses = [self._pose(header) for header in headers]
+        if not self.counts:
+            raise InputError(
+                "contains no scan", where=path, remedy="export scans, not only pictures"
+            )
+        super().__init__(np.arange(len(self.counts), dtype=float))
+        self.reference = poses_of(
+            self, range(len(poses)), lambda k: read_matrix_pose(poses[k], f"{path}: scan {k}")
+        )
+        read_unshifted = partial(self._read, shift=np.zeros(3))
+        self._shift, self._cached = find_shift(read_unshifted, len(self.counts))
+        note_shift(self, path, self._shift)
+
+    def load(self, index: int) -> CloudFrame:
+        """See `FileSource.load`."""
+        cached = self._cached.pop(index, None)
+        return self._read(index, self._shift) if cached is None else cached
+
+    def _read(self, index: int, shift: Float64) -> CloudFrame:
+        where = f"{self.path}: scan {index}"
+        if self.counts[index] > MAX_POINTS:
+            raise InputError(
+                f"point count: {self.counts[index]} is more than the limit of {MAX_POINTS}",
+                where=where,
+                remedy="export the scan with fewer points",
+            )
+        with library_errors(where, _COPY), closing(self._pye57.E57(str(self.path))) as file:
+            data = file.read_scan(
+                index, intensity=True, colors=True, ignore_missing_fields=True, transform=False
+            )
+            points = np.stack([np.asarray(data[f"cartesian{a}"], float) for a in "XYZ"], 1)
+        color = None
+        if all(f"color{c}" in data for c in ("Red", "Green", "Blue")):
+            color = np.stack([np.asarray(data[f"color{c}"]) for c in ("Red", "Green", "Blue")], 1)
+            color = color.astype(np.uint8)
+        amplitude = data.get("intensity")
+        return cloud_frame(
+            index,
+            float(index),
+            points,
+            amplitude=None if amplitude is None else np.asarray(amplitude, np.float32),
+            color=color,
+            shift=shift,
+        )
+
+    def _pose(self, header: Any) -> Float64:
+        if not header.has_pose():
+            return np.eye(4)
+        w, x, y, z = (float(value) for value in header.rotation)
+        return to_pose([x, y, z, w], header.translation)

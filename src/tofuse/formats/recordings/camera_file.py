@@ -1,0 +1,601 @@
+"""camera.json: the description of the camera of a native recording."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.reading import input_error, is_file, read_text
+from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable
+from tofuse.engine.geometry.se3 import check_pose
+from tofuse.engine.frames.frames import AmplitudeKind, DepthKind
+
+# Limits for any camera: a frame per month to a million per second; ambiguity ranges of modulation
+# at 15 GHz to 1.5 kHz.
+_RATES_HZ = (1e-7, 1e6)
+_PERIODS_M = (0.01, 1e5)
+
+SCHEMA = 1
+MAX_SLOPE = 1e4  # of a ray: 89.99 degrees off the axis
+MAX_SKEW_PX = 0.005  # a smaller displacement of pixels by skew is neglected
+AMPLITUDE_KINDS = ("raw", "range_compensated", "ir")
+
+_METRES = "the metres of one count, such as 0.001"
+_LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
+_KEYS = (
+    "schema",
+    *_LENS,
+    "depth_unit_m",
+    "depth_kind",
+    "frame_rate_hz",
+    "ambiguity_m",
+    "confidence_max",
+    "amplitude_kind",
+    "sigma_unit_m",
+    "sensor",
+    "color_registered",
+    "color",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ColorCamera:
+    """The camera of colour images that are not registered to depth.
+
+    `T_color_depth` (4, 4) maps points in m from the depth camera's frame to the colour camera's.
+    """
+
+    camera: Pinhole
+    T_color_depth: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFile:
+    """Content of a camera.json.
+
+    Attributes
+    ----------
+    camera
+        None if the model is "rays" (it is in rays.npy then), and for clouds.
+    size
+        (width, height), or None for clouds.
+    depth_unit_m
+        Metres per count.
+    depth_kind
+        "z" or "range".
+    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind, sigma_unit_m, sensor
+        See the native format in docs/formats.md; None where not given.
+    color_registered
+        Whether colour without its own camera is registered to depth.
+    color
+        The colour camera, unless colour has the pixels of depth.
+    unknown
+        Unknown keys.
+    """
+
+    camera: Pinhole | None
+    size: tuple[int, int] | None
+    depth_unit_m: float = 0.001
+    depth_kind: DepthKind = "z"
+    frame_rate_hz: float | None = None
+    ambiguity_m: float | None = None
+    confidence_max: float | None = None
+    amplitude_kind: AmplitudeKind | None = None
+    sigma_unit_m: float | None = None
+    sensor: str | None = None
+    color_registered: bool = True
+    color: ColorCamera | None = None
+    unknown: tuple[str, ...] = ()
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """Metadata of a recording's depth and sensor."""
+        return {"depth_kind": self.depth_kind, **self.stated("sensor")}
+
+    def stated(self, *names: str) -> dict[str, Any]:
+        """Return those of the named attributes that are given."""
+        values = {name: getattr(self, name) for name in names}
+        return {name: value for name, value in values.items() if value is not None}
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read, is invalid (with line and column), or is not an object.
+    """
+    text = read_text(path, limit=64 << 20)
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"is invalid JSON ({error.msg}, line {error.lineno} column {error.colno})",
+            where=path,
+            remedy="correct it there",
+        ) from error
+    except (RecursionError, ValueError) as error:
+        raise InputError("is invalid JSON", where=path, remedy="write it again") from error
+    if not isinstance(data, dict):
+        raise InputError("is not a JSON object", where=path, remedy="write {...}")
+    return data
+
+
+def number_in(
+    data: Mapping[str, Any],
+    name: str,
+    where: str | Path,
+    default: float | None = None,
+    remedy: str = "use a number",
+) -> float:
+    """Return a number of JSON data.
+
+    Parameters
+    ----------
+    data
+        The object.
+    name
+        Its field.
+    where
+        The file, for errors.
+    default
+        The value if it is missing; required unless given.
+    remedy
+        The remedy.
+
+    Raises
+    ------
+    InputError
+        If it is missing and has no default, is not a number, or does not fit into a float.
+    """
+    value = data.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        problem = "is missing" if value is None else f"is {value!r:.60}"
+        raise InputError(problem, where=f"{where}: {name}", remedy=remedy)
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise InputError("is too large", where=f"{where}: {name}", remedy=remedy) from error
+
+
+def numbers_in(
+    data: Mapping[str, Any],
+    name: str,
+    where: str | Path,
+    shape: tuple[int, ...],
+    remedy: str,
+    *,
+    finite: bool = True,
+) -> Float64:
+    """Return an array of numbers of JSON data.
+
+    Parameters
+    ----------
+    data
+        The object.
+    name
+        Its field, which contains lists of numbers, nested or not.
+    where
+        The file, for errors.
+    shape
+        Of the array; -1 in it stands for any length.
+    remedy
+        The remedy.
+    finite
+        Whether all numbers have to be finite.
+
+    Raises
+    ------
+    InputError
+        If it is missing, has another count of numbers, or contains anything else.
+    """
+    place = f"{where}: {name}"
+    if data.get(name) is None:
+        raise InputError("is missing", where=place, remedy=remedy)
+    try:
+        values = np.array(data[name], float).reshape(shape)
+        valid = not finite or np.isfinite(values).all()
+    except (TypeError, ValueError, OverflowError):
+        valid = False
+    if not valid:
+        counts = " x ".join("N" if count < 0 else str(count) for count in shape)
+        noun = "finite numbers" if finite else "numbers"
+        raise InputError(f"is not {counts} {noun}", where=place, remedy=remedy)
+    return values
+
+
+def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
+    """Read and check a camera.json.
+
+    Parameters
+    ----------
+    path
+        The file.
+    clouds
+        Whether the recording has clouds, which need no camera.
+
+    Raises
+    ------
+    InputError
+        Naming file and field, with a remedy.
+    """
+    data = read_json(path)
+    get = _Fields(data, str(path))
+    schema = data.get("schema")
+    if schema != SCHEMA or isinstance(schema, bool):
+        raise get.error(
+            "schema",
+            f"is {schema!r}" if "schema" in data else "is missing",
+            f"write {SCHEMA}, the only version",
+        )
+    camera = size = None
+    color = None
+    unit = 0.001
+    kind: DepthKind = "z"
+    if not (clouds and "model" not in data):
+        camera, size = _lens(get)
+        unit = get.positive("depth_unit_m", required=True, hint=_METRES) or 0.001
+        if not 1e-9 <= unit <= 1:
+            raise get.error("depth_unit_m", f"is {unit}", "set the metres per count, at most 1")
+        kind = get.choice("depth_kind", ("z", "range"), required=True)  # type: ignore[assignment]
+        color = _color(get)
+    return CameraFile(
+        camera,
+        size,
+        unit,
+        kind,
+        get.within("frame_rate_hz", *_RATES_HZ),
+        get.within("ambiguity_m", *_PERIODS_M),
+        get.positive("confidence_max"),
+        get.choice("amplitude_kind", AMPLITUDE_KINDS),  # type: ignore[arg-type]
+        get.positive("sigma_unit_m"),
+        get.text("sensor"),
+        get.flag("color_registered", default=True),
+        color,
+        tuple(key for key in data if key not in _KEYS),
+    )
+
+
+def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[CameraFile, Camera]:
+    """Read a camera.json and the rays.npy in its folder, which overrides the lens model.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size
+        Expected width and height, if known.
+
+    Raises
+    ------
+    InputError
+        As `read_camera_file`; also if the sizes differ, or the model is "rays" without a table.
+    """
+    path = Path(path)
+    description = read_camera_file(path)
+    if size is not None and description.size != size:
+        raise InputError(
+            f"is of {' x '.join(map(str, description.size or ()))} pixels, depth of "
+            f"{size[0]} x {size[1]}",
+            where=path,
+            remedy="pass the camera of these images",
+        )
+    table = path.parent / "rays.npy"
+    if not is_file(table):
+        if description.camera is None:
+            raise InputError(
+                "is 'rays' and there is no rays.npy",
+                where=f"{path}: model",
+                remedy="add rays.npy, or use a lens model",
+            )
+        return description, description.camera
+    camera = read_rays(table)
+    if description.size != (camera.width, camera.height):
+        raise InputError(
+            f"is {camera.width} x {camera.height}, {path.name} says "
+            f"{' x '.join(map(str, description.size or ()))}",
+            where=table,
+            remedy="use the table of this camera",
+        )
+    return description, camera
+
+
+def camera_file_of(folder: Path, camera_file: Path | None, content: str) -> Path:
+    """Return the camera.json passed by the user, or else that of a recording's folder.
+
+    Parameters
+    ----------
+    folder, camera_file
+        The recording, and the file passed by the user, if any.
+    content
+        Content of files of this format, for the message, such as "neither size nor lens".
+
+    Raises
+    ------
+    InputError
+        If there is no such file.
+    """
+    path = camera_file or folder / "camera.json"
+    if not is_file(path):
+        raise InputError(
+            f"is missing: such files contain {content}",
+            where=path,
+            remedy="pass a camera.json with --camera",
+        )
+    return path
+
+
+def check_size(image: NDArray[Any], camera: Camera, where: str | Path) -> None:
+    """Raise InputError, naming `where`, unless an image (H, W, ...) has the size of its camera."""
+    if image.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            f"is {image.shape[1]} x {image.shape[0]} pixels, its camera "
+            f"{camera.width} x {camera.height}",
+            where=where,
+            remedy="pass the camera of these images with --camera",
+        )
+
+
+def read_rays(path: Path) -> RayTable:
+    """Read a rays.npy: (H, W, 2) float32 of x/z and y/z."""
+    try:
+        # Mapped first, so that a damaged header can't cause an allocation larger than the file.
+        table = np.load(path, mmap_mode="r", allow_pickle=False)
+        if not isinstance(table, np.ndarray) or table.dtype.kind != "f":
+            raise ValueError("not an array of floats")
+        if table.ndim != 3 or table.shape[2] != 2:
+            raise ValueError(f"shape {table.shape}, not (H, W, 2)")
+        rays = np.array(table, float)
+        finite = np.isfinite(rays)
+        if (np.abs(rays[finite]) > MAX_SLOPE).any():
+            raise ValueError("rays at 90 degrees from the optical axis or more")
+        directions = rays[finite.all(2)]
+        if not len(directions):
+            raise ValueError("no pixel has a ray")
+        if len(directions) > 1 and not np.ptp(directions, axis=0).any():
+            raise ValueError("all rays are the same")
+        return RayTable(np.where(finite, rays, np.nan).astype(np.float32))
+    except OSError as error:
+        raise input_error(error, path) from error
+    except InputError as error:
+        raise InputError(error.problem, where=path, remedy=error.remedy) from error
+    except Exception as error:  # NumPy evaluates the header as Python, which can raise anything
+        raise InputError(
+            f"is not a table of rays ({error})",
+            where=path,
+            remedy="save (H, W, 2) float32",
+        ) from error
+
+
+def camera_fields(camera: Camera) -> dict[str, Any]:
+    """Return the fields of camera.json that describe a camera; only the size of a ray table."""
+    if isinstance(camera, RayTable):
+        return {"model": "rays", "width": camera.width, "height": camera.height}
+    if not isinstance(camera, Pinhole):
+        raise InputError(
+            f"is a {type(camera).__name__}",
+            where="camera",
+            remedy="use one of the models, or a RayTable of its rays",
+        )
+    out: dict[str, Any] = {"model": camera.model, "width": camera.width, "height": camera.height}
+    out |= {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
+    if order := DISTORTION_ORDER[camera.model]:
+        out["distortion"] = [float(getattr(camera, name)) for name in order]
+    return out
+
+
+class _Fields:
+    """Checked access to the fields of an object, with errors that name file and field."""
+
+    def __init__(self, data: dict[str, Any], where: str) -> None:
+        self.data, self.where = data, where
+
+    def error(self, field: str, problem: str, remedy: str) -> InputError:
+        return InputError(problem, where=f"{self.where}: {field}", remedy=remedy)
+
+    def number(self, field: str, *, required: bool = False, hint: str = "a number") -> float | None:
+        if self.data.get(field) is None and not required:
+            return None
+        value = number_in(self.data, field, self.where, remedy=f"use {hint}")
+        if not math.isfinite(value):
+            raise self.error(field, f"is {value}", f"use a finite {hint.removeprefix('a ')}")
+        return value
+
+    def positive(
+        self, field: str, *, required: bool = False, hint: str = "a positive number"
+    ) -> float | None:
+        value = self.number(field, required=required, hint=hint)
+        if value is not None and value <= 0:
+            raise self.error(field, f"is {value}", f"use {hint}")
+        return value
+
+    def within(self, field: str, low: float, high: float) -> float | None:
+        value = self.positive(field)
+        if value is not None and not low <= value <= high:
+            raise self.error(field, f"is {value:g}", f"use a number from {low:g} to {high:g}")
+        return value
+
+    def pixels(self, field: str) -> int:
+        value = self.number(field, required=True, hint="a number of pixels")
+        if value is None or value != int(value) or not 2 <= value <= 16384:
+            raise self.error(field, f"is {value}", "use a whole number of pixels, 2 to 16384")
+        return int(value)
+
+    def text(self, field: str) -> str | None:
+        value = self.data.get(field)
+        if value is not None and (not isinstance(value, str) or not value.isprintable()):
+            raise self.error(field, f"is {value!r:.60}", "write a name on one line")
+        return value if value is None else value[:200]
+
+    def flag(self, field: str, *, default: bool) -> bool:
+        value = self.data.get(field, default)
+        if not isinstance(value, bool):
+            raise self.error(field, f"is {value!r:.60}", "write true or false")
+        return value
+
+    def choice(self, field: str, choices: tuple[str, ...], *, required: bool = False) -> str | None:
+        value = self.data.get(field)
+        if value is None and not required:
+            return None
+        if value not in choices or not isinstance(value, str):
+            problem = "is missing" if field not in self.data else f"is {value!r:.60}"
+            raise self.error(field, problem, f"write one of {', '.join(choices)}")
+        return value
+
+
+def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
+    model = get.choice("model", (*MODELS, "rays"), required=True)
+    size = (get.pixels("width"), get.pixels("height"))
+    if model == "rays" or model is None:
+        return None, size
+    values: dict[str, float] = {}
+    for name in ("fx", "fy"):
+        values[name] = get.positive(name, required=True) or 1.0
+    for name in ("cx", "cy"):
+        values[name] = get.number(name, required=True) or 0.0
+    order = DISTORTION_ORDER[model]
+    coefficients = get.data.get("distortion")
+    coefficients = [] if coefficients is None else coefficients
+    if not isinstance(coefficients, list):
+        raise get.error("distortion", f"is {coefficients!r:.60}", f"use a list [{' '.join(order)}]")
+    for k, value in enumerate(coefficients):
+        _Fields({f"distortion[{k}]": value}, get.where).number(f"distortion[{k}]", required=True)
+    extra = coefficients[len(order) :]
+    if any(extra):
+        raise get.error(
+            "distortion",
+            f"has {len(coefficients)} numbers, the model {model!r} takes {len(order)}",
+            f"use [{' '.join(order)}], or another model",
+        )
+    values |= {name: float(v) for name, v in zip(order, coefficients, strict=False)}
+    cls = MODELS[model]
+    parameters = {f.name for f in fields(cls)}
+    values = {name: v for name, v in values.items() if name in parameters}
+    return checked_lens(cls, size, values, get.where), size
+
+
+def image_size(width: float, height: float, where: str | Path) -> tuple[int, int]:
+    """Return (width, height) from a file in whole pixels; InputError if no image has this size."""
+    if not (2 <= width <= 16384 and 2 <= height <= 16384):
+        raise InputError(f"is {width:g} x {height:g}", where=where, remedy="give pixels")
+    return int(width), int(height)
+
+
+def pinhole_values(K: Float64, height: int, where: str | Path) -> dict[str, float]:
+    """Return fx, fy, cx and cy of a matrix K (3, 3).
+
+    Parameters
+    ----------
+    K
+        The matrix.
+    height
+        Of the images, in pixels: it decides whether a skew is negligible.
+    where
+        The file or argument, for errors.
+
+    Raises
+    ------
+    InputError
+        If it is not such a matrix, or has skew, which a pinhole camera has not.
+    """
+    if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)) or K[1, 0] != 0:
+        raise InputError(
+            f"is not a matrix K: {K.tolist()}" if K.size < 20 else f"has shape {K.shape}",
+            where=where,
+            remedy="use [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the depth images",
+        )
+    if abs(K[0, 1]) * height > MAX_SKEW_PX * abs(K[1, 1]):
+        raise InputError(
+            f"has a skew of {K[0, 1]:.3g} px",
+            where=where,
+            remedy="use the rays of the pixels (rays, RayTable), or 0 if it is negligible",
+        )
+    return _lens_values(K)
+
+
+def _lens_values(K: Float64) -> dict[str, float]:
+    return {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+
+
+def checked_lens(
+    cls: type[Pinhole], size: tuple[int, int], values: dict[str, float], where: str | Path
+) -> Pinhole:
+    """Return a camera with parameters from a file.
+
+    Parameters
+    ----------
+    cls
+        The lens model.
+    size
+        (width, height) in pixels.
+    values
+        The other parameters by name.
+    where
+        The file, for errors.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the parameter, if it isn't finite or plausible.
+    """
+    for name, value in values.items():
+        low = 0.01 if name in ("fx", "fy") else -1e6
+        if not low <= value <= 1e6:
+            raise InputError(
+                f"is {value}", where=f"{where}: {name}", remedy=f"use {low:g} to 1000000"
+            )
+    try:
+        return cls(size[0], size[1], **values)
+    except InputError as error:
+        raise InputError(
+            error.problem, where=f"{where}: {error.where}", remedy=error.remedy
+        ) from error
+
+
+def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pinhole:
+    """Return the camera of a matrix from a file.
+
+    Parameters
+    ----------
+    K
+        (3, 3) of focal lengths and principal point.
+    size
+        (width, height) in pixels.
+    where
+        The file, for errors.
+
+    Raises
+    ------
+    InputError
+        See `checked_lens`.
+    """
+    return checked_lens(Pinhole, size, _lens_values(K), where)
+
+
+def _color(get: _Fields) -> ColorCamera | None:
+    data = get.data.get("color")
+    if data is None:
+        return None
+    if not isinstance(data, dict) or not isinstance(data.get("intrinsics"), dict):
+        raise get.error("color", "has no intrinsics", "use {intrinsics: {...}, T_color_depth: ...}")
+    camera, _ = _lens(
+        _Fields({"model": "pinhole"} | data["intrinsics"], f"{get.where}: color.intrinsics")
+    )
+    if camera is None:
+        raise get.error("color.intrinsics.model", "is 'rays'", "use a lens model")
+    field = "color.T_color_depth"
+    try:
+        matrix = np.array(data.get("T_color_depth"), float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise get.error(field, "is not a 4x4 matrix", "use four rows of four numbers") from error
+    return ColorCamera(camera, check_pose(matrix, where=f"{get.where}: {field}"))

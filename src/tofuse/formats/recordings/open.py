@@ -1,0 +1,514 @@
+"""Opening a recording, again as it was opened before, or a single view of it by name."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.formats.files.reading import input_error, is_folder, list_folder, path_of
+from tofuse.formats.files.trajectory_formats import TimedPoses, read_poses
+from tofuse.engine.parts import discover, name_of, registered
+from tofuse.formats.recordings.cloud_sequence import describe_shift
+from tofuse.engine.frames.frames import Frame
+from tofuse.formats.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
+from tofuse.engine.frames.recording import Recording, Source
+from tofuse.formats.recordings.rig import RigSource, read_rig, recordings_of, rig_file_in
+from tofuse.formats.recordings.sources import JoinedSource, LimitedSource
+from tofuse.formats.recordings.still import average_still
+
+# Proprietary recordings: problem and remedy by suffix.
+CLOSED = {
+    ".rrf": (
+        "contains raw phases of a pmd camera, whose layout and calibration aren't published",
+        "play it by pmd's Royale and export its frames as PLY (sampleExportPLY), or record the "
+        "camera's ROS topics, and use those",
+    ),
+    ".xef": (
+        "is of Kinect Studio, whose layout isn't published",
+        "play it by Kinect Studio and save its depth images, or record by iai_kinect2",
+    ),
+}
+
+# A folder with these may contain depth images of an unknown camera.
+_IMAGES = (".png", ".pgm", ".tif", ".tiff", ".jpg", ".jpeg")
+
+
+def readers() -> dict[str, Reader]:
+    """Return the readers by name."""
+    discover("tofuse.formats.readers")
+    return {name: cls() for name, cls in registered("reader").items()}
+
+
+def open_recording(
+    *paths: str | Path,
+    format: str | None = None,  # noqa: A002
+    camera: str | Path | None = None,
+    topic: str | None = None,
+    min_depth: float | None = None,
+    max_depth: float | None = None,
+) -> Recording:
+    """Open a recording; its format is detected from names and contents.
+
+    Parameters
+    ----------
+    paths
+        Files or folders; several are joined in the order given. A folder of native or SR4000
+        recordings is joined in name order; if it contains a rig.json, its recordings are the
+        cameras of a rig, one image of each in turn.
+    format
+        Name of a reader, instead of detection.
+    camera
+        A camera.json that replaces the recording's own camera.
+    topic
+        Topic of a bag with the depth images or clouds, instead of detection.
+    min_depth, max_depth
+        In m; nearer or farther points are dropped: by z in images, by distance in clouds.
+
+    Raises
+    ------
+    InputError
+        If the format is ambiguous (with the evidence, and the option to select it), or nothing can
+        be read.
+    """
+    for path in paths:
+        path_of(path, "path", "pass a path, or several: tofuse.open(a, b)")
+    if not paths:
+        raise InputError("no recording was given", remedy="pass a path")
+    _check_depths(min_depth, max_depth)
+    options = ReaderOptions(None if camera is None else Path(camera), topic)
+    rig_file = rig_file_in(paths[0]) if len(paths) == 1 else None
+    if rig_file is not None:
+        rig = _rig_source(rig_file, format, options)
+        if min_depth is not None or max_depth is not None:
+            raise InputError(
+                "do not apply to a rig", where="min_depth, max_depth", remedy="leave them out"
+            )
+        return Recording.of(rig, str(paths[0]), "rig")
+    for path in paths:
+        _check_kind(Path(path))
+    located = [item for path in paths for item in _resolve(Path(path), format)]
+    sources = [item.reader.open(item.path, options) for item in located]
+    source: Source = sources[0]
+    if len(sources) > 1:
+        source = JoinedSource(sources, _short_names([item.path for item in located]))
+    _check_usable(source, paths[0])
+    if min_depth is not None or max_depth is not None:
+        source = LimitedSource(
+            source, min_depth or 0.0, float("inf") if max_depth is None else max_depth
+        )
+    names = dict.fromkeys(name_of(item.reader) for item in located)
+    return Recording.of(source, " ".join(map(str, paths)), "+".join(names))
+
+
+def _rig_source(
+    rig_file: Path,
+    format: str | None,  # noqa: A002
+    options: ReaderOptions,
+) -> RigSource:
+    """The recordings of a rig's cameras, in the folder of its file."""
+    recordings = []
+    for name, path in recordings_of(rig_file).items():
+        if not path.exists():
+            raise InputError(
+                f"has no recording of the camera {name!r}",
+                where=rig_file.parent,
+                remedy=f"put it into {path}, or remove the camera from {rig_file.name}",
+            )
+        located = _resolve(path, format)
+        if len(located) > 1:
+            raise InputError("contains several recordings", where=path, remedy="leave one")
+        source = located[0].reader.open(located[0].path, options)
+        _check_usable(source, path)
+        recordings.append(Recording.of(source, path, name_of(located[0].reader)))
+    return RigSource(read_rig(rig_file), recordings)
+
+
+@dataclass(frozen=True)
+class _Located:
+    path: Path
+    reader: Reader
+
+
+def _check_kind(path: Path) -> None:
+    """Refuse special files such as pipes: reading them could block for ever."""
+    try:
+        special = path.exists() and not path.is_file() and not path.is_dir()
+    except (OSError, ValueError):
+        return  # reported when it is opened
+    if special:
+        raise InputError(
+            "is neither a file nor a folder", where=path, remedy="pass a recording's path"
+        )
+
+
+def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
+    """The recordings at a path, each with its reader."""
+    try:
+        path.stat()
+    except OSError as error:
+        raise input_error(error, path) from error
+    except ValueError as error:
+        raise InputError(f"is not a path ({error})", where=repr(str(path))) from error
+    children = list_folder(path) if path.is_dir() else []
+    if path.is_dir() and not children:
+        raise InputError("is an empty folder", where=path, remedy="pass a recording")
+    if format is not None:
+        return _resolve_as(path, format)
+    sniffs = _sniff(path)
+    # A camera.json or names of one format outweigh a cloud in the same folder.
+    best = max((sniff.confidence for sniff in sniffs.values()), default=0.0)
+    confident = {n: sniff for n, sniff in sniffs.items() if sniff.confidence >= max(best, CERTAIN)}
+    if len(confident) == 1:
+        return [_Located(path, readers()[next(iter(confident))])]
+    if len(confident) > 1:
+        evidence = "; ".join(f"{name}: {sniff.evidence}" for name, sniff in confident.items())
+        raise InputError(
+            f"could be several formats ({evidence})",
+            where=path,
+            remedy=f"use --format {' or '.join(confident)}",
+        )
+    if not sniffs and (parts := _recordings_in(path)):
+        return parts
+    suffixes = {p.suffix.lower() for p in (children or [path]) if p.is_file()}
+    for suffix in suffixes & CLOSED.keys():
+        problem, remedy = CLOSED[suffix]
+        raise InputError(problem, where=path, remedy=remedy)
+    raise _unidentified(path, sniffs, children)
+
+
+def _resolve_as(path: Path, format: str) -> list[_Located]:  # noqa: A002
+    choices = readers()
+    if format not in choices:
+        raise InputError(
+            f"there is no format {format!r}",
+            where="--format",
+            remedy=f"use one of {', '.join(choices)}",
+        )
+    reader = choices[format]
+    if reader.joinable and path.is_dir() and _sniff_as(reader, path) is None:
+        parts = [p for p in list_folder(path) if is_folder(p) and _sniff_as(reader, p) is not None]
+        if parts:
+            return [_Located(p, reader) for p in parts]
+    return [_Located(path, reader)]
+
+
+def _sniff_as(reader: Reader, path: Path) -> Sniff | None:
+    """Detect a format; None also if what tells it can't be read."""
+    try:
+        return reader.sniff(path)
+    except InputError:
+        return None
+
+
+def _sniff(path: Path) -> dict[str, Sniff]:
+    sniffs = {name: _sniff_as(reader, path) for name, reader in readers().items()}
+    return {name: sniff for name, sniff in sniffs.items() if sniff is not None}
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a reader recognises a file or folder as a recording of its format."""
+    return any(sniff.confidence >= CERTAIN for sniff in _sniff(path).values())
+
+
+def _recordings_in(path: Path) -> list[_Located]:
+    """The recordings in a folder, if any; InputError if they can't be joined."""
+    if not is_folder(path):
+        return []
+    format_of: dict[Path, str] = {}
+    for folder in list_folder(path):
+        if not is_folder(folder):
+            continue
+        sniffs = _sniff(folder)
+        confident = [name for name, s in sniffs.items() if s.confidence >= CERTAIN]
+        if confident:
+            format_of[folder] = max(confident, key=lambda name: sniffs[name].confidence)
+    if not format_of:
+        return []
+    formats = sorted(set(format_of.values()))
+    listed = ", ".join(f"{p.name} ({name})" for p, name in list(format_of.items())[:6])
+    reader = readers()[formats[0]]
+    if len(formats) > 1 or not reader.joinable:
+        raise InputError(
+            f"contains several recordings: {listed}",
+            where=path,
+            remedy="pass one of them, or several in order",
+        )
+    return [_Located(p, reader) for p in format_of]
+
+
+def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
+    if sniffs:
+        evidence = "; ".join(dict.fromkeys(sniff.evidence for sniff in sniffs.values()))
+        remedies = [sniff.remedy or f"use --format {name}" for name, sniff in sniffs.items()]
+        return InputError(
+            f"could not be identified: it has {evidence}",
+            where=path,
+            remedy=", or ".join(dict.fromkeys(remedies)),
+        )
+    remedy = "check the path"
+    if path.is_dir():
+        kinds = Counter((p.suffix or "no suffix") if p.is_file() else "folders" for p in children)
+        evidence = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4))
+        problem = f"is not a recording of a known format: it contains {evidence}"
+        if any(kind.lower() in _IMAGES for kind in kinds):
+            remedy = "if these are depth images, move them to depth/ in it and add a camera.json"
+    else:
+        problem = f"is not a recording of a known format, but a {path.suffix!r} file"
+    return InputError(
+        problem, where=path, remedy=f"{remedy}, or use --format ({', '.join(readers())})"
+    )
+
+
+def _check_depths(min_depth: float | None, max_depth: float | None) -> None:
+    for name, value in (("--min-depth", min_depth), ("--max-depth", max_depth)):
+        if value is not None and not value >= 0:
+            raise InputError(f"is {value}", where=name, remedy="use metres, 0 or more")
+    if min_depth is not None and max_depth is not None and min_depth >= max_depth:
+        raise InputError(
+            f"{min_depth} and {max_depth} leave no points",
+            where="--min-depth, --max-depth",
+            remedy="pass the smaller one first",
+        )
+
+
+def _check_usable(source: Source, path: str | Path) -> None:
+    """Refuse a recording without a readable frame; stops at the first readable one."""
+    first_error: UnreadableFrameError | None = None
+    for index in range(len(source.timestamps)):
+        try:
+            source.read(index)
+            return
+        except UnreadableFrameError as error:
+            first_error = first_error or error
+    if first_error is None:
+        raise InputError("has no frames", where=path, remedy="pass a recording")
+    count = len(source.timestamps)
+    problem = (
+        first_error.problem if count == 1 else f"none of {count} frames can be read: {first_error}"
+    )
+    raise InputError(
+        problem,
+        where=first_error.where if count == 1 else path,
+        remedy=first_error.remedy if count == 1 else None,
+    )
+
+
+def _short_names(paths: list[Path]) -> list[str]:
+    """The last part of each path, or the full paths if these are not unique."""
+    names = [p.name for p in paths]
+    return names if len(set(names)) == len(names) else [str(p) for p in paths]
+
+
+def read_reference(path: str | Path) -> TimedPoses:
+    """Read reference poses from a trajectory file, or from a recording of any format.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, or the recording has no reference poses.
+    """
+    path = Path(path)
+    poses_file = path / "groundtruth.txt" if path.is_dir() else path
+    readers_of_poses = [lambda: read_poses(poses_file), lambda: open_recording(path)]
+    if not poses_file.is_file():  # else the images are not needed
+        readers_of_poses = [lambda: open_recording(path), lambda: read_poses(path)]
+    errors: list[InputError] = []
+    for read in readers_of_poses:
+        try:
+            found = read()
+        except InputError as error:
+            errors.append(error)
+            continue
+        return found if isinstance(found, TimedPoses) else _reference_of(found, path)
+    raise errors[0] from None
+
+
+def _reference_of(recording: Recording, path: Path) -> TimedPoses:
+    poses = recording.reference
+    if poses is None or not np.isfinite(poses).all((1, 2)).any():
+        raise InputError(
+            "has no reference poses",
+            where=path,
+            remedy="pass a trajectory, such as TUM's (timestamp tx ty tz qx qy qz qw)",
+        )
+    posed = np.isfinite(poses).all((1, 2))
+    return TimedPoses(poses[posed], timestamps=recording.timestamps[posed])
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpeningOptions:
+    """Options with which a recording is opened.
+
+    Attributes
+    ----------
+    format, camera, topic
+        See `open_recording`.
+    start, end, every
+        The selected frames, see `Recording.select`.
+    average_still
+        Whether stationary intervals are averaged to one frame each.
+    """
+
+    format: str | None = None
+    camera: Path | None = None
+    topic: str | None = None
+    start: int = 0
+    end: int | None = None
+    every: int = 1
+    average_still: bool = False
+
+
+@dataclass(frozen=True)
+class Opening(OpeningOptions):
+    """Arguments with which a recording was opened; see `open_recording` and `tofuse run`.
+
+    Attributes
+    ----------
+    paths
+        Files or folders.
+    """
+
+    paths: tuple[Path, ...]
+
+    @classmethod
+    def of(cls, inputs: Iterable[str | Path], options: object) -> Opening:
+        """Return the opening of files or folders with options named like the fields.
+
+        Fields without an option keep their defaults.
+        """
+        names = [f.name for f in fields(cls) if hasattr(options, f.name)]
+        return cls(tuple(map(Path, inputs)), **{name: getattr(options, name) for name in names})
+
+    def open(self) -> Recording:
+        """Open the recording; InputError if that fails."""
+        recording = open_recording(
+            *self.paths, format=self.format, camera=self.camera, topic=self.topic
+        ).select(self.start, self.end, self.every)
+        return average_still(recording) if self.average_still else recording
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data, with absolute paths."""
+        options = {field.name: getattr(self, field.name) for field in fields(OpeningOptions)}
+        camera = None if self.camera is None else str(self.camera.absolute())
+        paths = [str(path.absolute()) for path in self.paths]
+        return {"paths": paths} | options | {"camera": camera}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], where: str | Path) -> Opening:
+        """Return the inverse of `to_dict`; InputError naming `where` if the data is invalid."""
+        try:
+            paths = tuple(Path(str(path)) for path in data["paths"])
+            camera, end = data["camera"], data["end"]
+            opening = cls(
+                paths,
+                format=data["format"],
+                camera=None if camera is None else Path(str(camera)),
+                topic=data["topic"],
+                start=int(data["start"]),
+                end=None if end is None else int(end),
+                every=int(data["every"]),
+                average_still=bool(data["average_still"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError("does not state how its recording was opened", where=where) from error
+        if not paths:
+            raise InputError("names no recording", where=where)
+        return opening
+
+
+MIN_POINTS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class SingleView:
+    """A frame and its origin.
+
+    Attributes
+    ----------
+    name
+        As the user wrote it.
+    path, format, index
+        The recording, its reader, and the index of the frame.
+    frame
+        The view.
+    shift
+        (3,) m, to add to coordinates of the frame to get those of the file. Nonzero only for clouds
+        in map coordinates.
+    warnings
+        Notes for the user on how it was read.
+    """
+
+    name: str
+    path: str
+    format: str
+    index: int
+    frame: Frame
+    shift: Float64
+    warnings: tuple[str, ...] = ()
+
+
+def open_view(
+    name: str,
+    *,
+    format: str | None = None,  # noqa: A002
+    camera: Path | None = None,
+    topic: str | None = None,
+) -> SingleView:
+    """Read the view called `name`; for the options see `open_recording`.
+
+    Raises
+    ------
+    InputError
+        If there is no such frame, the recording has several and `name` doesn't state which, or the
+        frame can't be read or has fewer than ten points.
+    """
+    path, index = split_name(name)
+    recording = open_recording(path, format=format, camera=camera, topic=topic)
+    count = len(recording)
+    if index is None and count > 1:
+        raise InputError(
+            f"contains {count} frames",
+            where=name,
+            remedy=f"choose one: {name}#0 to {name}#{count - 1}",
+        )
+    index = index or 0
+    if index >= count:
+        available = "its only frame is 0" if count == 1 else f"its frames are 0 to {count - 1}"
+        raise InputError(f"has no frame {index}", where=path, remedy=available)
+    frame = recording[index]
+    if len(frame) < MIN_POINTS:
+        raise InputError(
+            f"has {len(frame)} valid points",
+            where=name,
+            remedy=f"use a view with {MIN_POINTS} or more",
+        )
+    shift = np.asarray(recording.metadata.get("shift_m", np.zeros(3)), float)
+    # The shift is returned with the view, so a warning about it would mislead.
+    shift_note = describe_shift(shift)
+    warnings = tuple(line for line in recording.warnings if not line.endswith(shift_note))
+    return SingleView(name, path, recording.format, index, frame, shift, warnings)
+
+
+def split_name(name: str) -> tuple[str, int | None]:
+    """Return the path and the frame index in `name`; None if it has no index.
+
+    An existing path is taken literally, with any # in it.
+    """
+    if "#" not in name or os.path.lexists(name):
+        return name, None
+    path, _, frame = name.rpartition("#")
+    if not (frame.isascii() and frame.isdecimal()):
+        raise InputError(
+            f"has the frame index {frame!r}",
+            where=name,
+            remedy="write a whole number after the #, such as recording#12",
+        )
+    return path, int(frame)

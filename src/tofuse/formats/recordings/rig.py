@@ -1,0 +1,336 @@
+"""rig.json: rigidly connected cameras, and their recordings as one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.atomic import write_text
+from tofuse.formats.files.reading import if_file
+from tofuse.engine.cameras.cameras import ray_lengths
+from tofuse.engine.geometry.se3 import check_pose
+from tofuse.formats.recordings.camera_file import number_in, numbers_in, read_json
+from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames.recording import Recording
+
+SCHEMA = 1
+FILE_NAME = "rig.json"
+# Larger clock and depth offsets are in wrong units.
+_MAX_SECONDS, _MAX_METRES = 1e10, 10.0
+
+_REMEDY = "correct it, or write the file again by `tofuse rig calibrate`"
+
+
+@dataclass(frozen=True, eq=False)
+class RigCamera:
+    """One camera of a rig.
+
+    Attributes
+    ----------
+    name
+        Unique name.
+    recording
+        The recording used for its calibration, as given.
+    T_rig_camera
+        (4, 4) mounting pose.
+    covariance
+        (6, 6) of its right perturbation, m and rad.
+    random_covariance
+        (6, 6) the part of it due to errors that differ between two calibrations in the same scene,
+        without systematic ones such as multipath; None if unknown.
+    time_offset_s
+        The rig's time is the camera's timestamp plus this.
+    depth_offset_m
+        Excess of its ranges over those of the first camera, m.
+    """
+
+    name: str
+    recording: str
+    T_rig_camera: Float64
+    covariance: Float64
+    time_offset_s: float = 0.0
+    depth_offset_m: float = 0.0
+    random_covariance: Float64 | None = None
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """Median distance in m between surfaces of two cameras (by name), and the number of pixels."""
+
+    a: str
+    b: str
+    median_m: float
+    pixels: int
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Rigidly connected cameras; the frame of the first is that of the rig.
+
+    Attributes
+    ----------
+    cameras
+        Those with known poses.
+    disagreement
+        Of pairs of cameras.
+    unplaced
+        Reasons why other cameras could not be located, by name.
+    """
+
+    cameras: tuple[RigCamera, ...]
+    disagreement: tuple[Disagreement, ...] = ()
+    unplaced: Mapping[str, str] = field(default_factory=dict)
+
+    def camera(self, name: str) -> RigCamera | None:
+        """Return the camera called `name`; None if there is none."""
+        return next((camera for camera in self.cameras if camera.name == name), None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data, as stored in rig.json."""
+        data: dict[str, Any] = {
+            "schema": SCHEMA,
+            "cameras": [_camera_data(c) for c in self.cameras],
+            "disagreement": [
+                {"a": d.a, "b": d.b, "median_m": d.median_m, "pixels": d.pixels}
+                for d in self.disagreement
+            ],
+        }
+        if self.unplaced:
+            data["unplaced"] = [{"name": n, "reason": r} for n, r in self.unplaced.items()]
+        return data
+
+
+def _camera_data(camera: RigCamera) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "name": camera.name,
+        "recording": camera.recording,
+        "T_rig_camera": camera.T_rig_camera.tolist(),
+        "covariance": camera.covariance.ravel().tolist(),
+        "time_offset_s": camera.time_offset_s,
+        "depth_offset_m": camera.depth_offset_m,
+    }
+    if camera.random_covariance is not None:
+        data["random_covariance"] = camera.random_covariance.ravel().tolist()
+    return data
+
+
+def write_rig(path: str | Path, rig: Rig) -> None:
+    """Write a rig.json; see `replacing` for errors."""
+    write_text(path, json.dumps(rig.to_dict(), indent=1) + "\n")
+
+
+def read_rig(path: str | Path) -> Rig:
+    """Read and check a rig.json.
+
+    Raises
+    ------
+    InputError
+        Naming the invalid field.
+    """
+    data = read_json(path)
+    schema = data.get("schema")
+    if schema != SCHEMA or isinstance(schema, bool):
+        problem = f"schema is {schema!r}" if "schema" in data else "schema is missing"
+        raise InputError(problem, where=path, remedy=f"write {SCHEMA}, the only version")
+    rows = data.get("cameras")
+    if not isinstance(rows, list) or not rows:
+        raise InputError("cameras is not a list of cameras", where=path, remedy=_REMEDY)
+    cameras = tuple(_camera(row, k, path) for k, row in enumerate(rows))
+    names = [camera.name for camera in cameras]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"has two cameras called {name!r}", where=path, remedy=_REMEDY)
+    if not np.allclose(cameras[0].T_rig_camera, np.eye(4), atol=1e-6):
+        raise InputError(
+            f"the first camera, {names[0]!r}, is not the identity", where=path, remedy=_REMEDY
+        )
+    rows = data.get("disagreement", [])
+    if not isinstance(rows, list):
+        raise InputError("disagreement is not a list", where=path, remedy=_REMEDY)
+    pairs = tuple(_disagreement(row, k, names, path) for k, row in enumerate(rows))
+    return Rig(cameras, pairs, _unplaced(data.get("unplaced", []), path))
+
+
+def rig_file_in(folder: str | Path) -> Path | None:
+    """Return the rig.json in a folder; None if there is none."""
+    return if_file(Path(folder) / FILE_NAME)
+
+
+def recordings_of(rig_file: Path) -> dict[str, Path]:
+    """Return the recordings in the folder of a rig.json, by the names of its cameras."""
+    return {c.name: rig_file.parent / c.name for c in read_rig(rig_file).cameras}
+
+
+def _is_plain_name(name: str) -> bool:
+    """Whether a name can't refer to another folder on any system."""
+    return name not in (".", "..") and not any(c in "/\\:" or ord(c) < 32 for c in name)
+
+
+def _camera(row: object, k: int, path: str | Path) -> RigCamera:
+    location = f"cameras[{k}]"
+    if not isinstance(row, dict):
+        raise InputError(f"{location} is not an object", where=path, remedy=_REMEDY)
+    name, recording = row.get("name"), row.get("recording", "")
+    if not isinstance(name, str) or not name.strip():
+        raise InputError(f"{location}.name is {name!r}, not a name", where=path, remedy=_REMEDY)
+    if not _is_plain_name(name):
+        raise InputError(
+            f"{location}.name is {name!r:.80}, which is not a folder name",
+            where=path,
+            remedy="choose one without / \\ : and not . or ..",
+        )
+    if not isinstance(recording, str):
+        raise InputError(f"{location}.recording is not a path", where=path, remedy=_REMEDY)
+    where = f"{path}: {location}"
+    T = check_pose(numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY), where=str(path))
+    C = _covariance(row, "covariance", where) if "covariance" in row else np.zeros((6, 6))
+    random = None
+    if row.get("random_covariance") is not None:
+        random = _covariance(row, "random_covariance", where)
+    time = _number(row, "time_offset_s", _MAX_SECONDS, where, 0.0)
+    depth = _number(row, "depth_offset_m", _MAX_METRES, where, 0.0)
+    return RigCamera(name, recording, T, C, time, depth, random)
+
+
+def _covariance(row: dict[str, Any], name: str, where: str) -> Float64:
+    C = numbers_in(row, name, where, (6, 6), _REMEDY)
+    min_eigenvalue = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
+    tolerance = 1e-6 * max(np.abs(C).max(), 1e-9)
+    if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or min_eigenvalue < -tolerance:
+        raise InputError("is not a covariance", where=f"{where}: {name}", remedy=_REMEDY)
+    return np.asarray(0.5 * (C + C.T), np.float64)
+
+
+def _disagreement(row: object, k: int, names: list[str], path: str | Path) -> Disagreement:
+    location = f"disagreement[{k}]"
+    if not isinstance(row, dict) or row.get("a") not in names or row.get("b") not in names:
+        raise InputError(f"{location} does not name two cameras", where=path, remedy=_REMEDY)
+    where = f"{path}: {location}"
+    median = _number(row, "median_m", 1e6, where)
+    pixels = _number(row, "pixels", 1e15, where, 0.0)
+    return Disagreement(str(row["a"]), str(row["b"]), median, int(pixels))
+
+
+def _unplaced(rows: object, path: str | Path) -> dict[str, str]:
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise InputError("unplaced is not a list of cameras", where=path, remedy=_REMEDY)
+    return {str(row.get("name", "")): str(row.get("reason", "")) for row in rows}
+
+
+def _number(
+    row: dict[str, Any], name: str, limit: float, where: str, default: float | None = None
+) -> float:
+    value = number_in(row, name, where, default, _REMEDY)
+    if not abs(value) <= limit:
+        raise InputError(
+            f"is {value:g}, not at most {limit:g}", where=f"{where}: {name}", remedy=_REMEDY
+        )
+    return value
+
+
+# Largest time difference within an instant, as a fraction of the frame interval.
+_SAME_INSTANT = 0.6
+
+
+class RigSource:
+    """Images of all cameras in temporal order, with depth offsets relative to the first camera.
+
+    Parameters
+    ----------
+    rig
+        The rig; its cameras have the order of the recordings.
+    recordings
+        One for each camera.
+
+    Attributes
+    ----------
+    instant, camera
+        (N,) number of the instant and of the camera of each frame.
+    """
+
+    reference: Float64 | None = None
+    odometry: Float64 | None = None
+    gravity: Float64 | None = None
+
+    def __init__(self, rig: Rig, recordings: Sequence[Recording]) -> None:
+        self.rig = rig
+        self._recordings = list(recordings)
+        rows = self._rows()
+        if not len(rows):
+            raise InputError(
+                "no images of its cameras are of the same time",
+                where="the rig",
+                remedy="pass recordings of the same time, or calibrate the clocks again",
+            )
+        self.instant, self.camera, self._row = rows.T
+        self.timestamps = np.array(
+            [
+                float(recordings[c].timestamps[row]) + rig.cameras[c].time_offset_s
+                for _, c, row in rows
+            ]
+        )
+        self.warnings: list[str] = [
+            f"{camera.name}: {warning}"
+            for camera, recording in zip(rig.cameras, recordings, strict=True)
+            for warning in recording.warnings
+        ]
+        if not any(camera.covariance.any() for camera in rig.cameras[1:]):
+            self.warnings.append(
+                "the rig has no covariances: the accuracy leaves out errors of its cameras' poses"
+            )
+        self.metadata: dict[str, Any] = {
+            key: value
+            for key, value in recordings[0].metadata.items()
+            if all(r.metadata.get(key) == value for r in recordings)
+        }
+        self.metadata["cameras"] = [camera.name for camera in rig.cameras]
+
+    def _rows(self) -> Intp:
+        """(N, 3) instant, camera, and position in the recording of each frame."""
+        times = [
+            recording.timestamps + camera.time_offset_s
+            for recording, camera in zip(self._recordings, self.rig.cameras, strict=True)
+        ]
+        single = all(len(t) == 1 for t in times)
+        rows: list[tuple[int, int, int]] = []
+        instant = 0
+        for k, t in enumerate(times[0]):
+            images = [(0, k)]
+            for c, other in enumerate(times[1:], 1):
+                nearest = int(np.abs(other - t).argmin())
+                interval = float(np.median(np.diff(other))) if len(other) > 1 else 0.0
+                if single or abs(other[nearest] - t) <= _SAME_INSTANT * interval:
+                    images.append((c, nearest))
+            if len(images) == len(times):
+                rows += [(instant, c, row) for c, row in images]
+                instant += 1
+        return np.array(rows, np.intp).reshape(-1, 3)
+
+    @property
+    def T_rig_camera(self) -> Float64:
+        """(N, 4, 4) mounting pose of the camera of each frame."""
+        return np.stack([self.rig.cameras[c].T_rig_camera for c in self.camera])
+
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        camera = int(self.camera[index])
+        frame = self._recordings[camera][int(self._row[index])]
+        if isinstance(frame, RangeFrame):
+            frame = with_range_added(frame, -self.rig.cameras[camera].depth_offset_m)
+        return replace(frame, index=index, timestamp=float(self.timestamps[index]))
+
+
+def with_range_added(frame: RangeFrame, metres: float) -> RangeFrame:
+    """Return the image with `metres` added to its ranges."""
+    if metres == 0:
+        return frame
+    scale = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
+    depth = np.where(frame.valid, np.maximum(frame.depth + metres * scale, 0), 0)
+    return replace(frame, depth=np.nan_to_num(depth).astype(np.float32))

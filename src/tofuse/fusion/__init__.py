@@ -1,1 +1,0 @@
-"""From poses and views to one model."""

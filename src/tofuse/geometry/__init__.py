@@ -1,1 +1,0 @@
-"""Rigid motions and cameras: the frames that everything else is expressed in."""

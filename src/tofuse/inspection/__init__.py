@@ -1,1 +1,0 @@
-"""Inspection of recordings: facts and faults."""

@@ -1,1 +1,0 @@
-"""Numba kernels of the simulator and of the laboratory's methods."""

@@ -1,1 +1,0 @@
-"""Live frames: connected cameras, and recordings played like one."""

@@ -1,1 +1,0 @@
-"""From pairs to a sequence: one pose for each frame as it arrives."""

@@ -1,1 +1,0 @@
-"""Poses and measurements between them: loops, optimisers, g2o files."""

@@ -1,1 +1,0 @@
-"""Views and recordings, and one reader for each format."""

@@ -1,1 +1,0 @@
-"""The readers, one file each; all modules here are imported when a recording is opened."""

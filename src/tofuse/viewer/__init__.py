@@ -1,1 +1,0 @@
-"""`tofuse view`: the report of a result in the browser; `run --view`: a run while it works."""

@@ -1,0 +1,464 @@
+"""Global registration of clouds: viewpoints, evidence for a pose, and the pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tofuse
+from registration_scenes import box_walls, bumpy_ball, turn
+from tofuse.engine.errors import RegistrationError
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.ply import write_ply
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.peaks import peaks_views
+from tofuse.lab.simulation.record import plan
+from tofuse.engine.tracking.pairwise import Pairwise
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.clouds import cloud_pair
+from tofuse.engine.alignment.base import Registration
+from tofuse.engine.clouds.cloud_agreement import CloudMap, cloud_agreement
+from tofuse.engine.clouds.cloud_pair import register_clouds
+from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
+from tofuse.engine.clouds.reduce import averaged
+from tofuse.engine.clouds.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
+
+ANYWHERE = se3.exp([1.0, -0.7, 0.4, 1.9, 0.3, -1.0])
+
+
+def scanned(at, heading, count=20_000, seed=0, name="flat"):
+    """A scan with equal angles, z up, at a place of a simulated flat: its pose and points."""
+    built, _ = scenes.build(name, seed=0)
+    rows = int(np.sqrt(count / 2))
+    up, around = np.meshgrid(
+        np.linspace(-1.2, 1.5, rows), np.linspace(-np.pi, np.pi, 2 * rows, False), indexing="ij"
+    )
+    rays = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], -1)
+    rays = rays.reshape(-1, 3)
+    T = se3.exp([0, 0, 0, 0, 0, heading])
+    T[:3, 3] = at
+    distance = built.cast(T[:3, 3], rays @ T[:3, :3].T).distance.astype(float)
+    seen = np.isfinite(distance)
+    distance += np.random.default_rng(seed).normal(0, 0.003, len(distance))
+    return T, (rays[seen] * distance[seen, None]).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def scans():
+    """Two scans of one room of the flat, from different places."""
+    (T_a, a), (T_b, b) = scanned([-2.6, -2.5, 1.3], 0.4), scanned([-1.6, -2.2, 1.3], 2.6, seed=1)
+    return b, a, se3.inverse(T_a) @ T_b
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Two images of a furnished room, and the second one's pose in the first."""
+    made = plan("room", every=16, frames=2, effects=Effects().without("multipath", "gloss"))
+    rendered = [r.frame for r in made.frames(None)]
+    return rendered[0], rendered[1], se3.inverse(made.poses[0]) @ made.poses[1]
+
+
+def off(T, true, points):
+    """Error in m at the median of the source, and in degrees."""
+    middle = np.median(points, 0)[None].astype(float)
+    gap = se3.transform(T, middle) - se3.transform(true, middle)
+    return np.linalg.norm(gap), np.degrees(se3.angle(se3.inverse(true) @ T))
+
+
+# Viewpoints
+
+
+def test_viewpoint_of_image_points_is_their_origin(frames):
+    for frame in frames[:2]:
+        found = viewpoint_of(CloudFrame.of(frame.points))
+        assert found is not None
+        pixel = viewpoint_of(frame)
+        # Pixels at the borders are closer together in angle than those in the middle.
+        assert 0.8 * pixel.spacing < found.spacing < 1.1 * pixel.spacing
+        thinned = frame.points[np.random.default_rng(0).permutation(len(frame))[:5000]]
+        found = viewpoint_of(CloudFrame.of(thinned))
+        assert found.spacing == pytest.approx(pixel.spacing * np.sqrt(len(frame) / 5000), rel=0.2)
+
+
+def test_viewpoint_of_scan_is_detected(scans):
+    assert viewpoint_of(CloudFrame.of(scans[0])) is not None
+    origin = np.array([3.0, 4.0, -2.0])
+    moved = CloudFrame(0, 0.0, scans[0] + origin.astype(np.float32), origin=origin)
+    np.testing.assert_array_equal(viewpoint_of(moved).origin, origin)
+
+
+@pytest.mark.slow
+def test_moved_points_have_no_viewpoint(frames, scans):
+    """Mostly: from some places the surfaces of a small image are sampled as evenly."""
+    rng = np.random.default_rng(4)
+    for points in (frames[0].points, scans[0]):
+        found = []
+        for _ in range(20):
+            T = se3.exp(np.r_[rng.uniform(-2, 2, 3), rng.uniform(-2, 2, 3)])
+            found.append(viewpoint_of(CloudFrame.of(se3.transform(T, points.astype(float)))))
+        assert sum(v is not None for v in found) <= 7
+
+
+def test_evenly_sampled_surfaces_have_no_viewpoint(frames):
+    even = averaged(CloudFrame.of(frames[0].points), 0.08)
+    assert viewpoint_of(even) is None
+    assert viewpoint_of(CloudFrame.of(np.zeros((100, 3)))) is None
+    assert viewpoint_of(CloudFrame.of(frames[0].points[:20])) is None
+
+
+def test_image_of_cloud_matches_original_image(frames):
+    frame = frames[0]
+    color = np.random.default_rng(0).integers(0, 255, (*frame.depth.shape, 3)).astype(np.uint8)
+    frame = replace(frame, color_image=color)
+    cloud = CloudFrame(3, 4.0, frame.points, color=frame.color, amplitude=frame.amplitude)
+    image, T = as_image(cloud, viewpoint_of(cloud))
+    np.testing.assert_array_equal(T, np.eye(4))
+    assert (image.index, image.timestamp) == (3, 4.0)
+    assert 0.7 * frame.depth.shape[1] < image.depth.shape[1] <= frame.depth.shape[1]
+    # Each point of the image is on the surface that the camera measured.
+    pixel = np.round(frame.camera.project(image.points)).astype(int)
+    inside = (pixel >= 0).all(1) & (pixel < frame.depth.shape[::-1]).all(1)
+    z = frame.z[pixel[inside, 1], pixel[inside, 0]]
+    assert np.mean(np.abs(image.points[inside, 2] - z) < 0.05 * z) > 0.95
+    assert image.color_image[image.valid].any()
+    assert np.isin(image.amplitude, frame.amplitude).all()
+
+
+def test_pixels_of_slanted_plane_are_unbiased() -> None:
+    """Points are anywhere in their pixels; their offsets must not displace the surface."""
+    xy = np.random.default_rng(4).uniform(-0.5, 0.5, (60_000, 2))
+    z = 2.0 / (1 - 0.6 * xy[:, 0] + 0.3 * xy[:, 1])  # a plane, slanted by more than 30 degrees
+    points = np.column_stack([xy * z[:, None], z])
+    camera = Pinhole(100, 100, 100.0, 100.0, 49.5, 49.5)
+    image = rendered(CloudFrame.of(points), camera)
+    rays = camera.rays()[3:-3, 3:-3]
+    expected = 2.0 / (1 - 0.6 * rays[..., 0] + 0.3 * rays[..., 1])
+    seen = image.depth[3:-3, 3:-3]
+    off = np.abs(seen / expected - 1)[seen > 0]
+    assert np.median(off) < 2e-5  # plain means of the points in each pixel are off by 7e-4
+    assert np.quantile(off, 0.95) < 5e-4
+
+
+def test_cloud_with_z_up_is_rendered_upright(frames):
+    # x forward, y left, z up, as in scanners.
+    axes = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float)
+    cloud = CloudFrame.of(frames[0].points @ axes.T)
+    image, T = as_image(cloud, viewpoint_of(cloud))
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    assert np.degrees(np.arccos(T[:3, 1] @ [0, 0, -1])) < 30  # y is down
+    near, _ = tofuse.engine.geometry.kdtree.KdTree(cloud.points).nearest(
+        se3.transform(T, image.points.astype(float)), 0.1
+    )
+    assert np.mean(near >= 0) > 0.95
+
+
+def test_full_sphere_does_not_fit_into_image(scans):
+    cloud = CloudFrame.of(scans[0])
+    assert as_image(cloud, viewpoint_of(cloud)) is None
+
+
+def test_range_sphere_stores_free_space(scans):
+    cloud = CloudFrame.of(scans[0])
+    sphere = RangeSphere.of(cloud, viewpoint_of(cloud))
+    points = scans[0][::50].astype(float)
+    assert (
+        np.nanmedian(sphere.distance_in_front(0.5 * points) / np.linalg.norm(0.5 * points, axis=1))
+        > 0.9
+    )
+    assert np.mean(sphere.distance_in_front(points) <= 1e-3) > 0.99
+    assert np.nanmax(sphere.distance_in_front(1.5 * points)) <= 0
+    # No measurements straight down.
+    assert np.isnan(sphere.distance_in_front(np.array([[0.0, 0, -1]]))).all()
+
+
+# Agreement
+
+
+def maps(source, target, size=0.12):
+    views = CloudFrame.of(source), CloudFrame.of(target)
+    return [CloudMap.of(averaged(v, size), size, v) for v in views]
+
+
+def test_correct_pose_is_supported_and_not_contradicted(scans):
+    source, target, true = scans
+    agreement = cloud_agreement(*maps(source, target), true)
+    assert agreement.support > 0.6
+    assert agreement.contradiction < 0.01
+    assert agreement.rms_m < 0.03
+
+
+def test_wrong_pose_is_contradicted_by_free_space(scans):
+    source, target, true = scans
+    views = maps(source, target)
+    right = cloud_agreement(*views, true)
+    for wrong in (turn([0, 0, 1], 180), se3.exp([0.6, 0, 0, 0, 0, 0]), turn([1, 0, 0], 20)):
+        agreement = cloud_agreement(*views, true @ wrong)
+        assert agreement.violation > 0.02
+        assert agreement.score < right.score - 0.2
+    # Without viewpoints, free space is unknown.
+    without_viewpoint = maps(se3.transform(ANYWHERE, source.astype(float)), target)
+    assert without_viewpoint[0].sphere is None
+    agreement = cloud_agreement(
+        without_viewpoint[0], replace(without_viewpoint[1], sphere=None), turn([0, 0, 1], 180)
+    )
+    assert agreement.violation == 0
+
+
+def with_mixed_pixels(aside):
+    """A disc before a wall, from a place `aside` m to the right; outline pixels mix both depths."""
+    v, u = np.mgrid[-60:61, -80:81] * 0.005
+    disc = [np.hypot(1.2 * (u + du) + aside, 1.2 * (v + dv)) < 0.3 for du, dv in SUBPIXELS]
+    share = np.mean(disc, axis=0)
+    z = 1.2 * share + 2.0 * (1 - share)
+    points = np.stack([u * z, v * z, z], -1).reshape(-1, 3).astype(np.float32)
+    return points, ((share > 0) & (share < 1)).ravel()
+
+
+SUBPIXELS = [(du, dv) for du in (-0.002, 0, 0.002) for dv in (-0.002, 0, 0.002)]
+
+
+def test_flying_pixels_do_not_contradict_correct_pose():
+    (source, mixed), (target, _) = with_mixed_pixels(0.15), with_mixed_pixels(0.0)
+    views = maps(source, target, 0.03)
+    true = se3.exp([0.15, 0, 0, 0, 0, 0])
+    assert cloud_agreement(*views, true).contradiction < 0.002
+    # They do lie in free space of the other view.
+    seen = se3.transform(true, source[mixed].astype(float))
+    assert np.mean(views[1].sphere.distance_in_front(seen) > 0.1) > 0.1
+    # Surfaces do contradict a wrong pose.
+    wrong = cloud_agreement(*views, se3.exp([0.15, 0, -0.4, 0, 0, 0]))
+    assert wrong.contradiction > 0.05
+
+
+def test_agreement_is_symmetric(scans):
+    source, target, true = scans
+    a, b = maps(source, target)
+    there, back = cloud_agreement(a, b, true), cloud_agreement(b, a, se3.inverse(true))
+    assert there.score == pytest.approx(back.score, abs=1e-9)
+    assert there.support == pytest.approx(back.support, abs=1e-9)
+
+
+def test_evidence_without_free_space_depends_on_margin():
+    """Images and clouds have their own models of evidence."""
+    cases = [
+        PoseEvidence(0.6, c, m, k, CLOUDS) for c, m, k in ((0, 0.6, 0), (0.03, 0.25, 0), (0, 0, 1))
+    ]
+    right, other_room, slides = (case.probability for case in cases)
+    assert right > 0.9 > 0.7 > other_room > slides
+    assert "degenerate" in cases[2].rejection_reason()
+
+
+# Registration
+
+
+@pytest.fixture(scope="module")
+def registered(scans):
+    """The second scan registered to the first, by one thread."""
+    with threads(1):
+        return tofuse.register(*scans[:2])
+
+
+def test_scans_with_any_heading(scans, registered):
+    (source, _, true), found = scans, registered
+    assert off(found.T_target_source, true, source)[0] < 0.02
+    assert off(found.T_target_source, true, source)[1] < 0.5
+    assert found.believed
+    assert found.probability > 0.9
+    assert found.contradiction < 0.01
+
+
+@pytest.mark.slow
+def test_clouds_without_viewpoint_under_any_rotation(frames):
+    target, source, true = frames
+    moved = se3.transform(ANYWHERE, source.points.astype(float))
+    found = tofuse.register(moved, target.points)
+    shift, angle = off(found.T_target_source, true @ se3.inverse(ANYWHERE), moved)
+    assert shift < 0.1
+    assert angle < 4
+
+
+@pytest.mark.slow
+def test_clouds_of_different_density(scans):
+    source, target, true = scans
+    few = source[np.random.default_rng(2).permutation(len(source))[: len(source) // 10]]
+    for pair, T in (((few, target), true), ((target, few), se3.inverse(true))):
+        found = tofuse.register(*pair)
+        assert off(found.T_target_source, T, pair[0])[0] < 0.05
+        assert off(found.T_target_source, T, pair[0])[1] < 1.5
+
+
+@pytest.mark.parametrize("scale", [0.01, 20.0])
+def test_registration_is_independent_of_scale(scans, scale):
+    source, target, true = scans
+    scaled = true.copy()
+    scaled[:3, 3] *= scale
+    found = tofuse.register(source * scale, target * scale)
+    assert off(found.T_target_source, scaled, source * scale)[0] < 0.02 * scale
+    assert found.believed
+
+
+@pytest.mark.slow
+def test_views_without_overlap_are_rejected(scans):
+    _, elsewhere = scanned([2.5, -2.5, 1.3], 1.0, seed=3)
+    for source, target, reason in (
+        (elsewhere, scans[1], "probability"),
+        (np.random.default_rng(0).normal(size=(3000, 3)), scans[1], "points of both views"),
+    ):
+        found = tofuse.register(source, target)
+        assert found.believed is False
+        assert reason in found.reason
+
+
+@pytest.mark.slow
+def test_views_of_different_extent_raise_error(scans, frames):
+    ball = bumpy_ball(5000, 1)
+    with pytest.raises(RegistrationError, match="does not fit; check the units"):
+        tofuse.register(ball, scans[0])
+    with pytest.raises(RegistrationError, match="0 points of the views correspond"):
+        tofuse.register(frames[0].points, ball * 4)
+
+
+@pytest.mark.slow
+def test_ambiguous_corridor_is_rejected():
+    """Two parallel walls and a floor: the pose along them is unobservable."""
+    found = tofuse.register(box_walls(6000, 1, 0.003, "xy"), box_walls(6000, 0, 0.003, "xy"))
+    assert found.believed is False
+    assert "degenerate" in found.reason
+    assert len(found.unobservable) >= 1
+
+
+@pytest.mark.parametrize("scale", [0.001, 1000.0])
+def test_different_units_are_reported(scans, scale):
+    source, target, _ = scans
+    found = tofuse.register(source * scale, target)
+    assert found.believed is False
+    assert f"{1 / scale:g} times as large" in found.reason
+    assert "unit" in found.reason
+
+
+def test_different_units_are_reported_without_an_accepted_pose():
+    """A square room fits in four ways, so that no scale is accepted."""
+    scale = 100.0
+    walls, other = (box_walls(4000, seed, 0.003, "xyz") for seed in (0, 1))
+    with pytest.raises(RegistrationError, match="check the units of both clouds") as caught:
+        tofuse.register(other * scale, walls)
+    assert f"{scale:g} times that of the target" in str(caught.value)
+
+
+def test_guess_resolves_symmetry():
+    """An empty square room is the same after a rotation by 90 degrees."""
+    walls = box_walls(8000, 0, 0.003, "xyz")
+    other = box_walls(8000, 1, 0.003, "xyz")
+    guess = se3.exp([0.02, -0.01, 0.01, 0.01, 0.02, -0.01])
+    found = tofuse.register(other, walls, guess=guess)
+    assert off(found.T_target_source, np.eye(4), other)[0] < 0.01
+
+
+def test_result_is_independent_of_threads(scans, registered):
+    with threads(2):
+        found = tofuse.register(*scans[:2])
+    np.testing.assert_array_equal(found.T_target_source, registered.T_target_source)
+    assert found.probability == registered.probability
+
+
+def test_degenerate_clouds_are_not_accepted():
+    rng = np.random.default_rng(0)
+    plane = rng.uniform(-1, 1, (3000, 3)) * [1, 1, 0] + [0, 0, 2]
+    ten = rng.normal(size=(10, 3))
+    for points in (plane, ten):
+        found = tofuse.register(points, points)
+        assert found.believed is False
+        assert "3 directions are degenerate" in found.reason
+    line = rng.uniform(-1, 1, (3000, 1)) * [1.0, 0.2, 0.1] + [0, 0, 2]
+    with pytest.raises(RegistrationError, match="0 points of the views correspond"):
+        tofuse.register(line, line)
+    same = np.ones((3000, 3))
+    with pytest.raises(RegistrationError, match="has 1 points, 3 are needed"):
+        tofuse.register(same, same)
+
+
+def test_image_is_registered_to_cloud(frames):
+    target, source, true = frames
+    found = tofuse.register(source, CloudFrame.of(target.points))
+    assert off(found.T_target_source, true, source.points)[0] < 0.05
+    assert found.believed
+
+
+def test_registration_in_other_frames():
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(6, 6))
+    T, T_a, T_b = (se3.exp(rng.normal(size=6)) for _ in range(3))
+    slide = np.array([[1.0, 0, 0, 0, 0, 0]])
+    found = Registration(T, True, 1, 1, 1, 0.0, 0.0, A @ A.T, slide, runner_up=np.eye(4))
+    moved = found.between(T_a, T_b)
+    np.testing.assert_allclose(moved.T_target_source, T_a @ T @ T_b)
+    np.testing.assert_allclose(moved.runner_up, T_a @ T_b)
+    # A motion of b is the same motion in the source's frame.
+    xi = 1e-6 * rng.normal(size=6)
+    inside = se3.log(T_b @ se3.exp(xi) @ se3.inverse(T_b))
+    assert xi @ moved.information @ xi == pytest.approx(inside @ found.information @ inside)
+    there = se3.log(T_b @ se3.exp(1e-6 * moved.unobservable[0]) @ se3.inverse(T_b))
+    np.testing.assert_allclose(np.abs(there / np.linalg.norm(there)), np.abs(slide[0]), atol=1e-6)
+
+
+# Sequences of views
+
+
+@pytest.mark.slow
+def test_views_are_chained_and_rejected_views_start_components(scans):
+    source, target, true = scans
+    tracker = Pairwise().start(0)
+    views = [target, source, bumpy_ball(5000, 1), source + np.float32(1e-4)]
+    steps = [tracker.push(replace(CloudFrame.of(p), index=k)) for k, p in enumerate(views)]
+    assert [s.status for s in steps] == ["tracked"] * 4
+    assert [s.component for s in steps] == [0, 0, 1, 2]
+    assert off(steps[1].T_component_camera, true, source)[0] < 0.02
+    assert not steps[1].doubtful
+    # The first view of the last component is linked to the first component.
+    assert [(link.i, link.j) for link in steps[3].links] == [(1, 3)]
+    assert off(steps[3].links[0].T_i_j, np.eye(4), source)[0] < 0.01
+    lost = tracker.push(replace(CloudFrame.of(target[:5]), index=4))
+    assert lost.status == "lost"
+    assert "5 valid points" in lost.reason
+    for bad in ({"references": 0}, {"minimum_points": 0}, {"probable": 2.0}):
+        with pytest.raises(ValueError, match=next(iter(bad))):
+            Pairwise(**bad)
+
+
+@pytest.mark.slow
+def test_folder_of_scans_becomes_one_model(tmp_path):
+    """Through a door, with any heading: neighbours are found, and walls keep their thickness."""
+    places = (([-2.6, -2.5, 1.3], 0.4), ([-1.6, -2.2, 1.3], 2.6), ([-0.5, -2.3, 1.3], -1.0))
+    taken = [scanned(at, heading, seed=k) for k, (at, heading) in enumerate(places)]
+    (tmp_path / "scans").mkdir()
+    for k, (_, points) in enumerate(taken):
+        write_ply(tmp_path / "scans" / f"{k}.ply", GeometryRecord(points))
+    result = tofuse.reconstruct(tofuse.open(tmp_path / "scans"))
+    assert [f.status for f in result.diagnostics.frames] == ["tracked"] * 3
+    for k, (T, points) in enumerate(taken):
+        true = se3.inverse(taken[0][0]) @ T
+        assert off(result.trajectory[k], true, points)[0] < 0.02
+        assert off(result.trajectory[k], true, points)[1] < 0.3
+
+
+@pytest.mark.slow
+def test_candidates_of_same_pose_are_not_rivals():
+    """With large noise, iterations stop slightly apart; a pose elsewhere remains a rival."""
+    views, truth = peaks_views(0.1, 101)
+    source, target, T = views[1], views[0], se3.inverse(truth[0]) @ truth[1]
+    both = cloud_pair._Views.of(source, target, np.random.default_rng(0))
+    best = both.evaluated(T)
+    beside = both.evaluated(T @ se3.exp([0.3, 0, 0, 0, 0.05, 0]))
+    elsewhere = both.evaluated(T @ se3.exp([0, 0, 0, 0, 0, 2.5]))
+    assert both.are_distinct_poses(beside.T_target_source, T)
+    assert cloud_pair._rival(both, [best, beside, elsewhere], best, T) is elsewhere
+    assert cloud_pair._rival(both, [best, beside], best, T) is cloud_pair._NO_RIVAL
+    found = register_clouds(source, target, None, np.random.default_rng(0))
+    assert found.probability > 0.5

@@ -1,0 +1,273 @@
+"""``tofuse.register``: two clouds or views, without options."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import tofuse
+from registration_scenes import (
+    box_walls,
+    bumpy_ball,
+    error,
+    relief,
+    relief_image,
+    rng,
+    stone,
+    turn,
+    view,
+)
+from tofuse.formats.files.ply import read_ply
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.lab.methods.variants import Tricp
+from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
+from tofuse.engine.clouds.reduce import averaged
+from tofuse.engine.clouds.remapping import Remapping
+from tofuse.engine.clouds.surface_metrics import PointToPlane
+
+
+def source_of(points, T):
+    return se3.transform(se3.inverse(T), points)
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 50.0])
+@pytest.mark.parametrize("degrees", [3, 20])
+def test_clouds_of_any_size_are_registered(scale, degrees):
+    T = turn([1, 2, 0.5], degrees, centre=np.array([0, 0, 2.0]))
+    to = np.diag([scale, scale, scale, 1.0])
+    T = to @ T @ np.linalg.inv(to)
+    found = tofuse.register(source_of(stone(3000, 1) * scale, T), stone(3000, 0) * scale)
+    gap = se3.inverse(T) @ found.T_target_source
+    assert np.rad2deg(se3.angle(gap)) < 0.2
+    assert np.linalg.norm(gap[:3, 3]) < 0.01 * scale
+    assert found.converged
+    assert found.inlier_ratio > 0.9
+    assert found.rms_m < 0.05 * scale
+    assert np.linalg.eigvalsh(found.information).min() > 0
+    assert len(found.unobservable) == 0
+
+
+@pytest.mark.slow
+def test_half_of_each_view_may_be_outside_overlap():
+    for k in range(3):
+        T = turn(rng(k).normal(size=3), 6)
+        source = source_of(relief(4000, 2 * k + 1, 0.0, 1.0, outliers=100), T)
+        found = tofuse.register(source, relief(4000, 2 * k, -0.5, 0.5))
+        assert error(found, T)[0] < 0.005
+        assert error(found, T)[1] < 0.5
+        assert 0.4 < found.inlier_ratio < 0.65
+
+
+def test_images_of_camera_are_registered():
+    T = se3.exp([0.05, -0.04, 0.06, 0.05, -0.04, 0.06])
+    found = tofuse.register(relief_image(T, 1, 0.003), relief_image(np.eye(4), 0, 0.003))
+    assert error(found, T)[0] < 0.002
+    assert error(found, T)[1] < 0.1
+
+
+def test_view_and_array_may_be_mixed():
+    T = turn([1, 2, 0.5], 3)
+    found = tofuse.register(view(relief(3000, 1), T), relief(3000, 0))
+    assert error(found, T)[0] < 0.003
+
+
+@pytest.mark.slow
+def test_real_pair_of_lidar_scans(shared_data):
+    folder = shared_data / "lidar_pair_gt"
+    source, target = (read_ply(folder / f"{name}.ply").points for name in ("source", "target"))
+    T = np.loadtxt(folder / "T_target_source.txt")
+    for offset in (np.zeros(6), np.array([1.5, -1, 0.3, 0.05, -0.05, 0.2])):
+        found = tofuse.register(source, target, guess=T @ se3.exp(offset) if any(offset) else None)
+        gap = se3.inverse(T) @ found.T_target_source
+        # The reference itself was registered: its median residual is larger than that found here.
+        assert np.linalg.norm(gap[:3, 3]) < 0.03
+        assert np.rad2deg(se3.angle(gap)) < 0.35
+        assert found.inlier_ratio > 0.8
+        assert len(found.unobservable) == 0
+
+
+def test_large_clouds_are_downsampled():
+    T = turn([1, 2, 0.5], 5)
+    found = tofuse.register(source_of(relief(100_000, 1), T), relief(100_000, 0))
+    assert found.points <= 20_000
+    assert error(found, T)[0] < 5e-4
+    assert error(found, T)[1] < 0.05
+
+
+def test_map_coordinates_keep_precision():
+    far = np.array([[500_000.0, 5_000_000, 300]])
+    shift = np.eye(4)
+    shift[:3, 3] = far
+    T = turn([1, 2, 0.5], 2)
+    near = tofuse.register(source_of(relief(3000, 1), T), relief(3000, 0))
+    guess = shift @ np.linalg.inv(shift)
+    found = tofuse.register(source_of(relief(3000, 1), T) + far, relief(3000, 0) + far, guess=guess)
+    here = np.linalg.inv(shift) @ found.T_target_source @ shift
+    np.testing.assert_allclose(here, near.T_target_source, atol=1e-4)
+    A = se3.adjoint(shift)
+    back = A.T @ found.information @ A
+    np.testing.assert_allclose(np.diag(back)[:3], np.diag(near.information)[:3], rtol=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("walls", "count", "noise"),
+    [("z", 3, 0.01), ("x", 3, 0.001), ("xy", 1, 0.01), ("xyz", 0, 0.001)],
+    ids=str,
+)
+def test_unobservable_directions_are_reported_and_stay_as_guessed(walls, count, noise):
+    T = se3.exp([0.03, -0.02, 0.02, 0.01, 0.015, -0.01])
+    target, source = (box_walls(4000, s, noise, walls) for s in (0, 1))
+    guess = T @ se3.exp([0.01, 0.02, -0.01, 0.01, -0.01, 0.01])
+    found = tofuse.register(source_of(source, T), target, guess=guess)
+    assert found.unobservable.shape == (count, 6)
+    np.testing.assert_allclose(np.linalg.norm(found.unobservable, axis=1), 1)
+    # Constrained directions are found, the rest is that of the guess.
+    remapping = Remapping.of(found.unobservable, source_of(source, T)) if count else None
+    missed = se3.inverse(T) @ found.T_target_source
+    moved = se3.inverse(guess) @ found.T_target_source
+    if remapping:
+        missed, slid = remapping.across(missed), remapping.along(moved)
+        np.testing.assert_allclose(slid, np.eye(4), atol=1e-3)
+    assert np.linalg.norm(se3.log(missed)) < 0.3 * noise + 2e-3
+
+
+def test_ball_does_not_constrain_rotation():
+    d = rng(0).normal(size=(8000, 3))
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    d = d[d[:, 2] < 0] * 0.3 + np.array([0, 0, 2])
+    found = tofuse.register(d[::2] + np.array([0.01, 0, 0]), d[1::2])
+    assert len(found.unobservable) == 3
+    ball = np.array([[0.01, 0, 2.0]])
+    np.testing.assert_allclose(se3.transform(found.T_target_source, ball), [[0, 0, 2]], atol=2e-3)
+
+
+def test_remapping_projects_motions():
+    points = rng(1).normal(size=(50, 3)) + np.array([0, 0, 2])
+    slide = np.array([[1.0, 0, 0, 0, 0, 0]])
+    remapping = Remapping.of(slide, points)
+    xi = np.array([0.1, 0.02, 0.03, 0, 0, 0])
+    np.testing.assert_allclose(
+        se3.log(remapping.along(se3.exp(xi))), [0.1, 0, 0, 0, 0, 0], atol=1e-12
+    )
+    across = se3.log(remapping.across(se3.exp(xi)))
+    np.testing.assert_allclose(across, [0, 0.02, 0.03, 0, 0, 0], atol=1e-12)
+
+
+def test_other_method_may_be_given():
+    T = turn([1, 2, 0.5], 3)
+    source, target = source_of(relief(3000, 1), T), relief(3000, 0)
+    found = tofuse.register(source, target, method=Tricp(0.02, points=300, overlap=0.9))
+    assert found.points == 300
+    again = tofuse.register(source, target, method=Tricp(0.02, points=300, overlap=0.9))
+    assert found.T_target_source.tobytes() == again.T_target_source.tobytes()
+    other = tofuse.register(source, target, method=Tricp(0.02, points=300, overlap=0.9), seed=1)
+    assert found.T_target_source.tobytes() != other.T_target_source.tobytes()
+
+
+def test_result_is_independent_of_threads():
+    target, source = bumpy_ball(12000, 0, 0.002), bumpy_ball(12000, 1, 0.002)
+    results = []
+    for count in (1, 2, 5):
+        with threads(count):
+            results.append(tofuse.register(source, target))
+    assert len({r.T_target_source.tobytes() for r in results}) == 1
+    assert len({r.information.tobytes() for r in results}) == 1
+
+
+def test_averaged_is_mean_of_each_cube():
+    points = rng(2).uniform(-1, 1, (1000, 3))
+    reduced = averaged(view(points), 0.5)
+    low = points.astype(np.float32).astype(float).min(0)
+    cells = {}
+    for p in points.astype(np.float32).astype(float):
+        cells.setdefault(tuple(np.floor((p - low) / 0.5)), []).append(p)
+    wanted = np.array([np.mean(cells[cell], 0) for cell in sorted(cells)])
+    np.testing.assert_allclose(reduced.points, wanted, atol=1e-6)
+    assert len(averaged(view(np.zeros((0, 3))), 0.5)) == 0
+
+
+GOOD = np.random.default_rng(0).normal(size=(200, 3))
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (np.zeros((0, 3)), "has 0 finite points"),
+        (np.full((50, 3), np.nan), "has 0 finite points"),
+        (GOOD[:2], "has 2 finite points"),
+        (np.zeros((10, 2)), r"shape \(10, 2\)"),
+        (np.zeros(3), r"shape \(3,\)"),
+        ("cloud.ply", "type <U9"),
+        (None, "type object"),
+        ([[1, 2, 3], [1, 2]], "is not an array"),
+        (GOOD + 1j, "complex"),
+        (GOOD * 1e12, "coordinates up to"),
+    ],
+)
+def test_invalid_arrays_are_refused(bad, message):
+    with pytest.raises(tofuse.InputError, match=message) as raised:
+        tofuse.register(bad, GOOD)
+    assert str(raised.value).startswith("source: ")
+    with pytest.raises(tofuse.InputError, match=message) as raised:
+        tofuse.register(GOOD, bad)
+    assert str(raised.value).startswith("target: ")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [
+        (np.ones((100, 3)), GOOD),
+        (GOOD, np.ones((100, 3))),
+        (np.outer(np.arange(100.0), [1, 1, 1]),) * 2,
+        (GOOD, GOOD + 1e6),
+        (np.repeat(GOOD[:4], 30, 0), GOOD),
+    ],
+    ids=["one place", "one place as target", "line", "far apart", "four places"],
+)
+def test_degenerate_clouds_are_refused(source, target):
+    with pytest.raises(tofuse.RegistrationError):
+        tofuse.register(source, target, guess=np.eye(4))
+
+
+def test_empty_views_are_refused():
+    empty, full = view(np.zeros((0, 3)), index=7), view(relief(100, 0))
+    for pair in ((empty, full), (full, empty), (empty, empty)):
+        with pytest.raises(tofuse.RegistrationError, match="frame 7: has 0 points"):
+            tofuse.register(*pair)
+
+
+def test_invalid_guess_is_refused():
+    for guess in (np.zeros((4, 4)), np.eye(3), 2 * np.eye(4), np.full((4, 4), np.nan)):
+        with pytest.raises(tofuse.InputError, match="guess"):
+            tofuse.register(GOOD, GOOD, guess=guess)
+
+
+def test_non_finite_points_are_dropped():
+    T = turn([1, 2, 0.5], 3)
+    source, target = source_of(relief(3000, 1), T), relief(3000, 0)
+    source[::7] = np.nan
+    target[5] = np.inf
+    assert error(tofuse.register(source, target), T)[0] < 0.003
+
+
+def test_finest_level_depends_on_noise():
+    plane = rng(0).uniform(-1, 1, (20000, 3)) * [1, 1, 0] + np.array([0, 0, 2])
+    sizes = []
+    for noise in (0.0, 0.02):
+        noisy = plane + rng(1).normal(0, noise, plane.shape) * [0, 0, 1]
+        sizes.append(CoarseToFine().finest(view(noisy), view(noisy), 0.01)[0])
+    assert sizes[1] > 2 * sizes[0]
+    given = CoarseToFine(resolution=0.1, metric=PointToPlane())
+    found = given.register(view(plane), view(plane), np.eye(4), rng(2))
+    assert found.points == len(averaged(view(plane), 0.1))
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: CoarseToFine(resolution=0.0), lambda: CoarseToFine(points=5)]
+)
+def test_invalid_options_are_refused(make):
+    with pytest.raises(ValueError, match="must be"):
+        make()

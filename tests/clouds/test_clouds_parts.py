@@ -1,0 +1,354 @@
+"""Each part of an ICP behaves as in its paper, and equals its slow reference."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.geometry import se3
+from tofuse.engine.clouds.icp_kernels import point_information, shortest_of_each_target, transform_points, weighted_moments
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.clouds.interfaces import Alignment, History, Matches, Points
+from tofuse.engine.clouds.matchers import ClosestPoint
+from tofuse.engine.clouds.metrics import PointToPoint
+from tofuse.engine.clouds.rejectors import MaxDistance, Unique
+from tofuse.engine.clouds.selectors import All, Random
+from tofuse.engine.clouds.stopping import TwoLoops
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def everything(points):
+    view = CloudFrame.of(points)
+    return Points.of(view, np.arange(len(view)))
+
+
+def alignment(source, target, T=None, resolution=0.01):
+    source, target = everything(source), everything(target)
+    T = np.eye(4) if T is None else T
+    return Alignment(source, target, resolution, T, transform_points(T, source.points))
+
+
+def pairs(m, weight=None):
+    return Matches(np.arange(m), np.arange(m), np.zeros(m), weight)
+
+
+def cost(T, a, matches):
+    p = se3.transform(T, a.transformed[matches.source])
+    q = a.target.points[matches.target]
+    return float((matches.weights() * ((p - q) ** 2).sum(1)).sum())
+
+
+# Selectors
+
+
+def test_all_selects_every_point():
+    view = CloudFrame.of(np.zeros((7, 3)))
+    np.testing.assert_array_equal(All().select(view, np.random.default_rng(0)), np.arange(7))
+
+
+def test_random_selection_is_sorted_without_repetition():
+    view = CloudFrame.of(np.zeros((5000, 3)))
+    index = Random(1000).select(view, np.random.default_rng(4))
+    assert len(np.unique(index)) == 1000
+    assert (np.diff(index) > 0).all()
+    assert index.min() >= 0
+    assert index.max() < 5000
+    np.testing.assert_array_equal(index, Random(1000).select(view, np.random.default_rng(4)))
+    assert (index != Random(1000).select(view, np.random.default_rng(5))).any()
+
+
+def test_random_selection_is_uniform():
+    view = CloudFrame.of(np.zeros((100, 3)))
+    rng = np.random.default_rng(0)
+    counts = sum(np.bincount(Random(10).select(view, rng), minlength=100) for _ in range(3000))
+    # Each point is drawn 300 times on average, with a standard deviation of 16.4.
+    assert abs(counts - 300).max() < 5 * 16.4
+
+
+def test_random_selects_all_points_of_small_view():
+    view = CloudFrame.of(np.zeros((5, 3)))
+    np.testing.assert_array_equal(Random(10).select(view, np.random.default_rng(0)), np.arange(5))
+
+
+# Matchers
+
+
+@settings(max_examples=25)
+@given(seed=seeds, reach=st.sampled_from([0.05, 0.3, np.inf]))
+def test_closest_point_matches_brute_force(seed, reach):
+    rng = np.random.default_rng(seed)
+    T = se3.exp(rng.normal(0, 0.2, 6))
+    a = alignment(rng.uniform(-1, 1, (60, 3)), rng.uniform(-1, 1, (80, 3)), T)
+    got = ClosestPoint().prepare(a.target).match(a, reach)
+    distance = np.linalg.norm(a.transformed[:, None] - a.target.points[None], axis=2)
+    near = np.flatnonzero(distance.min(1) <= reach)
+    np.testing.assert_array_equal(got.source, near)
+    np.testing.assert_array_equal(got.target, distance[near].argmin(1))
+    np.testing.assert_allclose(got.distance, distance[near].min(1), rtol=1e-12)
+
+
+# Rejectors
+
+
+def test_max_distance_drops_pairs_beyond_two_resolutions():
+    a = alignment(np.zeros((4, 3)), np.zeros((4, 3)), resolution=0.25)
+    distance = np.array([0.1, 0.5, np.nextafter(0.5, 1), 3.0])
+    matches = Matches(np.arange(4), np.arange(4), distance, np.array([1.0, 2, 3, 4]))
+    left = MaxDistance(2.0).reject(matches, a)
+    np.testing.assert_array_equal(left.source, [0, 1])
+    np.testing.assert_array_equal(left.distance, [0.1, 0.5])
+    np.testing.assert_array_equal(left.weight, [1, 2])
+    assert MaxDistance(3.0).reach(0.1) == pytest.approx(0.3)
+
+
+def test_unique_keeps_shortest_and_first_of_equal_pairs():
+    a = alignment(np.zeros((7, 3)), np.zeros((3, 3)))
+    target = np.array([0, 1, 0, 1, 0, 2, 1])
+    distance = np.array([0.3, 0.2, 0.1, 0.2, 0.2, 0.9, 0.2])
+    left = Unique().reject(Matches(np.arange(7), target, distance), a)
+    np.testing.assert_array_equal(left.source, [1, 2, 5])
+    np.testing.assert_array_equal(left.target, [1, 0, 2])
+
+
+@settings(max_examples=50)
+@given(
+    pairs_=st.lists(
+        st.tuples(st.integers(0, 6), st.sampled_from([0.0, 0.1, 0.2, 0.3])), max_size=40
+    )
+)
+def test_unique_matches_reference(pairs_):
+    target = np.array([t for t, _ in pairs_], np.int64)
+    distance = np.array([d for _, d in pairs_], float)
+    best: dict[int, int] = {}
+    for i, (t, d) in enumerate(pairs_):
+        if t not in best or d < distance[best[t]]:
+            best[t] = i
+    want = np.zeros(len(pairs_), bool)
+    want[list(best.values())] = True
+    np.testing.assert_array_equal(shortest_of_each_target(target, distance, 7), want)
+
+
+# Metrics
+
+
+@settings(max_examples=40)
+@given(
+    seed=seeds,
+    m=st.integers(3, 40),
+    kind=st.sampled_from(["noisy", "planar", "mirrored", "unrelated"]),
+    weighted=st.booleans(),
+)
+def test_no_motion_fits_better_than_that_of_arun(seed, m, kind, weighted):
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(m, 3))
+    if kind == "planar":
+        source[:, 2] = 0
+    target = se3.transform(se3.exp(rng.normal(0, 2, 6)), source) + rng.normal(0, 0.1, (m, 3))
+    if kind == "mirrored":
+        target = source * [1, 1, -1]
+    elif kind == "unrelated":
+        target = rng.normal(size=(m, 3))
+    a = alignment(source, target)
+    matches = pairs(m, rng.uniform(0.1, 2, m) if weighted else None)
+    T = PointToPoint().motion(matches, a)
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    best = cost(T, a, matches)
+    for scale in (1e-3, 0.1, 3.0):
+        for xi in rng.normal(0, scale, (20, 6)):
+            assert cost(T @ se3.exp(xi), a, matches) >= best * (1 - 1e-12) - 1e-12
+
+
+def test_weighted_rotation_agrees_with_scipy():
+    rng = np.random.default_rng(1)
+    a = alignment(rng.normal(size=(30, 3)), rng.normal(size=(30, 3)))
+    weight = rng.uniform(0.1, 2, 30)
+    p, q = a.transformed, a.target.points
+    p0, q0 = np.average(p, 0, weight), np.average(q, 0, weight)
+    want, _ = Rotation.align_vectors(q - q0, p - p0, weights=weight)
+    got = PointToPoint().motion(pairs(30, weight), a)
+    np.testing.assert_allclose(got[:3, :3], want.as_matrix(), atol=1e-12)
+
+
+def test_best_fit_is_never_a_reflection():
+    """Umeyama's case: the best orthogonal matrix is a reflection, the best rotation is not."""
+    rng = np.random.default_rng(2)
+    source = rng.normal(size=(20, 3))
+    a = alignment(source, source * [1, 1, -1])
+    _, _, H, _ = weighted_moments(
+        a.transformed, a.target.points, np.arange(20), np.arange(20), np.ones(20)
+    )
+    U, _, Vt = np.linalg.svd(H)
+    assert np.linalg.det(U @ Vt) < 0
+    T = PointToPoint().motion(pairs(20), a)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        np.outer([0.0, 1, 2, 3], [1.0, 0.3, -0.2]) + np.array([4, 5, 6]),
+        np.tile([1.0, 2, 3], (4, 1)),
+    ],
+    ids=["line", "one place"],
+)
+def test_degenerate_pairs_are_refused(source):
+    a = alignment(source, se3.transform(se3.exp([1, 2, 3, 0.1, 0.2, 0.3]), source))
+    with pytest.raises(RegistrationError, match="line"):
+        PointToPoint().motion(pairs(4), a)
+
+
+@pytest.mark.parametrize("m", [0, 1, 2])
+def test_fewer_than_three_pairs_are_refused(m):
+    a = alignment(np.eye(3), np.eye(3))
+    with pytest.raises(RegistrationError, match=f"only {m} points"):
+        PointToPoint().motion(pairs(m), a)
+
+
+def test_kernels_match_numpy():
+    rng = np.random.default_rng(6)
+    p, q, weight = rng.normal(size=(20, 3)), rng.normal(size=(30, 3)), rng.uniform(0.1, 2, 12)
+    i, j = rng.integers(0, 20, 12), rng.integers(0, 30, 12)
+    T = se3.exp(rng.normal(size=6))
+    np.testing.assert_allclose(transform_points(T, p), se3.transform(T, p), rtol=1e-12)
+    p0, q0, H, size = weighted_moments(p, q, i, j, weight)
+    a, b = p[i] - np.average(p[i], 0, weight), q[j] - np.average(q[j], 0, weight)
+    np.testing.assert_allclose(p0, np.average(p[i], 0, weight), rtol=1e-12)
+    np.testing.assert_allclose(q0, np.average(q[j], 0, weight), rtol=1e-12)
+    np.testing.assert_allclose(H, (weight[:, None] * a).T @ b, rtol=1e-10, atol=1e-12)
+    assert size == pytest.approx((weight * ((p[i] ** 2).sum(1) + (q[j] ** 2).sum(1))).sum())
+
+
+def test_information_is_for_right_perturbation():
+    rng = np.random.default_rng(3)
+    T = se3.exp(rng.normal(size=6))
+    points = rng.normal(size=(9, 3))
+    weight = rng.uniform(0.5, 2, 9)
+    step = 1e-6
+    J = np.stack(
+        [
+            (se3.transform(T @ se3.exp(step * e), points) - se3.transform(T, points)) / step
+            for e in np.eye(6)
+        ],
+        -1,
+    )
+    want = np.einsum("n,nai,naj->ij", weight, J, J)
+    got = point_information(points, np.arange(9), weight)
+    np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(got, got.T)
+
+
+def test_information_predicts_scatter_for_true_pairs():
+    """With true pairs the errors xi, T_found = T exp(xi), have covariance information^-1."""
+    rng = np.random.default_rng(4)
+    T = se3.exp([0.3, -1, 2, 0.5, 1.0, -0.7])
+    source = rng.normal(0, [1.0, 0.3, 0.1], (40, 3)) + np.array([0, 0, 2])
+    metric = PointToPoint()
+    chi2 = []
+    for _ in range(300):
+        target = se3.transform(T, source) + rng.normal(0, 0.02, source.shape)
+        before = alignment(source, target, T)
+        found = metric.motion(pairs(40), before) @ T
+        after = alignment(source, target, found)
+        xi = se3.log(se3.inverse(T) @ found)
+        chi2.append(xi @ metric.information(pairs(40), after) @ xi)
+    # chi^2 with 6 degrees of freedom, a little wider since sigma is estimated.
+    assert 5.3 < np.mean(chi2) < 6.9
+
+
+def test_information_of_perfect_data_is_finite():
+    source = np.random.default_rng(5).normal(size=(10, 3))
+    information = PointToPoint().information(pairs(10), alignment(source, source))
+    assert np.isfinite(information).all()
+    assert np.linalg.eigvalsh(information).min() > 0
+
+
+# Stopping
+
+
+@pytest.mark.parametrize(
+    ("counts", "errors", "k", "iterations"),
+    [
+        # Stable at once: two iterations of the first loop, k of the second.
+        ([5] * 9, [1.0] * 9, 3, 5),
+        ([5] * 9, [1.0] * 9, 1, 3),
+        # The number of correspondences continues the first loop for four iterations.
+        ([5, 6, 7, 7, 8, 9, 9, 9, 9], [1.0] * 9, 2, 6),
+        # It may change again in the second loop, and E in the first is ignored.
+        ([5, 5, 6, 7, 8, 9, 9, 9, 9], [1.0] * 9, 3, 5),
+        # A change of E in the second loop restarts the count.
+        ([5] * 9, [1, 1, 1, 1, 2, 2, 2, 2, 2], 3, 8),
+        ([5] * 9, [1, 2, 3, 3, 3, 3, 3, 3, 3], 3, 6),
+        # The first change of the second loop is that from the last E of the first.
+        ([5] * 9, [1, 2, 2, 2, 2, 2, 2, 2, 2], 3, 5),
+        # A slow drift below epsilon counts as no change.
+        ([5] * 9, np.arange(9) * 0.9e-4, 3, 5),
+        # Not met.
+        ([1, 2, 1, 2, 1, 2, 1, 2, 1], [1.0] * 9, 1, None),
+        ([5] * 9, np.arange(9) * 1.1e-4, 1, None),
+    ],
+)
+def test_two_loops_stop_as_in_algorithm_1(counts, errors, k, iterations):
+    rule = TwoLoops(epsilon=1e-4, k=k)
+    history = History()
+    met = None
+    for i, (count, error) in enumerate(zip(counts, errors, strict=True)):
+        history.correspondences.append(count)
+        history.errors.append(float(error))
+        if rule.met(history):
+            met = i + 1
+            break
+    assert met == iterations
+
+
+@settings(max_examples=200)
+@given(
+    steps=st.lists(st.tuples(st.integers(1, 2), st.integers(1, 2)), min_size=1, max_size=14),
+    k=st.integers(1, 3),
+)
+def test_two_loops_match_literal_loops(steps, k):
+    def written_out():
+        i = 0
+        while True:  # the first loop
+            i += 1
+            if i >= len(steps):
+                return None
+            if steps[i][0] == steps[i - 1][0]:
+                break
+        unchanged = 0
+        while unchanged < k:  # the second
+            i += 1
+            if i >= len(steps):
+                return None
+            unchanged = unchanged + 1 if steps[i][1] == steps[i - 1][1] else 0
+        return i + 1
+
+    rule, history, met = TwoLoops(epsilon=0.5, k=k), History(), None
+    for i, (count, error) in enumerate(steps):
+        history.correspondences.append(count)
+        history.errors.append(float(error))
+        if rule.met(history):
+            met = i + 1
+            break
+    assert met == written_out()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Random(0),
+        lambda: MaxDistance(0.0),
+        lambda: MaxDistance(float("nan")),
+        lambda: TwoLoops(epsilon=0.0),
+        lambda: TwoLoops(k=0),
+        lambda: TwoLoops(max_iterations=0),
+    ],
+)
+def test_invalid_options_are_refused(make):
+    with pytest.raises(ValueError, match="must be"):
+        make()

@@ -1,0 +1,140 @@
+"""Kernels that a second process compiles during the first run."""
+
+from __future__ import annotations
+
+import gc
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from tofuse.engine.compute import ahead, jit
+
+
+def test_listed_kernels_exist() -> None:
+    listed = ahead.signatures()
+    for name, _ in listed:
+        module, function = name.rsplit(".", 1)
+        __import__(f"tofuse.engine.compute.{module}")
+        assert hasattr(sys.modules[f"tofuse.engine.compute.{module}"], function)
+    assert len(listed) == len(set(listed)) > 50
+
+
+@pytest.mark.slow
+def test_listed_signatures_compile(tmp_path: Path) -> None:
+    """From the cache of these tests, or compiled now: unsupported types would fail."""
+    words = [sys.executable, "-m", "tofuse.engine.compute.ahead"]
+    subprocess.run(words, check=True, capture_output=True)
+    assert ahead.compiled_marker().exists()
+
+
+@pytest.mark.slow
+def test_run_uses_listed_signatures(room_recording: Path) -> None:
+    program = textwrap.dedent(
+        """
+        import sys, tofuse
+        from importlib import import_module
+        from tofuse.engine.compute import ahead
+        tofuse.reconstruct(tofuse.open(sys.argv[1]).select(end=3))
+        for name, types in ahead.signatures():
+            module, function = name.rsplit(".", 1)
+            module = sys.modules.get(f"tofuse.engine.compute.{module}")
+            if module is not None and types in getattr(module, function).overloads:
+                print(name)
+        """
+    )
+    words = [sys.executable, "-c", program, str(room_recording)]
+    done = subprocess.run(words, check=True, capture_output=True, text=True)
+    called = done.stdout.split()
+    for name in (
+        "steps.iterate_level",
+        "view_planes.fit_planes",
+        "pair_equations.target_equations",
+    ):
+        assert name in called
+    assert len(called) > 40
+
+
+def test_only_first_run_starts_compiler_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(ahead, "usable_cores", lambda: 7)
+    started = []
+
+    class Process:
+        ended = 0
+
+        def terminate(self) -> None:
+            self.ended += 1
+
+        def wait(self) -> None:
+            self.ended += 1
+
+    def start(words: list[str], **_: object) -> Process:
+        started.append(Process())
+        assert words[1:] == ["-m", "tofuse.engine.compute.ahead", str(len(started) - 1), "3"]
+        return started[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    with pytest.raises(RuntimeError), ahead.compiling_in_background():
+        raise RuntimeError
+    assert [p.ended for p in started] == [2, 2, 2]
+    ahead.compiled_marker().touch()
+    with ahead.compiling_in_background():
+        pass
+    assert len(started) == 3
+
+
+@pytest.mark.parametrize("cores", [1, 2, 4])
+def test_half_of_the_cores_compile_in_background(
+    cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(ahead, "usable_cores", lambda: cores)
+    started = []
+    monkeypatch.setattr(subprocess, "Popen", lambda words, **_: started.append(words) or Ended())
+    before = gc.get_threshold()
+    with ahead.compiling_in_background():
+        assert (gc.get_threshold() != before) == (cores > 1)
+    assert gc.get_threshold() == before
+    assert len(started) == cores // 2
+
+
+class Ended:
+    """A process that has ended."""
+
+    def terminate(self) -> None:
+        """Do nothing."""
+
+    def wait(self) -> None:
+        """Do nothing."""
+
+
+def test_helpers_begin_at_different_places(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    compiled: list[str] = []
+    monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(ahead, "signatures", lambda: [(f"motion.{k}", ()) for k in "abcd"])
+    kernels = {k: SimpleNamespace(compile=lambda _, k=k: compiled.append(k)) for k in "abcd"}
+    monkeypatch.setattr(ahead, "import_module", lambda _: SimpleNamespace(**kernels))
+    ahead.compile_listed()
+    assert compiled == list("dcba")
+    compiled.clear()
+    ahead.compile_listed(1, 2)
+    assert compiled == list("badc")
+    assert ahead.compiled_marker().exists()
+
+
+def test_failed_process_start_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise OSError("no more processes")
+
+    monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(subprocess, "Popen", refused)
+    with ahead.compiling_in_background():
+        pass

@@ -1,0 +1,93 @@
+"""Compiled kernels without a writable cache, and a cache that can't become stale."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tofuse.engine.compute import jit
+
+_COMPILE = """
+import numpy as np
+from pathlib import Path
+from tofuse.engine.compute import jit
+from tofuse.formats.files.lzf_kernels import lzf_decompress
+out = np.zeros(3, np.uint8)
+assert lzf_decompress(np.frombuffer(bytes([2]) + b"abc", np.uint8), out) == 3
+print(out.tobytes().decode())
+print(jit.cache_folder())
+print(len(list(Path(jit.cache_folder()).rglob("*.nbi"))))
+"""
+
+
+def _run(env: dict[str, str], code: str = _COMPILE) -> list[str]:
+    clean = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=clean | env, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout.splitlines()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="the home folder is used on POSIX systems only")
+@pytest.mark.parametrize("place", ["file", "missing"])
+def test_unwritable_home_uses_temporary_cache(tmp_path, place) -> None:
+    # Even root can't write below a file, nor into /proc.
+    if place == "file":
+        home = tmp_path / "home"
+        home.write_text("not a folder")
+    else:
+        home = Path("/proc/no-such-home")
+    env = {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache"), "TMPDIR": str(tmp_path)}
+    text, folder, files = _run(env)
+    assert text == "abc"
+    assert Path(folder).parent == tmp_path
+    assert int(files) > 0
+    assert not Path(folder).exists()  # nothing is left behind
+    assert [p.name for p in tmp_path.iterdir()] == (["home"] if place == "file" else [])
+
+
+@pytest.mark.slow
+def test_writable_cache_is_kept_and_reused(tmp_path) -> None:
+    env = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    text, folder, files = _run(env)
+    assert text == "abc"
+    assert Path(folder) == tmp_path / "cache" / f"kernels-{jit.source_hash()}"
+    stamps = {p: p.stat().st_mtime_ns for p in Path(folder).rglob("*.nb*")}
+    assert len(stamps) >= int(files) > 0
+    assert _run(env)[0] == "abc"
+    assert {p: p.stat().st_mtime_ns for p in Path(folder).rglob("*.nb*")} == stamps  # reused
+
+
+@pytest.mark.slow
+def test_cache_key_changes_with_any_kernel(tmp_path) -> None:
+    package = tmp_path / "kernels"
+    shutil.copytree(Path(jit.__file__).parent, package, ignore=shutil.ignore_patterns("__pyc*"))
+    code = (
+        "import importlib.util as u, sys;"
+        f"s = u.spec_from_file_location('copy', r'{package / 'jit.py'}');"
+        "m = u.module_from_spec(s); s.loader.exec_module(m); print(m.source_hash())"
+    )
+    assert _run({}, code) == [jit.source_hash()]
+    with (package / "lzf.py").open("a") as file:
+        file.write("# changed\n")
+    changed = _run({}, code)
+    assert changed != [jit.source_hash()]
+    (package / "lzf.py").rename(package / "renamed.py")
+    assert _run({}, code) != changed
+
+
+def test_kernels_of_the_laboratory_depend_on_both_packages(tmp_path: Path) -> None:
+    from tofuse.lab import simulation as kernels
+
+    folder = Path(kernels.__file__).parent
+    assert jit.source_hash(folder) != jit.source_hash()
+    (tmp_path / "more.py").write_text("")
+    assert jit.source_hash(tmp_path) not in (jit.source_hash(), jit.source_hash(folder))

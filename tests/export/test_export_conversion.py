@@ -1,0 +1,213 @@
+"""Any recording as a native folder: nothing is lost on the way."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import made_arrays
+from camera_files import MAKERS
+from damaged_files import make_native, make_ply
+from made_recordings import CAMERA, make_7scenes, make_sr4000
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.cameras.cameras import Pinhole, RayTable
+from tofuse.formats.export.conversion import convert
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.noise.choice import family_of
+from tofuse.formats.recordings.open import open_recording
+from tofuse.formats.readers.native import NativeSource
+from tofuse.engine.frames.recording import Recording
+
+CHANNELS = ("amplitude_image", "confidence_image", "color_image")
+
+
+def check_same(before: Recording, after: Recording, *, depth: float = 1e-6) -> None:
+    """Compare all that two recordings hold; `depth` is how far depth may be off, in m."""
+    assert after.format == "native"
+    assert len(after) == len(before)
+    np.testing.assert_array_equal(after.timestamps, before.timestamps)
+    for name in ("reference", "odometry"):
+        old, new = getattr(before, name), getattr(after, name)
+        assert (old is None) == (new is None)
+        if old is not None:
+            np.testing.assert_allclose(new, old, atol=1e-6)
+    for key in ("sensor", "confidence_max", "frame_rate_hz"):
+        assert after.metadata.get(key) == before.metadata.get(key)
+    for a, b in zip(before, after, strict=True):
+        assert (a.depth_kind, a.color_registered) == (b.depth_kind, b.color_registered)
+        assert a.ambiguity_m == b.ambiguity_m
+        np.testing.assert_array_equal(a.camera.rays(), b.camera.rays())
+        np.testing.assert_array_equal(a.depth > 0, b.depth > 0)
+        np.testing.assert_allclose(a.depth, b.depth, atol=depth)
+        for name in CHANNELS:
+            old, new = getattr(a, name), getattr(b, name)
+            if old is None:
+                assert new is None or not new.any()
+            else:
+                np.testing.assert_allclose(new, old, atol=0.51 if name[0] == "a" else 0)
+        assert (a.sigma_image is None) == (b.sigma_image is None)
+        if a.sigma_image is not None:
+            np.testing.assert_allclose(b.sigma_image, a.sigma_image, atol=1e-5)
+        if a.amplitude_image is not None:
+            assert a.amplitude_kind == b.amplitude_kind
+    family = [family_of(r, r[0] if isinstance(r[0], RangeFrame) else None) for r in (before, after)]
+    if "sensor" in before.metadata:
+        assert family[0] == family[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MAKERS)
+def test_every_camera(tmp_path: Path, name: str) -> None:
+    make, file, _ = MAKERS[name]
+    make(tmp_path / "scan" / (file or "."))
+    before = open_recording(tmp_path / "scan" / (file or "."))
+    done = convert(before, tmp_path / "out")
+    assert (done.folder, done.frames, done.warnings) == (tmp_path / "out", len(before), ())
+    # Float depth without a unit is rounded to 0.1 mm.
+    rounded = 1e-6 if "depth_unit_m" in before.metadata else 0.51e-4
+    check_same(before, open_recording(tmp_path / "out"), depth=rounded)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "scan"]
+
+
+def test_lens_of_each_frame_is_kept(tmp_path: Path) -> None:
+    MAKERS["3dscannerapp"][0](tmp_path / "scan")
+    before = open_recording(tmp_path / "scan")
+    convert(before, tmp_path / "out")
+    for a, b in zip(before, open_recording(tmp_path / "out"), strict=True):
+        assert isinstance(b.camera, Pinhole)
+        assert a.camera == b.camera
+
+
+def test_rays_of_each_frame(tmp_path: Path) -> None:
+    make_sr4000(tmp_path / "scan")
+    before = open_recording(tmp_path / "scan")
+    convert(before, tmp_path / "out")
+    after = open_recording(tmp_path / "out")
+    check_same(before, after, depth=0.51e-4)
+    assert isinstance(after[1].camera, RayTable)
+    assert not np.array_equal(
+        after[0].camera.rays(),
+        after[1].camera.rays(),
+    )
+    (tmp_path / "out" / "rays" / "000001.npy").unlink()
+    with pytest.raises(InputError, match="rays: has 2 images"):
+        open_recording(tmp_path / "out")
+
+
+def test_correction_is_kept_with_raw_measurements(tmp_path: Path) -> None:
+    make_native(tmp_path / "scan")
+    (tmp_path / "scan" / "noise.json").write_text("{}")
+    before = open_recording(tmp_path / "scan")
+    convert(before.select(every=2), tmp_path / "out")
+    after = open_recording(tmp_path / "out")
+    check_same(before.select(every=2), after)
+    for folder in ("scan", "out"):
+        assert (tmp_path / folder / "correction.npz").is_file()
+    source = after.source
+    assert isinstance(source, NativeSource)
+    assert source.imu["t"].tolist() == [0, 1, 2, 3]
+    assert source.frame_columns["temperature_c"].tolist() == [0, 2]
+    assert (tmp_path / "out" / "noise.json").read_text() == "{}"
+    # The given recording still applies its correction.
+    assert isinstance(before.source, NativeSource)
+    assert before.source.correction is not None
+
+
+def test_unregistered_colour_stays_unregistered(tmp_path: Path) -> None:
+    make_7scenes(tmp_path / "scan")
+    convert(open_recording(tmp_path / "scan"), tmp_path / "out")
+    frame = open_recording(tmp_path / "out")[0]
+    assert not frame.color_registered
+    about = json.loads((tmp_path / "out" / "camera.json").read_text())
+    about["color_registered"] = "no"
+    (tmp_path / "out" / "camera.json").write_text(json.dumps(about))
+    with pytest.raises(InputError, match=r"color_registered: is 'no'; write true or false"):
+        open_recording(tmp_path / "out")
+
+
+def test_clouds(tmp_path: Path) -> None:
+    make_ply(tmp_path / "scan")
+    before = open_recording(tmp_path / "scan").select(end=1)
+    convert(before, tmp_path / "out")
+    (a,), (b,) = list(before), list(open_recording(tmp_path / "out"))
+    assert isinstance(b, CloudFrame)
+    np.testing.assert_array_equal(a.points, b.points)
+    np.testing.assert_allclose(a.normals, b.normals)
+
+
+def test_change_of_camera_between_sampled_frames_is_refused(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from tofuse.engine.frames.recording import ArraySource
+
+    depth = np.ones((30, 40), np.float32)
+    frames = [RangeFrame(k, k / 10, CAMERA, depth) for k in range(100)]
+    frames[50] = replace(frames[50], camera=Pinhole(40, 30, 36.0, 36.0, 19.5, 14.5))
+    recording = Recording.of(ArraySource(frames), "mine", "mine")
+    with pytest.raises(InputError, match="mine: frame 50: has another camera"):
+        convert(recording, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_convert_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made_arrays.make_zense(tmp_path / "scan")
+    path = tmp_path / "scan" / "depth_0001.png"
+    path.write_bytes(path.read_bytes()[:60])
+    words = ["convert", str(tmp_path / "scan"), "--out", str(tmp_path / "out")]
+    assert main(words) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"2 frames in {tmp_path / 'out'}"
+    assert any("depth_0001.png" in line for line in lines[1:])
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert error == f"tofuse: {tmp_path / 'out'}: isn't empty; choose a new folder\n"
+    assert main([*words[:-1], str(tmp_path / "new"), "--start", "7"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "new").exists()
+
+
+def test_failed_conversion_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made_arrays.make_npz(tmp_path / "a.npz")
+    recording = open_recording(tmp_path / "a.npz")
+
+    def stop(_count: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        convert(recording, tmp_path / "out", stop)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match="isn't empty"):
+        convert(recording, tmp_path / "file")
+    shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    (tmp_path / "out").mkdir()
+    assert convert(recording, tmp_path / "out").frames == 3
+
+
+REAL: list[tuple[str, int, dict[str, Any]]] = [
+    ("sr4000_corridor", 3, {"depth": 0.51e-4}),
+    ("kinectv2_loop/recording", 8, {}),
+    ("iphone_chair_3dscannerapp", 30, {}),
+    ("iphone_stray", 90, {}),
+    ("iphone_record3d", 12, {"depth": 0.51e-4}),
+    ("azure_kinect_mkv", 1, {}),
+    ("ifm_o3r", 1, {}),
+    ("pico_zense_static", 5, {}),
+    ("open3d_rgbd5", 2, {}),
+]
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(("name", "every", "how"), REAL)
+def test_real_recordings(
+    shared_data: Path, tmp_path: Path, name: str, every: int, how: dict[str, Any]
+) -> None:
+    before = open_recording(shared_data / name).select(every=every)
+    convert(before, tmp_path / "out")
+    check_same(before, open_recording(tmp_path / "out"), **how)

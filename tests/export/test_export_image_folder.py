@@ -1,0 +1,280 @@
+"""Images with poses for nerfstudio and COLMAP, by an independent reading of their conventions.
+
+nerfstudio and COLMAP have the corner of the first pixel at (0, 0), so its centre at (0.5, 0.5).
+nerfstudio's cameras look along -z with y up.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import made_dumps
+import made_phones
+from posed_results import BROWN, DISTANCE, NORMAL, POSED, POSES, SIZE, made_result, plane
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError, OutputError
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.ply import read_ply, write_ply
+from tofuse.formats.files.trajectory import write_tum
+from tofuse.formats.files.trajectory_formats import read_poses
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
+from tofuse.formats.recordings.open import Opening
+from tofuse.apps.export.exporting import export
+
+PLAIN = Pinhole(*SIZE, 40.0, 41.0, 23.0, 18.0)
+BENT = BrownConrady(*SIZE, 40.0, 41.0, 23.0, 18.0, k1=-0.1, k2=0.02, k3=0.01)
+RATIO = Rational(*SIZE, 40.0, 41.0, 23.0, 18.0, k1=0.2, k2=-0.1, k4=0.3, k5=-0.1)
+WIDE = Fisheye(*SIZE, 30.0, 30.0, 23.0, 18.0, k1=0.02, k2=-0.003)
+TABLE = RayTable(np.array(BROWN.rays()))
+
+
+def opencv_rays(data: dict[str, float]) -> np.ndarray:
+    """x/z and y/z (H, W, 2) of a lens by OpenCV, from the numbers in transforms.json."""
+    w, h = int(data["w"]), int(data["h"])
+    K = np.array([[data["fl_x"], 0, data["cx"]], [0, data["fl_y"], data["cy"]], [0, 0, 1]])
+    v, u = np.mgrid[0:h, 0:w] + 0.5
+    pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
+    if data["camera_model"] == "OPENCV_FISHEYE":
+        bent = np.array([data.get(f"k{i}", 0.0) for i in (1, 2, 3, 4)])
+        rays = cv2.fisheye.undistortPoints(pixels, K, bent)
+    else:
+        assert data["camera_model"] == "OPENCV"
+        bent = np.array([data.get(n, 0.0) for n in ("k1", "k2", "p1", "p2", "k3")])
+        ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+        rays = cv2.undistortPoints(pixels, K, bent, criteria=ends)
+    return rays.reshape(h, w, 2)
+
+
+@pytest.mark.parametrize("camera", [PLAIN, BROWN, BENT, WIDE, RATIO, TABLE])
+def test_nerfstudio_depth_and_poses_reproduce_points(tmp_path: Path, camera: Camera) -> None:
+    result = made_result(tmp_path, camera)
+    (folder,) = export(result, ["nerfstudio"])
+    data = json.loads((folder / "transforms.json").read_text())
+    kept = camera in (PLAIN, BROWN, BENT, WIDE)
+    assert len(data["frames"]) == len(POSED)
+    for k, frame in zip(POSED, data["frames"], strict=True):
+        depth, sigma = (
+            cv2.imread(str(folder / frame[f"{kind}_file_path"]), cv2.IMREAD_UNCHANGED)
+            for kind in ("depth", "sigma")
+        )
+        assert depth.dtype == sigma.dtype == np.uint16
+        z = depth * data["depth_unit_scale_factor"]
+        T = np.array(frame["transform_matrix"])
+        rays = opencv_rays(data)
+        seen = z > 0
+        assert seen.mean() > (0.9 if kept else 0.7)
+        # From OpenGL's axes to the world; then the plane is where the camera measured it.
+        local = np.concatenate([rays, np.ones((*z.shape, 1))], -1) * z[..., None] * [1, -1, -1]
+        world = local[seen] @ T[:3, :3].T + T[:3, 3]
+        camera_axes = (world - POSES[k, :3, 3]) @ POSES[k, :3, :3]
+        off = np.abs(camera_axes @ NORMAL - DISTANCE - 0.1 * k)
+        assert off.max() < (1.2e-3 if kept else 2e-3)  # depth in whole mm, rounded twice
+        assert (sigma[seen] > 0).all()
+        assert (sigma[~seen] == 0).all()
+        assert np.median(sigma) * data["sigma_unit_scale_factor"] < 0.05
+        image = cv2.imread(str(folder / frame["file_path"]))[..., ::-1]
+        mask = image.any(-1)
+        assert (image[mask][:, 0] == 10 + k).all()
+        assert frame["timestamp"] == pytest.approx(0.1 * k)
+        covariance = frame.get("pose_covariance")
+        assert (covariance is None) == (k == 1)
+        if covariance is not None:
+            np.testing.assert_array_equal(np.reshape(covariance, (6, 6)), np.eye(6) * k)
+    if kept:
+        np.testing.assert_array_equal(image[0, :, 1], np.arange(48))
+    points = read_ply(folder / data["ply_file_path"])
+    np.testing.assert_array_equal(points.points, read_ply(result / "cloud.ply").points)
+    assert (points.color == 77).all()
+    masked = [frame.get("mask_path") for frame in data["frames"]]
+    assert len({path is None for path in masked}) == 1
+    # Our own reader of trajectories agrees, too.
+    np.testing.assert_allclose(read_poses(folder).poses, POSES[POSED], atol=1e-9)
+
+
+@pytest.mark.parametrize("camera", [PLAIN, BROWN, BENT, RATIO, WIDE, TABLE])
+def test_colmap_read_by_pycolmap(tmp_path: Path, camera: Camera) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    result = made_result(tmp_path, camera)
+    (folder,) = export(result, ["colmap"])
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+    assert len(model.images) == len(POSED)
+    assert len(model.points3D) == 40
+    (lens,) = model.cameras.values()
+    expected = {PLAIN: "PINHOLE", BROWN: "OPENCV", BENT: "FULL_OPENCV", RATIO: "FULL_OPENCV"}
+    expected |= {WIDE: "OPENCV_FISHEYE", TABLE: "PINHOLE"}
+    assert lens.model.name == expected[camera]
+    points = np.random.default_rng(6).normal(size=(50, 3)) * 0.3 + [0, 0, 2]
+    if camera is not TABLE:
+        found = lens.img_from_cam(points)
+        np.testing.assert_allclose(found, camera.project(points) + 0.5, atol=1e-9)
+    for image in model.images.values():
+        k = int(image.name.removeprefix("frame_").removesuffix(".png"))
+        assert (folder / "images" / image.name).is_file()
+        T = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+        np.testing.assert_allclose(T.matrix(), se3.inverse(POSES[k])[:3], atol=1e-9)
+    cloud = read_ply(result / "cloud.ply").points
+    for number, point in model.points3D.items():
+        np.testing.assert_allclose(point.xyz, cloud[number - 1], atol=1e-6)
+        assert point.color.tolist() == [77, 77, 77]
+
+
+def test_colmap_text_files(tmp_path: Path) -> None:
+    """The text files, for machines without pycolmap."""
+    result = made_result(tmp_path, BROWN)
+    (folder,) = export(result, ["colmap"], every=2)
+    text = (folder / "sparse" / "0" / "cameras.txt").read_text().splitlines()[1]
+    assert text == "1 OPENCV 48 36 40.0 41.0 23.5 18.5 -0.1 0.02 0.002 -0.001"
+    lines = (folder / "sparse" / "0" / "images.txt").read_text().split("\n")
+    assert [line.split()[-1] for line in lines[1:-1:2]] == ["frame_000000.png", "frame_000003.png"]
+    assert lines[2] == ""
+    found = read_poses(folder / "sparse" / "0" / "images.txt")
+    np.testing.assert_allclose(found.poses, POSES[[0, 3]], atol=1e-9)
+    assert sorted(p.name for p in (folder / "images").iterdir()) == [
+        "frame_000000.png",
+        "frame_000003.png",
+    ]
+
+
+def test_images_are_rectified_on_request(tmp_path: Path) -> None:
+    (folder,) = export(made_result(tmp_path, BROWN), ["colmap"], pinhole=True)
+    text = (folder / "sparse" / "0" / "cameras.txt").read_text()
+    assert " PINHOLE " in text
+    assert "OPENCV" not in text
+
+
+def test_amplitude_replaces_missing_colour(tmp_path: Path) -> None:
+    """The image is the albedo: equal at all distances, and masked without a measurement."""
+    (folder,) = export(made_result(tmp_path, PLAIN, color="amplitude"), ["nerfstudio"])
+    data = json.loads((folder / "transforms.json").read_text())
+    for frame in data["frames"]:
+        image, mask = (
+            cv2.imread(str(folder / frame[f"{kind}_path"]), cv2.IMREAD_UNCHANGED)
+            for kind in ("file", "mask")
+        )
+        np.testing.assert_array_equal(mask == 255, image.any(-1))
+        assert not mask[:4, :4].any()
+        assert (mask[4:] == 255).all()
+
+
+def test_corrected_camera_is_written(tmp_path: Path) -> None:
+    config = {"corrections": [{"part": "camera-errors", "focal": 0.05, "offset_m": 0.1}]}
+    (folder,) = export(made_result(tmp_path, PLAIN, config=config), ["nerfstudio"])
+    data = json.loads((folder / "transforms.json").read_text())
+    assert data["fl_x"] == pytest.approx(40.0 / 1.05)
+    z = cv2.imread(str(folder / data["frames"][0]["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+    assert z[18, 23] == pytest.approx(1000 * plane(PLAIN, 0)[18, 23] + 100, abs=1)
+
+
+def test_colour_of_phones_keeps_recorded_size(tmp_path: Path) -> None:
+    """Depth is unchanged; the lens is that of the image. A frame without colour has no image."""
+    recording = tmp_path / "scan"
+    made_dumps.make_polycam(recording)
+    (recording / "keyframes" / "images" / "5250000.jpg").unlink()
+    result = tmp_path / "result"
+    result.mkdir()
+    frames = [
+        {
+            "index": k,
+            "timestamp": 5 + 0.25 * k,
+            "status": "tracked",
+            "component": None,
+            "covariance": None,
+        }
+        for k in range(3)
+    ]
+    about = {"path": str(recording), "opening": Opening((recording,)).to_dict()}
+    run = {"schema": 1, "version": "0", "verdict": "good", "frames": frames, "input": about}
+    (result / "run.json").write_text(json.dumps(run | {"components": [], "config": {}}))
+    write_tum(result / "trajectory.txt", 5 + 0.25 * np.arange(3), POSES[:3])
+    write_ply(result / "cloud.ply", GeometryRecord(np.zeros((1, 3), np.float32)))
+    (folder,) = export(result, ["nerfstudio"])
+    data = json.loads((folder / "transforms.json").read_text())
+    names = [Path(frame["file_path"]).name for frame in data["frames"]]
+    assert names == ["frame_000000.png", "frame_000002.png"]
+    for k, frame in zip((0, 2), data["frames"], strict=True):
+        image = cv2.imread(str(folder / frame["file_path"]))
+        depth = cv2.imread(str(folder / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+        assert image.shape[:2] == (frame["h"], frame["w"]) == (192, 256)
+        assert depth.shape == (24, 32)
+        # The lens is given for 1920 x 1440 pixels, from the centre of the first.
+        assert frame["fl_x"] == pytest.approx((made_phones.FX + k) * 256 / 1920)
+        assert frame["cx"] == pytest.approx((made_phones.CX + 0.5) * 256 / 1920)
+    assert read_ply(folder / "points.ply").color.tolist() == [[128, 128, 128]]
+
+
+def _gone(result: Path) -> None:
+    shutil.rmtree(result.parent / "scan")
+
+
+def _longer(result: Path) -> None:
+    path = result / "run.json"
+    run = json.loads(path.read_text())
+    for frame in run["frames"]:
+        frame["timestamp"] += 1.0
+    path.write_text(json.dumps(run))
+
+
+def _damaged(result: Path) -> None:
+    path = result / "run.json"
+    run = json.loads(path.read_text())
+    del run["input"]
+    path.write_text(json.dumps(run))
+
+
+def _with_invalid_corrections(result: Path) -> None:
+    path = result / "run.json"
+    run = json.loads(path.read_text())
+    path.write_text(json.dumps(run | {"config": {"corrections": [3]}}))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (_gone, "which doesn't exist"),
+        (_longer, "does not match the frames"),
+        (_damaged, "is damaged"),
+        (_with_invalid_corrections, "is damaged"),
+    ],
+)
+def test_impossible_exports_are_refused(
+    tmp_path: Path, spoil: Callable[[Path], None], says: str, capsys
+) -> None:
+    result = made_result(tmp_path, PLAIN)
+    spoil(result)
+    for name in ("nerfstudio", "colmap"):
+        assert main(["export", str(result), name]) == 2
+        error = capsys.readouterr().err
+        assert says in error
+        assert len(error.strip().splitlines()) == 1
+        assert not (result / name).exists()
+    assert sorted(p.name for p in result.iterdir()) == ["cloud.ply", "run.json", "trajectory.txt"]
+
+
+def test_recording_without_colour_or_amplitude_is_refused(tmp_path: Path) -> None:
+    result = made_result(tmp_path, PLAIN, color="none")
+    with pytest.raises(InputError, match="neither colour nor amplitude"):
+        export(result, ["kitti", "nerfstudio"])
+    assert not (result / "trajectory.kitti.txt").exists()
+
+
+def test_only_own_folders_are_replaced(tmp_path: Path) -> None:
+    result = made_result(tmp_path, PLAIN)
+    (folder,) = export(result, ["colmap"])
+    with pytest.raises(OutputError, match="--overwrite"):
+        export(result, ["colmap"])
+    (folder / "images" / "frame_000001.png").unlink()
+    export(result, ["colmap"], overwrite=True)
+    assert (folder / "images" / "frame_000001.png").is_file()
+    (folder / "trained.ckpt").write_text("mine")
+    with pytest.raises(OutputError, match=r"contains trained\.ckpt"):
+        export(result, ["colmap"], overwrite=True)
+    assert (folder / "trained.ckpt").read_text() == "mine"
+    assert not [p for p in result.iterdir() if p.name.startswith(".")]

@@ -1,0 +1,378 @@
+"""Results in other formats, read back by third-party libraries."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from parsed_glb import parse
+from tofuse.apps.cli.program import main
+from tofuse.apps.cli.parser import EXPORTS
+from tofuse.engine.errors import InputError, OutputError
+from tofuse.formats.files import las
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.ply import read_ply, write_ply
+from tofuse.formats.files.trajectory import write_tum
+from tofuse.engine.geometry import se3
+from tofuse.apps.export.exporting import FORMATS, export
+from tofuse.apps.results.folder import OutputFolder
+
+TIMES, POSES = np.array([0.1, 0.2, 0.5]), se3.exp(np.random.default_rng(1).normal(size=(3, 6)))
+POSES[0] = np.eye(4)
+T_UP_WORLD = se3.exp(np.array([0, 0, 0, 2.6, 0.4, -0.3]))
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    """A result of three poses, with frame 3 of the recording lost, and a small curved surface."""
+    folder = tmp_path / "result"
+    folder.mkdir()
+    frames = [{"index": k, "timestamp": t} for k, t in ((1, 0.1), (2, 0.2), (3, 0.3), (5, 0.5))]
+    fields = {"T_up_world": T_UP_WORLD.tolist(), "frames": frames}
+    text = json.dumps({"schema": 1, "version": "0", "verdict": "good"} | fields)
+    (folder / "run.json").write_text(text)
+    write_tum(folder / "trajectory.txt", TIMES, POSES)
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.arange(6.0), np.arange(5.0))
+    points = np.stack([x, y, 2 + 0.1 * x * x], -1).reshape(-1, 3) / 10
+    normals = rng.normal(size=(30, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    a = (np.arange(5) + 6 * np.arange(4)[:, None]).ravel()
+    faces = np.concatenate([np.stack([a, a + 1, a + 6], 1), np.stack([a + 1, a + 7, a + 6], 1)])
+    columns = {
+        "normals": normals,
+        # Smooth, so that a texture has only rounding errors.
+        "color": np.round(60 + 40 * points @ [[3, 0, 1], [0, 3, 1], [5, 0, 0]]).astype(np.uint8),
+        "scalars": {
+            "views": rng.integers(1, 900, 30).astype(np.int32),
+            "sigma": rng.uniform(0.001, 0.02, 30).astype(np.float32),
+        },
+    }
+    write_ply(folder / "cloud.ply", GeometryRecord(points, **columns))
+    write_ply(folder / "mesh.ply", GeometryRecord(points, faces=faces, **columns))
+    return folder
+
+
+@pytest.fixture
+def expected(result: Path) -> SimpleNamespace:
+    ply = read_ply(result / "cloud.ply")
+    return SimpleNamespace(
+        points=ply.points,
+        normals=ply.normals,
+        color=ply.color,
+        views=ply.scalars["views"],
+        sigma=ply.scalars["sigma"],
+        faces=read_ply(result / "mesh.ply").faces,
+    )
+
+
+def test_ply_read_by_trimesh(result: Path, expected) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    mesh = trimesh.load(result / "mesh.ply", process=False)
+    np.testing.assert_array_equal(mesh.vertices, expected.points)
+    np.testing.assert_array_equal(mesh.faces, expected.faces)
+    np.testing.assert_array_equal(mesh.visual.vertex_colors[:, :3], expected.color)
+    columns = mesh.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(columns["views"].ravel(), expected.views)
+    np.testing.assert_array_equal(columns["sigma"].ravel(), expected.sigma)
+    for k, name in enumerate(("nx", "ny", "nz")):
+        np.testing.assert_array_equal(columns[name].ravel(), expected.normals[:, k])
+
+
+def test_pcd(result: Path, expected) -> None:
+    pypcd4 = pytest.importorskip("pypcd4")
+    (path,) = export(result, ["pcd"])
+    cloud = pypcd4.PointCloud.from_path(path)
+    xyz = cloud.numpy(("x", "y", "z", "normal_x", "normal_y", "normal_z", "sigma", "views"))
+    np.testing.assert_array_equal(xyz[:, :3], expected.points)
+    np.testing.assert_array_equal(xyz[:, 3:6], expected.normals)
+    np.testing.assert_array_equal(xyz[:, 6], expected.sigma)
+    np.testing.assert_array_equal(xyz[:, 7], expected.views)
+    rgb = pypcd4.PointCloud.decode_rgb(cloud.pc_data["rgb"])
+    np.testing.assert_array_equal(rgb, expected.color)
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_las(result: Path, expected, suffix: str) -> None:
+    laspy = pytest.importorskip("laspy")
+    if suffix == "laz":
+        pytest.importorskip("lazrs")
+    (path,) = export(result, [suffix])
+    found = laspy.read(path)
+    assert found.header.are_points_compressed == (suffix == "laz")
+    assert str(found.header.version) == "1.4"
+    assert found.header.point_format.id == 7
+    assert found.header.generating_software.startswith("tofuse")
+    np.testing.assert_allclose(found.xyz, expected.points, atol=0.51e-4)
+    np.testing.assert_allclose(found.header.mins, expected.points.min(0), atol=1e-6)
+    np.testing.assert_allclose(found.header.maxs, expected.points.max(0), atol=1e-6)
+    rgb = np.stack([found.red, found.green, found.blue], -1)
+    np.testing.assert_array_equal(rgb // 256, expected.color)
+    np.testing.assert_array_equal(found["views"], expected.views)
+    np.testing.assert_array_equal(found["sigma"], expected.sigma)
+    normals = np.stack([found[f"normal {a}"] for a in "xyz"], -1)
+    np.testing.assert_array_equal(normals, expected.normals)
+
+
+def test_e57(result: Path, expected) -> None:
+    pye57 = pytest.importorskip("pye57")
+    (path,) = export(result, ["e57"])
+    file = pye57.E57(str(path))
+    try:
+        assert file.scan_count == 1
+        header = file.get_header(0)
+        assert header.point_count == len(expected.points)
+        data = file.read_scan(0, colors=True, ignore_missing_fields=True)
+        image = file.image_file
+        assert image.extensionsLookupPrefix("tofuse", "") is not None
+        more = ("nor:normalX", "nor:normalY", "nor:normalZ", "tofuse:views", "tofuse:sigma")
+        assert set(more) <= set(header.point_fields)
+        buffers, arrays = pye57.libe57.VectorSourceDestBuffer(), {}
+        for name in more:
+            arrays[name] = np.zeros(30)
+            buffers.append(pye57.libe57.SourceDestBuffer(image, name, arrays[name], 30, True, True))
+        assert header.points.reader(buffers).read() == 30
+    finally:
+        file.close()
+    xyz = np.stack([data[f"cartesian{a}"] for a in "XYZ"], -1)
+    np.testing.assert_array_equal(xyz.astype(np.float32), expected.points)
+    rgb = np.stack([data[f"color{c}"] for c in ("Red", "Green", "Blue")], -1)
+    np.testing.assert_array_equal(rgb, expected.color)
+    normals = np.stack([arrays[name] for name in more[:3]], -1)
+    np.testing.assert_array_equal(normals.astype(np.float32), expected.normals)
+    np.testing.assert_array_equal(arrays["tofuse:views"], expected.views)
+    np.testing.assert_array_equal(arrays["tofuse:sigma"].astype(np.float32), expected.sigma)
+
+
+@pytest.fixture
+def upright(expected) -> SimpleNamespace:
+    """The surface in its upright orientation, as stated in `run.json`."""
+    R = T_UP_WORLD[:3, :3]
+    return SimpleNamespace(
+        points=expected.points @ R.T,
+        normals=expected.normals @ R.T,
+        color=expected.color.astype(float),
+        corners=np.sort((expected.points @ R.T)[expected.faces].reshape(-1, 9).round(4), 0),
+    )
+
+
+def check_surface(upright, points, faces, normals, color, *, exact: float = 2e-5) -> None:
+    """What another program read equals what was written, whatever vertices are doubled at seams."""
+    points = np.asarray(points, float)
+    distance = np.linalg.norm(points[:, None] - upright.points[None], axis=2)
+    near = distance.argmin(1)
+    assert distance.min(1).max() < exact
+    assert distance.min(0).max() < exact
+    corners = np.sort(points[np.asarray(faces)].reshape(-1, 9).round(4), 0)
+    np.testing.assert_allclose(corners, upright.corners, atol=2e-4)
+    if normals is not None:
+        np.testing.assert_allclose(normals, upright.normals[near], atol=0.01)
+    if color is not None:
+        assert np.abs(np.asarray(color, float) - upright.color[near]).max() <= 0.01 * 255 + 1
+
+
+@pytest.mark.parametrize("name", ["glb", "gltf", "obj", "stl"])
+def test_surfaces_read_by_trimesh(name: str, result: Path, upright) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    (path,) = export(result, [name])
+    (mesh,) = trimesh.load_scene(path, process=False, maintain_order=True).geometry.values()
+    plain = name == "stl"
+    color = None if plain else mesh.visual.to_color().vertex_colors[:, :3]
+    check_surface(upright, mesh.vertices, mesh.faces, None if plain else mesh.vertex_normals, color)
+
+
+@pytest.mark.parametrize("name", ["glb", "obj", "stl"])
+def test_surfaces_read_by_open3d(name: str, result: Path, upright) -> None:
+    open3d = pytest.importorskip("open3d", reason="open3d is not installed")
+    (path,) = export(result, [name])
+    mesh = open3d.io.read_triangle_mesh(str(path))
+    points, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+    color = None
+    if name != "stl":
+        (image,) = (np.asarray(each) for each in mesh.textures if not each.is_empty())
+        # UV coordinates of the corners of triangles, from the lower left; each vertex has one.
+        uv = np.zeros((len(points), 2))
+        uv[faces.ravel()] = np.asarray(mesh.triangle_uvs)
+        color = sampled(image, uv)
+    normals = None if name == "stl" else np.asarray(mesh.vertex_normals)
+    check_surface(upright, points, faces, normals, color)
+
+
+def sampled(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Colours (N, 3) at UV coordinates (N, 2) from the upper left corner."""
+    size = np.array(image.shape[1::-1])
+    u, v = np.rint(uv * size - 0.5).astype(int).clip(0, size - 1).T
+    return image[v, u, :3]
+
+
+def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    monkeypatch.setattr("tofuse.apps.export.exporting._MAX_TEXTURED_FACES", 10)
+    glb, obj = export(result, ["glb", "obj"])
+    (mesh,) = trimesh.load_scene(obj, process=False, maintain_order=True).geometry.values()
+    color = mesh.visual.vertex_colors[:, :3]
+    check_surface(upright, mesh.vertices, mesh.faces, mesh.vertex_normals, color)
+    document, arrays = parse(glb)
+    (primitive,) = document["meshes"][0]["primitives"]
+    found = arrays[primitive["attributes"]["COLOR_0"]][:, :3] / 65535
+    # glTF stores linear light, by the inverse of sRGB.
+    s = upright.color / 255
+    light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(found, light, atol=1e-4)
+
+
+def test_simplified_surfaces_keep_colours(result: Path) -> None:
+    """A texture preserves the colours between the few remaining vertices."""
+    trimesh = pytest.importorskip("trimesh")
+    n = 120
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
+    points = np.stack([x, y, np.full_like(x, 2.0)], -1).reshape(-1, 3)
+    color = np.zeros((n * n, 3), np.uint8)
+    color[:, 0] = np.round(127 + 120 * np.sin(6 * points[:, 0]))
+    color[:, 1] = np.round(127 + 120 * np.cos(6 * points[:, 1]))
+    a = (np.arange(n - 1) + n * np.arange(n - 1)[:, None]).ravel()
+    faces = np.concatenate([np.stack([a, a + n, a + 1], 1), np.stack([a + 1, a + n, a + n + 1], 1)])
+    normals = np.tile(np.float32([0, 0, -1]), (n * n, 1))
+    write_ply(
+        result / "mesh.ply", GeometryRecord(points, faces=faces, normals=normals, color=color)
+    )
+    write_tum(result / "trajectory.txt", TIMES, np.tile(np.eye(4), (3, 1, 1)))
+    glb, stl = export(result, ["glb", "stl"], faces=200)
+    (mesh,) = trimesh.load_scene(glb, process=False).geometry.values()
+    assert 50 < len(mesh.faces) <= 200
+    assert len(trimesh.load(stl).faces) <= 200
+    image = np.array(mesh.visual.material.baseColorTexture.convert("RGB")).astype(int)
+    # Points within triangles, between vertices, have the colours of the full mesh.
+    weights = np.random.default_rng(3).dirichlet([1, 1, 1], (20, len(mesh.faces)))
+    uv = np.einsum("kfi,fic->kfc", weights, mesh.visual.uv[mesh.faces]).reshape(-1, 2)
+    p = np.einsum("kfi,fic->kfc", weights, mesh.vertices[mesh.faces]).reshape(-1, 3)
+    p = p @ T_UP_WORLD[:3, :3]
+    found = sampled(image, uv * [1, -1] + [0, 1])
+    np.testing.assert_allclose(p[:, 2], 2, atol=1e-5)
+    assert np.abs(found[:, 0] - (127 + 120 * np.sin(6 * p[:, 0]))).max() < 20
+    assert np.abs(found[:, 1] - (127 + 120 * np.cos(6 * p[:, 1]))).max() < 20
+
+
+def test_laz_is_reproducible_and_written_in_blocks(result: Path, monkeypatch) -> None:
+    laspy = pytest.importorskip("laspy")
+    (path,) = export(result, ["laz"])
+    first = path.read_bytes()
+    export(result, ["laz"], overwrite=True)
+    assert path.read_bytes() == first
+    monkeypatch.setattr(las, "_BLOCK_POINTS", 7)
+    export(result, ["laz", "las"], overwrite=True)
+    np.testing.assert_array_equal(
+        laspy.read(path).points.array, laspy.read(result / "cloud.las").points.array
+    )
+
+
+def test_kitti(result: Path) -> None:
+    (path,) = export(result, ["kitti"])
+    rows = np.loadtxt(path)
+    np.testing.assert_allclose(rows.reshape(3, 3, 4), POSES[:, :3], atol=1e-15)
+
+
+def test_log_tum_and_kitti_by_open3d(result: Path) -> None:
+    open3d = pytest.importorskip("open3d", reason="open3d is not installed")
+    (log,) = export(result, ["log"])
+    for path in (log, result / "trajectory.txt"):
+        read = open3d.io.read_pinhole_camera_trajectory(str(path))
+        found = [np.linalg.inv(p.extrinsic) for p in read.parameters]
+        np.testing.assert_allclose(found, POSES, atol=1e-9)
+
+
+def test_log_contains_frame_indices(result: Path) -> None:
+    (path,) = export(result, ["log"])
+    lines = path.read_text().splitlines()
+    assert [lines[k] for k in (0, 5, 10)] == ["1 1 2", "2 2 3", "5 5 6"]
+    block = np.array([line.split() for line in lines[6:10]], float)
+    np.testing.assert_allclose(block, POSES[1], atol=1e-15)
+
+
+def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
+    assert set(EXPORTS) == set(FORMATS)
+    out = tmp_path / "new" / "files"
+    assert main(["export", str(result), "las", "kitti", "--out", str(out)]) == 0
+    assert capsys.readouterr().out.split() == [
+        str(out / "cloud.las"),
+        str(out / "trajectory.kitti.txt"),
+    ]
+    before = (out / "cloud.las").read_bytes()
+    (out / "cloud.las").write_bytes(b"mine")
+    assert main(["export", str(result), "las", "--out", str(out)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main(["export", str(result), "las", "--out", str(out), "--overwrite"]) == 0
+    assert (out / "cloud.las").read_bytes() == before
+    assert main(["export", str(tmp_path), "las"]) == 2
+    assert "is not a result" in capsys.readouterr().err
+    assert main(["export", str(result), "doc"]) == 2
+    assert "use one of" in capsys.readouterr().err
+
+
+def test_missing_surface_and_package_are_reported(result: Path, monkeypatch) -> None:
+    (result / "mesh.ply").unlink()
+    with pytest.raises(InputError, match="clouds without a camera model have no surface"):
+        export(result, ["obj"])
+    monkeypatch.setitem(__import__("sys").modules, "pye57", None)
+    with pytest.raises(InputError, match=r"needs the package pye57; pip install 'tofuse\[scan\]'"):
+        export(result, ["e57"])
+    assert not (result / "cloud.e57").exists()
+
+
+def test_empty_cloud(result: Path) -> None:
+    write_ply(result / "cloud.ply", GeometryRecord(np.zeros((0, 3))))
+    laspy = pytest.importorskip("laspy")
+    pypcd4 = pytest.importorskip("pypcd4")
+    las, pcd = export(result, ["las", "pcd"])
+    assert len(laspy.read(las).points) == 0
+    assert pypcd4.PointCloud.from_path(pcd).points == 0
+    with pytest.raises(InputError, match="there are no points"):
+        export(result, ["e57"])
+
+
+def test_only_one_process_writes_to_a_result(result: Path, tmp_path: Path) -> None:
+    with OutputFolder(result, overwrite=True):
+        with pytest.raises(OutputError, match="is being written by another process"):
+            export(result, ["kitti"])
+        assert export(result, ["kitti"], tmp_path / "other")[0].exists()  # the old result
+    seen: list[OutputError] = []
+
+    def during(_result: object, _path: Path) -> None:
+        with pytest.raises(OutputError, match="is being written by another process") as caught:
+            OutputFolder(result, overwrite=True)
+        seen.append(caught.value)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(FORMATS, "log", ("trajectory.log", during))
+        export(result, ["log"])
+    assert len(seen) == 1
+    assert not list(result.parent.glob(".tofuse-*"))
+
+
+def test_component_uses_lock_of_its_result(result: Path) -> None:
+    """A run replaces its component folders as a whole, so they must contain no lock files."""
+    part = result / "component-1"
+    shutil.copytree(result, result.parent / "copy")
+    shutil.move(result.parent / "copy", part)
+    with OutputFolder(result, overwrite=True):
+        with pytest.raises(OutputError, match="is being written") as caught:
+            export(part, ["kitti"])
+        assert caught.value.where == str(result)
+    assert export(part, ["kitti"])[0].exists()
+    assert not list(part.glob(".tofuse-*"))
+
+
+def test_result_replaced_during_export_is_refused(result: Path, tmp_path: Path) -> None:
+    def during(_result: object, _path: Path) -> None:
+        os.utime(result / "run.json", ns=(1, 1))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(FORMATS, "log", ("trajectory.log", during))
+        with pytest.raises(InputError, match="was replaced by another run while it was read"):
+            export(result, ["log"], tmp_path / "other")

@@ -1,0 +1,281 @@
+"""Castellani's optimisation: the objective of eq 2.10, and claims of the paper."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import quaternion, se3
+from tofuse.lab.experiments.peaks import chain
+from tofuse.engine.graph.build import Measured, build_graph
+from tofuse.engine.graph.castellani import Castellani, Problem, free_vertices, normalisation_factors
+from tofuse.formats.files.g2o import read_g2o
+from tofuse.engine.graph.graph import PoseGraph
+
+NORMALISATIONS = ("thesis", "fusiello")
+
+
+def turn(axis: int, angle: float) -> Float64:
+    """Pure rotation about one axis."""
+    w = np.zeros(6)
+    w[3 + axis] = angle
+    return se3.exp(w)
+
+
+def circle(n: int, noise: float, seed: int = 0) -> tuple[PoseGraph, Float64]:
+    """A camera on a circle, measured with noise; and the true poses."""
+    rng = np.random.default_rng(seed)
+    step = se3.exp([0.2, 0.0, 0.03, 0.01, 2 * np.pi / n, 0.0])
+    truth = np.array([np.linalg.matrix_power(step, k) for k in range(n)])
+    relative = se3.inverse(truth[:-1]) @ truth[1:] @ se3.exp(noise * rng.normal(size=(n - 1, 6)))
+    closing = se3.inverse(truth[0]) @ truth[-1]
+    return chain(relative, [Measured(0, n - 1, closing, np.eye(6))]), truth
+
+
+def random_graph(rng: np.random.Generator, n: int = 6) -> PoseGraph:
+    """Edges between many pairs, all inconsistent."""
+    pairs = [(i, j) for i in range(n) for j in range(n) if i != j and rng.random() < 0.4]
+    edges = [Measured(i, j, se3.exp(rng.normal(size=6)), np.eye(6)) for i, j in pairs]
+    poses = se3.exp(0.7 * rng.normal(size=(n, 6)))
+    return build_graph(range(n), poses, edges[::2], edges[1::2])
+
+
+def literal_objective(graph: PoseGraph, normalisation: str) -> float:
+    """Eqs 2.10 and 3.5's normalisation, evaluated one edge at a time."""
+    T = graph.measurements
+    sequential = [k for k in range(len(T)) if not graph.loop[k]]
+
+    def screw(R: Float64) -> float:
+        return float(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+
+    angles = [screw(T[k][:3, :3]) for k in sequential]
+    lengths = [np.linalg.norm(T[k][:3, 3]) for k in sequential]
+    total = 0.0
+    for k, (i, j) in enumerate(graph.edges):
+        R_i, R_j, R_ij = graph.poses[i, :3, :3], graph.poses[j, :3, :3], T[k, :3, :3]
+        t_i, t_j, t_ij = graph.poses[i, :3, 3], graph.poses[j, :3, 3], T[k, :3, 3]
+        if normalisation == "thesis":
+            sigma_a = np.sqrt(np.mean(np.square(angles)))
+            sigma_t = np.sqrt(np.mean(np.square(lengths)))
+        else:
+            sigma_a, sigma_t = np.pi, np.linalg.norm(t_ij)
+        total += (screw(R_i @ R_ij @ R_j.T) / sigma_a) ** 2
+        total += (np.linalg.norm(R_i @ t_ij + t_i - t_j) / sigma_t) ** 2
+    return total
+
+
+@pytest.mark.parametrize("normalisation", NORMALISATIONS)
+def test_squared_residuals_sum_to_equation_2_10(normalisation):
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        graph = random_graph(rng)
+        problem = Problem.of(graph, normalisation)
+        q = quaternion.from_matrix(graph.poses[:, :3, :3])
+        value = problem.objective(q, graph.poses[:, :3, 3])
+        assert value == pytest.approx(literal_objective(graph, normalisation), rel=1e-9)
+        # Eq 2.11: norm and sign of a quaternion are irrelevant.
+        other = problem.objective(q * rng.uniform(-2, 2, (len(q), 1)), graph.poses[:, :3, 3])
+        assert other == pytest.approx(value, rel=1e-9)
+
+
+@pytest.mark.parametrize("normalisation", NORMALISATIONS)
+def test_jacobians_agree_with_finite_differences(normalisation):
+    graph = random_graph(np.random.default_rng(2))
+    problem = Problem.of(graph, normalisation)
+    q = quaternion.from_matrix(graph.poses[:, :3, :3])
+    t = graph.poses[:, :3, 3]
+    J_i, J_j = problem.jacobian(q, t)
+    h = 1e-6
+    for vertex in range(len(q)):
+        for axis in range(6):
+            sides = []
+            for sign in (1, -1):
+                q2, t2 = q.copy(), t.copy()
+                if axis < 3:
+                    t2[vertex, axis] += sign * h
+                else:
+                    turned = np.append(np.eye(3)[axis - 3] * sign * h / 2, 1.0)
+                    q2[vertex] = quaternion.multiply(turned, q[vertex])
+                sides.append(problem.residuals(q2, t2))
+            numeric = (sides[0] - sides[1]) / (2 * h)
+            analytic = np.zeros_like(numeric)
+            for edge, (i, j) in enumerate(graph.edges):
+                analytic[edge] += J_i[edge, :, axis] * (i == vertex)
+                analytic[edge] += J_j[edge, :, axis] * (j == vertex)
+            np.testing.assert_allclose(analytic, numeric, atol=1e-7)
+
+
+@pytest.mark.parametrize("normalisation", NORMALISATIONS)
+def test_result_minimises_literal_objective(normalisation):
+    graph, _ = circle(12, 0.03)
+    optimised = Castellani(normalisation).optimise(graph).graph
+    best = literal_objective(optimised, normalisation)
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        xi = rng.normal(size=(12, 6)) * 10 ** rng.uniform(-4, -1)
+        xi[0] = 0
+        moved = optimised.with_poses(optimised.poses @ se3.exp(xi))
+        assert literal_objective(moved, normalisation) > best
+
+
+@pytest.mark.parametrize("normalisation", NORMALISATIONS)
+def test_objective_is_logged_and_never_rises(normalisation):
+    graph, _ = circle(30, 0.05)
+    result = Castellani(normalisation).optimise(graph)
+    log = np.array(result.objective)
+    assert result.converged
+    assert log[0] == pytest.approx(literal_objective(graph, normalisation))
+    assert log[-1] == pytest.approx(literal_objective(result.graph, normalisation))
+    assert (np.diff(log) <= 0).all()
+    assert log[-1] < 0.2 * log[0]
+
+
+def test_loop_error_is_spread_evenly():
+    """Castellani's claim: the gap of a loop is shared by all its edges."""
+    n = 20
+    angle = 2 * np.pi / n
+    # Every step rotates 1 degree too far: the sequence misses its start by 20 degrees.
+    graph = chain(
+        np.repeat(turn(1, angle + np.radians(1))[None], n - 1, axis=0),
+        [Measured(n - 1, 0, turn(1, angle + np.radians(1)), np.eye(6))],
+    )
+    before = np.degrees(se3.angle(se3.exp(graph.residuals())))
+    after = np.degrees(se3.angle(se3.exp(Castellani().optimise(graph).graph.residuals())))
+    assert before[-1] == pytest.approx(20)
+    np.testing.assert_allclose(before[:-1], 0, atol=1e-6)
+    np.testing.assert_allclose(after, 1, rtol=1e-6)
+
+
+def test_gap_of_straight_trajectory_is_spread_evenly():
+    n = 10
+    step = np.eye(4)
+    step[0, 3] = 1.0
+    back = np.eye(4)
+    back[:3, 3] = [9.5, 0.2, 0]
+    graph = chain(np.repeat(step[None], n - 1, axis=0), [Measured(0, n - 1, back, np.eye(6))])
+    optimised = Castellani().optimise(graph).graph
+    steps = se3.inverse(optimised.poses[:-1]) @ optimised.poses[1:]
+    # The missing half metre is shared by ten edges.
+    np.testing.assert_allclose(optimised.poses[-1, 0, 3], 9 + 0.5 * 0.9, atol=5e-3)
+    np.testing.assert_allclose(steps[:, 0, 3], 1 + 0.05, atol=5e-3)
+
+
+def test_optimisation_reduces_effect_of_noise():
+    gains = []
+    for seed in range(8):
+        graph, truth = circle(24, 0.02, seed)
+        optimised = Castellani().optimise(graph).graph
+        gains.append(
+            np.linalg.norm(optimised.poses[:, :3, 3] - truth[:, :3, 3])
+            / np.linalg.norm(graph.poses[:, :3, 3] - truth[:, :3, 3])
+        )
+    assert np.mean(gains) < 0.75
+
+
+def test_two_edges_match_closed_form():
+    """Two measurements of one motion, pure rotations: the minimum is half way between."""
+    first, second = turn(2, 0.3), turn(2, 0.5)
+    first[:3, 3], second[:3, 3] = [1, 0, 0], [1, 0, 0.4]
+    graph = chain(first[None], [Measured(0, 1, second, np.eye(6))])
+    optimised = Castellani().optimise(graph).graph.poses[1]
+    np.testing.assert_allclose(optimised[:3, :3], turn(2, 0.4)[:3, :3], atol=1e-9)
+    np.testing.assert_allclose(optimised[:3, 3], [1, 0, 0.2], atol=1e-9)
+
+
+def test_information_is_ignored():
+    """All motions are assumed to have the same error (chapter 7), as in the paper."""
+    graph, _ = circle(10, 0.05)
+    heavy = PoseGraph(
+        graph.ids,
+        graph.poses,
+        graph.edges,
+        graph.measurements,
+        graph.information * np.arange(1, 11)[:, None, None],
+        graph.loop,
+    )
+    a, b = Castellani().optimise(graph), Castellani().optimise(heavy)
+    np.testing.assert_array_equal(a.graph.poses, b.graph.poses)
+
+
+def test_exact_graph_stays_and_first_pose_is_fixed():
+    graph, _ = circle(15, 0.0)
+    result = Castellani().optimise(graph)
+    np.testing.assert_allclose(result.graph.poses, graph.poses, atol=1e-7)
+    noisy, _ = circle(15, 0.05)
+    start = se3.exp([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    elsewhere = noisy.with_poses(start @ noisy.poses)
+    optimised = Castellani().optimise(elsewhere).graph
+    np.testing.assert_array_equal(optimised.poses[0], elsewhere.poses[0])
+    # The result does not depend on the frame of reference.
+    reference = Castellani().optimise(noisy).graph.poses
+    np.testing.assert_allclose(optimised.poses, start @ reference, atol=1e-6)
+
+
+def test_disconnected_parts_are_optimised_separately():
+    one, _ = circle(8, 0.05, seed=1)
+    two, _ = circle(9, 0.05, seed=2)
+    there = se3.exp([5.0, 0, 0, 0, 1.0, 0])
+    both = PoseGraph(
+        np.arange(17),
+        np.concatenate([one.poses, there @ two.poses]),
+        np.concatenate([one.edges, two.edges + 8]),
+        np.concatenate([one.measurements, two.measurements]),
+        np.concatenate([one.information, two.information]),
+        np.concatenate([one.loop, two.loop]),
+    )
+    assert np.flatnonzero(~free_vertices(both)).tolist() == [0, 8]
+    tight = Castellani("fusiello", tolerance=1e-14)
+    poses = tight.optimise(both).graph.poses
+    np.testing.assert_array_equal(poses[8], both.poses[8])
+    np.testing.assert_allclose(poses[:8], tight.optimise(one).graph.poses, atol=1e-6)
+    np.testing.assert_allclose(poses[8:], there @ tight.optimise(two).graph.poses, atol=1e-6)
+
+
+def test_normalisation_uses_sequential_motions_only():
+    graph, _ = circle(10, 0.05)
+    sigma_a, sigma_t = normalisation_factors(graph, "thesis")
+    angles = se3.angle(graph.measurements[:-1])
+    assert sigma_a[0] == pytest.approx(np.sqrt((angles**2).mean()))
+    lengths = np.linalg.norm(graph.measurements[:-1, :3, 3], axis=1)
+    assert sigma_t[0] == pytest.approx(np.sqrt((lengths**2).mean()))
+    assert (sigma_a == sigma_a[0]).all()
+    sigma_a, sigma_t = normalisation_factors(graph, "fusiello")
+    assert (sigma_a == np.pi).all()
+    np.testing.assert_allclose(sigma_t, np.linalg.norm(graph.measurements[:, :3, 3], axis=1))
+
+
+@pytest.mark.parametrize("normalisation", NORMALISATIONS)
+def test_rotation_only_or_static_camera_is_handled(normalisation):
+    for step in (turn(1, 0.1), np.eye(4)):
+        graph = chain(np.repeat(step[None], 5, axis=0), [Measured(0, 5, turn(1, 0.4), np.eye(6))])
+        result = Castellani(normalisation).optimise(graph)
+        assert np.isfinite(result.graph.poses).all()
+        assert result.objective[-1] < result.objective[0]
+
+
+def test_trivial_graphs_are_unchanged():
+    for graph in (PoseGraph.empty(), chain(np.zeros((0, 4, 4)))):
+        result = Castellani().optimise(graph)
+        assert result.converged
+        assert result.objective == (0.0,)
+        np.testing.assert_array_equal(result.graph.poses, graph.poses)
+
+
+def test_non_finite_value_is_refused():
+    graph, _ = circle(5, 0.0)
+    poses = graph.poses.copy()
+    poses[2, 0, 3] = np.nan
+    with pytest.raises(InputError, match="pose 2 is not finite"):
+        Castellani().optimise(graph.with_poses(poses))
+
+
+def test_benchmark_graph_is_optimised(shared_data):
+    graph = read_g2o(shared_data / "pose_graphs" / "parking-garage.g2o")
+    result = Castellani().optimise(graph)
+    assert result.converged
+    assert result.objective[-1] < 2e-4 * result.objective[0]
+    # The squared error weighted by the information, which the optimiser does not use,
+    # falls from 16727 as well.
+    assert result.graph.chi2() < 1.5

@@ -1,0 +1,335 @@
+"""The default optimiser: exact derivatives, weights, false loops, gravity, parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
+from tofuse.engine.graph import robust
+from tofuse.engine.graph.build import Measured, build_graph
+from tofuse.formats.files.g2o import read_g2o
+from tofuse.engine.graph.graph import Gravity, PoseGraph
+from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
+from tofuse.engine.graph.solver import Settings, solve
+from tofuse.engine.graph.sparse import Blocks, PairSystem
+from walked_graph import SIGMA, walk
+
+
+def ate(poses: Float64, truth: Float64) -> float:
+    """Position error without alignment: the first pose is exact."""
+    return float(np.sqrt(((poses - truth)[:, :3, 3] ** 2).sum(1).mean()))
+
+
+def objective(graph: PoseGraph, poses: Float64) -> float:
+    return graph.with_poses(poses).chi2()
+
+
+def test_result_is_minimum_in_every_direction():
+    """At the solution no small motion of any pose lowers the objective, and slopes are zero."""
+    graph, _, _ = walk(20, 10)
+    done = minimise(graph, Settings("none", tolerance=1e-14))
+    least = done.graph.chi2()
+    assert least == pytest.approx(done.objective[-1])
+    assert least < 0.1 * graph.chi2()
+    for k in range(1, 20):
+        for axis in range(6):
+            step = np.zeros(6)
+            step[axis] = 1e-4
+            values = []
+            for sign in (1, -1):
+                poses = done.graph.poses.copy()
+                poses[k] = poses[k] @ se3.exp(sign * step)
+                values.append(objective(graph, poses))
+            assert min(values) > least
+            # The slope, in units of the curvature over one standard deviation.
+            slope, curvature = (values[0] - values[1]) / 2e-4, (sum(values) - 2 * least) / 1e-8
+            assert abs(slope / curvature) < 1e-6
+
+
+def dense(system: PairSystem, matrix: Blocks) -> Float64:
+    """The whole matrix, in the order of the free poses."""
+    n, k = len(system.free), system.size
+    out = np.zeros((n, k, n, k))
+    out[np.arange(n), :, np.arange(n)] = matrix.diagonal
+    out[system.rows, :, system.columns] = matrix.below
+    out[system.columns, :, system.rows] = np.swapaxes(matrix.below, 1, 2)
+    return out.reshape(n * k, n * k)
+
+
+def test_gradient_and_curvature_match_objective():
+    """The assembled system agrees with numerical derivatives, far from the minimum."""
+    graph, _, _ = walk(8, 5)
+    rng = np.random.default_rng(1)
+    poses = graph.poses @ se3.exp(rng.normal(size=(8, 6)) * 0.3)
+    i, j = graph.edges.T
+    system = PairSystem(8, graph.edges)
+    e = graph.with_poses(poses).residuals()
+    J = se3.jacobian_inverse(e)
+    H = np.swapaxes(J, 1, 2) @ graph.information @ J
+    g = (np.swapaxes(J, 1, 2) @ graph.information @ e[..., None])[..., 0]
+    matrix, gradient = system.relative(H, g, se3.inverse(poses[i]) @ poses[j])
+
+    root = np.linalg.cholesky(graph.information)
+
+    def whitened(x: Float64) -> Float64:
+        moved = poses.copy()
+        moved[system.free] = poses[system.free] @ se3.exp(x.reshape(-1, 6))
+        r = graph.with_poses(moved).residuals()
+        return np.einsum("mji,mj->mi", root, r).ravel()
+
+    h = 1e-6
+    numeric = np.stack([(whitened(h * u) - whitened(-h * u)) / (2 * h) for u in np.eye(42)], axis=1)
+    scale = np.abs(numeric.T @ numeric).max()
+    np.testing.assert_allclose(dense(system, matrix), numeric.T @ numeric, atol=1e-7 * scale)
+    expected = numeric.T @ whitened(np.zeros(42))
+    np.testing.assert_allclose(gradient.ravel(), expected, atol=1e-7 * np.abs(expected).max())
+
+
+def test_one_step_solves_damped_system():
+    graph, _, _ = walk(12, 8)
+    rng = np.random.default_rng(2)
+    m = len(graph.edges)
+    root = rng.normal(size=(m, 6, 6))
+    H, g = root @ np.swapaxes(root, 1, 2), rng.normal(size=(m, 6))
+    system = PairSystem(12, graph.edges)
+    matrix, gradient = system.relative(H, g, graph.measurements)
+    whole = dense(system, matrix)
+    for damping in (0.0, 0.5):
+        step = system.solve(H, g, graph.measurements, damping)
+        damped = whole + damping * np.diag(np.diag(whole))
+        expected = np.linalg.solve(damped, -gradient.ravel())
+        np.testing.assert_allclose(step[system.free].ravel(), expected, rtol=1e-8, atol=1e-12)
+        assert (step[0] == 0).all()
+    # Terms of single poses, here enough to constrain a pose that no pair reaches.
+    lonely = PairSystem(13, graph.edges, np.zeros(13, bool))
+    single = np.tile(np.eye(6), (13, 1, 1)), np.tile(np.arange(6.0), (13, 1))
+    np.testing.assert_allclose(
+        lonely.solve(H, g, graph.measurements, unary=single)[12], -np.arange(6.0)
+    )
+    assert lonely.solve(H, g, graph.measurements) is None
+
+
+@pytest.mark.slow
+def test_covariances_match_repeated_measurements():
+    """Marginals of the dense inverse, and the spread over many graphs, agree."""
+    graph, truth, _ = walk(16, 8)
+    solution = solve(graph.poses, graph.edges, graph.measurements, graph.information)
+    factor = solution.factor()
+    assert factor is not None
+    C = factor.covariances()
+    np.testing.assert_array_equal(C[0], 0)
+    joint = factor.joint_covariance(np.array([3, 0, 9]))
+    np.testing.assert_allclose(joint[:6, :6], C[3], rtol=1e-9)
+    np.testing.assert_allclose(joint[12:, 12:], C[9], rtol=1e-9)
+    np.testing.assert_array_equal(joint[6:12], 0)
+    # Relative ones, from the joint covariance of the two ends.
+    i, j = graph.edges.T
+    T_i_j = se3.inverse(solution.poses[i]) @ solution.poses[j]
+    relative = factor.relative_covariances(T_i_j)
+    for m in (0, 4, len(i) - 1):
+        both = factor.joint_covariance(graph.edges[m])
+        J = np.concatenate([-se3.adjoint(se3.inverse(T_i_j[m])), np.eye(6)], axis=1)
+        np.testing.assert_allclose(relative[m], J @ both @ J.T, rtol=1e-7, atol=1e-14)
+    rng = np.random.default_rng(5)
+    exact = se3.inverse(truth[graph.edges[:, 0]]) @ truth[graph.edges[:, 1]]
+    errors = []
+    for _ in range(150):
+        noisy = exact @ se3.exp(rng.normal(size=(len(exact), 6)) * SIGMA)
+        found = solve(truth, graph.edges, noisy, graph.information).poses
+        errors.append(se3.log(se3.inverse(truth) @ found)[15])
+    x = np.array(errors)
+    mahalanobis = np.einsum("ki,ij,kj->k", x, np.linalg.inv(C[15]), x)
+    # 150 chi-square variables with six degrees of freedom: 6 with a deviation of 0.28.
+    assert mahalanobis.mean() == pytest.approx(6, abs=1)
+
+
+def test_information_weights_edges():
+    """Two measurements of one motion: the mean, weighted by the whole matrix."""
+    rng = np.random.default_rng(3)
+    roots = rng.normal(size=(2, 6, 6))
+    information = roots @ np.swapaxes(roots, 1, 2)
+    small = rng.normal(size=(2, 6)) * 1e-4
+    edges = [Measured(0, 1, se3.exp(x), W) for x, W in zip(small, information, strict=True)]
+    graph = build_graph([0, 1], np.tile(np.eye(4), (2, 1, 1)), edges)
+    found = se3.log(minimise(graph, Settings(tolerance=1e-14)).graph.poses[1])
+    expected = np.linalg.solve(
+        information.sum(0), sum(W @ x for x, W in zip(small, information, strict=True))
+    )
+    np.testing.assert_allclose(found, expected, atol=5e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_false_loops_are_left_out_and_true_loops_kept(seed):
+    clean, truth, _ = walk(seed=seed)
+    graph, _, false = walk(false=12, seed=seed)
+    done = LevenbergMarquardt().optimise(graph)
+    np.testing.assert_array_equal(done.weights == 0, false)
+    alone = ate(LevenbergMarquardt().optimise(clean).graph.poses, truth)
+    assert ate(done.graph.poses, truth) < 1.01 * alone
+    plain = LevenbergMarquardt(robust="none").optimise(graph).graph.poses
+    assert ate(plain, truth) > 20 * alone
+
+
+@pytest.mark.parametrize("seed", [0, 4, 5])
+def test_false_loop_is_found_despite_weak_odometry(seed):
+    """It bends the odometry and then fits; but the other loops contradict it."""
+    rng = np.random.default_rng(7)
+    graph, truth, false = walk(loops=5, false=2, seed=seed)
+    i, j = graph.edges[:59].T
+    measurements = graph.measurements.copy()
+    noise = se3.exp(rng.normal(size=(59, 6)) * SIGMA * 10)
+    measurements[:59] = se3.inverse(truth[i]) @ truth[j] @ noise
+    loose = np.where(graph.loop, 1.0, 0.01)[:, None, None]
+    graph = replace(graph, measurements=measurements, information=loose * graph.information)
+    plain = LevenbergMarquardt(robust="none").optimise(graph).graph
+    r = plain.residuals()[false]
+    assert np.einsum("mi,mij,mj->m", r, plain.information[false], r).max() < 6
+    done = LevenbergMarquardt().optimise(graph)
+    np.testing.assert_array_equal(done.weights == 0, false)
+    assert ate(done.graph.poses, truth) < 0.5 * ate(plain.poses, truth)
+
+
+def test_uncritical_outlier_loop_is_kept():
+    graph, _, _ = walk(60, 600)
+    measurements = graph.measurements.copy()
+    # One is off by 11 standard deviations, among 600 that share a squared error of 3600.
+    off = np.zeros(6)
+    off[0] = 11 * SIGMA[0]
+    measurements[-1] = measurements[-1] @ se3.exp(off)
+    graph = replace(graph, measurements=measurements)
+    plain = LevenbergMarquardt(robust="none").optimise(graph)
+    done = LevenbergMarquardt().optimise(graph)
+    assert done.weights.all()
+    np.testing.assert_array_equal(done.graph.poses, plain.graph.poses)
+    measurements[-1] = measurements[-1] @ se3.exp(10 * off)
+    assert LevenbergMarquardt().optimise(graph).weights[-1] == 0
+
+
+def test_without_false_loops_result_is_least_squares():
+    graph, _, _ = walk()
+    plain = LevenbergMarquardt(robust="none").optimise(graph)
+    done = LevenbergMarquardt().optimise(graph)
+    np.testing.assert_array_equal(done.graph.poses, plain.graph.poses)
+    assert done.objective == plain.objective
+    assert (done.weights == 1).all()
+    # Standard deviations that are too small by a factor of three do not make true loops false.
+    boast = replace(graph, information=9 * graph.information)
+    assert (LevenbergMarquardt().optimise(boast).weights == 1).all()
+
+
+@pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman-mcclure", "dcs", "switchable"])
+def test_robust_kernels(kernel):
+    """Weights are the slope of the cost; small errors have full weight, large ones less."""
+    x = np.array([1e-6, 0.5, 3.9, 4.1, 7.0, 40.0, 1e4])
+    h = 1e-6 * x
+    slope = (robust.cost(kernel, x + h, 4.0) - robust.cost(kernel, x - h, 4.0)) / (2 * h)
+    np.testing.assert_allclose(robust.weight(kernel, x, 4.0), slope, rtol=1e-5)
+    assert robust.weight(kernel, x, 4.0)[0] == pytest.approx(1, abs=1e-5)
+    assert robust.weight(kernel, x, 4.0)[-1] < 0.03
+    graph, truth, _ = walk(false=3, seed=4)
+    done = LevenbergMarquardt(robust=kernel, gate=16.0).optimise(graph)
+    assert (np.diff(done.objective) <= 0).all()
+    plain = LevenbergMarquardt(robust="none").optimise(graph)
+    assert ate(done.graph.poses, truth) < 0.8 * ate(plain.graph.poses, truth)
+
+
+def test_optimal_switch_cost_equals_kernel():
+    x = np.array([0.1, 4.0, 100.0])
+    s = np.linspace(0, 1, 200001)[:, None]
+    best = (s**2 * x + 4.0 * (1 - s) ** 2).min(axis=0)
+    np.testing.assert_allclose(robust.cost("switchable", x, 4.0), best, rtol=1e-6)
+
+
+def test_gravity_stabilises_tilt_of_chain():
+    """Without loops the tilt drifts; gravity edges stop it, the heading is unchanged."""
+    graph, truth, _ = walk(60, 0)
+    down = np.swapaxes(truth[:, :3, :3], 1, 2) @ np.array([0.1, 0.9, np.sqrt(1 - 0.82)])
+    for world in (None, np.array([0.1, 0.9, np.sqrt(1 - 0.82)])):
+        gravity = Gravity(np.arange(60), down, np.full(60, 1e-4), world)
+        done = minimise(replace(graph, gravity=gravity), Settings(tolerance=1e-10))
+
+        def tilt(poses: Float64) -> Float64:
+            up = poses[:, :3, :3] @ down[..., None]
+            return np.linalg.norm(np.cross(up[..., 0], truth[0, :3, :3] @ down[0]), axis=1)
+
+        assert tilt(graph.poses).max() > 0.01
+        assert tilt(done.graph.poses).max() < 5e-4
+        assert done.converged
+        np.testing.assert_array_equal(done.graph.poses[0], graph.poses[0])
+
+
+def test_parts_are_solved_and_reported_separately():
+    a, _, _ = walk(20, 8)
+    b, _, _ = walk(12, 5, seed=1)
+    n, m = len(a.ids), len(a.edges)
+    both = PoseGraph(
+        np.concatenate([a.ids, 100 + b.ids, [500]]),
+        np.concatenate([a.poses, b.poses, np.eye(4)[None]]),
+        np.concatenate([a.edges, b.edges + n]),
+        np.concatenate([a.measurements, b.measurements]),
+        np.concatenate([a.information, b.information]),
+        np.concatenate([a.loop, b.loop]),
+    )
+    optimiser = LevenbergMarquardt()
+    done = optimiser.optimise(both)
+    np.testing.assert_array_equal(done.graph.poses[:n], optimiser.optimise(a).graph.poses)
+    np.testing.assert_array_equal(done.graph.poses[n:-1], optimiser.optimise(b).graph.poses)
+    assert [(p.first, p.vertices, p.edges) for p in done.parts] == [
+        (0, 20, m),
+        (100, 12, len(b.edges)),
+        (500, 1, 0),
+    ]
+    assert [p.improved for p in done.parts] == [True, True, False]
+    assert done.objective[-1] == pytest.approx(sum(p.after for p in done.parts))
+
+
+def test_optimal_input_is_unchanged():
+    graph, truth, _ = walk(10, 4)
+    i, j = graph.edges.T
+    exact = replace(graph, poses=truth, measurements=se3.inverse(truth[i]) @ truth[j])
+    best = minimise(exact, Settings(tolerance=1e-15))
+    again = minimise(best.graph, Settings(tolerance=1e-15))
+    assert not again.parts[0].improved
+    np.testing.assert_array_equal(again.graph.poses, best.graph.poses)
+    empty = LevenbergMarquardt().optimise(PoseGraph.empty())
+    assert (len(empty.graph.ids), empty.converged) == (0, True)
+
+
+def test_invalid_graphs_and_options_are_refused():
+    graph, _, _ = walk(8, 2)
+    poses = graph.poses.copy()
+    poses[2, 0, 3] = np.nan
+    with pytest.raises(InputError, match="pose 2 is not finite"):
+        LevenbergMarquardt().optimise(graph.with_poses(poses))
+    information = graph.information.copy()
+    information[3, 1, 1] *= -1
+    with pytest.raises(InputError, match="edge 3 4: the information matrix is not positive"):
+        LevenbergMarquardt().optimise(replace(graph, information=information))
+    with pytest.raises(ValueError, match="gate must be above 0"):
+        LevenbergMarquardt(gate=0.0)
+    with pytest.raises(InputError, match="names no vertex"):
+        replace(graph, gravity=Gravity(np.array([8]), np.array([[0.0, 1, 0]]), np.ones(1)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "least"), [("sphere", 63789.07892761), ("parking-garage", 0.63419240)]
+)
+def test_benchmark_graphs_match_gtsam(shared_data, name, least):
+    """Half the squared error, as GTSAM 4.3's Levenberg-Marquardt reports it from the same start."""
+    graph = read_g2o(shared_data / "pose_graphs" / f"{name}.g2o")
+    done = LevenbergMarquardt().optimise(graph)
+    assert done.converged
+    assert done.graph.chi2() / 2 < 1.00001 * least
+    assert (done.weights == 1).all()
+
+
+def test_options_match_settings():
+    part, function = LevenbergMarquardt(), Settings()
+    for name in ("robust", "gate"):
+        assert getattr(part, name) == getattr(function, name)

@@ -1,0 +1,244 @@
+"""The error of given poses is estimated without a reference."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tofuse
+from made_phones import make_stray
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError
+from tofuse.engine.quality.pose_deviation import deviation
+from tofuse.engine.quality.trajectory import align, displacement
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.trajectory import write_tum
+from tofuse.engine.geometry import se3
+from tofuse.engine.tracking.given import GivenPoses
+from tofuse.engine.mapping.config import from_method
+from tofuse.apps.jobs.judging import device_sentence, poses_for, sentence, with_odometry
+from tofuse.engine.quality.accuracy import Accuracy
+from tofuse.engine.refinement.refinement import NoRefinement
+from tofuse.formats.recordings.phones import POSES_BY
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.apps.results.folder import FILES
+
+
+@pytest.fixture(scope="module")
+def recording(room_recording):
+    return tofuse.open(room_recording)
+
+
+@pytest.fixture(scope="module")
+def truth(recording):
+    return recording.reference
+
+
+def bent(truth):
+    """The second half is displaced from the first by 8 cm and 3 degrees."""
+    out = truth.copy()
+    out[4:] = se3.exp(np.array([0.06, 0.04, -0.03, 0.02, -0.05, 0])) @ out[4:]
+    return out
+
+
+@pytest.fixture(scope="module")
+def of_truth(recording, truth):
+    return tofuse.judge(recording, truth)
+
+
+@pytest.fixture(scope="module")
+def of_bent(recording, truth):
+    return tofuse.judge(recording, bent(truth))
+
+
+def test_correct_poses_are_good(of_truth) -> None:
+    assert of_truth.verdict == "good"
+    assert of_truth.reasons == ()
+    assert of_truth.started
+    assert of_truth.displacement_m.max() < 0.012
+    assert of_truth.accuracy.position_m < 0.02
+    assert of_truth.deviation.consistent
+    assert of_truth.deviation.at_most_m < 0.03
+    assert of_truth.consistency is not None
+    assert of_truth.consistency.inlier_ratio > 0.9
+
+
+def test_stated_error_of_wrong_poses_is_correct(of_bent, truth) -> None:
+    wrong, _ = displacement(truth, bent(truth))
+    assert wrong > 0.02
+    stated = of_bent.accuracy.position_m
+    assert wrong < stated < 1.6 * wrong
+    assert of_bent.verdict == "degraded"
+    assert [r.code for r in of_bent.reasons] == ["inconsistent_poses", "jumped"]
+    assert of_bent.reasons[0].ranges == ((3, 4),)
+    assert "The motion from frame 3 to 4 is wrong by itself." in of_bent.reasons[0].text
+    assert of_bent.reasons[1].frames == (4, 4)
+    refined = of_bent.refined
+    assert displacement(truth, refined.trajectory)[0] < 0.01
+    assert refined.diagnostics.accuracy.position_m < 0.01
+    assert refined.diagnostics.verdict == "good"
+    assert of_bent.refined_consistency.rms_m < of_bent.consistency.rms_m
+
+
+def test_wrong_poses_deviate_more_from_measurements(recording, truth, of_truth, of_bent) -> None:
+    wrong, right = of_bent.deviation, of_truth.deviation
+    depth_m = wrong.fit.depth_m
+    aligned = align(bent(truth), truth, arm_m=depth_m) @ bent(truth)
+    x = se3.log(se3.inverse(truth) @ aligned) * [1, 1, 1, depth_m, depth_m, depth_m]
+    true = float(np.sqrt((x**2).sum(1).mean()))
+    assert right.estimate_m < 0.005 < wrong.at_least_m <= true < wrong.at_most_m
+    assert wrong.estimate_m == pytest.approx(true, rel=0.3)
+    assert wrong.ids[wrong.steps].tolist() == [[3, 4]]
+    # Other poses of the recording are compared without repeating registrations.
+    again = deviation(right.fit, bent(truth)[right.ids])
+    assert again.estimate_m == pytest.approx(wrong.estimate_m, rel=0.1)
+
+
+@pytest.mark.slow
+def test_tolerance_decides_verdict(recording, truth) -> None:
+    recording, near = recording.select(every=2), truth[::2].copy()
+    near[:, :3, 3] += 0.004 * np.random.default_rng(3).standard_normal((4, 3))
+    assert tofuse.judge(recording, near, tolerance_m=0.05).verdict == "good"
+    (reason,) = tofuse.judge(recording, near, tolerance_m=0.004).reasons
+    assert reason.code == "uncertain_poses"
+
+
+@pytest.mark.slow
+def test_poses_of_another_place_are_contradicted_and_replaced(recording, truth) -> None:
+    turns = np.array([se3.exp(np.array([0, 0, 0, 0, 2.5 * k, 0])) for k in range(8)])
+    found = tofuse.judge(recording, turns @ truth)
+    assert not found.started
+    assert found.verdict == "degraded"
+    assert "inconsistent_poses" in [r.code for r in found.reasons]
+    assert found.accuracy.rotation_rad > 1
+    assert displacement(truth, found.refined.trajectory)[0] < 0.01
+    away = np.array([se3.exp(np.array([0, 0, 0, 0, 1.1 * k, 0])) for k in range(8)])
+    found = tofuse.judge(recording, away @ np.linalg.inv(truth))
+    assert found.verdict == "failed"
+    assert "images_disagree" in [r.code for r in found.reasons]
+
+
+@pytest.mark.slow
+def test_frames_without_pose_stay_without(recording, truth) -> None:
+    some = truth.copy()
+    some[[2, 5]] = np.nan
+    found = tofuse.judge(recording, some)
+    assert found.verdict == "good"
+    assert ", poses of 6 of 8 frames; refined: " in sentence(found, "poses.txt")
+    assert np.flatnonzero(np.isnan(found.displacement_m)).tolist() == [2, 5]
+    assert found.to_dict()["frames"] == 6
+
+
+@pytest.mark.slow
+def test_given_poses_are_kept_without_refinement(recording, truth) -> None:
+    moved = bent(truth)
+    config = replace(from_method("default"), odometry=GivenPoses(), refinement=NoRefinement())
+    result = tofuse.reconstruct(with_odometry(recording, moved), config)
+    expected = se3.inverse(moved[0]) @ moved
+    np.testing.assert_allclose(result.diagnostics.sequential, expected, atol=1e-9)
+    assert [f.status for f in result.diagnostics.frames] == ["tracked"] * 8
+
+
+def test_unusable_poses_are_refused(recording, truth, tmp_path) -> None:
+    with pytest.raises(InputError, match=r"pass \(8, 4, 4\)"):
+        tofuse.judge(recording, truth[:5])
+    one = np.full_like(truth, np.nan)
+    one[3] = np.eye(4)
+    with pytest.raises(InputError, match="has a pose for 1 of the 8 frames"):
+        tofuse.judge(recording, one)
+    with pytest.raises(InputError, match="has no rotation"):
+        tofuse.judge(recording, truth * np.array([2.0, 1, 1, 1]))
+    write_tum(tmp_path / "late.txt", recording.timestamps + 1000, truth)
+    with pytest.raises(InputError, match=r"late.txt: has a pose for 0 .* on the clock"):
+        poses_for(recording, tmp_path / "late.txt")
+    for k in range(3):
+        points = np.random.default_rng(k).uniform(-1, 1, (500, 3)).astype(np.float32)
+        tofuse_ply(tmp_path / f"scans/{k}.ply", points)
+    with pytest.raises(InputError, match=r"takes .*range"):
+        tofuse.judge(tofuse.open(tmp_path / "scans"), np.tile(np.eye(4), (3, 1, 1)))
+
+
+def test_poses_in_recording_of_phone_are_read(tmp_path) -> None:
+    make_stray(tmp_path)
+    phone = tofuse.open(tmp_path)
+    np.testing.assert_allclose(poses_for(phone, tmp_path), phone.reference)
+
+
+def tofuse_ply(path, points) -> None:
+    from tofuse.formats.files.ply import write_ply
+
+    path.parent.mkdir(exist_ok=True)
+    write_ply(path, GeometryRecord(points))
+
+
+@pytest.mark.slow
+def test_command(room_recording, truth, tmp_path, capsys) -> None:
+    recording = tofuse.open(room_recording)
+    poses = tmp_path / "poses.txt"
+    write_tum(poses, recording.timestamps, bent(truth))
+    words = ["judge", str(room_recording), str(poses), "--out", str(tmp_path / "out")]
+    assert main([*words, "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["verdict"] == "degraded"
+    assert data["out"] == str(tmp_path / "out")
+    kept = json.loads((tmp_path / "out/judge.json").read_text())
+    assert {**kept, "out": data["out"]} == data
+    assert kept["refined"]["verdict"] == "good"
+    assert kept["refined"]["from_these_poses"]
+    assert kept["refined"]["accuracy"]["position_m"] < 0.4 * kept["accuracy"]["position_m"]
+    written = {p.name for p in (tmp_path / "out").iterdir()}
+    assert written <= set(FILES)
+    assert {"trajectory.txt", "report.html", "run.json", "judge.json"} <= written
+    report = (tmp_path / "out/report.html").read_text()
+    assert "poses.txt: ±" in report
+    assert "Inconsistent with the depth: surfaces displaced by about" in report
+    deviation = kept["deviation"]
+    assert 0 < deviation["at_least_m"] <= deviation["estimate_m"] <= deviation["at_most_m"]
+    assert len(deviation["frames"]) == len(deviation["of_frames_m"])
+    assert deviation["inconsistent_steps"] == [[3, 4]]
+    # Its result is replaced only on request, and is a trajectory itself.
+    assert main(words) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main(["judge", str(room_recording), str(tmp_path / "out")]) == 0
+    out = capsys.readouterr().out
+    assert "\nout: ±" in out
+    assert "Consistent with the depth to within" in out
+    assert "map consistency: given" in out
+
+
+def test_command_refuses(room_recording, tmp_path, capsys) -> None:
+    assert main(["judge", str(room_recording), str(tmp_path / "none.txt")]) == 2
+    assert "none.txt" in capsys.readouterr().err
+    assert main(["judge", str(room_recording), str(room_recording), "--overwrite"]) == 2
+    assert "pass --out" in capsys.readouterr().err
+    shutil.copytree(room_recording, tmp_path / "mine")
+    poses = str(room_recording / "groundtruth.txt")
+    assert main(["judge", str(room_recording), poses, "--out", str(tmp_path / "mine")]) == 2
+    assert "contains no earlier result" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_device_poses_are_judged_by_default(recording, truth) -> None:
+    """The stated errors also hold for wrong poses of the phone."""
+    result = tofuse.reconstruct(recording)
+    assert device_sentence(recording, result) == ""  # a simulation has no device
+    phone = phone_of(recording, bent(truth))
+    sentence = device_sentence(phone, result)
+    match = re.fullmatch(r"ARKit's poses: ±(\d+) mm \(95 %\); these: ±([\d.]+) mm\.", sentence)
+    assert match is not None
+    wrong, _ = displacement(truth, bent(truth))
+    assert wrong < float(match[1]) / 1e3 < 1.6 * wrong
+    assert float(match[2]) < 12
+    loose = replace(result.diagnostics, accuracy=Accuracy(assessed=True))
+    sentence = device_sentence(phone, replace(result, diagnostics=loose))
+    assert sentence.startswith("ARKit's poses differ from these by ")
+
+
+def phone_of(recording, poses):
+    source = ArraySource(list(recording), poses, metadata={POSES_BY: "ARKit"})
+    return Recording.of(source, "phone", "frames")

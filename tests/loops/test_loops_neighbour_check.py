@@ -1,0 +1,102 @@
+"""Neighbouring views must agree after loop closure as well as before."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from tofuse.engine.geometry import se3
+from tofuse.engine.tracking.base import Step
+from tofuse.engine.mapping.backend import BackEnd
+from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.progress import Stopwatch
+from tofuse.engine.graph.external_sensors import SensorPriors
+from tofuse.engine.graph.graph import LoopRecord
+from tofuse.engine.loops.loops import ClosedLoop
+from tofuse.engine.loops.neighbour_check import degraded_neighbours
+from tofuse.engine.alignment.base import Registration
+
+SIGMA = np.array([0.003] * 3 + [0.002] * 3)
+SIDEWAYS = se3.exp(np.array([0.08, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+def displaced_from(truth, k):
+    return np.concatenate([truth[:k], truth[k:] @ SIDEWAYS])
+
+
+def test_separated_neighbours_are_found_where_registrations_are_uncertain(posed_views) -> None:
+    posed, truth = posed_views
+    pulled = displaced_from(truth, 3)
+    everywhere = frozenset(range(len(truth)))
+    assert list(degraded_neighbours(posed, truth, pulled, everywhere)) == [(2, 3)]
+    assert list(degraded_neighbours(posed, truth, pulled, frozenset({3}))) == [(2, 3)]
+    assert not list(degraded_neighbours(posed, truth, pulled, everywhere - {3}))
+    # A loop that repairs a pair is accepted, and so is one that changes nothing.
+    assert not list(degraded_neighbours(posed, pulled, truth, everywhere))
+    assert not list(degraded_neighbours(posed, truth, truth, everywhere))
+
+
+def chain(posed, truth, inflation, wrong):
+    """A back end whose registrations are correct, except that of the frame `wrong`."""
+    entries, poses = [], {}
+    information = np.diag(SIGMA**-2)
+    T = np.eye(4)
+    for k in range(len(truth)):
+        step = Step("tracked", "", T)
+        if k:
+            T_before = se3.inverse(truth[k - 1]) @ truth[k]
+            T_before = T_before @ SIDEWAYS if k == wrong else T_before
+            T = T @ T_before
+            own = information / inflation.get(k, 1.0) ** 2
+            found = Registration(T_before, True, 5, 100, 100, 0.1, 0.01, own)
+            factor = inflation.get(k, 1.0)
+            step = Step("tracked", "", T, k - 1, found, doubtful=factor > 1, inflation=factor)
+        record = SimpleNamespace(index=k, timestamp=0.1 * k, unobservable=np.zeros((0, 6)))
+        entries.append(SimpleNamespace(record=record, step=step))
+        poses[k] = T
+    log = SimpleNamespace(posed=entries, entries=entries)
+    kept = SimpleNamespace(views=SimpleNamespace(of=lambda row: posed))
+    progress = SimpleNamespace(stage=lambda *_: None)
+    return BackEnd(from_method("default"), log, poses, (), (), kept, progress, Stopwatch())
+
+
+def test_loop_gap_does_not_separate_consistent_images(posed_views) -> None:
+    posed, truth = posed_views
+    n = len(truth)
+    wrong, unusual = 2, n - 2
+    loop = ClosedLoop(
+        LoopRecord(0, n - 1, True, "made"),
+        se3.inverse(truth[0]) @ truth[-1],
+        np.diag(SIGMA**-2),
+    )
+    end = chain(posed, truth, {unusual: 100.0}, wrong)
+
+    def moved(graph, k):
+        T = se3.inverse(graph.poses[k - 1]) @ graph.poses[k]
+        return np.linalg.norm((se3.inverse(T) @ se3.inverse(truth[k - 1]) @ truth[k])[:3, 3])
+
+    # Least squares alone separates the uncertain pair, which was correct.
+    plain = end._config.optimiser.optimise(end._tracked.build([loop])).graph
+    assert moved(plain, unusual) > 0.07
+    optimisation, confirmed = end._optimise(end._tracked.build([loop]), [loop], SensorPriors())
+    assert confirmed == {unusual}
+    assert moved(optimisation.graph, unusual) < 0.04
+    assert moved(optimisation.graph, wrong) < moved(plain, wrong)
+
+
+def test_registration_contradicted_by_images_stays_uncertain(posed_views) -> None:
+    posed, truth = posed_views
+    n, wrong = len(truth), 3
+    loop = ClosedLoop(
+        LoopRecord(0, n - 1, True, "made"),
+        se3.inverse(truth[0]) @ truth[-1],
+        np.diag(SIGMA**-2),
+    )
+    end = chain(posed, truth, {wrong: 100.0}, wrong)
+    optimisation, confirmed = end._optimise(end._tracked.build([loop]), [loop], SensorPriors())
+    assert not confirmed
+    relative = se3.inverse(se3.inverse(truth[2]) @ truth[3]) @ (
+        se3.inverse(optimisation.graph.poses[2]) @ optimisation.graph.poses[3]
+    )
+    assert np.linalg.norm(relative[:3, 3]) < 0.005

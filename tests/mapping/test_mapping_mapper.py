@@ -1,0 +1,354 @@
+"""The mapper: online and whole runs agree, and invalid frames are rejected."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.engine.errors import InputError
+from tofuse.engine.filters.base import Filter
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import thread_count
+from tofuse.lab.methods.filters_temporal import TemporalDeviation
+from tofuse.lab.simulation.peaks import peaks_views
+from tofuse.engine.parts import part
+from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.graph.graph import Optimisation, Optimiser
+from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+
+# Fine enough for few frames, and fast.
+CONFIG = changed(
+    from_method("thesis"), {"odometry": {"registration": {"resolution": 0.03}}}, where="tests"
+)
+
+
+@pytest.fixture(scope="module")
+def recording(room_recording) -> Recording:
+    return tofuse.open(room_recording)
+
+
+@pytest.fixture(scope="module")
+def frames(recording):
+    return list(recording)
+
+
+@pytest.fixture(scope="module")
+def whole(recording):
+    return reconstruct(recording, CONFIG)
+
+
+@dataclass(frozen=True)
+class OnlyClouds(Filter):
+    part_name: ClassVar[str] = "only clouds"
+    takes: ClassVar[frozenset[str]] = frozenset({"cloud"})
+
+
+def in_memory(frames, **options) -> Recording:
+    return Recording.of(ArraySource(frames, **options), "memory", "frames")
+
+
+def blank(frame: RangeFrame) -> RangeFrame:
+    return replace(frame, depth=np.zeros_like(frame.depth))
+
+
+def test_frames_pushed_one_by_one_give_same_bytes(frames, whole) -> None:
+    mapper = Mapper(CONFIG)
+    poses = [mapper.push(frame) for frame in frames]
+    result = mapper.finish()
+    np.testing.assert_array_equal(poses, whole.diagnostics.sequential)
+    assert result.trajectory.tobytes() == whole.trajectory.tobytes()
+    assert result.cloud.points.tobytes() == whole.cloud.points.tobytes()
+    assert result.cloud.normals.tobytes() == whole.cloud.normals.tobytes()
+    assert result.graph.information.tobytes() == whole.graph.information.tobytes()
+    assert result.recording == {"path": None, "format": "frames", "frames": 8}
+
+
+def test_result_of_whole_run(whole, recording) -> None:
+    assert whole.trajectory.shape == (8, 4, 4)
+    np.testing.assert_array_equal(whole.trajectory[0], np.eye(4))
+    np.testing.assert_array_equal(whole.timestamps, recording.timestamps)
+    assert len(whole.mesh.faces) > 1000
+    np.testing.assert_array_equal(whole.mesh.vertices, whole.cloud.points)
+    assert whole.graph.ids.tolist() == list(range(8))
+    assert len(whole.cloud) > 1000
+    assert {"filters", "tracking", "loops", "fusion", "checking"} <= set(whole.diagnostics.seconds)
+    assert 0 < whole.diagnostics.removed["neighbour_fraction"] < 1
+    # The simulated camera rotates; the estimate must be close, not just present.
+    error = np.linalg.norm(whole.trajectory[:, :3, 3] - recording.reference[:, :3, 3], axis=1)
+    assert error.max() < 0.1
+
+
+def test_seed_and_threads(recording, whole) -> None:
+    same = reconstruct(recording, CONFIG, threads=1)
+    assert same.trajectory.tobytes() == whole.trajectory.tobytes()
+    assert same.threads == 1
+    other = reconstruct(recording, CONFIG, seed=1)
+    assert other.trajectory.tobytes() != whole.trajectory.tobytes()
+    np.testing.assert_allclose(other.trajectory, whole.trajectory, atol=0.1)
+
+
+def test_thread_count_is_restored(frames) -> None:
+    before = thread_count()
+    mapper = Mapper(threads=before + 1)
+    mapper.push(frames[0])
+    mapper.finish()
+    assert thread_count() == before
+
+
+def test_order_kind_and_end_are_checked(frames) -> None:
+    mapper = Mapper()
+    mapper.push(frames[3])
+    for index in (3, 1):
+        with pytest.raises(InputError, match=f"frame {index}: comes after frame 3; number"):
+            mapper.push(frames[index])
+        with pytest.raises(InputError, match=f"frame {index}: comes after frame 3"):
+            mapper.skip(index, 0.0, "broken")
+    cloud = CloudFrame.of(frames[4].points, index=4)
+    with pytest.raises(InputError, match="frame 4: is a cloud view among range views"):
+        mapper.push(cloud)
+    mapper.push(frames[4])
+    assert mapper.finish().has_pose.tolist() == [True, True]
+    for call in (lambda: mapper.push(frames[5]), mapper.finish, lambda: mapper.skip(6, 0.0, "")):
+        with pytest.raises(InputError, match="mapper: is finished; make a new Mapper"):
+            call()
+
+
+def test_no_frames_and_no_usable_frames_are_refused(frames) -> None:
+    with pytest.raises(InputError, match="none of the 0 frames"):
+        Mapper().finish()
+    mapper = Mapper()
+    assert mapper.push(blank(frames[0])) is None
+    with pytest.raises(InputError, match=r"none of the 1 frames has enough valid points.*0 valid"):
+        mapper.finish()
+
+
+def test_filter_for_images_refuses_clouds_early(frames) -> None:
+    config = replace(CONFIG, filters=(TemporalDeviation(),))
+    mapper = Mapper(config)
+    with pytest.raises(InputError, match=r"filter 'temporal' takes .'range'. views"):
+        mapper.push(CloudFrame.of(frames[0].points))
+    mapper.push(frames[0])  # the refused view does not set the kind
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "amplitude", "filters", "corrected", "ready"),
+    [
+        ("default", False, [], 2, True),
+        ("default", True, [], 1, False),  # multipath is learnt frame by frame
+        ("default", False, [{"part": "temporal"}], 2, False),
+        ("thesis", True, [], 0, True),
+    ],
+)
+def test_preparation_out_of_order_gives_same_result(
+    frames, method, amplitude, filters, corrected, ready
+) -> None:
+    config = changed(from_method(method), {"filters": filters}, where="tests")
+    case = frames[:3] if amplitude else [replace(f, amplitude_image=None) for f in frames[:3]]
+    plain, early = Mapper(config, threads=1), Mapper(config, threads=2)
+    prepared = [early.prepare(f) for f in reversed(case)][::-1]
+    assert {(p.corrected, p.filtered is not None) for p in prepared} == {(corrected, ready)}
+    for frame, p in zip(case, prepared, strict=True):
+        np.testing.assert_array_equal(plain.push(frame), early.push(frame, prepared=p))
+    a, b = plain.finish(), early.finish()
+    assert a.trajectory.tobytes() == b.trajectory.tobytes()
+    assert a.cloud.points.tobytes() == b.cloud.points.tobytes()
+    assert a.diagnostics.removed == b.diagnostics.removed
+    assert [s.index for s in a.diagnostics.samples] == [s.index for s in b.diagnostics.samples]
+
+
+def test_clouds_and_unsuitable_frames_are_not_prepared(frames) -> None:
+    assert Mapper().prepare(CloudFrame.of(np.ones((5, 3)))) is None
+    assert Mapper(from_method("default", "cloud")).prepare(frames[0]) is not None
+    only_clouds = replace(from_method("default"), filters=(OnlyClouds(),))
+    assert Mapper(only_clouds).prepare(frames[0]) is None
+
+
+def test_lost_frame_has_no_pose_and_tracking_continues(frames) -> None:
+    lost = [blank(f) if f.index == 3 else f for f in frames]
+    result = reconstruct(in_memory(lost), CONFIG)
+    assert result.has_pose.tolist() == [k != 3 for k in range(8)]
+    assert [f.status for f in result.diagnostics.frames].count("lost") == 1
+    assert "0 valid points" in result.diagnostics.frames[3].reason
+    assert result.graph.ids.tolist() == [0, 1, 2, 4, 5, 6, 7]
+    assert [2, 3] in result.graph.edges.tolist()  # frame 2 to frame 4
+    assert result.diagnostics.verdict == "degraded"
+
+
+def test_lost_first_frame_is_not_the_origin(frames) -> None:
+    result = reconstruct(in_memory([blank(frames[0]), *frames[1:4]]))
+    assert not result.has_pose[0]
+    np.testing.assert_array_equal(result.trajectory[1], np.eye(4))
+
+
+def test_given_loops_are_used_or_rejected(frames, whole) -> None:
+    measured = np.linalg.inv(whole.trajectory[0]) @ whole.trajectory[7]
+    given = [PriorLoop(0, 7, measured), PriorLoop(1, 3, np.eye(4))]
+    lost = [blank(f) if f.index == 3 else f for f in frames]
+    result = reconstruct(in_memory(lost), CONFIG, loops=given)
+    used, refused = result.diagnostics.loops[1], result.diagnostics.loops[0]
+    assert (used.i, used.j, used.accepted) == (0, 7, True)
+    assert (refused.i, refused.j, refused.accepted) == (1, 3, False)
+    assert "loop_rejected" in [r.code for r in result.diagnostics.reasons]
+    assert result.graph.loop.sum() == 1
+    assert len(result.diagnostics.objective) > 0
+
+
+@pytest.mark.slow
+def test_clouds_alone_give_a_model(frames) -> None:
+    clouds = [CloudFrame.of(f.points[::6], index=f.index, timestamp=f.index) for f in frames[:3]]
+    result = reconstruct(in_memory(clouds))
+    assert result.has_pose.all()
+    assert result.cloud.color is None
+
+
+def test_covariances_are_relative_to_first_pose(whole) -> None:
+    first, second, *_, last = whole.diagnostics.frames
+    np.testing.assert_array_equal(first.covariance, 0)
+    edge = np.flatnonzero((whole.graph.edges == [0, 1]).all(1))[0]
+    np.testing.assert_allclose(
+        second.covariance @ whole.graph.information[edge], np.eye(6), atol=1e-6
+    )
+    # Without loop closures, errors accumulate.
+    assert np.trace(last.covariance[:3, :3]) > 2 * np.trace(second.covariance[:3, :3])
+
+
+@part("optimiser", "test-doubting")
+@dataclass(frozen=True)
+class Doubting(Optimiser):
+    """Leaves out the second loop as an outlier."""
+
+    def optimise(self, graph):
+        weights = np.ones(len(graph.edges))
+        weights[np.flatnonzero(graph.loop)[1]] = 0.0
+        return Optimisation(graph, (2.0, 1.0), True, weights)
+
+
+def test_loops_left_out_by_optimiser_are_rejected(frames, whole) -> None:
+    loops = [PriorLoop(0, k, whole.trajectory[k]) for k in (3, 4, 5)]
+    mapper = Mapper(replace(CONFIG, optimiser=Doubting()), loops=loops)
+    for frame in frames[:6]:
+        mapper.push(frame)
+    result = mapper.finish()
+    assert [p.accepted for p in result.diagnostics.loops] == [True, False, True]
+    assert "contradicts the rest of the graph" in result.diagnostics.loops[1].reason
+    assert result.graph.loop.sum() == 2
+    assert result.graph.edges[result.graph.loop].tolist() == [[0, 3], [0, 5]]
+    assert [r.code for r in result.diagnostics.reasons].count("loop_rejected") == 1
+
+
+@part("filter", "test-history")
+@dataclass(frozen=True)
+class SeesHistory(Filter):
+    """Records the frames it was given, and their numbers of points."""
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+    seen: ClassVar[list[tuple[int, list[int], list[int]]]] = []
+
+    @property
+    def window(self) -> int:
+        return 3
+
+    def mask(self, frame, history):
+        self.seen.append((frame.index, [f.index for f in history], [len(f) for f in history]))
+        keep = frame.valid.copy()
+        keep[::2] = False
+        return keep
+
+
+def test_temporal_filters_see_raw_neighbours_of_selected_frames(recording, frames) -> None:
+    SeesHistory.seen.clear()
+    config = replace(CONFIG, filters=(SeesHistory(),))
+    result = reconstruct(recording.select(0, None, 3), config)
+    assert [(i, past) for i, past, _ in SeesHistory.seen] == [(0, []), (3, [1, 2]), (6, [4, 5])]
+    for _, past, counts in SeesHistory.seen:
+        assert counts == [len(frames[k]) for k in past]  # unfiltered
+    assert [f.index for f in result.diagnostics.frames] == [0, 3, 6]
+
+
+def test_unreadable_neighbours_are_left_out(recording, room_recording, tmp_path) -> None:
+    copy = shutil.copytree(room_recording, tmp_path / "copy")
+    (copy / "depth" / "000002.png").write_bytes(b"no image")
+    SeesHistory.seen.clear()
+    config = replace(CONFIG, filters=(SeesHistory(),))
+    result = reconstruct(tofuse.open(copy).select(0, None, 3), config)
+    assert [(i, past) for i, past, _ in SeesHistory.seen] == [(0, []), (3, [1]), (6, [4, 5])]
+    assert result.has_pose.all()
+
+
+def test_joined_recordings_share_no_history(room_recording) -> None:
+    SeesHistory.seen.clear()
+    joined = tofuse.open(room_recording, room_recording).select(6, 11)
+    reconstruct(joined, replace(CONFIG, filters=(SeesHistory(),)))
+    found = [(i, past) for i, past, _ in SeesHistory.seen]
+    assert found == [(6, [4, 5]), (7, [5, 6]), (8, []), (9, [8]), (10, [8, 9])]
+
+
+def test_pushed_frames_form_the_history(frames) -> None:
+    SeesHistory.seen.clear()
+    mapper = Mapper(replace(CONFIG, filters=(SeesHistory(),)))
+    for frame in frames[:4]:
+        mapper.push(frame)
+    assert [past for _, past, _ in SeesHistory.seen] == [[], [0], [0, 1], [1, 2]]
+    assert SeesHistory.seen[3][2] == [len(frames[1]), len(frames[2])]
+
+
+@pytest.mark.slow
+def test_odometry_is_used_as_guess_on_request(frames, recording) -> None:
+    config = replace(CONFIG, odometry=replace(CONFIG.odometry, guess="odometry"))
+    odometry = recording.reference.copy()
+    with_odometry = reconstruct(in_memory(frames, odometry=odometry), config)
+    without = reconstruct(in_memory(frames), config)
+    assert with_odometry.trajectory.tobytes() != without.trajectory.tobytes()
+    odometry[3] = np.nan
+    assert reconstruct(in_memory(frames, odometry=odometry), config).has_pose.all()
+
+
+@pytest.mark.slow
+def test_model_before_loop_closure_is_kept() -> None:
+    views, poses = peaks_views(0.06, 0)
+    recording = Recording.of(ArraySource(views, poses), "peaks", "peaks")
+    changes = {
+        "filters": [],
+        "odometry": {
+            "registration": {
+                "resolution": 1.0,
+                "source": {"part": "all"},
+                "target": {"part": "all"},
+            }
+        },
+        "loops": {"per_frame": 0},
+    }
+    config = changed(from_method("thesis", "cloud"), changes, where="test")
+    closing = se3.inverse(poses[0]) @ poses[-1]
+    closed = reconstruct(recording, config, loops=[PriorLoop(0, len(views) - 1, closing)])
+    opened = reconstruct(recording, config)
+    before = closed.diagnostics.cloud_before
+    assert opened.diagnostics.cloud_before is None
+    assert before is not None
+    np.testing.assert_array_equal(before.points, opened.cloud.points)
+    assert len(closed.cloud) != len(before)
+
+
+@pytest.mark.slow
+def test_camera_that_jumps_back_is_tracked(frames) -> None:
+    mapper = Mapper("default")
+    again = [replace(f, index=k) for k, f in enumerate([*frames[:6], *frames[:4]])]
+    for frame in again:
+        mapper.push(frame)
+    result = mapper.finish()
+    assert [f.status for f in result.diagnostics.frames] == ["tracked"] * 10
+    assert [f.index for f in result.diagnostics.frames] == list(range(10))
+    assert list(result.graph.ids) == list(range(10))
+    for k in range(4):
+        apart = se3.inverse(result.trajectory[k]) @ result.trajectory[6 + k]
+        assert np.linalg.norm(apart[:3, 3]) < 0.02

@@ -1,0 +1,237 @@
+"""Noise models: the physics of amplitude, tables over confidence, JSON, and invalid models."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from paths import DOCS
+from tofuse.engine.errors import InputError
+from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
+from tofuse.engine.noise import noise_kernels as kernels
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.noise.model import NOISE, AmplitudeLaw, ConfidenceLaw, NoiseModel, RangeLaw, incidence_cosine
+
+CAMERA = Pinhole(40, 30, 30.0, 30.0, 19.5, 14.5)
+DARK = NoiseModel("dark", RangeLaw(0.01, 0.0), AmplitudeLaw(0.0, 2.0), ceiling_m=10.0)
+
+
+def image(value: float | np.ndarray) -> np.ndarray:
+    return np.broadcast_to(np.asarray(value, np.float32), (30, 40)).copy()
+
+
+def frame(depth: float | np.ndarray = 2.0, **channels: object) -> RangeFrame:
+    return RangeFrame(0, 0.0, CAMERA, image(depth), "range", **channels)  # type: ignore[arg-type]
+
+
+def test_noise_is_inversely_proportional_to_amplitude() -> None:
+    amplitudes = np.geomspace(10, 1000, 40)
+    sigma = DARK.sigma(frame(amplitude_image=image(amplitudes)))
+    np.testing.assert_allclose(sigma * amplitudes, 2.0, rtol=1e-6)
+
+
+def test_shot_noise_falls_with_square_root_of_amplitude() -> None:
+    model = replace(DARK, amplitude=AmplitudeLaw(0.5, 0.0))
+    amplitudes = np.geomspace(10, 1000, 40)
+    sigma = model.sigma(frame(amplitude_image=image(amplitudes)))
+    np.testing.assert_allclose(sigma * np.sqrt(amplitudes), 0.5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["raw", "range_compensated"])
+def test_noise_of_constant_albedo_grows_with_squared_range(kind: str) -> None:
+    ranges = np.linspace(1, 5, 40)
+    amplitude = 500.0 / ranges**2 if kind == "raw" else np.full(40, 500.0)
+    seen = frame(ranges, amplitude_image=image(amplitude), amplitude_kind=kind)
+    np.testing.assert_allclose(DARK.sigma(seen)[0] / ranges**2, 2.0 / 500.0, rtol=1e-5)
+
+
+@pytest.mark.parametrize("power", [0.0, 3.0, 4.0])
+def test_compensated_amplitude_excludes_falloff(power: float) -> None:
+    model = replace(DARK, amplitude=AmplitudeLaw(0.0, 2.0, falloff=power))
+    seen = frame(amplitude_image=image(500.0), amplitude_kind="range_compensated")
+    expected = 2.0 * 4.0 / 500.0 * ray_lengths(CAMERA) ** power
+    np.testing.assert_allclose(model.sigma(seen), expected, rtol=1e-5)
+    raw = frame(amplitude_image=image(500.0))
+    np.testing.assert_allclose(model.sigma(raw), 2.0 / 500.0, rtol=1e-5)
+
+
+def test_terms_add_in_squares_up_to_ceiling() -> None:
+    model = NoiseModel("all", RangeLaw(0.01, 0.0), AmplitudeLaw(0.3, 2.0, 0.02), ceiling_m=1.0)
+    sigma = model.sigma(frame(amplitude_image=image(50.0)))
+    assert sigma[0, 0] == pytest.approx(math.sqrt(0.02**2 + 0.09 / 50 + (2 / 50) ** 2))
+    amplitude = image(50.0)
+    amplitude[0, :3] = 0.01, 0.0, SATURATED_AMPLITUDE
+    np.testing.assert_allclose(model.sigma(frame(amplitude_image=amplitude))[0, :3], 1.0)
+
+
+def test_confidence_is_monotone_and_saturates_at_last_level() -> None:
+    model = NoiseModel("table", RangeLaw(1.0, 0.0), confidence=ConfidenceLaw((0.3, 0.1, 0.03), 1.0))
+    levels = np.broadcast_to(np.arange(40, dtype=np.uint8), (30, 40))
+    sigma = model.sigma(frame(2.0, confidence_image=levels))
+    assert (np.diff(sigma[0]) <= 0).all()
+    np.testing.assert_allclose(sigma[0, :5], [0.6, 0.2, 0.06, 0.06, 0.06], rtol=1e-6)
+
+
+def test_noise_of_every_family_is_monotone() -> None:
+    for model in NOISE.values():
+        ramp = np.linspace(0.5, 6, 40)
+        plain = model.sigma(frame(ramp))
+        assert (np.diff(plain[0]) > 0).all()
+        assert 0.0002 < plain[0, 5] < 0.1
+        light = model.sigma(frame(2.0, amplitude_image=image(np.geomspace(1, 5000, 40))))
+        assert (np.diff(light[0]) <= 0).all()
+        levels = np.broadcast_to(np.arange(40, dtype=np.uint8) // 6, (30, 40))
+        assert (np.diff(model.sigma(frame(2.0, confidence_image=levels))[0]) <= 0).all()
+
+
+def test_precedence_of_laws() -> None:
+    model = replace(NOISE["sr4000"], name="x")
+    full = frame(
+        amplitude_image=image(300.0),
+        confidence_image=np.full((30, 40), 5, np.uint8),
+        sigma_image=image(0.123),
+    )
+    assert model.law(full) == "camera"
+    np.testing.assert_allclose(model.sigma(full), 0.123, rtol=1e-3)
+    assert model.law(replace(full, sigma_image=None)) == "amplitude"
+    assert model.law(replace(full, sigma_image=None, amplitude_image=None)) == "confidence"
+    assert model.law(frame()) == "range"
+
+
+def test_invalid_pixels_have_no_sigma_and_z_less_than_range() -> None:
+    depth = image(2.0)
+    depth[3, 4] = 0
+    seen = frame(depth)
+    sigma, z = DARK.sigma(seen), DARK.sigma_z(seen)
+    assert sigma.dtype == np.float32
+    assert sigma[3, 4] == z[3, 4] == 0
+    assert (sigma > 0).sum() == sigma.size - 1
+    np.testing.assert_allclose(z[0, 0] * ray_lengths(CAMERA)[0, 0], sigma[0, 0], rtol=1e-6)
+
+
+def test_z_images_have_noise_of_their_range() -> None:
+    seen = frame(2.0 + np.arange(40) / 40)
+    as_z = RangeFrame(0, 0.0, CAMERA, seen.z, "z")
+    model = NOISE["unknown"]
+    np.testing.assert_allclose(model.sigma(as_z), model.sigma(seen), rtol=1e-5)
+
+
+def test_tilted_wall_is_noisier_by_change_within_pixel() -> None:
+    # z = d / (n . ray) for a plane at 60 degrees: the exact change to the next pixel.
+    normal = np.array([np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)])
+    rays = np.dstack([CAMERA.rays(), np.ones((30, 40))])
+    z = (-2.0 / (rays @ normal)).astype(np.float32)
+    z[z < 0] = 0
+    normals = np.broadcast_to(normal.astype(np.float32), (30, 40, 3))
+    seen = RangeFrame(0, 0.0, CAMERA, z, "z", normal_image=normals)
+    cosine = incidence_cosine(seen)
+    assert cosine is not None
+    model = NoiseModel("flat", RangeLaw(1e-6, 0.0), footprint=0.29)
+    sigma = model.sigma(seen)[15, 15:25]
+    distance = np.linalg.norm(seen.point_image[15], axis=-1)
+    change = np.abs(np.gradient(distance))[15:25]
+    # The step to the neighbour is perpendicular to the ray: within the obliqueness of these rays.
+    np.testing.assert_allclose(sigma, 0.29 * change, rtol=0.12)
+    assert (model.sigma(seen, np.ones((30, 40), np.float32)) < 1e-5).all()
+    unknown = np.full((30, 40), np.nan, np.float32)
+    assert (model.sigma(seen, unknown) < 1e-5).all()
+
+
+def twin(seen: RangeFrame, model: NoiseModel, cosine: np.ndarray) -> np.ndarray:
+    r = seen.radial_range.astype(float)
+    length = ray_lengths(CAMERA).astype(float)
+    light = model.amplitude
+    assert light is not None
+    with np.errstate(all="ignore"):
+        counts = seen.amplitude_image / r**2 / length**light.falloff
+        variance = light.floor**2 + light.shot**2 / counts + (light.dark / counts) ** 2
+        bad = (seen.amplitude_image <= 0) | (seen.amplitude_image >= 65535)
+        variance = np.minimum(np.where(bad, np.inf, variance), model.ceiling_m**2)
+        change = model.footprint / 30.0 * r / length * np.sqrt(1 / np.maximum(cosine, 0.1) ** 2 - 1)
+    variance += np.where(np.isfinite(cosine), change, 0) ** 2
+    return np.where(r > 0, np.sqrt(variance), 0)
+
+
+def test_kernel_matches_numpy_for_any_number_of_threads() -> None:
+    rng = np.random.default_rng(3)
+    depth = rng.uniform(0.5, 5, (30, 40)) * (rng.random((30, 40)) < 0.9)
+    amplitude = rng.uniform(0, 1000, (30, 40)).astype(np.float32)
+    amplitude[rng.random((30, 40)) < 0.05] = 65535
+    amplitude[rng.random((30, 40)) < 0.05] = 0
+    cosine = rng.uniform(0, 1, (30, 40)).astype(np.float32)
+    cosine[rng.random((30, 40)) < 0.1] = np.nan
+    seen = frame(depth, amplitude_image=amplitude, amplitude_kind="range_compensated")
+    model = NOISE["sr4000"]
+    with threads(1):
+        one = model.sigma(seen, cosine)
+    with threads(3):
+        three = model.sigma(seen, cosine)
+    np.testing.assert_array_equal(one, three)
+    np.testing.assert_allclose(one, twin(seen, model, cosine), rtol=2e-5)
+
+
+def test_kernel_writes_only_its_rows() -> None:
+    out = np.full((30, 40), -1, np.float32)
+    none = np.empty((0, 0), np.float32)
+    parameters = np.array([1, 0, 0, 0, 0, 0.01, 0, 0, 0.29])
+    kernels.range_sigma(
+        image(1.0), True, CAMERA.rays(), kernels.BY_RANGE, none, False,
+        np.zeros(1), none, parameters, 5, 9, out,
+    )  # fmt: skip
+    assert (out[5:9] > 0).all()
+    assert (np.delete(out, range(5, 9), 0) == -1).all()
+
+
+def test_json_round_trip(tmp_path: Path) -> None:
+    for model in NOISE.values():
+        model.save(tmp_path / "noise.json")
+        assert NoiseModel.load(tmp_path / "noise.json") == model
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"schema": 2}, "schema: is 2"),
+        ({"range": {"a": 5.2e3, "b": 0.0}}, "a must be 0 to 5, not 5200.0"),
+        ({"range": {"a": 0.0, "b": 3.0}}, "b must be 0 to 1, not 3.0"),
+        ({"range": {"a": -0.1, "b": 0.0}}, "a must be 0 to 5, not -0.1"),
+        ({"range": {"a": float("nan"), "b": 0.0}}, "a must be 0 to 5, not nan"),
+        ({"confidence": {"sigma_m": [0.1, 0.2]}}, "grows with confidence"),
+        ({"confidence": {"sigma_m": [604.0, 180.0, 15.0]}}, "sigma_m must be 0 to 5"),
+        ({"confidence": {"sigma_m": []}}, "sigma_m must be non-empty, not ()"),
+        ({"amplitude": {"shot": 0, "dark": 0}}, "both 0"),
+        ({"amplitude": {"shot": "loud", "dark": 0}}, "is 'loud'"),
+        ({"amplitude": {"shot": float("inf"), "dark": 1}}, "shot must be 0 or more, not inf"),
+        ({"amplitude": {"shot": 1, "dark": 1, "floor": 20.0}}, "floor must be 0 to 5, not 20.0"),
+        ({"ceiling_m": 0.0}, "ceiling_m must be between 0 and 100"),
+        ({"loudness": 1}, "unknown option 'loudness'"),
+        ({"range": None}, "range"),
+    ],
+)
+def test_invalid_values_are_refused_by_name(tmp_path: Path, change: dict, message: str) -> None:
+    path = tmp_path / "noise.json"
+    path.write_text(json.dumps({**NOISE["sr4000"].to_dict(), **change}))
+    with pytest.raises(InputError, match=r"noise\.json") as caught:
+        NoiseModel.load(path)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", "null", "[" * 100_000])
+def test_invalid_files(tmp_path: Path, text: str) -> None:
+    (tmp_path / "noise.json").write_text(text)
+    with pytest.raises(InputError, match=r"noise\.json"):
+        NoiseModel.load(tmp_path / "noise.json")
+
+
+def test_documented_file_is_valid() -> None:
+    text = (DOCS / "noise.md").read_text()
+    (block,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    assert NoiseModel.from_dict(json.loads(block)).name == "mine"

@@ -1,0 +1,298 @@
+"""Coverage of the error bounds; unobservable poses are not bounded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.engine.quality.trajectory import displacement
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate_recording
+from tofuse.engine.quality import accuracy
+from tofuse.engine.quality.accuracy import Accuracy, ObservedErrors, accuracy_of, covariances_of, degenerate_directions, without_degenerate
+from tofuse.engine.graph.build import Measured, build_graph
+from tofuse.engine.graph.covariances import GraphCovariances
+from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph.levenberg import LevenbergMarquardt
+from tofuse.engine.stored_views.view_store import PosedView
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
+from walks import round_walk, true_poses
+
+N = 14
+TRUE = true_poses(N)
+X, TURN = np.eye(6)[:1], np.eye(6)[4:5]
+
+
+def walk(rng: np.random.Generator | None = None, *, loops=((0, N - 1), (2, 9))) -> PoseGraph:
+    return round_walk(N, rng, loops)
+
+
+def bounded(graph, unobservable, unmeasured=()) -> PoseGraph:
+    """The graph of frames that are degenerate in all their pairs."""
+    directions = degenerate_directions(graph, unobservable, (), {})
+    return without_degenerate(graph, directions, unmeasured)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loops", [(), ((0, N - 1), (2, 9))])
+def test_coverage_of_error_bounds(loops, monkeypatch) -> None:
+    """With noise alone, which the covariance models completely."""
+    monkeypatch.setattr(accuracy, "UNOBSERVED_ERROR_FACTOR", 1.0)
+    rng = np.random.default_rng(11)
+    solve = LevenbergMarquardt(robust="none").optimise
+    found = np.array(
+        [displacement(TRUE, solve(walk(rng, loops=loops)).graph.poses) for _ in range(300)]
+    )
+    bound = accuracy_of(GraphCovariances(walk(loops=loops)), ObservedErrors(), 2.0)
+    for column, limit in zip(found.T, (bound.position_m, bound.rotation_rad), strict=True):
+        assert 0.91 < np.mean(column < limit) < 0.985
+        assert limit < 2.5 * np.median(column)
+    assert bound.assessed
+    assert bound.relative == bound.position_m / 2
+    assert bound.worst is not None
+    assert bound.worst.position_m > bound.position_m
+    assert bound.unbounded == ()
+
+
+def test_uncertainty_is_largest_at_ends_without_loops() -> None:
+    a = accuracy_of(GraphCovariances(walk(loops=())), ObservedErrors(), 1.0)
+    assert a.worst is not None
+    assert a.worst.frame in (0, N - 1)
+    assert (
+        a.position_m > 1.5 * accuracy_of(GraphCovariances(walk()), ObservedErrors(), 1.0).position_m
+    )
+
+
+def test_errors_shown_by_recording_are_added() -> None:
+    plain = accuracy_of(GraphCovariances(walk()), ObservedErrors(), 1.0)
+    more = accuracy_of(GraphCovariances(walk()), ObservedErrors(0.03, 0.02, 0.04), 1.0)
+    assert more.position_m > 0.05
+    assert more.position_m == pytest.approx(
+        np.hypot(plain.position_m, accuracy.UNOBSERVED_ERROR_FACTOR * 0.05), rel=1e-6
+    )
+    assert more.rotation_rad > plain.rotation_rad
+    bent = accuracy_of(
+        GraphCovariances(walk()), ObservedErrors(calibration_m=0.2, calibration_rad=0.1), 1.0
+    )
+    assert bent.position_m > 0.2
+    assert bent.rotation_rad > 0.1
+    C = covariances_of(GraphCovariances(walk()), ObservedErrors(0.03, 0.02, 0.04))
+    np.testing.assert_array_equal(C[0], 0)
+    assert np.trace(C[5, :3, :3]) > 0.05**2
+
+
+def test_split_half_errors_replace_too_small_covariance() -> None:
+    plain = accuracy_of(GraphCovariances(walk()), ObservedErrors(), 1.0)
+    stated = plain.position_m / accuracy.UNOBSERVED_ERROR_FACTOR
+    assert accuracy_of(GraphCovariances(walk()), ObservedErrors(split_m=0.3 * stated), 1.0) == plain
+    known = GraphCovariances(walk())
+    one, more = (accuracy_of(known, ObservedErrors(split_m=k * stated), 1.0) for k in (2, 4))
+    # They are rms errors, and a 95 % bound on them is larger.
+    assert one.position_m > 2 * plain.position_m
+    assert more.position_m == pytest.approx(2 * one.position_m)
+    assert more.rotation_rad == plain.rotation_rad
+    C = [
+        covariances_of(GraphCovariances(walk()), ObservedErrors(split_m=m))[5]
+        for m in (0.0, 3 * stated)
+    ]
+    assert np.trace(C[1][:3, :3]) > np.trace(C[0][:3, :3]) + stated**2
+    np.testing.assert_array_equal(C[1][3:, 3:], C[0][3:, 3:])
+
+
+def test_larger_of_refinement_and_split_half_errors_counts() -> None:
+    """Both stand for errors that pairs of views share."""
+    moved = accuracy_of(GraphCovariances(walk()), ObservedErrors(moved_m=0.5), 1.0)
+    assert (
+        accuracy_of(GraphCovariances(walk()), ObservedErrors(moved_m=0.5, split_m=0.1), 1.0)
+        == moved
+    )
+    split = accuracy_of(GraphCovariances(walk()), ObservedErrors(split_m=0.5), 1.0)
+    assert (
+        accuracy_of(GraphCovariances(walk()), ObservedErrors(moved_m=0.1, split_m=0.5), 1.0)
+        == split
+    )
+
+
+@pytest.mark.parametrize("direction", [X, TURN])
+def test_unmeasured_direction_is_unbounded(direction) -> None:
+    """Whatever information noise has suggested; frames on both sides stay bounded."""
+    graph = walk()
+    slide = dict.fromkeys((4, 5, 6), direction)
+    a = accuracy_of(GraphCovariances(bounded(graph, slide)), ObservedErrors(), 1.0)
+    assert a.unbounded == (4, 5, 6)
+    assert a.worst is not None
+    assert a.worst.frame in (4, 5, 6)
+    worst = a.worst.position_m if direction is X else a.worst.rotation_rad
+    assert np.isinf(worst)
+    assert np.isinf(a.position_m if direction is X else a.rotation_rad)
+    # Edges of other frames are unchanged.
+    others = [k for k, (i, j) in enumerate(graph.edges) if not {i, j} & {4, 5, 6}]
+    np.testing.assert_array_equal(
+        bounded(graph, slide).information[others], graph.information[others]
+    )
+
+
+@pytest.mark.parametrize(("degrees", "neighbours"), [(1, 4), (3, 12)])
+def test_slightly_different_directions_do_not_bound_each_other(degrees, neighbours) -> None:
+    """A slide along x, whose direction every pair of views knows to some degrees only."""
+    rng = np.random.default_rng(3)
+    pairs = [(i, j) for i in range(N) for j in range(i + 1, min(i + 1 + neighbours, N))]
+    steps = [
+        Measured(i, j, se3.inverse(TRUE[i]) @ TRUE[j], np.diag([1e7] * 3 + [1e8] * 3))
+        for i, j in pairs
+    ]
+    graph = build_graph(list(range(N)), TRUE, steps)
+    directions = []
+    for i, j in pairs:
+        slides = {i, j} & set(range(5, 10))
+        x = TRUE[j, :3, :3].T @ [1.0, *np.radians(rng.normal(0, degrees, 2))]
+        directions.append(np.array([[*x, 0, 0, 0]]) if slides else np.zeros((0, 6)))
+    a = accuracy_of(GraphCovariances(without_degenerate(graph, directions)), ObservedErrors(), 1.0)
+    assert set(range(5, 10)) <= set(a.unbounded)
+    assert not set(range(5)) & set(a.unbounded)
+
+
+def test_tracking_edge_is_degenerate_with_its_own_frame() -> None:
+    """Degeneracy of its keyframe with an earlier one does not affect it."""
+    graph = walk()
+    own = {
+        (i, j) for (i, j), loop in zip(graph.edges.tolist(), graph.loop, strict=True) if not loop
+    }
+    found = degenerate_directions(graph, {5: X}, own, {})
+    assert [tuple(graph.edges[k]) for k, d in enumerate(found) if len(d)] == [(4, 5)]
+    either = degenerate_directions(graph, {5: X}, (), {})
+    assert [tuple(graph.edges[k]) for k, d in enumerate(either) if len(d)] == [(4, 5), (5, 6)]
+
+
+@pytest.mark.parametrize(("view", "degenerate"), [("wall", True), ("corner", False)])
+def test_degeneracy_depends_on_views_of_pair(view, degenerate) -> None:
+    """A frame that is degenerate with its keyframe need not be so with other views."""
+    surface = flat_wall() if view == "wall" else surface_of_corner()
+    steps = [Measured(0, 1, np.eye(4), np.eye(6) * 1e6)]
+    graph = build_graph([0, 1], np.tile(np.eye(4), (2, 1, 1)), steps)
+    (found,) = degenerate_directions(
+        graph, {1: X}, (), dict.fromkeys((0, 1), PosedView(surface, np.eye(4)))
+    )
+    assert (len(found) > 0) == degenerate
+
+
+@pytest.mark.parametrize(("view", "degenerate"), [("wall", True), ("corner", False)])
+def test_pairs_across_degenerate_frame_are_aligned_again(view, degenerate) -> None:
+    """After a slide in frame 1, frames 0 and 2 overlap wherever the slide ended."""
+    surface = flat_wall() if view == "wall" else surface_of_corner()
+    steps = [Measured(0, 2, np.eye(4), np.eye(6) * 1e6), Measured(2, 3, np.eye(4), np.eye(6) * 1e6)]
+    graph = build_graph(range(4), np.tile(np.eye(4), (4, 1, 1)), steps)
+    views = dict.fromkeys(range(4), PosedView(surface, np.eye(4)))
+    over, after = degenerate_directions(graph, {1: X}, (), views)
+    assert (len(over) > 0) == degenerate
+    assert not len(after)
+
+
+@pytest.mark.parametrize(("corners", "constrained"), [(1, False), (5, True)])
+def test_single_constrained_pair_of_degenerate_view_is_chance(corners, constrained) -> None:
+    """One constrained pair of 20 would bound the pose; five of 20 are more than by chance."""
+    steps = [Measured(k, 20, np.eye(4), np.eye(6) * 1e6) for k in range(20)]
+    graph = build_graph(range(21), np.tile(np.eye(4), (21, 1, 1)), steps)
+    wall, corner = (PosedView(surface, np.eye(4)) for surface in (flat_wall(), surface_of_corner()))
+    views = dict.fromkeys(range(20), wall) | dict.fromkeys([*range(corners), 20], corner)
+    found = degenerate_directions(graph, {20: X}, (), views)
+    assert [len(d) == 0 for d in found] == [constrained and k < corners for k in range(20)]
+
+
+def flat_wall():
+    z = np.full((60, 80), 2.0, np.float32)
+    return prepare_view(as_frame(z, 0), SurfaceOptions())
+
+
+def surface_of_corner():
+    rays = CAMERA.rays()
+    x, y = np.moveaxis(rays, -1, 0)
+    planes = [(0.6, 0.0, 0.8), (-0.6, 0.0, 0.8), (0.0, -0.8, 0.6)]
+    z = np.min([1.5 / (a * x + b * y + c) for a, b, c in planes], axis=0)
+    return prepare_view(as_frame(z.astype(np.float32), 0), SurfaceOptions())
+
+
+CAMERA = Pinhole(80, 60, 80.0, 80.0, 39.5, 29.5)
+
+
+def as_frame(z, index) -> RangeFrame:
+    noise = np.random.default_rng(index).normal(0, 0.001, z.shape)
+    return RangeFrame(index, float(index), CAMERA, (z + noise).astype(np.float32), "z")
+
+
+def test_other_directions_of_degenerate_frame_stay_bounded() -> None:
+    graph = bounded(walk(), {5: X})
+    C = covariances_of(GraphCovariances(graph), ObservedErrors())[5]
+    sigma = np.sqrt(np.linalg.eigvalsh(C[:3, :3]))
+    assert sigma[1] < 0.05
+    assert sigma[2] > 1
+
+
+def test_degenerate_start_leaves_rest_bounded() -> None:
+    """Relative to the first frame, all poses would be unbounded."""
+    graph = bounded(walk(loops=((2, N - 1),)), {0: X, 1: X})
+    a = accuracy_of(GraphCovariances(graph), ObservedErrors(), 1.0)
+    assert a.unbounded == (0, 1)
+
+
+def test_extrapolated_motion_bounds_nothing() -> None:
+    graph = walk(loops=())
+    a = accuracy_of(GraphCovariances(bounded(graph, {}, [(9, 8)])), ObservedErrors(), 1.0)
+    assert set(a.unbounded) in ({*range(9)}, {*range(9, N)})
+    assert np.isinf(a.position_m)
+
+
+def test_disconnected_parts_are_unbounded() -> None:
+    graph = walk(loops=())
+    keep = np.arange(N - 1) != 8
+    columns = {k: getattr(graph, k)[keep] for k in ("edges", "measurements", "information", "loop")}
+    a = accuracy_of(GraphCovariances(replace(graph, **columns)), ObservedErrors(), 1.0)
+    assert a.assessed
+    assert np.isinf(a.position_m)
+    assert len(a.unbounded) in (5, 9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["wall", "corridor"])
+def test_slide_along_bare_walls_is_unbounded(scene) -> None:
+    """Whatever the error happens to be: it was not measured."""
+    effects = Effects.none(shot_noise=True)
+    recording = simulate_recording(scene, frames=8, every=2, texture=False, effects=effects)
+    coarse = {"fusion": {"voxel_m": 0.1}}  # only the poses matter
+    result = tofuse.reconstruct(recording, coarse)
+    d = result.diagnostics
+    degenerate = {f.index for f in d.frames if len(f.unobservable)}
+    assert len(degenerate) >= 6
+    assert set(d.accuracy.unbounded) >= degenerate
+    assert np.isinf(d.accuracy.position_m)
+    assert d.verdict == "degraded"
+    assert "unobserved_motion" in [r.code for r in d.reasons]
+    # With texture the albedo measures it.
+    recorded = simulate_recording(scene, frames=8, every=2, effects=effects)
+    textured = tofuse.reconstruct(recorded, coarse)
+    a = textured.diagnostics.accuracy
+    assert a.unbounded == ()
+    assert recording.reference is not None
+    assert displacement(recording.reference, textured.trajectory)[0] < a.position_m < 0.1
+
+
+def test_single_pose_is_not_assessed() -> None:
+    one = build_graph([7], TRUE[:1], [])
+    assert accuracy_of(GraphCovariances(one), ObservedErrors(), 1.0) == Accuracy()
+
+
+def test_displacement_ignores_common_motion() -> None:
+    moved = se3.exp(np.array([1.0, 2, 3, 0.3, -0.2, 0.5])) @ TRUE
+    np.testing.assert_allclose(displacement(TRUE, moved), 0, atol=1e-9)
+    other = moved.copy()
+    other[3, :3, 3] += [0.0, 0.1, 0.0]
+    distance, angle = displacement(TRUE, other)
+    assert 0.02 < distance < 0.1 / np.sqrt(N) + 1e-9
+    assert angle == pytest.approx(0, abs=1e-9)

@@ -1,0 +1,91 @@
+"""The accuracy card states the accuracy of a result in one line, and possible improvements."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from made_results import result
+from tofuse.apps.cli.program import main
+from tofuse.engine.quality.accuracy import Accuracy, WorstFrame
+from tofuse.engine.quality.accuracy_card import SEPARATOR, bound, card, length, weakest_frame
+from tofuse.engine.quality.types import Reason
+
+KNOWN = Accuracy(0.0238, 0.004, 0.0038, True, WorstFrame(17, 0.0291, 0.006))
+
+
+def of(accuracy, verdict="good", reasons=()):
+    made = result()
+    diagnostics = replace(made.diagnostics, accuracy=accuracy, verdict=verdict, reasons=reasons)
+    return replace(made, diagnostics=diagnostics)
+
+
+def test_good_result() -> None:
+    line = SEPARATOR.join(card(of(KNOWN)))
+    assert line.startswith("±24 mm (95 %) over ")
+    assert line.endswith(" · weakest: frame 17, 29 mm")
+    assert "0.38 %" in line
+    assert "to improve" not in line
+
+
+def test_improvement_is_suggested() -> None:
+    reasons = (
+        Reason("moving_objects", ((0, 1),), "Something moves."),
+        Reason("uncertain_poses", ((0, 1),), "The poses may be off."),
+    )
+    (last,) = card(of(KNOWN, "degraded", reasons))[-1:]
+    assert (
+        last
+        == "to improve: return to places seen before, or keep corners and texture in view there"
+    )
+
+
+@pytest.mark.parametrize(
+    ("cause", "advice"),
+    [
+        ("faulty_recording", "correct the input as the inspection proposes"),
+        ("calibration_alarm", "check the camera's calibration"),
+    ],
+)
+def test_cause_precedes_its_consequences(cause, advice) -> None:
+    reasons = (
+        Reason("disconnected", ((0, 9),), "Parts are not connected."),
+        Reason(cause, ((0, 1),), "The depth unit is wrong."),
+    )
+    assert card(of(KNOWN, "degraded", reasons))[-1].startswith(f"to improve: {advice}")
+
+
+def test_unbounded_and_unassessed_accuracy() -> None:
+    assert bound(Accuracy(), 5.0) == "accuracy not assessed"
+    assert weakest_frame(Accuracy()) == ""
+    loose = Accuracy(np.inf, 0.1, np.inf, True, WorstFrame(4, np.inf, 0.1), (4, 5, 6, 9))
+    assert bound(loose, 5.0) == "accuracy not bounded over 5 m"
+    assert bound(loose, 1790.4) == "accuracy not bounded over 1790 m"
+    assert weakest_frame(loose) == "frames 4-6, 9, not bounded"
+
+
+@pytest.mark.parametrize(
+    ("metres", "text"),
+    [(0.0023, "2.3 mm"), (0.0238, "24 mm"), (1.2, "1.20 m"), (0.0, "0.0 mm")],
+)
+def test_lengths(metres, text) -> None:
+    assert length(metres) == text
+
+
+@pytest.mark.parametrize("text", ["30mm", "3cm", "0.03", "0.03m", "3e-2", " 30 mm "])
+def test_tolerance_has_units(text, room_recording, tmp_path) -> None:
+    from tofuse.apps.cli.parser import make_parser
+
+    words = ["run", str(room_recording), "--out", str(tmp_path), "--tolerance", text]
+    assert make_parser().parse_args(words).tolerance == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize("text", ["0", "-1mm", "3 km", "mm", "nan", "inf", "1e999", "", "3mmm"])
+def test_invalid_tolerance_is_refused(text, room_recording, tmp_path, capsys) -> None:
+    words = ["run", str(room_recording), "--out", str(tmp_path / "out"), f"--tolerance={text}"]
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert "is not a length, such as 30mm" in capsys.readouterr().err

@@ -1,0 +1,38 @@
+"""Independent relative pose measurements of pairs of views."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.engine.geometry import se3
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.quality.pair_measurements import measured_pairs
+
+
+def test_pairs_measure_true_motion_from_inexact_poses(posed_views) -> None:
+    posed, truth = posed_views
+    rng = np.random.default_rng(0)
+    start = truth @ se3.exp(0.01 * rng.standard_normal((len(truth), 6)))
+    graph = measured_pairs(posed, start)
+    assert graph.ids.tolist() == list(range(len(truth)))
+    assert np.array_equal(graph.poses, start)
+    i, j = graph.edges.T
+    assert {(k, k + 1) for k in range(len(truth) - 1)} <= set(
+        zip(i.tolist(), j.tolist(), strict=True)
+    )
+    assert (j > i + 1).any()
+    right = graph.with_poses(truth)
+    e = right.residuals()
+    assert np.median(np.linalg.norm(e[:, :3], axis=1)) < 0.004
+    # Six if errors are as large as stated.
+    assert np.median(np.einsum("mi,mij,mj->m", e, graph.information, e)) < 12
+
+
+def test_result_is_independent_of_threads(posed_views) -> None:
+    posed, truth = posed_views
+    found = []
+    for count in (1, 2):
+        with threads(count):
+            found.append(measured_pairs(posed, truth))
+    assert np.array_equal(found[0].measurements, found[1].measurements)
+    assert np.array_equal(found[0].information, found[1].information)

@@ -1,0 +1,463 @@
+"""ROS bags, written by rosbags' own writers where it is installed."""
+
+from __future__ import annotations
+
+import errno
+import gc
+import os
+import struct
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ros_bags import (
+    COLOR_LENS,
+    COLOR_U,
+    COLOR_V,
+    COLORS,
+    COUNTS,
+    RNG,
+    STEP,
+    T_COLOR,
+    T_DEPTH,
+    TOPIC,
+    Bag,
+    orbbec,
+    real_sense,
+)
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.images import png_bytes
+from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, Rational
+from tofuse.engine.geometry.se3 import exp, inverse, log
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.formats.recordings.open import open_recording
+from tofuse.formats.readers.maker_bags import RealSenseSource
+
+KINDS = ("ros1", "ros2", "mcap")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_depth_images(tmp_path: Path, kind: str) -> None:
+    bag = Bag(tmp_path, kind)
+    bag.info("/camera/color/camera_info", D=(0.5,))
+    bag.info("/camera/depth/camera_info")
+    for k in range(3):
+        color = np.zeros((12, 16), np.uint16)
+        bag.image("/camera/color/depth_like", 10 + k / 10, color, "16UC1")
+        bag.image(TOPIC, 10 + k / 10, COUNTS[k], "16UC1", pad=6)
+    recording = open_recording(bag.close())
+    assert (recording.format, len(recording)) == ("ros", 3)
+    np.testing.assert_allclose(recording.timestamps, [10, 10.1, 10.2], atol=1e-6)
+    assert recording.metadata["topic"] == TOPIC
+    assert any("/camera/color/depth_like" in line for line in recording.warnings)
+    for k in (0, 1, 2, 1):  # in order, and back
+        frame = recording[k]
+        assert frame.camera == BrownConrady(16, 12, 20.0, 21.0, 7.5, 5.5, k1=0.1, k2=0.02)
+        np.testing.assert_allclose(frame.z, COUNTS[k] / 1000, rtol=1e-6)
+        assert frame.timestamp == recording.timestamps[k]
+
+
+def test_metres_and_a_fisheye(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros1")
+    bag.info("/tof/depth/camera_info", "equidistant", (0.1, 0.01, 0.001, 0.0001))
+    image = (COUNTS[0] / 1000).astype(np.float32)
+    image[0, 0] = np.nan
+    bag.image("/tof/depth/image_raw", 10, image, "32FC1")
+    frame = open_recording(bag.close())[0]
+    assert isinstance(frame.camera, Fisheye)
+    assert frame.camera.k2 == 0.01
+    assert not frame.valid[0, 0]
+    np.testing.assert_array_equal(frame.z[1:], image[1:])
+
+
+@pytest.mark.slow
+def test_compressed_depth(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros2")
+    bag.info("/a/depth/camera_info")
+    topic = "/a/depth/image_rect/compressedDepth"
+    head = struct.pack("<Iff", 0, 0, 0)
+    bag.compressed(topic, 10, head + png_bytes(COUNTS[0]), "16UC1; compressedDepth png")
+    recording = open_recording(bag.close())
+    frame = recording[0]
+    np.testing.assert_allclose(frame.z, COUNTS[0] / 1000, rtol=1e-6)
+    # Floats are stored as a / depth + b.
+    a, b = 4000.0, -10.0
+    second = Bag(tmp_path / "second", "ros1") if (tmp_path / "second").mkdir() is None else None
+    second.info("/a/depth/camera_info")
+    data = struct.pack("<Iff", 0, a, b) + png_bytes(COUNTS[1])
+    second.compressed(topic, 10, data, "32FC1; compressedDepth png")
+    frame = open_recording(second.close())[0]
+    np.testing.assert_allclose(frame.z, a / (COUNTS[1] - b), rtol=1e-5)
+
+
+def test_clouds(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    points = RNG.normal(size=(50, 3)).astype(np.float32)
+    points[7] = np.nan
+    light = RNG.uniform(size=50).astype(np.float32)
+    bag.cloud("/points", 10, points, light)
+    frame = open_recording(bag.close())[0]
+    assert isinstance(frame, CloudFrame)
+    keep = np.arange(50) != 7
+    np.testing.assert_array_equal(frame.points, points[keep])
+    np.testing.assert_array_equal(frame.amplitude, light[keep])
+
+
+def test_organised_clouds_become_images(tmp_path: Path) -> None:
+    """Organised clouds on the rays of a camera keep the grid, and get the camera."""
+    bag = Bag(tmp_path, "ros2")
+    z = RNG.uniform(1, 3, (4, 12, 16)).astype(np.float32)
+    z[:, 2, 3] = np.nan
+    v, u = np.mgrid[:12, :16].astype(np.float32)
+    light = RNG.uniform(size=(4, 192)).astype(np.float32)
+    for k in range(4):
+        points = np.stack([(u - 7.5) / 20 * z[k], (v - 5.5) / 21 * z[k], z[k]], -1)
+        bag.cloud("/tof/points", 10 + k, points.reshape(-1, 3), light[k], height=12)
+    recording = open_recording(bag.close())
+    for k in (0, 3):
+        frame = recording[k]
+        np.testing.assert_allclose(frame.z[frame.valid], z[k][np.isfinite(z[k])], rtol=1e-6)
+        assert frame.valid.sum() == 191
+        np.testing.assert_allclose(frame.camera.rays()[4, 9], (1.5 / 20, -1.5 / 21), atol=1e-5)
+        np.testing.assert_array_equal(frame.amplitude_image, light[k].reshape(12, 16))
+
+
+def test_infrared_of_same_pixels_is_the_amplitude(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros1")
+    bag.info("/camera/depth/camera_info")
+    bright = RNG.integers(0, 4000, (3, 12, 16)).astype(np.uint16)
+    for k in range(3):
+        bag.image(TOPIC, 10 + k / 10, COUNTS[k], "16UC1")
+        bag.image("/camera/infra_wide/image", 10 + k / 10, np.zeros((12, 20), np.uint16), "mono16")
+        if k != 1:
+            bag.image("/camera/ir/image_raw", 10.002 + k / 10, bright[k], "mono16")
+    recording = open_recording(bag.close())
+    assert recording.metadata["amplitude_topic"] == "/camera/ir/image_raw"
+    for k, expected in ((0, bright[0]), (1, np.zeros((12, 16))), (2, bright[2])):
+        frame = recording[k]
+        np.testing.assert_array_equal(frame.amplitude_image, expected)
+
+
+def test_topic_can_be_chosen(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    bag.info("/a/depth/camera_info")
+    bag.info("/b/depth/camera_info")
+    bag.image("/a/depth/image_raw", 10, COUNTS[0], "16UC1")
+    bag.image("/b/depth/image_raw", 10, COUNTS[1], "16UC1")
+    path = bag.close()
+    assert open_recording(path).metadata["topic"] == "/a/depth/image_raw"
+    recording = open_recording(path, topic="/b/depth/image_raw")
+    assert recording.warnings == []
+    frame = recording[0]
+    np.testing.assert_allclose(frame.z, COUNTS[1] / 1000, rtol=1e-6)
+    with pytest.raises(InputError, match=r"has no images or clouds at /c .*/a/depth/image_raw"):
+        open_recording(path, topic="/c")
+
+
+def expected_colors(z: np.ndarray, T: np.ndarray, lens: Pinhole = COLOR_LENS) -> np.ndarray:
+    """Colour (12, 16, 3) of each depth pixel, black where occluded, pixel by pixel."""
+    v, u = np.mgrid[:12, :16]
+    points = np.stack([(u - 7.5) / 20 * z, (v - 5.5) / 21 * z, z], -1) @ T[:3, :3].T + T[:3, 3]
+    uv = np.nan_to_num(lens.project(points), nan=-1)
+    pixel = np.rint(uv).astype(int)
+    out = np.zeros((12, 16, 3), np.uint8)
+    for i in range(12):
+        for j in range(16):
+            a, b = pixel[i, j]
+            if 0 <= a < 48 and 0 <= b < 40:
+                near = np.abs(uv - uv[i, j]).max(-1) < 2
+                if not (points[near, 2] < 0.9 * points[i, j, 2]).any():
+                    out[i, j] = COLORS[b, a]
+    return out
+
+
+def check_colors(found: np.ndarray | None, expected: np.ndarray, off: int = 0) -> None:
+    """Colours that both have are equal; most visible pixels have colour, occluded ones do not.
+
+    Occlusion depends on the assumed size of points, so single pixels may differ.
+    """
+    both = found.any(-1) & expected.any(-1)
+    assert np.abs(found[both].astype(int) - expected[both]).max() <= off
+    assert both.sum() > 0.8 * expected.any(-1).sum()
+    seen_behind = found.any(-1) & ~expected.any(-1)
+    assert seen_behind.sum() < 8
+    assert (~found.any(-1)).sum() > 5
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2"])
+def test_realsense_bags(tmp_path: Path, kind: str) -> None:
+    recording = open_recording(real_sense(tmp_path, kind, "None", name="Intel RealSense L515"))
+    assert (recording.format, len(recording)) == ("realsense-bag", 3)
+    assert recording.metadata["sensor"] == "Intel RealSense L515"
+    for k in (0, 2, 1):
+        frame = recording[k]
+        assert frame.camera == Pinhole(16, 12, 20.0, 21.0, 7.5, 5.5)
+        np.testing.assert_allclose(frame.z, COUNTS[k] * 0.00025, rtol=1e-6)
+        np.testing.assert_array_equal(frame.amplitude_image, COUNTS[k] % 250)
+
+
+def test_realsense_stereo_and_lenses(tmp_path: Path) -> None:
+    path = real_sense(tmp_path, "ros2", "Inverse Brown Conrady", name="Intel RealSense D435")
+    frame = open_recording(path)[0]
+    assert frame.amplitude_image is None  # infrared of another viewpoint
+    brown = BrownConrady(16, 12, 20.0, 21.0, 7.5, 5.5, 0.1, 0.02, 0.001, -0.002, 0.01)
+    straight = np.array([(3 - 7.5) / 20, (9 - 5.5) / 21, 1.0])
+    u, v = brown.project(straight)
+    expected = ((u - 7.5) / 20, (v - 5.5) / 21)
+    np.testing.assert_allclose(frame.camera.rays()[9, 3], expected, atol=1e-6)
+    with pytest.raises(InputError, match="--topic"):
+        open_recording(path, topic="/device_0/sensor_0/Depth_0/image/data")
+
+
+@pytest.mark.parametrize(("kind", "encoding", "off"), [
+    ("ros1", "rgb8", 0), ("ros1", "bgra8", 0), ("ros1", "yuyv", 12), ("ros2", "rgb8", 0),
+])  # fmt: skip
+def test_realsense_color_matches_points(tmp_path: Path, kind: str, encoding: str, off: int) -> None:
+    path = real_sense(tmp_path, kind, "None", name="Intel RealSense D435", color=encoding)
+    recording = open_recording(path)
+    assert recording.warnings == []
+    expected = expected_colors(STEP * 0.00025, T_COLOR @ inverse(T_DEPTH))
+    for k in (0, 2):
+        frame = recording[k]
+        check_colors(frame.color_image, expected, off)
+    without = recording[1]
+    assert without.color_image is None
+
+
+def test_realsense_color_with_inverse_distortion(tmp_path: Path) -> None:
+    """The lens maps pixels to rays; projection must map each ray back to its pixel."""
+    k = (0.12, -0.05, 0.002, -0.001, 0.01)
+    name = "Intel RealSense D455"
+    path = real_sense(tmp_path, "ros2", "None", name=name, color="rgb8", distortion=k)
+    source = open_recording(path).source
+    assert isinstance(source, RealSenseSource)
+    lens = source.color_camera.camera
+    stated = BrownConrady(48, 40, 40.0, 41.0, 23.0, 20.0, k[0], k[1], k[2], k[3], k[4])
+    slopes = np.stack([(COLOR_U - 23.0) / 40, (COLOR_V - 20.0) / 41, 0.0 * COLOR_U + 1], -1)
+    rays = (stated.project(slopes) - (23.0, 20.0)) / (40.0, 41.0)
+    points = np.concatenate([rays, np.ones((40, 48, 1))], -1)
+    np.testing.assert_allclose(lens.project(points), np.stack([COLOR_U, COLOR_V], -1), atol=0.1)
+
+
+def test_orbbec_color_without_pose_is_ignored(tmp_path: Path) -> None:
+    recording = open_recording(orbbec(tmp_path, (0.0,) * 8, color="jpeg", R=np.zeros((3, 3))))
+    frame = recording[0]
+    assert frame.color_image is None
+    assert ["colour is ignored" in line for line in recording.warnings] == [True]
+
+
+@pytest.mark.parametrize(("encoding", "off"), [("jpeg", 14), ("rgb8", 0)])
+def test_orbbec_color_matches_points(tmp_path: Path, encoding: str, off: int) -> None:
+    R = T_COLOR[:3, :3] * 0.999  # as stored
+    frame = open_recording(orbbec(tmp_path, (0.0,) * 8, color=encoding, R=R))[2]
+    check_colors(frame.color_image, expected_colors(STEP * 0.00025, T_COLOR), off)
+
+
+def test_orbbec_bags(tmp_path: Path) -> None:
+    k = (0.5, -2.6, 1.4, 0.4, -2.4, 1.4, 0.0001, -0.0002)  # k1 to k6, then p1 and p2
+    recording = open_recording(orbbec(tmp_path, k))
+    assert (recording.format, len(recording)) == ("orbbec-bag", 3)
+    assert np.diff(recording.timestamps) == pytest.approx(1 / 15, abs=1e-6)
+    for index in (0, 2, 1):
+        frame = recording[index]
+        assert isinstance(frame.camera, Rational)
+        assert (frame.camera.k3, frame.camera.p1) == pytest.approx((1.4, 0.0001))
+        np.testing.assert_allclose(frame.z, COUNTS[index] / 1000, rtol=1e-6)
+        np.testing.assert_array_equal(frame.amplitude_image, COUNTS[index] // 2)
+
+
+def test_missing_topics_are_named(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros1")
+    bag.image(TOPIC, 10, COUNTS[0], "16UC1")
+    with pytest.raises(InputError, match=r"has no CameraInfo for .*; pass .* --camera"):
+        open_recording(bag.close())
+    (tmp_path / "b").mkdir()
+    bag = Bag(tmp_path / "b", "ros1")
+    bag.image("/camera/color/image", 10, COUNTS[0], "mono16")
+    with pytest.raises(
+        InputError, match=r"no topic of depth images or clouds .*/camera/color/image"
+    ):
+        open_recording(bag.close())
+
+
+def fifo(path: Path) -> None:
+    if not hasattr(os, "mkfifo"):
+        pytest.skip("no FIFOs on this system")
+    path.unlink()
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize("name", ["metadata.yaml", "a.db3"])
+def test_fifos_in_folders_are_rejected(tmp_path: Path, name: str) -> None:
+    bag = Bag(tmp_path, "ros2")
+    depth_bag(bag)
+    path = bag.close()
+    fifo(path / name)
+    for format_ in ("ros", "realsense-bag"):
+        with pytest.raises(InputError, match="not a regular file"):
+            open_recording(path, format=format_)
+
+
+@pytest.mark.parametrize(
+    ("kind", "packed"),
+    [("ros1", "BZ2"), ("ros1", "LZ4"), ("mcap", "STORAGE"), ("mcap", "MESSAGE"),
+     ("ros2", "MESSAGE"), ("ros2", "FILE"), ("mcap", "FILE")],
+)  # fmt: skip
+def test_compressed_bags(
+    tmp_path: Path, kind: str, packed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Compressed files are decompressed into a temporary folder, which is removed."""
+    (temporary := tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    bag = Bag(tmp_path, kind, packed)
+    depth_bag(bag)
+    recording = open_recording(bag.close())
+    np.testing.assert_allclose(recording[2].z, COUNTS[2] / 1000, rtol=1e-6)
+    del recording
+    gc.collect()
+    assert list(temporary.iterdir()) == []
+
+
+def test_no_space_for_decompressed_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag = Bag(tmp_path, "ros2", "FILE")
+    depth_bag(bag)
+    path = bag.close()
+
+    def full(*_words: object, **_options: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(tempfile, "mkdtemp", full)
+    with pytest.raises(InputError, match=r"no space for the decompressed files .* TMPDIR"):
+        open_recording(path)
+
+
+def test_missing_rosbags_is_reported_with_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(4096))
+
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(InputError, match=r"needs the package rosbags.*pip install 'tofuse\[ros\]'"):
+        open_recording(tmp_path / "a.bag")
+
+
+COLOR_TOPIC = "/camera/color/image_raw"
+RGB_LENS = Pinhole(32, 24, 40.0, 42.0, 15.5, 11.5)
+T_RIG_DEPTH, T_RIG_COLOR = exp(
+    np.array([[0.1, 0.2, 0.3, 0.1, 0.2, 0.3], [0.12, 0.2, 0.3, 0, 0, 0]])
+)
+T_WORLD_RIG = exp(np.random.default_rng(101).normal(size=(3, 6)) * 0.1)
+
+
+def depth_bag(bag: Bag) -> None:
+    bag.info("/camera/depth/camera_info", D=())
+    for k in range(3):
+        bag.image(TOPIC, 10 + 0.1 * k, COUNTS[k], "16UC1")
+
+
+def color_at(k: int) -> np.ndarray:
+    """The column and the row as red and green, the frame index as blue."""
+    v, u = np.mgrid[0:24, 0:32]
+    return np.stack([8 * u, 10 * v, np.full_like(u, 50 + k)], -1).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("kind", "compressed"), [("ros1", False), ("ros2", True), ("mcap", False)])
+def test_colour_of_separate_camera(tmp_path: Path, kind: str, compressed: bool) -> None:
+    """Posed by tf_static, over intermediate frames; each point has the colour at its projection."""
+    bag = Bag(tmp_path, kind)
+    depth_bag(bag)
+    bag.info("/camera/color/camera_info", D=(), lens=RGB_LENS)
+    bag.tf("/tf_static", 9.0, "rig", "middle", T_RIG_DEPTH)
+    bag.tf("/tf_static", 9.0, "middle", "depth", np.eye(4))
+    bag.tf("/tf_static", 9.0, "rig", "color", T_RIG_COLOR)
+    for k in range(2):  # the third frame has none
+        image, time = color_at(k), 10.005 + 0.1 * k
+        if compressed:
+            name = f"{COLOR_TOPIC}/compressed"
+            bag.compressed(name, time, png_bytes(image), "rgb8; png", frame="color")
+        else:
+            swapped = np.ascontiguousarray(image[..., ::-1])
+            bag.image(COLOR_TOPIC, time, swapped, "bgr8", frame="color", width=32)
+    recording = open_recording(bag.close())
+    assert recording.metadata["color_topic"].startswith(COLOR_TOPIC)
+    T = inverse(T_RIG_COLOR) @ T_RIG_DEPTH
+    for k, frame in enumerate(recording):
+        np.testing.assert_allclose(frame.depth, COUNTS[k] / 1000, atol=1e-6)
+        assert (frame.color_image is None) == (k == 2)
+        if frame.color_image is None:
+            continue
+        seen = frame.color_image.any(-1)
+        assert seen.sum() > 30
+        points = frame.point_image[seen] @ T[:3, :3].T + T[:3, 3]
+        uv = np.rint(RGB_LENS.project(points))
+        np.testing.assert_array_equal(frame.color_image[seen][:, 0], 8 * uv[:, 0])
+        np.testing.assert_array_equal(frame.color_image[seen][:, 1], 10 * uv[:, 1])
+        assert (frame.color_image[seen][:, 2] == 50 + k).all()
+
+
+def test_colour_registered_to_depth(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros2")
+    topic = "/camera/aligned_depth_to_color/image_raw"
+    bag.info("/camera/aligned_depth_to_color/camera_info", D=())
+    bag.image(topic, 10.0, COUNTS[0], "16UC1")
+    image = np.ascontiguousarray(color_at(0)[:12, :16])
+    bag.image(COLOR_TOPIC, 10.0, image, "rgb8", frame="color", width=16)
+    frame = open_recording(bag.close())[0]
+    np.testing.assert_array_equal(frame.color_image, image)
+
+
+def test_colour_without_pose_is_ignored(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros2")
+    depth_bag(bag)
+    bag.image(COLOR_TOPIC, 10.0, color_at(0), "rgb8", frame="color", width=32)
+    recording = open_recording(bag.close())
+    frame = recording[0]
+    assert frame.color_image is None
+    assert any(f"colour is ignored: the relation of {COLOR_TOPIC}" in w for w in recording.warnings)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2"])  # names with and without a slash
+def test_poses_from_tf(tmp_path: Path, kind: str) -> None:
+    """Odometry below a map that corrects it; poses are interpolated between messages."""
+    bag = Bag(tmp_path, kind)
+    depth_bag(bag)
+    slash = "/" if kind == "ros1" else ""
+    bag.tf("/tf_static", 9.0, f"{slash}base_link", f"{slash}depth", T_RIG_DEPTH)
+    T_MAP_ODOM = exp(np.array([1.0, 2.0, 0.5, 0.0, 0.0, 0.4]))
+    for k, T in enumerate(T_WORLD_RIG):  # at 9.95, 10.05, 10.15: interpolated; the last has none
+        bag.tf("/tf", 9.95 + 0.1 * k, "odom", "base_link", T)
+        bag.tf("/tf", 9.95 + 0.1 * k, "map", "odom", T_MAP_ODOM)
+    recording = open_recording(bag.close())
+    assert recording.odometry is not None
+    assert recording.reference is not None
+    for k in range(2):
+        A, B = T_WORLD_RIG[k], T_WORLD_RIG[k + 1]
+        half = A @ exp(log(inverse(A) @ B) / 2)
+        np.testing.assert_allclose(recording.odometry[k], half @ T_RIG_DEPTH, atol=1e-6)
+        expected = T_MAP_ODOM @ half @ T_RIG_DEPTH
+        np.testing.assert_allclose(recording.reference[k], expected, atol=1e-6)
+    assert np.isnan(recording.reference[2]).all()
+    assert np.isnan(recording.odometry[2]).all()
+
+
+def test_invalid_transforms_are_ignored(tmp_path: Path) -> None:
+    """A loop of frames, a zero quaternion, and a static tree: no poses, and no error."""
+    bag = Bag(tmp_path, "ros2")
+    depth_bag(bag)
+    bag.tf("/tf", 10.0, "depth", "a", np.eye(4))
+    bag.tf("/tf", 10.0, "a", "depth", np.eye(4))
+    bag.tf("/tf_static", 10.0, "world", "b", np.eye(4))
+    broken = bag.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 0.0)
+    vector = bag.make("geometry_msgs/msg/Vector3", float("nan"), 0.0, 0.0)
+    motion = bag.make("geometry_msgs/msg/Transform", vector, broken)
+    stamped = bag.make(
+        "geometry_msgs/msg/TransformStamped", bag.header(10.0, "map"), "odom", motion
+    )
+    name = "tf2_msgs/msg/TFMessage"
+    bag.write("/tf", name, 10.0, bag.make(name, [stamped]))
+    recording = open_recording(bag.close())
+    assert len(list(recording)) == 3
+    assert recording.odometry is None

@@ -1,0 +1,264 @@
+"""Readers of ScanNet's .sens, and of LAS, LAZ and E57 scans."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tofuse
+from made_sens import BASELINE_M, COLORS, DEPTH, HEIGHT, WIDTH, make_sens, pose
+from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.formats.files.las import write_las
+from tofuse.engine.geometry.quaternion import to_matrix
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+
+
+def image(recording: tofuse.Recording, k: int) -> RangeFrame:
+    frame = recording[k]
+    assert isinstance(frame, RangeFrame)
+    return frame
+
+
+@pytest.mark.parametrize("depth", ["zlib", "raw"])
+@pytest.mark.parametrize("color", ["jpeg", "png", "raw"])
+def test_sens(tmp_path: Path, depth: str, color: str) -> None:
+    make_sens(tmp_path / "scene.sens", depth=depth, color=color)
+    recording = tofuse.open(tmp_path / "scene.sens")
+    assert (recording.format, len(recording)) == ("sens", 3)
+    assert np.allclose(recording.timestamps, (33_333 * np.arange(3) + 10) / 1e6)
+    for k in range(3):
+        frame = image(recording, k)
+        assert np.allclose(frame.depth, DEPTH[k] / 1000.0)
+        assert frame.depth_kind == "z"
+        assert frame.camera.rays()[2, 7] == pytest.approx([(7 - 19.5) / 35, (2 - 14.5) / 35])
+        seen = frame.color_image[frame.color_image.any(-1)]
+        assert len(seen) > 0.3 * WIDTH * HEIGHT
+        assert np.abs(seen.astype(int) - COLORS[k]).max() <= 8  # JPEG
+    reference = recording.reference
+    assert np.allclose(reference[2], pose(2))
+    assert np.isnan(reference[1]).all()  # lost
+
+
+def test_sens_color_is_projected_from_its_own_camera(tmp_path: Path) -> None:
+    """A point at the depth camera's left edge is not visible to a camera to its right."""
+    make_sens(tmp_path / "scene.sens", color="raw")
+    frame = image(tofuse.open(tmp_path / "scene.sens"), 0)
+    assert frame.color_image is not None
+    v, u = np.nonzero(frame.valid)
+    x = frame.point_image[v, u, 0] - BASELINE_M
+    column = 70.0 * x / frame.point_image[v, u, 2] + 39.5
+    outside = np.rint(column) < 0
+    assert outside.any()
+    assert not frame.color_image[v, u][outside].any()
+
+
+def test_truncated_sens_keeps_complete_frames(tmp_path: Path) -> None:
+    path = tmp_path / "scene.sens"
+    make_sens(path)
+    path.write_bytes(path.read_bytes()[:-200])
+    recording = tofuse.open(path)
+    assert len(recording) == 2
+    assert any("cut off after 2 of 3" in w for w in recording.warnings)
+
+
+def test_invalid_sens_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "scene.sens"
+    make_sens(path, depth="occi")
+    with pytest.raises(InputError, match="compressed by method 2"):
+        tofuse.open(path)
+    make_sens(path)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"StructureSensor") + 15 + 256 + 16
+    data[at : at + 8] = struct.pack("<2I", 100_000, 100_000)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="depth images"):
+        tofuse.open(path)
+
+
+def test_sens_zip_bomb_is_one_unreadable_frame(tmp_path: Path) -> None:
+    """Depth that decompresses to more than the image size is not decompressed."""
+    import zlib
+
+    path = tmp_path / "scene.sens"
+    make_sens(path)
+    data = path.read_bytes()
+    old = zlib.compress(DEPTH[0].astype("<u2").tobytes())
+    bomb = zlib.compress(bytes(50_000_000))[: len(old)].ljust(len(old), b"\0")
+    path.write_bytes(data.replace(old, bomb))
+    recording = tofuse.open(path)
+    with pytest.raises(UnreadableFrameError, match="bytes of depth"):
+        recording[0]
+    assert np.allclose(image(recording, 2).depth, DEPTH[2] / 1000.0)
+
+
+POINTS = np.random.default_rng(91).uniform(-3, 3, (500, 3))
+RGB = np.random.default_rng(92).integers(0, 256, (500, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las_written_by_laspy(tmp_path: Path, suffix: str) -> None:
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(version="1.2", point_format=2)
+    header.scales = np.full(3, 1e-4)
+    for k in range(2):
+        data = laspy.LasData(header)
+        data.x, data.y, data.z = (POINTS + k).T
+        data.intensity = np.arange(500)
+        data.red, data.green, data.blue = RGB.astype(np.uint16).T * 256
+        data.write(tmp_path / f"{k}{suffix}")
+    recording = tofuse.open(tmp_path)
+    assert (recording.format, len(recording)) == ("las", 2)
+    frame = recording[1]
+    assert isinstance(frame, CloudFrame)
+    assert np.allclose(frame.points, POINTS + 1, atol=1e-4)
+    assert frame.amplitude[7] == 7
+    assert np.array_equal(frame.color, RGB)
+
+
+def test_exported_las_is_read_back(tmp_path: Path) -> None:
+    pytest.importorskip("laspy")
+    write_las(tmp_path / "a.las", GeometryRecord(POINTS, color=RGB))
+    frame = tofuse.open(tmp_path / "a.las")[0]
+    assert isinstance(frame, CloudFrame)
+    assert np.allclose(frame.points, POINTS, atol=1e-4)
+    assert np.array_equal(frame.color, RGB)
+    assert frame.amplitude is None
+
+
+def test_map_coordinates_keep_millimetre_precision(tmp_path: Path) -> None:
+    """Easting and northing exceed float32 precision: they are shifted, with a warning."""
+    laspy = pytest.importorskip("laspy")
+    where = np.array([453_210.0, 5_411_870.0, 300.0])
+    header = laspy.LasHeader(version="1.2", point_format=0)
+    header.scales, header.offsets = np.full(3, 1e-3), where
+    data = laspy.LasData(header)
+    data.x, data.y, data.z = (POINTS + where).T
+    data.write(tmp_path / "a.las")
+    recording = tofuse.open(tmp_path / "a.las")
+    shift = np.array(recording.metadata["shift_m"])
+    frame = recording[0]
+    assert isinstance(frame, CloudFrame)
+    assert np.allclose(frame.points + shift, POINTS + where, atol=2e-3)
+    assert any("minus (453000, 5412000, 0) m" in w for w in recording.warnings)
+
+
+def test_las_with_excessive_point_count(tmp_path: Path) -> None:
+    pytest.importorskip("laspy")
+    write_las(tmp_path / "a.las", GeometryRecord(POINTS))
+    data = bytearray((tmp_path / "a.las").read_bytes())
+    data[247:255] = struct.pack("<Q", 1 << 40)
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(InputError, match="1099511627776 points don't fit into"):
+        tofuse.open(tmp_path / "a.las")[0]
+
+
+def test_las_with_excessive_record_count(tmp_path: Path) -> None:
+    pytest.importorskip("laspy")
+    write_las(tmp_path / "a.las", GeometryRecord(POINTS))
+    content = (tmp_path / "a.las").read_bytes()
+    for at in (100, 243):  # records before and after the points
+        data = bytearray(content)
+        data[at : at + 4] = struct.pack("<I", 1 << 31)
+        (tmp_path / "a.las").write_bytes(data)
+        with pytest.raises(InputError, match="2147483648 variable-length records don't fit"):
+            tofuse.open(tmp_path / "a.las")
+
+
+def test_las_with_wrong_bounds(tmp_path: Path) -> None:
+    """The shift of its points is derived from the bounds in the header, which are wrong here."""
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(version="1.2", point_format=0)
+    data = laspy.LasData(header)
+    data.x, data.y, data.z = POINTS.T
+    data.write(tmp_path / "a.las")
+    content = bytearray((tmp_path / "a.las").read_bytes())
+    content[179:227] = struct.pack("<6d", *[1e300] * 6)
+    (tmp_path / "a.las").write_bytes(content)
+    for item in tofuse.open(tmp_path / "a.las").read_all():
+        assert isinstance(item, InputError) or np.isfinite(item.points).all()
+
+
+# In a LAZ file: the offset of the chunk table, or the number of chunks in it.
+@pytest.mark.parametrize(
+    ("where", "number"),
+    [("table", 4), ("table", 1 << 60), ("table", -1), ("count", (1 << 32) - 1), ("count", 0)],
+)
+def test_forged_chunk_tables_of_laz_are_rejected(tmp_path: Path, where: str, number: int) -> None:
+    """lazrs would allocate 64 GB for them, and abort the process if that fails."""
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(version="1.2", point_format=2)
+    data = laspy.LasData(header)
+    data.x, data.y, data.z = POINTS.T
+    path = tmp_path / "a.laz"
+    data.write(path)
+    with laspy.open(path) as file:
+        start = int(file.header.offset_to_point_data)
+    content = bytearray(path.read_bytes())
+    (table,) = struct.unpack_from("<q", content, start)
+    if where == "table":
+        struct.pack_into("<q", content, start, number)
+    else:
+        struct.pack_into("<I", content, table + 4, number)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.laz: chunk table: .*; copy the file again"):
+        tofuse.open(path)
+
+
+def test_laz_with_more_points_than_its_chunks(tmp_path: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(version="1.2", point_format=2)
+    data = laspy.LasData(header)
+    data.x, data.y, data.z = POINTS.T
+    path = tmp_path / "a.laz"
+    data.write(path)
+    content = bytearray(path.read_bytes())
+    for count, message in (
+        (60_000, "chunk table: 50000 points"),
+        (90_000_000, "90000000 points don't fit"),
+    ):
+        struct.pack_into("<I", content, 107, count)
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=message):
+            tofuse.open(path)
+
+
+def test_e57(tmp_path: Path) -> None:
+    pye57 = pytest.importorskip("pye57")
+    path = tmp_path / "scans.e57"
+    file = pye57.E57(str(path), mode="w")
+    half = np.sqrt(0.5)
+    for k in range(2):
+        columns = {f"cartesian{a}": POINTS[:, i] + k for i, a in enumerate("XYZ")}
+        columns |= {f"color{c}": RGB[:, i] for i, c in enumerate(("Red", "Green", "Blue"))}
+        columns["intensity"] = np.linspace(0, 1, 500)
+        file.write_scan_raw(
+            columns,
+            rotation=np.array([half, 0.0, 0.0, half * k] if k else [1.0, 0.0, 0.0, 0.0]),
+            translation=np.array([1.0 * k, 0.0, 0.5]),
+        )
+    file.close()
+    recording = tofuse.open(path)
+    assert (recording.format, len(recording)) == ("e57", 2)
+    frame = recording[1]
+    assert isinstance(frame, CloudFrame)
+    assert np.allclose(frame.points, POINTS + 1, atol=1e-5)  # in the scanner's own frame
+    assert np.array_equal(frame.color, RGB)
+    assert frame.amplitude[-1] == pytest.approx(1.0)
+    reference = recording.reference
+    assert np.allclose(reference[1][:3, :3], to_matrix(np.array([0, 0, half, half])))
+    assert np.allclose(reference[1][:3, 3], [1.0, 0.0, 0.5])
+
+
+def test_damaged_scans_are_refused_in_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("laspy")
+    pytest.importorskip("pye57")
+    (tmp_path / "a.las").write_bytes(b"LASF" + bytes(50))
+    (tmp_path / "b.e57").write_bytes(b"ASTM-E57" + bytes(50))
+    for name in ("a.las", "b.e57"):
+        with pytest.raises(InputError) as caught:
+            tofuse.open(tmp_path / name)
+        assert len(str(caught.value).splitlines()) == 1

@@ -1,0 +1,245 @@
+"""Views that determine the calibration error of their camera, and views that don't."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from aligned_surfaces import OPTIONS, path, surfaces
+from tofuse.engine.quality.trajectory import displacement
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.refinement.calibration_check import CalibrationCheck, check_calibration, proposal, significance_of
+from tofuse.engine.refinement.camera_response import response
+from tofuse.engine.refinement.joint_alignment import Refined, align_pairs, refine
+from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, longest_loop
+from tofuse.engine.stored_views.pair_equations import Round
+from tofuse.engine.refinement.pose_priors import Priors
+from tofuse.engine.stored_views.view_store import SampledView
+
+
+def kept(offset: float, views: int = 12) -> tuple[list[SampledView], Refined]:
+    """Views of a camera whose ranges are short by `offset`, refined as if they were correct."""
+    truth = path(12)[:views]
+    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.003, offset=offset)]
+    return views, refine(views, truth, OPTIONS)
+
+
+@pytest.mark.slow
+def test_range_offset_raises_alarm(monkeypatch):
+    views, refined = kept(0.06)
+    # With many pairs, a part of them and of their points is as conclusive.
+    monkeypatch.setattr("tofuse.engine.refinement.calibration_check._MAX_PAIRS", len(refined.pairs) // 2)
+    some = check_calibration(views, refined, OPTIONS, Priors.none())
+    monkeypatch.undo()
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    assert found.alarm
+    assert found.errors["offset"] == pytest.approx(0.06, abs=0.015)
+    assert found.sigmas["offset"] < 0.01
+    assert found.gap is not None
+    assert (found.gap.i, found.gap.j) == (0, 11)
+    # The offset does not bend this trajectory.
+    assert found.gap.before[0] < 0.01
+    assert found.moved == pytest.approx(displacement(path(12), refined.poses), rel=0.3)
+    assert found.gap.closes
+    assert found.support is not None
+    assert found.support[1] > found.support[0]
+    assert some.alarm
+    assert some.errors["offset"] == pytest.approx(found.errors["offset"], abs=0.01)
+    assert some.errors != found.errors
+    assert some.gap is not None
+    assert some.gap.before == found.gap.before
+
+
+def test_correct_camera_raises_no_alarm():
+    views, refined = kept(0.0)
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    assert not found.alarm
+    assert found.gap is None
+    # What the views estimate still counts: less than the uncertainty of the estimate.
+    assert 0 < found.moved[0] < 3 * found.focal_sigma * found.motion["focal"][0]
+
+
+def test_focal_length_without_rotation_is_undetermined():
+    # Without rotation a wrong focal length widens everything alike: the views still agree.
+    truth = path(12)
+    truth[:, :3, :3] = np.eye(3)
+    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.01)]
+    turned = [SampledView.of(s, 1500) for s in surfaces(path(12), noise=0.01)]
+
+    def sigma(views: list[SampledView], poses: np.ndarray) -> float:
+        pairs = refine(views, poses, OPTIONS).pairs
+        responses = response(views, poses, pairs, OPTIONS)
+        return float(responses.sigma(pairs, len(views))[kernels.FOCAL])
+
+    assert sigma(views, truth) > 0.1
+    assert sigma(turned, path(12)) < 0.02
+
+
+def test_single_step_estimates_whole_error() -> None:
+    """Although it weights residuals robustly; reweighted least squares finds 0.7 of it."""
+
+    def step(offset: float) -> float:
+        views, refined = kept(offset)
+        return float(
+            response(views, refined.poses, refined.pairs, OPTIONS).estimate()[kernels.OFFSET]
+        )
+
+    assert step(0.02) - step(0.005) == pytest.approx(0.015, rel=0.2)
+
+
+def test_focal_length_error_scales_sideways_motion() -> None:
+    truth = path(12)
+    truth[:, :3, :3] = np.eye(3)
+    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
+    found = check_calibration(views, refine(views, truth, OPTIONS), OPTIONS, Priors.none())
+    assert found.undetermined
+    sideways = truth[:, :2, 3] - truth[:, :2, 3].mean(0)
+    expected = 0.01 * np.sqrt((sideways**2).sum(1).mean())
+    assert 0.01 * found.motion["focal"][0] == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.slow
+def test_estimate_converges_in_errors_too() -> None:
+    """Poses may rest while the error still changes."""
+    views, refined = kept(0.06)
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    rounds = (*COARSE_TO_FINE[:-1], Round(100, 0.0, 0.0))
+    options = replace(OPTIONS, rounds=rounds, convergence=1e-4, shared=0.0)
+    converged = refine(
+        views, refined.poses, options, calibrate=[kernels.OFFSET], pairs=refined.pairs
+    )
+    assert found.errors["offset"] == pytest.approx(converged.errors[kernels.OFFSET], abs=1e-4)
+
+
+def test_few_views_need_larger_error() -> None:
+    # Student's t with 7 degrees of freedom, one-sided probability 3.17e-5.
+    assert significance_of(8) == pytest.approx(8.47, abs=0.01)
+    assert significance_of(100_000) == pytest.approx(4.0, abs=0.01)
+    assert CalibrationCheck(
+        errors={"offset": 0.05}, sigmas={"offset": 0.01}, significance=significance_of(100)
+    ).large
+    assert not CalibrationCheck(
+        errors={"offset": 0.05}, sigmas={"offset": 0.01}, significance=significance_of(8)
+    ).large
+
+
+def test_few_views_raise_no_alarm():
+    views, refined = kept(0.06, views=5)
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    assert not found.alarm
+    assert not found.errors
+
+
+def test_correction_must_close_the_loop():
+    assert Gap(0, 9, (0.3, 0.2), (0.1, 0.19)).closes
+    assert not Gap(0, 9, (0.3, 0.2), (0.2, 0.15)).closes  # less than half closed
+    assert not Gap(0, 9, (0.09, 0.048), (0.17, 0.059)).closes
+    assert not Gap(0, 9, (0.3, 0.02), (0.1, 0.04)).closes  # the rotation opens instead
+    # For a rotation on the spot the angle counts, not a few centimetres.
+    assert Gap(0, 9, (0.047, 0.18), (0.063, 0.046), 2.5).closes
+    assert not Gap(0, 9, (0.047, 0.18), (0.063, 0.16), 2.5).closes
+    assert not Gap(0, 9, (0.005, 0.001), (0.05, 0.001)).closes
+
+
+def test_unclosed_gap_contradicts_errors() -> None:
+    changed, hardly = (0.12, 0.05), (0.02, 0.01)
+    assert Gap(0, 9, (0.2, 0.05), (0.2, 0.04), 1.5, changed).contradicts
+    assert not Gap(0, 9, (0.2, 0.05), (0.2, 0.04), 1.5, (0.12, 0.01)).contradicts
+    assert not Gap(0, 9, (0.2, 0.05), (0.19, 0.05), 1.5, hardly).contradicts
+    assert Gap(0, 9, (0.2, 0.05), (0.23, 0.05), 1.5, hardly).contradicts  # wider
+    assert not Gap(0, 9, (0.2, 0.05), (0.08, 0.02), 1.5, changed).contradicts  # closed
+    assert not Gap(0, 9, (0.009, 0.008), (0.009, 0.008), 1.5, changed).contradicts  # no gap
+
+
+@pytest.mark.slow
+def test_error_that_only_closes_a_loop_is_rejected(monkeypatch):
+    """Drift of odometry leaves a gap, too: views of a correct camera do not keep the error."""
+    truth = path(24)[:8]
+    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
+    refined = refine(views, truth, OPTIONS)
+    drift = np.zeros(kernels.ERRORS)
+    drift[kernels.FOCAL] = -0.06
+
+    def drifting(views, pairs, T_i_j, options, errors):
+        # The last one closes the loop. It is measured by views that hardly differ, so an error of
+        # the camera does not matter there.
+        right = align_pairs(views, pairs, T_i_j, options, np.zeros_like(errors))
+        drifted = align_pairs(views, pairs, T_i_j, options, errors - drift)
+        return np.concatenate([drifted[:-1], right[-1:]])
+
+    monkeypatch.setattr("tofuse.engine.refinement.loop_drift.align_pairs", drifting)
+    assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm
+    monkeypatch.setattr(Loop, "error_by_views", lambda *args: -0.5 * args[-1])
+    assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm  # the opposite one
+    monkeypatch.setattr(Loop, "error_by_views", lambda *args: args[-1])
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    assert found.alarm
+    assert found.best == "focal"
+
+
+@pytest.mark.parametrize("true", [0.0, 0.06])
+def test_views_keep_only_true_error_of_loop(true):
+    views, refined = kept(true)
+    loop = Loop.longest(views, refined, OPTIONS)
+    assert loop is not None
+    assert loop.error_by_views(refined.poses, kernels.OFFSET, 0.06) == pytest.approx(true, abs=0.02)
+
+
+def test_longest_loop_uses_consecutive_views_only():
+    pairs = np.array([(0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (0, 5), (3, 5)])
+    assert longest_loop(pairs) == (0, 2)  # 2 and 3 are not connected, so 0 to 5 is no loop
+    joined = np.concatenate([pairs, [(2, 3)]])
+    assert longest_loop(joined) == (0, 5)
+    assert longest_loop(pairs[[0, 1]]) is None
+    assert longest_loop(pairs[:0]) is None
+
+
+@pytest.mark.slow
+def test_kinect_loop_raises_alarm(shared_data):
+    """Its intrinsics are wrong by 5 %, as box corners of 87 degrees confirm."""
+    from tofuse.engine.mapping.config import changed, from_method
+    from tofuse.engine.mapping.progress import Silent
+    from tofuse.engine.mapping.reconstruction import reconstruct
+    from tofuse.engine.mapping.self_calibration import self_calibrated
+    from tofuse.formats.recordings.open import open_recording
+
+    recording = open_recording(shared_data / "kinectv2_loop" / "recording")
+    # Only the poses matter: the model is coarse.
+    changes = {"self_calibration": False, "fusion": {"voxel_m": 0.1}}
+    config = changed(from_method("default"), changes, where="test")
+    result = reconstruct(recording, config)
+    assert "calibration_alarm" in {r.code for r in result.diagnostics.reasons}
+    refinement = result.diagnostics.refinement
+    assert refinement is not None
+    found = refinement.calibration_check
+    assert found is not None
+    assert found.errors["focal"] == pytest.approx(-0.05, abs=0.015)
+    assert found.gap is not None
+    assert found.gap.before[0] > 0.25
+    assert found.gap.after[0] < 0.5 * found.gap.before[0]
+    # Only a proposal: nothing was changed.
+    assert refinement.errors == {}
+    assert se3.angle(result.trajectory[0]) == pytest.approx(0, abs=1e-12)
+    # The correction itself is kept.
+    calibrated = self_calibrated(
+        result, config, partial(reconstruct, recording), Silent()
+    ).diagnostics
+    assert calibrated.calibrated is not None
+    assert calibrated.calibrated.focal == pytest.approx(-0.05, abs=0.015)
+    assert calibrated.accuracy.position_m < 0.1 * result.diagnostics.accuracy.position_m
+
+
+def test_proposal_names_two_alternatives_or_the_best() -> None:
+    errors = {"focal": -0.05, "distortion": -0.02}
+    assert proposal(errors, "focal") == (
+        "a focal length 5.3% larger or 2.0% more pincushion distortion at 45 degrees"
+    )
+    errors |= {"center_y": 0.03}
+    assert proposal(errors, "center_y") == (
+        "a principal point 3.0% of the focal length further up (or other calibration errors with a "
+        "similar effect)"
+    )

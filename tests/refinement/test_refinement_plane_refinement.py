@@ -1,0 +1,267 @@
+"""Refinement of clouds by common planes: against the peaks, a slow reference and the bound."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.engine.geometry import se3
+from tofuse.engine.refinement import plane_kernels as kernels
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.lab.experiments.bound import mean_distance, mean_distances, pose_covariances
+from tofuse.lab.experiments.peaks import PoseErrors, peaks_bound, peaks_bound_quantiles, run_peaks
+from tofuse.lab.simulation.peaks import peaks_views
+from tofuse.engine.refinement.common_planes import PlaneOptions, refine_clouds
+from tofuse.engine.refinement.plane_refinement import Planes
+from tofuse.engine.stored_views.view_store import Spacing, ViewStore
+from tofuse.engine.frames.frames import CloudFrame
+
+
+def nudged(poses, size, seed=0):
+    """Poses after as many random motions of about `size` m, and as many tenths of rad."""
+    steps = np.random.default_rng(seed).normal(size=(len(poses), 6)) * size
+    steps[:, 3:] /= 10
+    steps[0] = 0
+    return poses @ se3.exp(steps)
+
+
+@pytest.mark.slow
+def test_peaks_error_is_near_bound():
+    """From the drift of the thesis's method; `benchmarks/peaks.py` has more noise levels."""
+    sigma = 0.04
+    views, truth = peaks_views(sigma, 1)
+    thesis = run_peaks(sigma, 1)
+    found = refine_clouds([v.points for v in views], thesis.poses_optimised, PlaneOptions())
+    error = PoseErrors.of(found.poses, truth).position.mean()
+    assert error < 1.5 * peaks_bound(sigma)
+    assert error < thesis.optimised.position.mean() / 4
+    assert found.after.mean() > found.before.mean()
+    # It estimates the noise, and the uncertainty of its poses.
+    assert found.sigma == pytest.approx(sigma, rel=0.1)
+    alone = found.pairs[:, 0] == 0
+    rms = np.sqrt(np.trace(found.covariance[alone][:, :3, :3], axis1=1, axis2=2)).mean()
+    assert 0.7 < rms / peaks_bound(sigma) < 2
+
+
+@pytest.mark.slow
+def test_result_is_independent_of_threads():
+    views, truth = peaks_views(0.05, 0)
+    clouds, start = [v.points[::2] for v in views[:5]], nudged(truth[:5], 0.05)
+    found = []
+    for count in (1, 2, 3):
+        with threads(count):
+            found.append(refine_clouds(clouds, start, PlaneOptions()))
+    for other in found[1:]:
+        np.testing.assert_array_equal(other.poses, found[0].poses)
+        np.testing.assert_array_equal(other.covariance, found[0].covariance)
+
+
+def cells_of(rng, poses, cells=6, points=60):
+    """Points of every view on tilted planes, sorted by cell and view."""
+    n = len(poses)
+    x, view, start = [], [], [0]
+    for _ in range(cells):
+        normal = rng.normal(size=3)
+        normal /= np.linalg.norm(normal)
+        who = np.sort(rng.integers(0, n, points))
+        spots = rng.normal(size=(points, 3)) * 0.3
+        spots -= np.outer(spots @ normal, normal)
+        spots += 0.02 * rng.normal(size=(points, 1)) * normal
+        x.append(spots + rng.normal(size=3))
+        view.append(who)
+        start.append(start[-1] + points)
+    x, view = np.concatenate(x), np.concatenate(view)
+    p = se3.transform(se3.inverse(poses)[view], x[:, None])[:, 0]
+    return p, x, view, np.array(start)
+
+
+def test_planes_are_eliminated_exactly():
+    """Reference: one dense system of all poses and planes, with the planes eliminated."""
+    rng = np.random.default_rng(4)
+    poses = nudged(np.tile(np.eye(4), (3, 1, 1)), 1.0)
+    p, x, view, start = cells_of(rng, poses)
+    cells, n = len(start) - 1, len(poses)
+    mean, axes = np.empty((cells, 3)), np.empty((cells, 3, 3))
+    spread, views = np.empty((cells, 3)), np.empty(cells, np.int64)
+    kernels.fit_cells(x, view, start, mean, axes, spread, views)
+    number = np.full((n, n), -1)
+    pairs = np.array([(0, 1), (0, 2), (1, 2)])
+    number[pairs[:, 0], pairs[:, 1]] = np.arange(3)
+    own, gradient, mixed = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((3, 6, 6))
+    variance, robust = spread[:, 0].copy(), 2.0
+    variance[-1] = 0  # is excluded
+    kernels.plane_equations(
+        p,
+        x,
+        view,
+        start,
+        mean,
+        axes,
+        variance,
+        poses[:, :3, :3].copy(),
+        number,
+        robust,
+        own,
+        gradient,
+        mixed,
+    )
+    J = np.zeros((len(p), 6 * n + 3 * cells))
+    w, r = np.zeros(len(p)), np.zeros(len(p))
+    for s in range(cells):
+        rows = slice(start[s], start[s + 1])
+        _, vectors = np.linalg.eigh(np.cov(x[rows].T))
+        normal = vectors[:, 0] * np.sign(vectors[:, 0] @ axes[s, 0])
+        np.testing.assert_allclose(normal, axes[s, 0], atol=1e-9)
+        np.testing.assert_allclose(mean[s], x[rows].mean(0))
+        assert views[s] == len(np.unique(view[rows]))
+        apart = x[rows] - mean[s]
+        r[rows] = apart @ normal
+        if variance[s] > 0:
+            e2 = r[rows] ** 2 / variance[s] / robust**2
+            w[rows] = np.where(e2 < 1, (1 - e2) ** 2, 0) / variance[s]
+        along = np.column_stack([np.ones(len(apart)), apart @ vectors[:, 1:]])
+        J[rows, 6 * n + 3 * s : 6 * n + 3 * s + 3] = along
+        for k in range(start[s], start[s + 1]):
+            m = poses[view[k], :3, :3].T @ normal
+            J[k, 6 * view[k] : 6 * view[k] + 6] = np.r_[m, np.cross(p[k], m)]
+    H, g = (J * w[:, None]).T @ J, J.T @ (w * r)
+    a, b = slice(0, 6 * n), slice(6 * n, None)
+    rest = H[a, b] @ np.linalg.pinv(H[b, b])
+    schur, right = H[a, a] - rest @ H[b, a], g[a] - rest @ g[b]
+    tall = np.abs(schur).max()
+    for i in range(n):
+        block = schur[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
+        np.testing.assert_allclose(own[i], block, atol=1e-9 * tall)
+    for k, (i, j) in enumerate(pairs):
+        block = schur[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
+        np.testing.assert_allclose(mixed[k], block, atol=1e-9 * tall)
+    np.testing.assert_allclose(gradient.ravel(), right, atol=1e-9 * np.abs(g).max())
+
+
+def refined(part, views, poses):
+    out = part.start(ViewStore(Spacing()))
+    for view, T in zip(views, poses, strict=True):
+        out.push(view, T)
+    return out.finish([v.index for v in views], poses)
+
+
+@pytest.mark.slow
+def test_refinement_is_kept_only_if_views_support_it():
+    views, truth = peaks_views(0.05, 2)
+    start = nudged(truth[:10], 0.1)
+    better = refined(Planes(), views[:10], start)
+    assert better.kept
+    assert better.support[1] > better.support[0]
+    before = PoseErrors.of(start, truth[:10]).position.mean()
+    assert PoseErrors.of(better.poses, truth[:10]).position.mean() < before / 3
+    assert {(e.i, e.j) for e in better.edges} == {(k, k + 1) for k in range(9)}
+    for edge in better.edges:
+        assert np.linalg.eigvalsh(edge.information).min() > 0
+    assert not refined(Planes(), views[:1], truth[:1]).kept
+
+
+@pytest.mark.parametrize("count", [2, 10, 20])
+def test_distant_clouds_are_not_moved(count):
+    views, _ = peaks_views(0.05, 2)
+    apart = np.stack([se3.exp(np.array([100.0 * k, 0, 0, 0, 0, 0])) for k in range(count)])
+    same = refined(Planes(), views[:count], apart)
+    assert not same.kept
+    assert same.pairs == 0
+    np.testing.assert_array_equal(same.poses, apart)
+
+
+@pytest.mark.slow
+def test_view_of_another_place_does_not_drag_others():
+    views, truth = peaks_views(0.02, 0)
+    noise = np.random.default_rng(5).uniform(-8, 8, (2500, 3)).astype(np.float32)
+    views[7] = CloudFrame(7, 7.0, noise + np.float32([0, 0, 10]))
+    found = refined(Planes(), views, nudged(truth, 0.05))
+    others = np.delete(np.arange(20), 7)
+    error = PoseErrors.of(found.poses[others], truth[others]).position
+    assert error.mean() < 2 * peaks_bound(0.02)
+
+
+@pytest.mark.slow
+def test_two_sides_of_wall_stay_separate():
+    """Two rooms with a thin wall between them, each seen from inside; the rest is seen by both."""
+    rng = np.random.default_rng(0)
+
+    def seen(from_x, wall_x):
+        wall = np.c_[np.full(1500, wall_x), rng.uniform(-2, 2, (1500, 2))]
+        floor = np.c_[rng.uniform(-2.5, 2.5, (1500, 2)), np.full(1500, -2.0)]
+        end = np.c_[rng.uniform(-2.5, 2.5, 1500), np.full(1500, 2.5), rng.uniform(-2, 2, 1500)]
+        far = np.c_[np.full(300, 2.5), rng.uniform(1.5, 2.5, 300), rng.uniform(-2, 2, 300)]
+        points = np.concatenate([wall, floor, end, far]) + rng.normal(0, 0.01, (4800, 3))
+        return points - [from_x, 0, 0]
+
+    truth = np.stack([se3.exp([x, 0, 0, 0, 0, 0]) for x in (0.0, 0.3, 2.5, 2.8)])
+    truth[:, 0, 3] += -1.5
+    views = [
+        CloudFrame(k, float(k), seen(T[0, 3], -0.06 if T[0, 3] < 0 else 0.06).astype(np.float32))
+        for k, T in enumerate(truth)
+    ]
+    found = refined(Planes(), views, truth)
+    assert np.abs(found.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01
+
+
+@pytest.mark.slow
+def test_frames_that_are_not_kept_follow_the_others():
+    views, truth = peaks_views(0.03, 0)
+    part = Planes(max_views=12)
+    drift = np.cumsum(np.tile([0.01, 0.01, 0.0, 0.001, -0.001, 0.0], (20, 1)), axis=0)
+    start = truth @ se3.exp(drift - drift[0])
+    found = refined(part, views, start)
+    assert 6 <= found.views <= 12
+    error = PoseErrors.of(found.poses, truth).position
+    assert error.mean() < PoseErrors.of(start, truth).position.mean() / 2
+
+
+def test_bound_of_cube_seen_twice():
+    """Difference of two noisy heights, averaged over the samples that face each axis."""
+    corners = np.array([[0, 0.5, 0.5], [0, 0.5, -0.5], [0, -0.5, 0.5], [0, -0.5, -0.5]])
+    points, normals = [], []
+    for axis in range(3):
+        for side in (1, -1):
+            points.append(np.roll(corners, axis, 1) + side * np.eye(3)[axis])
+            normals.append(np.tile(side * np.eye(3)[axis], (4, 1)))
+    points, normals = np.concatenate(points), np.concatenate(normals)
+    seen = np.ones((24, 2), bool)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    C = pose_covariances(points, normals, seen, poses, 0.1)
+    np.testing.assert_array_equal(C[0], 0)
+    # 8 samples face each axis; 16 of them, with a lever of 0.5 m, constrain each rotation.
+    np.testing.assert_allclose(np.diag(C[1]), [2 * 0.01 / 8] * 3 + [2 * 0.01 / 4] * 3)
+    # A third view of the unknown surface improves its accuracy.
+    third = pose_covariances(
+        points, normals, np.ones((24, 3), bool), np.tile(np.eye(4), (3, 1, 1)), 0.1
+    )
+    np.testing.assert_allclose(third[1:], np.broadcast_to(C[1], (2, 6, 6)), atol=1e-12)
+    assert mean_distance(C[1:, :3, :3]) == pytest.approx(
+        np.sqrt(2 * 0.01 / 8) * np.sqrt(8 / np.pi), rel=0.01
+    )
+
+
+def test_bound_of_peaks_grows_with_noise():
+    assert peaks_bound(0.1) == pytest.approx(0.046, abs=0.001)
+    assert peaks_bound(0.02) == pytest.approx(peaks_bound(0.1) / 5)
+
+
+def test_bound_of_single_recordings_varies_with_first_view():
+    low, high = peaks_bound_quantiles(0.1, (0.05, 0.95))
+    assert low < peaks_bound(0.1) < high
+    assert high > 2 * low
+    # Two views: half the distance of the second one.
+    C = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
+    assert mean_distances(C).mean() == pytest.approx(np.sqrt(8 / np.pi) / 2, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("cls", "options"),
+    [
+        (Planes, {"points": 10}),
+        (Planes, {"max_views": 1}),
+    ],
+)
+def test_options_are_checked(cls, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        cls(**options)

@@ -1,0 +1,201 @@
+"""From recordings to a rig: static cameras, bad input, the commands, one model of all cameras."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tofuse
+from rig_room import ROOM
+from rig_scene import CAMERA, looked_at
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError
+from tofuse.formats.files.trajectory import read_tum
+from tofuse.engine.geometry import se3
+from tofuse.lab.simulation.rig import camera_ring, relative
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.formats.recordings.rig import Rig, RigCamera, read_rig, write_rig
+from tofuse.apps.report.scene import CAMERA_COLORS
+from tofuse.apps.report.section_parts import upright
+from tofuse.apps.rigs.calibrating import Calibration, calibrate_cameras, moves
+from tofuse.apps.rigs.inputs import Camera, unique_names
+
+# Three cameras, neighbours 25 degrees apart.
+STANDS = [
+    camera_ring((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + (k - 1) * np.radians(25))[0] for k in range(3)
+]
+
+
+def images(k: int, count: int = 1, offset: float = 0.0) -> list[RangeFrame]:
+    rng = np.random.default_rng([k, 9])
+    frames = [looked_at(STANDS[k], rng, offset, ROOM) for _ in range(count)]
+    return [RangeFrame(i, i / 30, CAMERA, frame.depth, "z", None) for i, frame in enumerate(frames)]
+
+
+def camera(k: int, frames: list[RangeFrame]) -> Camera:
+    return Camera(f"cam{k}", Recording.of(ArraySource(frames), f"cam{k}", "array"))
+
+
+def written(folder: Path, count: int = 2, cameras: int = 3) -> Path:
+    for k in range(cameras):
+        writer = RecordingWriter(folder / f"cam{k}", CAMERA, frame_rate_hz=30.0, depth_unit_m=2e-4)
+        for frame in images(k, count):
+            writer.add(frame)
+        writer.finish()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> Calibration:
+    return calibrate_cameras([camera(k, images(k)) for k in range(3)], ["a", "b", "c"])
+
+
+def test_static_cameras_are_calibrated_from_one_instant(calibrated: Calibration) -> None:
+    found = calibrated
+    assert found.how == "one instant"
+    assert not found.rig.unplaced
+    for stated, T in zip(found.rig.cameras, relative(STANDS), strict=True):
+        off = se3.inverse(stated.T_rig_camera) @ T
+        assert np.linalg.norm(off[:3, 3]) < 0.01
+        assert np.degrees(se3.angle(off)) < 0.3
+    assert {(d.a, d.b) for d in found.rig.disagreement} >= {("cam0", "cam1"), ("cam1", "cam2")}
+
+
+@pytest.mark.slow
+def test_camera_without_overlap_is_named() -> None:
+    wall = RangeFrame(0, 0.0, CAMERA, np.full((72, 96), 1.7, np.float32), "z", None)
+    cameras = [camera(0, images(0)), camera(1, images(1)), camera(2, [wall])]
+    found = calibrate_cameras(cameras, ["a", "b", "c"])
+    assert [c.name for c in found.rig.cameras] == ["cam0", "cam1"]
+    assert found.rig.unplaced["cam2"]
+
+
+@pytest.mark.slow
+def test_images_of_static_scene_are_averaged() -> None:
+    cameras = [camera(k, images(k, 6)) for k in range(2)]
+    assert not moves(cameras, "auto")
+    assert calibrate_cameras(cameras, ["a", "b"]).how == "one instant"
+
+
+def test_static_camera_beside_moving_camera_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    turned = [camera_ring((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + 0.12 * i)[0] for i in range(8)]
+    frames = [
+        RangeFrame(i, i / 30, CAMERA, looked_at(T, rng, 0.0, ROOM).depth, "z", None)
+        for i, T in enumerate(turned)
+    ]
+    with pytest.raises(InputError, match="cam0 stood still while other cameras moved"):
+        moves([camera(0, images(0, 8)), camera(1, frames)], "auto")
+
+
+def test_names_distinguish_cameras() -> None:
+    assert unique_names([Path("/a/left"), Path("/a/right")]) == ["left", "right"]
+    assert unique_names([Path("/a/x/depth"), Path("/a/y/depth")]) == ["x/depth", "y/depth"]
+
+
+@pytest.mark.slow
+def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # Two cameras: from three on, each could be the wrong one, which takes much longer.
+    folder = written(tmp_path / "rig", cameras=2)
+    cameras = [str(folder / f"cam{k}") for k in range(2)]
+    out = folder / "rig.json"
+    assert main(["rig", "calibrate", *cameras, "--out", str(out)]) == 0
+    assert "cam1" in capsys.readouterr().out
+    assert [c.name for c in read_rig(out).cameras] == ["cam0", "cam1"]
+    # It is not overwritten by default.
+    assert main(["rig", "calibrate", *cameras, "--out", str(out)]) == 2
+    capsys.readouterr()
+
+    assert main(["rig", "check", str(out), *cameras, "--json"]) == 0
+    checked = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert not any(c["moved"] for c in checked["cameras"])
+
+    assert main(["rig", "check", str(out), *cameras[:1]]) == 2
+    assert "2 cameras" in capsys.readouterr().err
+
+    # The folder opens like a recording, and gives one model.
+    recording = open_recording(folder)
+    assert recording.format == "rig"
+    assert len(recording) == 4
+    assert main(["run", str(folder), "--out", str(tmp_path / "model"), "--voxel", "3cm"]) == 0
+    times, poses = read_tum(tmp_path / "model" / "rig_trajectory.txt")
+    assert len(times) == 2
+    assert np.allclose(poses, np.eye(4))
+    _, of_images = read_tum(tmp_path / "model" / "trajectory.txt")
+    stated = read_rig(out).cameras
+    assert np.allclose(of_images[1], stated[1].T_rig_camera, atol=1e-9)
+    # Its accuracy is that of the rig, not that of one camera jumping from place to place.
+    run_json = json.loads((tmp_path / "model" / "run.json").read_text())
+    assert run_json["verdict"] == "good"
+    assert 0.005 < run_json["accuracy"]["position_m"] < 0.03
+    assert not run_json["reasons"]
+    report = (tmp_path / "model" / "report.html").read_text()
+    assert '<section id="rig">' in report
+    assert "cam0, cam1</td>" in report
+    assert ">cam1</text>" in report or ">cam1<" in report
+
+    # The camera of each frame is stated: in the file and in the report.
+    run_json = json.loads((tmp_path / "model" / "run.json").read_text())["rig"]
+    assert run_json == {"cameras": ["cam0", "cam1"], "of_frames": [0, 1, 0, 1]}
+    assert tofuse.load(tmp_path / "model").recording["rig"] == run_json
+    page = (tmp_path / "model" / "report.html").read_text(encoding="utf-8")
+    assert re.findall(r'background:(rgb\(.*?\))"></i>(cam\d)', page) == [
+        (f"rgb{color}".replace(" ", ""), f"cam{k}") for k, color in enumerate(CAMERA_COLORS[:2])
+    ]
+
+
+@pytest.mark.slow
+def test_displaced_camera_is_found(
+    calibrated: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = written(tmp_path / "rig", 1)
+    cameras = [str(folder / f"cam{k}") for k in range(3)]
+    rig = calibrated.rig
+    moved = rig.cameras[2].T_rig_camera @ se3.exp([0.03, 0, 0, 0, np.radians(1.5), 0])
+    last = replace(rig.cameras[2], T_rig_camera=moved)
+    write_rig(tmp_path / "knocked.json", Rig((*rig.cameras[:2], last)))
+    assert main(["rig", "check", str(tmp_path / "knocked.json"), *cameras]) == 3
+    output = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in output if "moved by" in line] == ["cam2"]
+
+
+@pytest.mark.slow
+def test_rig_that_contradicts_images_is_reported(tmp_path: Path) -> None:
+    folder = written(tmp_path / "rig", 1)
+    cameras = [str(folder / f"cam{k}") for k in range(3)]
+    knocked = relative(STANDS)
+    knocked[1] = knocked[1] @ se3.exp([0.1, 0, 0, 0, 0, 0])
+    rows = [RigCamera(f"cam{k}", "", T, 1e-8 * np.eye(6)) for k, T in enumerate(knocked)]
+    write_rig(tmp_path / "rig.json", Rig(tuple(rows)))
+    out = tmp_path / "model"
+    main(["run", "--rig", str(tmp_path / "rig.json"), *cameras, "--out", str(out)])
+    reasons = json.loads((out / "run.json").read_text())["reasons"]
+    (text,) = (r["text"] for r in reasons if r["code"] == "rig_changed")
+    assert "cam1 by" in text
+    assert "cam2" not in text
+
+
+def test_rig_folder_with_missing_camera_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = written(tmp_path / "rig", 1)
+    rows = [RigCamera(f"cam{k}", "", np.eye(4), np.zeros((6, 6))) for k in (0, 1)]
+    rows.append(RigCamera("top", "", np.eye(4), np.zeros((6, 6))))
+    write_rig(folder / "rig.json", Rig(tuple(rows)))
+    with pytest.raises(InputError, match="no recording of the camera 'top'"):
+        open_recording(folder)
+
+
+def test_ring_is_drawn_upright() -> None:
+    poses = upright(np.stack(relative(camera_ring((0.4, 0, 0.5), 1.6, 0.5, 6))))
+    heights = poses[:, 1, 3]
+    assert np.ptp(heights) < 1e-9  # though the first camera looks down on the others
+    # The first still looks forward, not sideways.
+    assert abs(poses[0, 0, 2]) < 1e-9
+    assert poses[0, 2, 2] > 0.7

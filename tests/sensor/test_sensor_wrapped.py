@@ -1,0 +1,76 @@
+"""Wrapped pixels are excluded from the model; dark and near ones are kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.engine.sensor.wrapped import Wrapped
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.mapping.methods import default
+from tofuse.engine.frames.frames import RangeFrame
+
+PERIOD = 5.0
+CAMERA = Pinhole(176, 144, 229.0, 229.0, 87.5, 71.5)
+
+
+def image(radial: np.ndarray, albedo: np.ndarray | float) -> RangeFrame:
+    """Measurement of surfaces at these ranges (H, W) by a camera with this period."""
+    light = 3000.0 * albedo / radial**2
+    return RangeFrame(
+        0,
+        0.0,
+        CAMERA,
+        np.mod(radial, PERIOD).astype(np.float32),
+        "range",
+        np.broadcast_to(light, radial.shape).astype(np.float32),
+        amplitude_kind="raw",
+        ambiguity_m=PERIOD,
+    )
+
+
+def corridor(length: float) -> np.ndarray:
+    """(H, W) ranges in a corridor 3 m wide and 2.4 m high, its end so far away."""
+    x, y = np.moveaxis(CAMERA.rays().astype(float), -1, 0)
+    with np.errstate(divide="ignore"):
+        z = np.minimum(1.5 / np.abs(x), 1.2 / np.abs(y))
+    return np.minimum(z, length) * np.sqrt(1 + x * x + y * y)
+
+
+def test_wrapped_pixels_are_removed() -> None:
+    radial = corridor(6.2)
+    rng = np.random.default_rng(1)
+    noisy = radial + rng.normal(0, 0.01, radial.shape)
+    keep = Wrapped().mask(image(noisy, rng.uniform(0.4, 0.6, radial.shape)), ())
+    assert (radial > PERIOD).mean() > 0.2
+    assert not keep[radial > PERIOD + 0.05].any()
+    assert keep[radial < PERIOD - 0.05].mean() > 0.999
+
+
+@pytest.mark.parametrize("albedo", [0.04, 0.08])
+def test_dark_surfaces_within_period_are_kept(albedo: float) -> None:
+    radial = corridor(4.5)
+    albedos = np.full(radial.shape, 0.6)
+    albedos[80:] = albedo  # a dark floor
+    albedos[50:80, 60:90] = albedo
+    assert Wrapped().mask(image(radial, albedos), ()).all()
+
+
+def test_all_is_kept_without_amplitude_or_period() -> None:
+    frame = image(corridor(6.2), 0.5)
+    plain = RangeFrame(0, 0.0, CAMERA, frame.depth, "range", ambiguity_m=PERIOD)
+    endless = RangeFrame(0, 0.0, CAMERA, frame.depth, "range", frame.amplitude_image)
+    assert Wrapped().mask(plain, ()).all()
+    assert Wrapped().mask(endless, ()).all()
+
+
+def test_default_method_filters_only_the_model() -> None:
+    config = default("range")
+    assert any(isinstance(part, Wrapped) for part in config.model_filters)
+    assert not any(isinstance(part, Wrapped) for part in config.filters)
+
+
+@pytest.mark.parametrize("wrong", [{"min_albedo": -0.1}, {"min_albedo": 2.0}])
+def test_invalid_options_are_rejected(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Wrapped(**wrong)

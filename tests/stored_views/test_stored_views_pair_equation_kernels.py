@@ -1,0 +1,235 @@
+"""The normal equations of a pair of views, against finite differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from corner_views import SHARP, corner, unpack
+from pair_equations import KNOWN, pair_equations
+from tofuse.engine.geometry import se3
+from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.alignment.projective import points_of
+from tofuse.engine.views.surface_options import SurfaceOptions
+
+SETTINGS = (0.05, 1.0, 0.1, 0.01, 4.0, 0.5)  # exposure, scales, slack, robust, cosine
+
+
+def evaluate(source, target, T, errors=None, known=KNOWN, settings=SETTINGS):
+    points = points_of(prepare_view(source, SHARP), 1)
+    return pair_equations(points, prepare_view(target, SHARP), T, settings, errors, known)[0]
+
+
+@pytest.fixture
+def pair():
+    T_target_source = se3.exp(np.array([0.06, -0.04, 0.05, 0.03, -0.04, 0.02]))
+    return corner(T_target_source), corner(np.eye(4)), T_target_source
+
+
+def test_steps_converge_to_truth(pair):
+    source, target, T = pair
+    xi = np.array([0.01, -0.008, 0.006, 0.004, 0.006, -0.005])
+    start = T @ se3.exp(xi)
+    for _ in range(6):
+        H, g = unpack(evaluate(source, target, start, settings=(0.0, 1.0, 0.1, 0.02, 4.0, 0.5)))
+        H[7:, 7:] = np.eye(kernels.ERRORS)
+        step = -np.linalg.solve(H, g)
+        start = start @ se3.exp(step[:6])
+    away = se3.log(se3.inverse(T) @ start)
+    assert np.abs(away[:3]).max() < 1e-3
+    assert np.abs(away[3:]).max() < 5e-4
+
+
+def as_measured(frame, kind):
+    """Return the frame with the depth that a camera of a kind, "z" or "range", measures."""
+    return frame if kind == "z" else replace(frame, depth=frame.radial_range, depth_kind=kind)
+
+
+@pytest.mark.parametrize("kind", ["z", "range"])
+@pytest.mark.parametrize(("scale_p", "tolerance"), [(0.0, 0.01), (0.5, 0.1)])
+@pytest.mark.parametrize("error", range(kernels.ERRORS))
+def test_camera_error_changes_gradient_as_predicted_by_hessian(
+    pair, error, scale_p, tolerance, kind
+):
+    """To first order g(e) = g(0) + H e: the mixed block is the slope of the gradient."""
+    _, _, T = pair
+    # A pattern so coarse that the pixel of a correspondence makes no difference.
+    source, target = (as_measured(corner(at, waves=0.1), kind) for at in (T, np.eye(4)))
+    known = KNOWN.copy()
+    known[error] = 0
+    wide = (0.0, 1.0, scale_p, 0.3, 50.0, 0.5)  # so wide that the robust weights are 1
+    h = 1e-4
+    plus, minus = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS)
+    plus[error], minus[error] = h, -h
+    # Where both views agree, so that second derivatives, which H leaves out, don't count.
+    H, _ = unpack(evaluate(source, target, T, known=known, settings=wide))
+    ends = [unpack(evaluate(source, target, T, e, known, wide))[1] for e in (plus, minus)]
+    slope = (ends[0] - ends[1]) / (2 * h)
+    column = H[:, 7 + error]
+    chosen = [*range(6), 7 + error]
+    scale = np.sqrt(np.diag(H)[chosen] * H[7 + error, 7 + error])
+    assert np.abs((slope - column)[chosen] / scale).max() < tolerance
+
+
+@pytest.mark.parametrize("kind", ["z", "range"])
+@pytest.mark.parametrize(
+    "error", [kernels.FOCAL, kernels.CENTER_X, kernels.CENTER_Y, kernels.DISTORTION]
+)
+def test_wrong_intrinsics_are_compensated(pair, kind, error):
+    """The measured quantity is kept: z, or the range along another ray."""
+    source, target, T = pair
+    errors = np.zeros(kernels.ERRORS)
+    errors[error] = 0.03 if error == kernels.DISTORTION else 0.01
+
+    def stated(frame):
+        camera = frame.camera
+        fx, fy = (f * (1 + errors[kernels.FOCAL]) for f in (camera.fx, camera.fy))
+        cx, cy = (
+            camera.cx + errors[kernels.CENTER_X] * fx,
+            camera.cy + errors[kernels.CENTER_Y] * fy,
+        )
+        wrong = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy)
+        if error == kernels.DISTORTION:
+            rays = camera.rays()
+            wrong = RayTable(rays / (1 + errors[error] * (rays**2).sum(-1, keepdims=True)))
+        return replace(as_measured(frame, kind), camera=wrong)
+
+    views = stated(source), stated(target)
+    known = KNOWN.copy()
+    known[error] = 0
+    plain = (0.0, 1.0, 0.1, 0.002, 4.0, 0.5)
+
+    def misfit(out):
+        return 1 - out[kernels.SUPPORT] / out[kernels.TERMS]
+
+    true = misfit(evaluate(source, target, T, settings=plain))
+    corrected = misfit(evaluate(*views, T, errors, known, plain))
+    wrong = misfit(evaluate(*views, T, known=known, settings=plain))
+    assert corrected - true < 0.3 * (wrong - true)
+
+
+@pytest.mark.parametrize("kind", ["z", "range"])
+@pytest.mark.parametrize("error", range(kernels.ERRORS))
+def test_known_errors_are_corrected_as_if_they_were_unknowns(pair, kind, error):
+    *_, T = pair
+    views = [as_measured(corner(at, waves=0.1), kind) for at in (T, np.eye(4))]
+    wide = (0.0, 1.0, 0.1, 0.3, 50.0, 0.5)  # so wide that the robust weights are 1
+    errors = np.zeros(kernels.ERRORS)
+    errors[error] = 0.01
+    unknown = KNOWN.copy()
+    unknown[error] = 0
+
+    def step(assumed, known=KNOWN):
+        H, g = unpack(evaluate(*views, T, assumed, known, wide))
+        return np.linalg.solve(H[:7, :7], g[:7])
+
+    effect = step(errors, unknown) - step(np.zeros(kernels.ERRORS))
+    assert np.abs(effect[:6]).max() > 5e-5
+    found = step(errors) - step(errors, unknown)
+    assert np.abs(found[:6]).max() < 0.2 * np.abs(effect[:6]).max()
+
+
+@pytest.mark.parametrize("kind", ["z", "range"])
+def test_few_points_with_known_errors_have_finite_equations(pair, kind):
+    source, target, T = pair
+    points = points_of(prepare_view(source, SHARP), 1)[::97]
+    surface = prepare_view(as_measured(target, kind), SHARP)
+    row, _ = pair_equations(points, surface, T, SETTINGS, np.full(kernels.ERRORS, 0.01))
+    assert 0 < row[kernels.COMPARED] <= len(points) < 128
+    assert np.isfinite(row).all()
+
+
+def test_points_behind_target_are_not_compared_with_known_errors(pair):
+    source, target, T = pair
+    errors = np.zeros(kernels.ERRORS)
+    errors[kernels.OFFSET] = 0.1
+    behind = T @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
+    assert evaluate(source, target, behind, errors)[kernels.COMPARED] == 0
+
+
+def test_fixed_unknowns_have_no_equations(pair):
+    source, target, T = pair
+    H, g = unpack(evaluate(source, target, T))
+    assert not H[7:].any()
+    assert not g[7:].any()
+    assert np.linalg.eigvalsh(H[:7, :7]).min() > 0
+
+
+def test_free_space_and_support_are_counted(pair):
+    source, target, T = pair
+    agree = evaluate(source, target, T)
+    assert agree[kernels.SUPPORT] > 0.9 * agree[kernels.TERMS] > 0
+    assert agree[kernels.IN_FRONT] == 0
+    nearer = replace(source, depth=source.depth * np.float32(0.6))
+    out = evaluate(nearer, target, T)
+    assert out[kernels.IN_FRONT] > 0.8 * out[kernels.COMPARED]
+    assert out[kernels.SUPPORT] < 0.1 * out[kernels.TERMS]
+
+
+def test_overlap_counts_points_seen_from_same_side(pair):
+    source, target, T = pair
+    surface = prepare_view(target, SurfaceOptions(radii=(2,)))
+    points = points_of(prepare_view(source, SurfaceOptions(radii=(2,))), 2)
+
+    def share(pose, cosine=0.5, least=0.0):
+        out = np.empty(1)
+        kernels.overlaps(
+            points,
+            np.array([0, len(points)]),
+            np.array([0]),
+            surface.target_image,
+            np.ascontiguousarray(pose),
+            np.eye(4)[None],
+            0.1,
+            cosine,
+            least,
+            out,
+        )
+        return out[0]
+
+    assert share(T) > 0.8
+    assert share(T @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))) == 0
+    aside = T @ se3.exp(np.array([0, 0, 0, 0, 0.4, 0]))
+    assert 0 < share(aside) < share(T)
+    assert share(aside, least=share(aside) - 0.01) == share(aside)
+    assert share(aside, least=share(aside) + 0.01) == 0
+    # Entirely behind the target's surface, so there is no overlap.
+    assert share(T @ se3.exp(np.array([0, 0, 1.5, 0, 0, 0]))) < 0.05
+
+
+@pytest.mark.parametrize("known", [KNOWN, np.array([0, 1, 0])])
+def test_pairs_of_target_have_equations_of_single_pairs(pair, known):
+    source, target, T = pair
+    errors = np.where(known, 0.0, 0.01)
+    poses = np.stack([T, T @ se3.exp(np.full(6, 0.01))])
+    views = [prepare_view(view, SHARP) for view in (source, target)]
+    points = [points_of(view, 1) for view in views]
+    ends = np.cumsum([0, *map(len, points)])
+    scales = np.array([0.05, 0.0]), np.array([1.0, 2.0]), np.array([0.1, 0.2])
+    found = np.empty((2, kernels.SIZE))
+    kernels.target_equations(
+        kernels.SourcePoints(
+            np.concatenate(points),
+            np.zeros(ends[-1], np.int64),
+            ends[:-1],
+            ends[1:],
+            np.zeros(2, bool),
+        ),
+        np.array([1, 0]),
+        views[1].target_image,
+        poses,
+        kernels.PairResiduals(*scales, *SETTINGS[3:]),
+        errors,
+        known,
+        views[1].measures_range,
+        found,
+        np.empty((2, 0, kernels.PATCH_SIZE)),
+    )
+    for k, of in enumerate((target, source)):
+        settings = (*(scale[k] for scale in scales), *SETTINGS[3:])
+        alone = evaluate(of, target, poses[k], errors, known, settings)
+        np.testing.assert_array_equal(found[k], alone)

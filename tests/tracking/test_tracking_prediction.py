@@ -1,0 +1,93 @@
+"""The error of extrapolated motion."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from tofuse.engine.geometry import se3
+from tofuse.engine.tracking.prediction import Prediction, degenerate_runs
+
+NONE, SOME = np.zeros((0, 6)), np.eye(6)[:1]
+
+
+def path(motions):
+    """Poses (N, 4, 4) of motions (N-1, 6)."""
+    poses = [np.eye(4)]
+    for T in se3.exp(motions):
+        poses.append(poses[-1] @ T)
+    return np.array(poses)
+
+
+def random_walk(rng, n):
+    """Motions (N, 6) whose change is random, small enough for rotations to add up."""
+    return np.cumsum(rng.standard_normal((n, 6)) * ([0.01] * 3 + [1e-3] * 3), axis=0)
+
+
+def around_a_mean(rng, n):
+    """Motions (N, 6) that are independent of each other."""
+    return rng.standard_normal((n, 6)) * ([0.01] * 3 + [1e-3] * 3)
+
+
+def test_runs_of_degenerate_frames() -> None:
+    assert degenerate_runs([NONE, SOME, SOME, NONE, SOME]).tolist() == [0, 1, 2, 0, 1]
+    assert degenerate_runs([SOME, SOME]).tolist() == [1, 2]
+    assert degenerate_runs([]).tolist() == []
+
+
+@pytest.mark.parametrize("n", [3, 20])
+def test_error_grows_as_for_random_walk_of_velocity(n) -> None:
+    """Frame by frame or over all frames at once, as in simulated random walks."""
+    step = np.random.default_rng(1).standard_normal((20_000, n))
+    expected = np.cumsum(np.cumsum(step, axis=1), axis=1)[:, -1].std()
+    usual = Prediction((1.0, 1.0))
+    single = np.sqrt(sum(usual.error(k, 1)[0] ** 2 for k in range(1, n + 1)))
+    assert single == pytest.approx(expected, rel=0.03)
+    assert usual.error(n, n)[0] == pytest.approx(single)
+    # Relative to a later frame of the run, the velocity is off from the first one on.
+    assert usual.error(n, 2)[0] == pytest.approx(np.hypot(n - 1, n))
+
+
+def test_single_prediction_has_its_own_error() -> None:
+    assert Prediction((0.3, 0.2)).error(1, 1) == (0.3, 0.2)
+    assert Prediction((0.3, 0.2)).error(0, 0) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("walk", "low", "high"), [(random_walk, 1.5, 2), (around_a_mean, 0.7, 1.3)]
+)
+def test_error_growth_is_estimated_from_constrained_motion(walk, low, high) -> None:
+    """It is faster for a random walk of the velocity than for independent motions."""
+    poses = path(walk(np.random.default_rng(5), 300))
+    found = Prediction.of(poses, [NONE] * len(poses))
+    assert low <= found.power[0] <= high
+    assert low <= found.power[1] <= high
+
+
+def test_predicted_error_matches_recording() -> None:
+    poses = path(around_a_mean(np.random.default_rng(6), 400))
+    found = Prediction.of(poses, [NONE] * len(poses))
+    steps = np.array([se3.log(se3.inverse(a) @ b) for a, b in itertools.pairwise(poses)])
+    off = [
+        poses[k + 12][:3, 3] - (poses[k] @ se3.exp(12 * steps[k - 1]))[:3, 3] for k in range(1, 380)
+    ]
+    assert found.error(12, 12)[0] == pytest.approx(np.sqrt(np.mean(np.square(off))), rel=0.15)
+
+
+def test_degenerate_directions_are_excluded() -> None:
+    """Extrapolated motion agrees with its prediction by construction, and is no evidence."""
+    motions = around_a_mean(np.random.default_rng(7), 300)
+    motions[:, 1] = 0.02
+    poses = path(motions * [1, 1, 1, 0, 0, 0])
+    weak = np.eye(6)[1:2]
+    found = Prediction.of(poses, [weak] * len(poses))
+    ignored = Prediction.of(poses, [NONE] * len(poses))
+    assert found.sigma[0] == pytest.approx(ignored.sigma[0] * np.sqrt(3 / 2), rel=1e-3)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 5])
+def test_few_poses_give_default_growth(n) -> None:
+    found = Prediction.of(path(np.full((n, 6), 0.1))[:n], [NONE] * n)
+    assert np.isfinite(found.sigma).all()
+    assert min(found.sigma) > 0
+    assert found.power == (2.0, 2.0)
