@@ -19,14 +19,14 @@ from tofuse.apps.calibration.board import Board
 from tofuse.apps.calibration.depth import calibrate_depth
 from tofuse.apps.calibration.lens import calibrate_lens
 from tofuse.apps.calibration.plane_views import PlaneView, board_planes, scene_planes
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.recording import Recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
 from tofuse.lab.simulation.sensor import factory_correction
-from tofuse.engine.frames.recording import Recording
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 EFFECTS = Effects(wiggling=2.6, thermal_drift=0.0).without("multipath")

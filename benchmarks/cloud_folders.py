@@ -27,7 +27,7 @@ import pairs
 import scoring
 import tofuse
 from sequences import DATA
-from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.files.ply import write_ply
 
 # Pose (4, 4) in a common frame and points (n, 3) of each view.

@@ -35,15 +35,15 @@ import pairs
 import tofuse
 from peers import kiss_global, o3d_global
 from sequences import DATA
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
-from tofuse.lab.simulation import scene as scenes
-from tofuse.engine.frames.frames import CloudFrame, Frame
-from tofuse.formats.recordings.open import open_recording
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.clouds.cloud_pair import follow_clouds, register_clouds
-from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
 from tofuse.engine.clouds.viewpoint import viewpoint_of
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.geometry import se3
+from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
+from tofuse.formats.recordings.open import open_recording
+from tofuse.lab.simulation import scene as scenes
 
 POINTS = 20_000
 RIGHT_M, RIGHT_FRACTION, RIGHT_DEG = 0.1, 0.05, 4.0

@@ -20,10 +20,10 @@ import numpy as np
 
 import sequences
 from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.quality.types import Reconstruction
 
 Corruption = Callable[[RangeFrame], RangeFrame]

@@ -23,21 +23,21 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
+from tofuse.engine.alignment.uncertainty import covariance
 from tofuse.engine.arrays import Float64
-from tofuse.engine.sensor.multipath_correction import Multipath
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.search.verification import FitStatistics
+from tofuse.engine.sensor.multipath_correction import Multipath
+from tofuse.engine.views.prepared_view import PreparedView, prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
-from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
-from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.engine.alignment.uncertainty import covariance
-from tofuse.engine.search.verification import FitStatistics
 
 KINDS = ("room", "empty-room", "wall", "corner", "corridor")
 PAIRS = ((0, 1), (1, 2), (0, 2))

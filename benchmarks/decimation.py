@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.formats.files.ply import read_ply
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.formats.files.ply import read_ply
 from tofuse.lab.experiments.surface_error import Surface, distances
 
 _POINTS = 400_000

@@ -29,20 +29,20 @@ from dataclasses import replace
 import numpy as np
 
 from covariance import KINDS
+from tofuse.engine.alignment.projective import UNITS, Level, ProjectiveOptions, Target, align
+from tofuse.engine.alignment.uncertainty import covariance
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.sensor.multipath_correction import Multipath
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import ray_lengths
+from tofuse.engine.geometry import se3
+from tofuse.engine.sensor.multipath_correction import Multipath
+from tofuse.engine.views.prepared_view import PreparedView, prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model, noise_of
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import Scene, build
-from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.alignment.projective import UNITS, Level, ProjectiveOptions, Target, align
-from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.engine.alignment.uncertainty import covariance
 
 SUBPIXELS = 3
 AWAY = 3.0  # in units of 1 cm and 1 degree

@@ -21,12 +21,12 @@ from tofuse.engine.filters.base import Filter, apply_filters
 from tofuse.engine.filters.confidence import Confidence
 from tofuse.engine.filters.distance import Distance
 from tofuse.engine.filters.neighbours import NeighbourFraction
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.methods.filters_amplitude import Amplitude
 from tofuse.lab.methods.filters_median import Median
 from tofuse.lab.methods.filters_neighbour_distance import NeighbourDistance
 from tofuse.lab.methods.filters_temporal import TemporalDeviation, z_deviation
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.open import open_recording
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "sr4000_corridor"
 

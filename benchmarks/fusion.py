@@ -37,9 +37,10 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.compute.spill import Spill
+from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.filters.base import apply_filters
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.layout import Layout
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.model import ModelBuilder
@@ -48,16 +49,15 @@ from tofuse.engine.fusion.range_view import RangeView
 from tofuse.engine.fusion.stored_views import StoredViews
 from tofuse.engine.fusion.tsdf import Volume, fitting_voxel, fuse_surface
 from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.mapping.config import Config, from_method
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.sensor.multipath_correction import Multipath
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.experiments.surface_error import Surface, compare_surfaces, distances
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import RecordingPlan, plan
-from tofuse.engine.mapping.config import Config, from_method
-from tofuse.engine.mapping.mapper import Mapper
-from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
 
 _NOISE = Effects.none(shot_noise=True, ambient=1.0, saturation=True, mixed_pixels=True, wrap=True)
 _NOISE_FRACTION = 0.01  # of the range

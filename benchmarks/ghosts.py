@@ -27,24 +27,24 @@ import numpy as np
 
 import sequences
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.quality.trajectory import align
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import Recording
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.range_view import RangeView
 from tofuse.engine.fusion.tsdf import fuse_surface
 from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import threads
-from tofuse.lab.experiments.surface_error import Surface, distances
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.record import RecordingPlan, plan, write
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.preparation import Preparation
 from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.quality.trajectory import align
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.formats.recordings.open import open_recording
+from tofuse.lab.experiments.surface_error import Surface, distances
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import RecordingPlan, plan, write
 
 OUT = sequences.OUT / "recordings" / "ghosts"
 WALKS = (

@@ -27,18 +27,18 @@ from pathlib import Path
 import numpy as np
 
 import sequences
-from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.compute.thread_pool import run_chunks, threads
-from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.fusion.options import Fusion
+from tofuse.engine.loops.revisits import Revisits
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.progress import Stopwatch
-from tofuse.engine.loops.revisits import Revisits
-from tofuse.engine.stored_views.view_store import SampledView, Spacing, ViewStore, overlaps
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.search.search import Search
 from tofuse.engine.quality.types import Reconstruction
+from tofuse.engine.search.search import Search
+from tofuse.engine.stored_views.view_store import SampledView, Spacing, ViewStore, overlaps
+from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 
 
 def there_and_back(frames: list[RangeFrame], count: int) -> Iterator[RangeFrame]:

@@ -34,23 +34,23 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from tofuse.apps.results.run_json import frames_in_main_model
 from tofuse.engine.arrays import Float64
-from tofuse.engine.quality.trajectory import evaluate_trajectory
-from tofuse.formats.files.trajectory import read_tum
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.formats.export.conversion import convert
+from tofuse.formats.files.trajectory import read_tum
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.scene import Scene
 from tofuse.lab.simulation.scenes import furniture, household
 from tofuse.lab.simulation.scenes.composition import Assembly, placed
 from tofuse.lab.simulation.texture import Material
-from tofuse.formats.export.conversion import convert
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.apps.results.run_json import frames_in_main_model
 
 OUT = Path(__file__).parent / "out"
 COLUMNS, ROWS = 128, 96

@@ -25,16 +25,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, ray_lengths, scaled
 from tofuse.apps.inspection.inspect import inspect_recording
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, ray_lengths, scaled
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import RecordingPlan
 from tofuse.lab.simulation.scene import SCENES, build
-from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.engine.frames.recording import ArraySource, Recording
 
 Frames = list[RangeFrame]
 

@@ -30,14 +30,14 @@ import sequences
 import verdict
 from pairs import roc_area
 from robustness import OURS, agreement, ours, peer, peer_methods
+from tofuse.apps.jobs.judging import judge
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import TofuseError
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pose_deviation import Fit, deviation
 from tofuse.engine.quality.trajectory import align, displacement
-from tofuse.engine.geometry import se3
-from tofuse.apps.jobs.judging import judge
 from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import Recording
 
 NOISE_M, NOISE_RAD = 1e-3, np.radians(0.02)
 # For size 1; other sizes are multiples.

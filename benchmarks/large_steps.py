@@ -27,18 +27,18 @@ from tofuse.engine.arrays import Float64
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import sequences
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.search.pair_agreement import agreement
+from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.search.view_pair import register_pair
+from tofuse.engine.views.prepared_view import PreparedView, prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.lab.methods.features import Features
 from tofuse.lab.methods.fpfh import Fpfh
 from tofuse.lab.methods.plane_sets import PlaneSets
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.search.pair_agreement import agreement
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.search.search import SearchOptions
-from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.engine.search.view_pair import register_pair
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 RIGHT_M, RIGHT_DEG = 0.15, 4.0

@@ -34,8 +34,8 @@ from boards.sequences_board import Sequences
 from boards.statements import statements
 from boards.two_views import TwoViews
 from sequences import DATA, OUT
-from tofuse.formats.files.atomic import write_text
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.formats.files.atomic import write_text
 
 BOARDS: dict[str, Board] = {board.name: board for board in (TwoViews(), Graphs(), Sequences())}
 KEPT = OUT / "leaderboard"

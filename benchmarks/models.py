@@ -15,19 +15,19 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.apps.jobs.run_options import Options, resolve
 from tofuse.engine.arrays import Float64
-from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.config import Config
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.engine.quality.types import Reconstruction
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.cases import CHEST
 from tofuse.lab.experiments.recorded import RecordedScene
 from tofuse.lab.simulation.record import plan, simulate_recording
 from tofuse.lab.simulation.scenes import box
-from tofuse.engine.mapping.config import Config
-from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.apps.jobs.run_options import Options, resolve
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.quality.types import Reconstruction
 
 CASES = {
     "rail": ("rail", {}),

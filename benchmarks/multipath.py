@@ -29,22 +29,22 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.apps.jobs.run_options import Options, resolve
 from tofuse.engine.arrays import Bool, Float32, Float64
-from tofuse.engine.sensor.multipath_correction import Multipath, MultipathCorrector
-from tofuse.engine.quality.trajectory import evaluate_trajectory
 from tofuse.engine.cameras.cameras import ray_lengths
 from tofuse.engine.compute.thread_pool import threads
-from tofuse.lab.simulation import record
-from tofuse.lab.simulation.effects import Effects, Flag
-from tofuse.lab.simulation.render import render
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import Recording
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.apps.jobs.run_options import Options, resolve
+from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.engine.sensor.multipath_correction import Multipath, MultipathCorrector
 from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.engine.frames.frames import RangeFrame
 from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import Recording
+from tofuse.lab.simulation import record
+from tofuse.lab.simulation.effects import Effects, Flag
+from tofuse.lab.simulation.render import render
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "sr4000_corridor"
 SCENES = ("corner", "room", "empty-room", "corridor", "box", "torso")

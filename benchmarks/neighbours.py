@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from sequences import DATA, KINDS
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry.kdtree import KdTree
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.geometry.kdtree import KdTree
 
 _REPEATS, _K = 7, 12
 

@@ -18,17 +18,17 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.apps.calibration.noise_estimation import NoiseFit, estimate_noise
-from tofuse.formats.files.images import read_image
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.noise.choice import noise_model_for
+from tofuse.formats.files.images import read_image
+from tofuse.formats.recordings.open import open_recording
+from tofuse.formats.recordings.still import average_still
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CAMERAS, camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.noise.choice import noise_model_for
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.formats.recordings.still import average_still
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 ZENSE = Pinhole(640, 480, 456.636, 456.226, 342.983, 233.82)

@@ -35,8 +35,8 @@ def ate(times: Sequence[float], poses: object, recording: object) -> str:
     """Errors of a trajectory as text."""
     import numpy as np
 
-    from tofuse.engine.quality.trajectory import evaluate_trajectory
     from tofuse.engine.frames.recording import Recording
+    from tofuse.engine.quality.trajectory import evaluate_trajectory
 
     assert isinstance(recording, Recording)
     if recording.reference is None:

@@ -42,20 +42,27 @@ import tofuse
 from pair_views import TAKEN, recorded
 from peers import o3d_global
 from sequences import DATA, OUT, kinect_loop
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
-from tofuse.lab.simulation.record import simulate
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.search.pair_agreement import agreement
-from tofuse.engine.clouds.any_pair import AnyPair
 from tofuse.engine.alignment.base import Registration
+from tofuse.engine.clouds.any_pair import AnyPair
 from tofuse.engine.clouds.cloud_pair import register_clouds
-from tofuse.engine.search.pose_probability import ACCEPTED, IMAGES, RIGHT_FRACTION, RIGHT_RAD, PoseEvidence, logistic
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.geometry import se3
+from tofuse.engine.search.pair_agreement import agreement
+from tofuse.engine.search.pose_probability import (
+    ACCEPTED,
+    IMAGES,
+    RIGHT_FRACTION,
+    RIGHT_RAD,
+    PoseEvidence,
+    logistic,
+)
+from tofuse.engine.search.view_pair import follow, register_pair
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.engine.search.view_pair import follow, register_pair
+from tofuse.formats.recordings.open import open_recording
+from tofuse.lab.simulation.record import simulate
 
 RIGHT_M, RIGHT_DEG = 0.1, 4.0
 # Ridge penalty: keeps coefficients finite where few pairs are perfectly separable.

@@ -25,17 +25,17 @@ from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.quality.trajectory import align
 from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.graph.castellani import Castellani
+from tofuse.engine.graph.graph import Optimiser, PoseGraph
+from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
+from tofuse.engine.graph.robust import Settings
+from tofuse.engine.quality.trajectory import align
+from tofuse.formats.files.g2o import read_g2o, write_g2o
 from tofuse.lab.methods.charts import Cosines, Quaternion, descend
 from tofuse.lab.methods.elch import Elch
 from tofuse.lab.methods.lu_milios import LuMilios
 from tofuse.lab.simulation.laps import drifting_laps
-from tofuse.engine.graph.castellani import Castellani
-from tofuse.formats.files.g2o import read_g2o, write_g2o
-from tofuse.engine.graph.graph import Optimiser, PoseGraph
-from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
-from tofuse.engine.graph.robust import Settings
 
 FALSE = 0.3  # fraction of false loops
 ODOMETRY = np.array([0.004] * 3 + [np.radians(0.2)] * 3)  # standard deviations, m and rad

@@ -29,8 +29,8 @@ sys.path[:0] = [str(ROOT / "tests" / "helpers"), str(ROOT / "tests" / "recording
 
 from camera_files import MAKERS, OTHERS  # noqa: E402
 from damaged_files import damage  # noqa: E402
-from tofuse.engine.errors import TofuseError  # noqa: E402
 from tofuse.engine.cameras.cameras import Pinhole  # noqa: E402
+from tofuse.engine.errors import TofuseError  # noqa: E402
 from tofuse.engine.frames.frames import RangeFrame  # noqa: E402
 from tofuse.formats.recordings.native import RecordingWriter  # noqa: E402
 from tofuse.formats.recordings.open import open_recording  # noqa: E402

@@ -12,9 +12,9 @@ import numpy as np
 from scoring import Tolerance
 from sequences import kinect_loop
 from tofuse.engine.arrays import Float64
+from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
 from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import Recording
 
 # Reads the candidate references of a recording; empty if there is none.
 References = Callable[[Path, Recording], list[Float64]]

@@ -29,21 +29,21 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
-from tofuse.lab.simulation import scene as scenes
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.models import CameraModel, camera_model
-from tofuse.lab.simulation.paths import look_at, rotation
-from tofuse.lab.simulation.rig import Mount, camera_ring, relative, simulate_rig, wander
-from tofuse.engine.stored_views.view_store import SampledView
-from tofuse.engine.frames.recording import Recording
-from tofuse.formats.recordings.rig import Rig, RigCamera
 from tofuse.apps.rigs.calibrating import calibrate, calibrate_cameras, largest_sigmas
 from tofuse.apps.rigs.checking import compare
 from tofuse.apps.rigs.hand_eye import Track, hand_eye
 from tofuse.apps.rigs.inputs import Camera, open_cameras
 from tofuse.apps.rigs.joint import View, disagreements, refine_together
+from tofuse.engine.arrays import Float64
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.formats.recordings.rig import Rig, RigCamera
+from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CameraModel, camera_model
+from tofuse.lab.simulation.paths import look_at, rotation
+from tofuse.lab.simulation.rig import Mount, camera_ring, relative, simulate_rig, wander
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "azure_kinect_rig"
 STILL = Effects(multipath=False, scatter=0.0, smear=False)

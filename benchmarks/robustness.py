@@ -29,13 +29,13 @@ import stress
 from peers import Method, kiss, o3d, sgicp
 from recorded import RECORDED, Recorded
 from scoring import Part, Score, Truth
+from tofuse.apps.jobs.run_options import Options, resolve
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.quality.consistency import map_consistency
-from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.apps.jobs.run_options import Options, resolve
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import Recording
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.quality.consistency import map_consistency
 
 OURS = "tofuse"
 TUNING_FRAMES = 40

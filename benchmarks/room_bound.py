@@ -15,12 +15,12 @@ import argparse
 
 import numpy as np
 
+from tofuse.engine.mapping.methods import default
+from tofuse.engine.mapping.reconstruction import reconstruct
 from tofuse.engine.quality.trajectory import evaluate_trajectory
 from tofuse.lab.experiments.recording_bound import trajectory_bounds
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan, simulate_recording
-from tofuse.engine.mapping.methods import default
-from tofuse.engine.mapping.reconstruction import reconstruct
 
 EFFECTS = {
     "noise": Effects.none(shot_noise=True, ambient=1.0, mixed_pixels=True, wrap=True),

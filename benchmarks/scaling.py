@@ -31,13 +31,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole, scaled
 from tofuse.engine.compute.thread_pool import run_chunks
 from tofuse.engine.compute.thread_pool import threads as using_threads
-from tofuse.engine.tracking.keyframes import Keyframes
-from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.formats.recordings.open import open_recording
 
 LENGTH = 60  # frames of the sequence that is played forwards and backwards

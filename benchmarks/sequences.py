@@ -17,16 +17,16 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.quality.consistency import poses_of_frames
-from tofuse.formats.files.trajectory import read_tum
 from tofuse.engine.filters.base import Filter, apply_filters
 from tofuse.engine.filters.foreground import Foreground
-from tofuse.lab.simulation.record import simulate
+from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import with_recording_defaults
 from tofuse.engine.mapping.methods import default
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.quality.consistency import poses_of_frames
+from tofuse.formats.files.trajectory import read_tum
 from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.lab.simulation.record import simulate
 
 HERE = Path(__file__).resolve().parent
 OUT = HERE / "out"

@@ -24,19 +24,19 @@ from unittest import mock
 
 import numpy as np
 
+from tofuse.apps.jobs.merging import MergeOptions, merge_files
+from tofuse.apps.jobs.run_options import Options
+from tofuse.apps.jobs.running import run
+from tofuse.apps.results.session_words import probability_text
 from tofuse.engine.arrays import Float64
-from tofuse.engine.quality.trajectory import align, displacement
 from tofuse.engine.geometry import se3
+from tofuse.engine.quality.trajectory import align, displacement
+from tofuse.engine.quality.types import Reconstruction
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import RecordingPlan, plan, write
 from tofuse.lab.simulation.scenes import flat, furniture
 from tofuse.lab.simulation.scenes.composition import Assembly, placed
-from tofuse.apps.jobs.merging import MergeOptions, merge_files
-from tofuse.apps.jobs.running import run
-from tofuse.apps.jobs.run_options import Options
-from tofuse.apps.results.session_words import probability_text
-from tofuse.engine.quality.types import Reconstruction
 
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "sessions"
 RUNS = Path(__file__).resolve().parent / "out" / "sessions"

@@ -32,19 +32,19 @@ import numpy as np
 
 from hours import there_and_back
 from scaling import LENGTH, made_frames
-from tofuse.engine.compute.memory import trim_memory
-from tofuse.engine.compute.spill import Spill, SpillFile
-from tofuse.lab.simulation.record import simulate
+from tofuse.apps.jobs.run_options import Options
+from tofuse.apps.jobs.running import run
 from tofuse.apps.live.device import DeviceError, Settings, Stream
 from tofuse.apps.live.recorder import record
+from tofuse.engine.compute.memory import trim_memory
+from tofuse.engine.compute.spill import Spill, SpillFile
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.mapping.adaptation import with_recording_defaults
 from tofuse.engine.mapping.config import Config, changed, from_method
 from tofuse.engine.mapping.mapper import Mapper
-from tofuse.apps.jobs.running import run
-from tofuse.apps.jobs.run_options import Options
-from tofuse.engine.frames.frames import RangeFrame
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
+from tofuse.lab.simulation.record import simulate
 
 FRAME_BYTES = 6000  # its record, its tracking, and their entries in lists
 RUN_BYTES = 10_000  # 1 MB per 100 runs

@@ -20,16 +20,16 @@ from scipy.sparse.csgraph import connected_components
 
 from scoring import Truth
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation import scene as simulated
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.passing import Kind, Passing
 from tofuse.lab.simulation.record import plan, write
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import ArraySource, Recording
 
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "robustness"
 

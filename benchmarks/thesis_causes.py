@@ -20,6 +20,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
+from tofuse.engine.mapping.progress import Silent
 from tofuse.lab.experiments.cases import CASES, DRAWS, run_case
 from tofuse.lab.experiments.page import NAMES
 from tofuse.lab.experiments.peaks import sweep_peaks
@@ -27,7 +28,6 @@ from tofuse.lab.experiments.statements import STATEMENTS, Results, judge_all
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.scenes import room
 from tofuse.lab.simulation.texture import Material
-from tofuse.engine.mapping.progress import Silent
 
 _PEAKS_SEEDS = 5
 

@@ -33,15 +33,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import peers
 import sequences
+from tofuse.engine.compute.thread_pool import threads as using_threads
 from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.methods import default
 from tofuse.engine.quality.consistency import map_consistency
 from tofuse.engine.quality.trajectory import evaluate_trajectory
-from tofuse.formats.files.atomic import write_text
-from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import threads as using_threads
 from tofuse.engine.tracking.keyframes import Keyframes
-from tofuse.engine.mapping.methods import default
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.files.atomic import write_text
 
 WARM_UP = 5
 CONSISTENCY_FRAMES = 60

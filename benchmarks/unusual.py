@@ -13,8 +13,10 @@ from functools import partial
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import paths, sensor
 from tofuse.lab.simulation import scene as scenes
@@ -25,8 +27,6 @@ from tofuse.lab.simulation.record import RecordingPlan
 from tofuse.lab.simulation.scenes.composition import Assembly, placed, shell
 from tofuse.lab.simulation.scenes.furniture import chair, plant
 from tofuse.lab.simulation.texture import Material
-from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.engine.frames.recording import ArraySource, Recording
 
 WALL = Material("wall", 0.65, 0.1, "noise", (0.5, 0.5, 0.5))
 GROUND = Material("ground", 0.4, 0.2, "speckle", (0.1, 0.1, 0.1))

@@ -18,11 +18,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.engine.sensor.unwrap_correction import Unwrap
 from tofuse.engine.cameras.cameras import range_from_z
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.sensor.unwrap_correction import Unwrap
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
-from tofuse.engine.frames.frames import RangeFrame
 
 PERIOD_M = 5.0
 SHORTER_M = (2.8, 3.2, 3.6, 4.0)

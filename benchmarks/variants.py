@@ -33,16 +33,16 @@ import sequences
 import stress
 import unusual
 from recorded import RECORDED
-from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable
 from tofuse.apps.inspection.inspect import inspect_recording
-from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.apps.jobs.running import with_findings
 from tofuse.apps.jobs.run_options import Options, resolve
+from tofuse.apps.jobs.running import with_findings
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import IMAGES, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.reconstruction import reconstruct
 
 SEED = 7
 MAX_FRAMES = 100

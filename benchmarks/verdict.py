@@ -30,19 +30,19 @@ import numpy as np
 import sequences
 import stress
 from recorded import RECORDED
+from tofuse.apps.inspection.inspect import inspect_recording
+from tofuse.apps.jobs.run_options import Options, resolve
+from tofuse.apps.jobs.running import with_findings
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import TofuseError
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.quality.checks import tolerance_of
 from tofuse.engine.quality.trajectory import displacement
-from tofuse.apps.inspection.inspect import inspect_recording
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
-from tofuse.engine.quality.checks import tolerance_of
-from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.apps.jobs.running import with_findings
-from tofuse.apps.jobs.run_options import Options, resolve
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import ArraySource, Recording
 
 OUT = sequences.OUT / "recordings" / "verdict"
 # Stride over the raw frames of each scene.

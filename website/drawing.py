@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Float64, UInt8
-from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.lab.simulation import bvh_kernels as bvh
 

@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 
 from drawing import ESTIMATE, TRUTH, Picture
+from tofuse.apps.jobs.run_options import Options
+from tofuse.apps.jobs.running import run
+from tofuse.apps.results.run_json import frames_in_main_model, read_run_json
+from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory import evaluate_trajectory
 from tofuse.formats.files.ply import read_ply
 from tofuse.formats.files.trajectory import read_tum
-from tofuse.engine.geometry import se3
 from tofuse.lab.demo import simulate_to
-from tofuse.apps.jobs.running import run
-from tofuse.apps.jobs.run_options import Options
-from tofuse.apps.results.run_json import frames_in_main_model, read_run_json
 
 ROOT = Path(__file__).resolve().parents[1]
 

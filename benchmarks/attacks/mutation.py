@@ -103,7 +103,8 @@ def _with_camera(make: Callable[[Path], Any], inside: str, format_: str) -> Subj
 
 
 def _depth_png(path: Path) -> None:
-    from tofuse.formats.files.images import png_bytes
+    from tofuse.formats.files.noise_file import read_noise
+from tofuse.formats.files.images import png_bytes
 
     path.write_bytes(png_bytes(np.full((24, 32), 2000, np.uint16)))
 
@@ -129,7 +130,7 @@ def _recording(
 
 def _scans() -> dict[str, Subject]:
     from tofuse.formats.files.e57 import write_e57
-    from tofuse.formats.files.geometry_record import GeometryRecord
+    from tofuse.engine.fusion.geometry_record import GeometryRecord
     from tofuse.formats.files.las import write_las
 
     points = np.random.default_rng(5).normal(size=(60, 3))
@@ -230,7 +231,8 @@ def _small() -> dict[str, Subject]:
     from tofuse.formats.files.trajectory_formats import read_poses
     from tofuse.engine.tracking.base import Step
     from tofuse.apps.jobs import tracked_file
-    from tofuse.engine.mapping.config import changed, from_method, read_changes
+    from tofuse.apps.jobs.run_options import read_changes
+    from tofuse.engine.mapping.config import changed, from_method
     from tofuse.engine.mapping.frame_log import FrameLog
     from tofuse.apps.jobs.tracked_file import TrackedFile
     from tofuse.formats.files.g2o import read_g2o
@@ -291,7 +293,7 @@ def _small() -> dict[str, Subject]:
         "columns": ("imu.csv", "t,ax,ay\n" + "0.1,1,2\n" * 5, read_columns),
         "config": ("a.toml", toml, configure),
         "jobs": ("a.toml", jobs, lambda path: read_jobs([path], run_arguments)),
-        "noise.json": ("noise.json", json.dumps(noise), NoiseModel.load),
+        "noise.json": ("noise.json", json.dumps(noise), read_noise),
     }  # fmt: skip
     found = {}
     for name, (file, text, read) in texts.items():

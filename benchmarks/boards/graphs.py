@@ -14,8 +14,8 @@ import numpy as np
 
 import pose_graphs
 from boards import Board, Score, default_made
-from tofuse.formats.files.g2o import read_g2o, write_g2o
 from tofuse.engine.graph.graph import PoseGraph
+from tofuse.formats.files.g2o import read_g2o, write_g2o
 
 SCENES = ("room", "walk")
 _GTSAM = "GTSAM"

@@ -19,26 +19,35 @@ from tofuse._version import __version__
 
 if TYPE_CHECKING:
     from tofuse.apps.api.result import Result, load, merge, reconstruct
-    from tofuse.engine.errors import InputError, OutputError, RegistrationError, TofuseError
-    from tofuse.engine.quality.change_detection import Change
-    from tofuse.engine.fusion.cloud import Cloud
-    from tofuse.engine.fusion.mesh import Mesh
-    from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, Rational, RayTable
     from tofuse.apps.inspection.inspect import inspect_recording as inspect
-    from tofuse.apps.live.player import Player
-    from tofuse.engine.mapping.config import Config
     from tofuse.apps.jobs.evaluating import Evaluation, evaluate
     from tofuse.apps.jobs.judging import Judgement, judge
-    from tofuse.engine.mapping.mapper import Mapper
-    from tofuse.engine.quality.accuracy import Accuracy
-    from tofuse.engine.graph.graph import LoopRecord, PoseGraph
+    from tofuse.apps.live.player import Player
+    from tofuse.engine.alignment.base import Registration
+    from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, Rational, RayTable
+    from tofuse.engine.clouds.pair import register
+    from tofuse.engine.errors import InputError, OutputError, RegistrationError, TofuseError
     from tofuse.engine.frames.frames import CloudFrame, RangeFrame
     from tofuse.engine.frames.from_arrays import from_arrays
-    from tofuse.formats.recordings.open import open_recording as open  # noqa: A004
     from tofuse.engine.frames.recording import Recording
-    from tofuse.engine.alignment.base import Registration
-    from tofuse.engine.clouds.pair import register
-    from tofuse.engine.quality.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction, SessionChange, SessionPair, SessionRecord
+    from tofuse.engine.fusion.cloud import Cloud
+    from tofuse.engine.fusion.mesh import Mesh
+    from tofuse.engine.graph.graph import LoopRecord, PoseGraph
+    from tofuse.engine.mapping.config import Config
+    from tofuse.engine.mapping.mapper import Mapper
+    from tofuse.engine.quality.accuracy import Accuracy
+    from tofuse.engine.quality.change_detection import Change
+    from tofuse.engine.quality.types import (
+        Component,
+        Diagnostics,
+        FrameRecord,
+        Reason,
+        Reconstruction,
+        SessionChange,
+        SessionPair,
+        SessionRecord,
+    )
+    from tofuse.formats.recordings.open import open_recording as open  # noqa: A004
 
 _HOMES = {
     "Accuracy": "tofuse.engine.quality.accuracy",

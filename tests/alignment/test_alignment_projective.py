@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.geometry import se3
+from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align, points_of
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.geometry import se3
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
-from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align, points_of
-from tofuse.engine.views.surface_options import SurfaceOptions
 
 OPTIONS = ProjectiveOptions()
 MODEL = camera_model("sr4000")

@@ -3,16 +3,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.alignment import tile_sum_kernels as tile_sums
-from tofuse.engine.views.residual_kernels import POINT_SIZE, Residuals
-from tofuse.engine.alignment.spurious_information_kernels import spurious_information
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
+from tofuse.engine.alignment.spurious_information_kernels import spurious_information
+from tofuse.engine.alignment.uncertainty import (
+    Patches,
+    UncertaintyOptions,
+    bounded_by_prior,
+    covariance,
+    covariance_of_patches,
+    patches,
+    with_prior,
+)
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.residual_kernels import POINT_SIZE, Residuals
 from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.engine.alignment.uncertainty import Patches, UncertaintyOptions, bounded_by_prior, covariance, covariance_of_patches, patches, with_prior
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
 GEOMETRY_ONLY = ProjectiveOptions(photometric=False)

@@ -11,13 +11,13 @@ import pytest
 
 import tofuse
 from tofuse.apps.cli.progress import TerminalProgress
+from tofuse.engine.clouds.icp import Icp
 from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
+from tofuse.formats.export.conversion import convert
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
-from tofuse.formats.export.conversion import convert
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.clouds.icp import Icp
 
 
 @pytest.fixture(scope="module")

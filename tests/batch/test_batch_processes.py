@@ -234,7 +234,9 @@ def test_workers_without_tofuse_are_reported(
 
 def test_job_ends_with_its_parent(room_recording: Path, tmp_path: Path) -> None:
     words = [str(tmp_path / "a.jpg"), str(room_recording), "--out", str(tmp_path / "out")]
-    job = subprocess.Popen([sys.executable, "-m", "tofuse.apps.cli.job", *words], stdin=subprocess.PIPE)
+    job = subprocess.Popen(
+        [sys.executable, "-m", "tofuse.apps.cli.job", *words], stdin=subprocess.PIPE
+    )
     assert job.stdin is not None
     job.stdin.close()
     assert job.wait(60) == -signal.SIGKILL

@@ -12,8 +12,8 @@ import pytest
 
 from paths import BENCHMARKS
 from tofuse.engine import parts
-from tofuse.engine.geometry import se3
 from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.geometry import se3
 
 
 class Inline:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from paths import BENCHMARKS
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
 
 
 @pytest.fixture

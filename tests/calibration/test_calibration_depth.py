@@ -13,18 +13,19 @@ from tofuse.apps.calibration.board import Board
 from tofuse.apps.calibration.depth import DepthFit, calibrate_depth, compose
 from tofuse.apps.calibration.plane_views import PlaneView, board_planes, scene_planes
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.formats.recordings.correction_file import read_correction
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
 from tofuse.lab.simulation.sensor import factory_correction
-from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.sensor.depth_correction import DepthCorrection
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 CAMERA = Pinhole(48, 36, 45.0, 45.0, 23.5, 17.5)
@@ -201,7 +202,7 @@ def test_command_writes_correction_that_is_applied(
     command = ["calibrate", "depth", str(folder), "--planes", "1", "--out", str(out)]
     assert main(command) == 0
     assert "planes in" in capsys.readouterr().out
-    first = DepthCorrection.load(out)
+    first = read_correction(out)
     after = open_recording(folder)
     assert after.metadata["corrected"] is True
     moved = (after[0].radial_range - before.radial_range)[before.valid]
@@ -210,7 +211,7 @@ def test_command_writes_correction_that_is_applied(
     assert main(command) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert main([*command, "--overwrite"]) == 0
-    again = DepthCorrection.load(out)
+    again = read_correction(out)
     r = np.linspace(1.2, 3.2, 50)
     change = np.interp(r, again.range_m, again.bias_m) - np.interp(r, first.range_m, first.bias_m)
     assert rms(change) < 0.004

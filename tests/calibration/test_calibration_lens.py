@@ -16,17 +16,17 @@ from tofuse.apps.calibration.board import Board, find_corners
 from tofuse.apps.calibration.board_pose import board_pose
 from tofuse.apps.calibration.lens import BoardView, LensFit, calibrate_lens
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Camera, Fisheye, Pinhole, Rational
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.scenes import checkerboard
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import ArraySource, Recording
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 TRUE = camera_model("sr4000").camera

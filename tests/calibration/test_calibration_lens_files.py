@@ -10,8 +10,8 @@ import pytest
 
 from tofuse.apps.calibration.lens_files import read_lens_file
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Rational
+from tofuse.engine.errors import InputError
 from tofuse.formats.recordings.camera_file import load_camera
 
 ROS = """image_width: 800

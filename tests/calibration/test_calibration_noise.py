@@ -13,19 +13,20 @@ import pytest
 
 from tofuse.apps.calibration.noise_estimation import estimate_noise
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.noise.choice import noise_model_for
+from tofuse.engine.noise.model import NOISE, NoiseModel
+from tofuse.formats.files.noise_file import read_noise
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.engine.noise.choice import noise_model_for
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.noise.model import NOISE, NoiseModel
 
 CAMERA = Pinhole(80, 60, 60.0, 60.0, 39.5, 29.5)
 
@@ -212,12 +213,12 @@ def test_noise_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert "mine, 4 frames in 1 static segment" in text
     recording = open_recording(tmp_path / "rec")
     assert recording.warnings == []
-    assert noise_model_for(recording) == NoiseModel.load(out)
+    assert noise_model_for(recording) == read_noise(out)
     assert main(["noise", str(tmp_path / "rec"), "--out", str(out)]) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert main(["noise", str(tmp_path / "rec"), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert NoiseModel.from_dict(printed["model"]).amplitude == NoiseModel.load(out).amplitude
+    assert NoiseModel.from_dict(printed["model"]).amplitude == read_noise(out).amplitude
     out.write_text('{"schema": 1, "name": "x", "range": {"a": 20, "b": 0}}')
     with pytest.raises(InputError, match="a must be 0 to 5"):
         noise_model_for(recording)

@@ -8,8 +8,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tofuse.engine.cameras.cameras import (
+    BrownConrady,
+    Camera,
+    Fisheye,
+    Pinhole,
+    Rational,
+    RayTable,
+    points_from_z,
+    range_from_z,
+    scaled,
+    z_from_range,
+)
 from tofuse.engine.errors import InputError
-from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable, points_from_z, range_from_z, scaled, z_from_range
 
 PINHOLE = Pinhole(176, 144, 230.0, 231.0, 87.0, 71.5)
 BROWN = BrownConrady(176, 144, 230.0, 231.0, 87.0, 71.5, -0.3, 0.1, 0.001, -0.002, 0.01)

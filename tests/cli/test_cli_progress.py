@@ -13,7 +13,14 @@ import time
 import pytest
 
 from tofuse.apps.cli import progress as module
-from tofuse.apps.cli.progress import Health, JsonProgress, Pace, QuietProgress, TerminalProgress, progress_for
+from tofuse.apps.cli.progress import (
+    Health,
+    JsonProgress,
+    Pace,
+    QuietProgress,
+    TerminalProgress,
+    progress_for,
+)
 from tofuse.engine.quality.types import FrameRecord
 
 

@@ -13,15 +13,15 @@ import pytest
 from browser import changed, chromium, watched
 from cli_calls import call, listing, refuses
 from registration_scenes import bumpy_ball, stone, turn
-from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.apps.jobs import pair as pair_module
+from tofuse.engine.alignment.base import Registration
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.geometry import se3
 from tofuse.formats.files.las import write_las
 from tofuse.formats.files.ply import read_ply, write_ply
 from tofuse.formats.files.pose import read_pose
 from tofuse.formats.files.trajectory import read_tum, tum_text, write_tum
-from tofuse.engine.geometry import se3
-from tofuse.apps.jobs import pair as pair_module
 from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.alignment.base import Registration
 
 FILES = {"registration.json", "transform.txt", "aligned.ply", "report.html"}
 MAP = np.array([512_345.25, 4_012_345.5, 310.0])

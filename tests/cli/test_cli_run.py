@@ -16,26 +16,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.apps.cli.program import main
 from tofuse.apps.cli.parser import DEMO_SCENES, make_parser
+from tofuse.apps.cli.program import main
+from tofuse.apps.jobs import running as run_module
+from tofuse.apps.results.run_json import main_poses
 from tofuse.engine.errors import TofuseError
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.parts import name_of
+from tofuse.engine.quality.types import Component, Reason, Reconstruction
+from tofuse.engine.quality.verdict import ADVICE, REASONS
+from tofuse.formats.export.conversion import convert
+from tofuse.formats.files.g2o import read_g2o
 from tofuse.formats.files.images import read_image, write_png
 from tofuse.formats.files.ply import read_ply
 from tofuse.formats.files.trajectory import read_tum
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab import demo as demo_module
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
-from tofuse.engine.parts import name_of
-from tofuse.apps.jobs import running as run_module
-from tofuse.engine.mapping.config import from_method
-from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.formats.files.g2o import read_g2o
-from tofuse.formats.export.conversion import convert
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.apps.results.run_json import main_poses
-from tofuse.engine.quality.types import Component, Reason, Reconstruction
-from tofuse.engine.quality.verdict import ADVICE, REASONS
 from wrapped_depth import wrapping
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")

@@ -19,9 +19,19 @@ from registration_scenes import (
     turn,
     view,
 )
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
+from tofuse.engine.clouds import shape
+from tofuse.engine.clouds.icp import Icp
 from tofuse.engine.clouds.icp_kernels import transform_points
+from tofuse.engine.clouds.interfaces import Alignment, History, Matches, Points
+from tofuse.engine.clouds.matchers import ClosestPoint
+from tofuse.engine.clouds.metrics import PointToPoint
+from tofuse.engine.clouds.rejectors import MaxDistance
+from tofuse.engine.clouds.selectors import All, Random, Uniform
+from tofuse.engine.clouds.stopping import SmallStep
+from tofuse.engine.clouds.surface_metrics import PointToPlane
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.geometry import se3
 from tofuse.lab.methods.compatibility import (
     AmplitudeCompatibility,
     Boundary,
@@ -38,16 +48,6 @@ from tofuse.lab.methods.correspondence import (
     ProjectionSearch,
 )
 from tofuse.lab.methods.sampling import IntensityGradient, NormalSpace, RandomEachIteration, Voxel
-from tofuse.engine.frames.frames import CloudFrame
-from tofuse.engine.clouds import shape
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.interfaces import Alignment, History, Matches, Points
-from tofuse.engine.clouds.matchers import ClosestPoint
-from tofuse.engine.clouds.metrics import PointToPoint
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.selectors import All, Random, Uniform
-from tofuse.engine.clouds.stopping import SmallStep
-from tofuse.engine.clouds.surface_metrics import PointToPlane
 
 
 def everything(a_view):

@@ -9,25 +9,25 @@ import pytest
 
 import tofuse
 from registration_scenes import box_walls, bumpy_ball, turn
-from tofuse.engine.errors import RegistrationError
-from tofuse.formats.files.geometry_record import GeometryRecord
-from tofuse.formats.files.ply import write_ply
-from tofuse.engine.geometry import se3
+from tofuse.engine.alignment.base import Registration
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.clouds import cloud_pair
+from tofuse.engine.clouds.cloud_agreement import CloudMap, cloud_agreement
+from tofuse.engine.clouds.cloud_pair import register_clouds
+from tofuse.engine.clouds.reduce import averaged
+from tofuse.engine.clouds.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.geometry import se3
+from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
+from tofuse.engine.tracking.pairwise import Pairwise
+from tofuse.formats.files.ply import write_ply
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.lab.simulation.record import plan
-from tofuse.engine.tracking.pairwise import Pairwise
-from tofuse.engine.frames.frames import CloudFrame
-from tofuse.engine.clouds import cloud_pair
-from tofuse.engine.alignment.base import Registration
-from tofuse.engine.clouds.cloud_agreement import CloudMap, cloud_agreement
-from tofuse.engine.clouds.cloud_pair import register_clouds
-from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
-from tofuse.engine.clouds.reduce import averaged
-from tofuse.engine.clouds.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
 
 ANYWHERE = se3.exp([1.0, -0.7, 0.4, 1.9, 0.3, -1.0])
 

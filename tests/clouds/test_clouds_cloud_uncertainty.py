@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from registration_scenes import bumpy_ball, view
-from tofuse.engine.geometry import se3
-from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.clouds.cloud_agreement import CloudMap
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
 from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.geometry import se3
 
 SIZE = 0.05
 # 99.9 % of a chi square of six dimensions.

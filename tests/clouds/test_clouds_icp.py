@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from tofuse.engine import parts
-from tofuse.engine.errors import InputError, RegistrationError
-from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.alignment.base import Registrar
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.clouds.icp import Icp, algorithm_1
 from tofuse.engine.clouds.interfaces import Alignment, Matcher, Matches, Points, Search, Selector
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.errors import InputError, RegistrationError
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.geometry import se3
 
 
 def corner(n, seed, noise=0.0):

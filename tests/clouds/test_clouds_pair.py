@@ -17,14 +17,14 @@ from registration_scenes import (
     turn,
     view,
 )
-from tofuse.formats.files.ply import read_ply
-from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import threads
-from tofuse.lab.methods.variants import Tricp
 from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
 from tofuse.engine.clouds.reduce import averaged
 from tofuse.engine.clouds.remapping import Remapping
 from tofuse.engine.clouds.surface_metrics import PointToPlane
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.geometry import se3
+from tofuse.formats.files.ply import read_ply
+from tofuse.lab.methods.variants import Tricp
 
 
 def source_of(points, T):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from tofuse.engine.filters.neighbours import NeighbourFraction
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.clouds.icp import algorithm_1
+from tofuse.engine.filters.neighbours import NeighbourFraction
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
 
 
 def test_neighbours_of_real_recording(shared_data):

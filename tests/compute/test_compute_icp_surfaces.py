@@ -6,9 +6,14 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tofuse.engine.geometry import se3
 from tofuse.engine.clouds.cloud_shape_kernels import local_shapes, symmetric_eigen
-from tofuse.engine.clouds.cloud_sum_kernels import direction_products, matrix_sums, plane_sums, plane_to_plane_weights
+from tofuse.engine.clouds.cloud_sum_kernels import (
+    direction_products,
+    matrix_sums,
+    plane_sums,
+    plane_to_plane_weights,
+)
+from tofuse.engine.geometry import se3
 from tofuse.engine.geometry.kdtree import KdTree
 
 seeds = st.integers(0, 2**32 - 1)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tofuse.engine.errors import OutputError
 from tofuse.engine.compute.spill import Spill
+from tofuse.engine.errors import OutputError
 
 
 @dataclass(frozen=True, eq=False)

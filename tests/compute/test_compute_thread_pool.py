@@ -8,8 +8,17 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from tofuse.engine.compute.thread_pool import (
+    chunk_bounds,
+    job_pool,
+    run_all,
+    run_chunks,
+    serial_chunks,
+    set_thread_count,
+    thread_count,
+    threads,
+)
 from tofuse.engine.errors import InputError
-from tofuse.engine.compute.thread_pool import chunk_bounds, job_pool, run_all, run_chunks, serial_chunks, set_thread_count, thread_count, threads
 
 
 @pytest.mark.parametrize("size", [0, 1, 2, 15, 16, 17, 1000])

@@ -15,14 +15,14 @@ from camera_files import MAKERS
 from damaged_files import make_native, make_ply
 from made_recordings import CAMERA, make_7scenes, make_sr4000
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.cameras.cameras import Pinhole, RayTable
-from tofuse.formats.export.conversion import convert
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.noise.choice import family_of
-from tofuse.formats.recordings.open import open_recording
-from tofuse.formats.readers.native import NativeSource
 from tofuse.engine.frames.recording import Recording
+from tofuse.engine.noise.choice import family_of
+from tofuse.formats.export.conversion import convert
+from tofuse.formats.readers.native import NativeSource
+from tofuse.formats.recordings.open import open_recording
 
 CHANNELS = ("amplitude_image", "confidence_image", "color_image")
 

@@ -19,15 +19,15 @@ import made_dumps
 import made_phones
 from posed_results import BROWN, DISTANCE, NORMAL, POSED, POSES, SIZE, made_result, plane
 from tofuse.apps.cli.program import main
+from tofuse.apps.export.exporting import export
+from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
 from tofuse.engine.errors import InputError, OutputError
-from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.geometry import se3
 from tofuse.formats.files.ply import read_ply, write_ply
 from tofuse.formats.files.trajectory import write_tum
 from tofuse.formats.files.trajectory_formats import read_poses
-from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
 from tofuse.formats.recordings.open import Opening
-from tofuse.apps.export.exporting import export
 
 PLAIN = Pinhole(*SIZE, 40.0, 41.0, 23.0, 18.0)
 BENT = BrownConrady(*SIZE, 40.0, 41.0, 23.0, 18.0, k1=-0.1, k2=0.02, k3=0.01)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tofuse.engine.errors import InputError
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.files.e57 import write_e57
-from tofuse.formats.files.geometry_record import GeometryRecord
 from tofuse.formats.files.glb import write_glb, write_gltf
 from tofuse.formats.files.las import write_las, write_laz
 from tofuse.formats.files.obj import write_obj

@@ -7,7 +7,7 @@ import pytest
 
 from parsed_glb import parse
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.files.glb import write_glb
 
 

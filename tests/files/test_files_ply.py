@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tofuse.engine.errors import InputError
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.files import ply as plys
-from tofuse.formats.files.geometry_record import GeometryRecord
 from tofuse.formats.files.ply import read_ply, write_ply
 
 CUBE = """ply

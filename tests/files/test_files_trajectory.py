@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.trajectory import associate, associated_poses, read_tum, tum_text, write_tum
 from tofuse.engine.geometry.se3 import exp
+from tofuse.formats.files.trajectory import (
+    associate,
+    associated_poses,
+    read_tum,
+    tum_text,
+    write_tum,
+)
 
 
 def _poses(n: int = 20) -> np.ndarray:

@@ -10,11 +10,11 @@ import pytest
 
 from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.quaternion import from_matrix
 from tofuse.engine.quality.trajectory import evaluate_trajectory
 from tofuse.formats.files.trajectory import write_kitti, write_log, write_tum
 from tofuse.formats.files.trajectory_formats import TimedPoses, read_poses
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.quaternion import from_matrix
 
 RNG = np.random.default_rng(3)
 POSES = np.stack(

@@ -13,15 +13,15 @@ import cv2
 import numpy as np
 import pytest
 
-from tofuse.engine.sensor.scattering_correction import LensScattering
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.background import Background
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.parts import to_dict
+from tofuse.engine.sensor.scattering_correction import LensScattering
+from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 from tofuse.lab.simulation.scenes import box
-from tofuse.engine.parts import to_dict
-from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.engine.frames.frames import RangeFrame
 
 OF_OBJECT = {"torso": ("skin", "hair", "shirt", "trousers", "seat"), "box": ("box",)}
 

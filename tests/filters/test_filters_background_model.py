@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.errors import InputError
 from tofuse.engine.filters.background_model import background_surface, moving_object
 from tofuse.engine.frames.frames import RangeFrame
 

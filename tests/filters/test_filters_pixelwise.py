@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tofuse.engine import parts
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter, Removal, apply_filters
 from tofuse.engine.filters.confidence import Confidence
 from tofuse.engine.filters.distance import Distance
 from tofuse.engine.filters.foreground import Foreground, otsu
-from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 
 NAN = float("nan")

@@ -9,9 +9,9 @@ import pytest
 
 from tofuse.engine.filters.base import Filter, apply_filters
 from tofuse.engine.filters.confidence import Confidence
-from tofuse.lab.methods.filters_temporal import TemporalDeviation, z_deviation
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.formats.recordings.open import open_recording
+from tofuse.lab.methods.filters_temporal import TemporalDeviation, z_deviation
 
 
 def noise(frames: list[RangeFrame], filters: list[Filter]) -> tuple[float, float]:

@@ -10,8 +10,8 @@ import pytest
 
 import made_arrays as made
 import tofuse
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
+from tofuse.engine.errors import InputError
 from tofuse.formats.recordings.open import open_recording
 
 

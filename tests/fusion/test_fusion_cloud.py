@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion import cloud as fusion
 from tofuse.engine.fusion.cloud import CloudBuilder, as_cloud, choose_voxel
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 
 EYE = np.eye(4)
 

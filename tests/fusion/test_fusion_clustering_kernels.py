@@ -6,7 +6,12 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from tofuse.engine.fusion.clustering_kernels import flatten_groups, number_keys, quadric_sums, union_faces
+from tofuse.engine.fusion.clustering_kernels import (
+    flatten_groups,
+    number_keys,
+    quadric_sums,
+    union_faces,
+)
 
 
 def test_keys_are_numbered_in_order_of_appearance() -> None:

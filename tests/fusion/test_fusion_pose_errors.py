@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.cloud import Cloud
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.model import Model
 from tofuse.engine.fusion.pose_errors import _variance, with_pose_errors
 from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.frames.frames import RangeFrame
 
 CAMERA = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)
 SIGMA = 1e-3

@@ -11,22 +11,22 @@ import pytest
 
 from parsed_glb import parse
 from tofuse.apps.cli.program import main
-from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.apps.jobs import run_options as options_module
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.fusion import atlas as atlas_module
+from tofuse.engine.fusion.atlas import MARGIN, plain_atlas, unwrap
+from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
+from tofuse.engine.fusion.colors import NO_COLOR
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.texture import TextureView, baked, exposures, textured
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping import texturing as paint
 from tofuse.formats.files.glb import linear, write_glb
 from tofuse.formats.files.images import png_bytes
 from tofuse.formats.files.obj import write_obj
 from tofuse.formats.files.ply import read_ply
-from tofuse.engine.fusion import atlas as atlas_module
-from tofuse.engine.fusion.atlas import MARGIN, plain_atlas, unwrap
-from tofuse.engine.fusion.colors import NO_COLOR
-from tofuse.engine.fusion.mesh import Mesh
-from tofuse.engine.fusion.texture import TextureView, baked, exposures, textured
-from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
-from tofuse.engine.mapping import texturing as paint
-from tofuse.apps.jobs import run_options as options_module
-from tofuse.engine.frames.frames import RangeFrame
 
 CAMERA = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
 

@@ -9,20 +9,27 @@ import numpy as np
 import pytest
 
 from ball_views import CAMERA, EYE, around_a_ball, frame_of, look, plane_range, sphere_range
+from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
 from tofuse.engine.compute.spill import Spill
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion import layout
+from tofuse.engine.fusion import tsdf_kernels as tsdf
+from tofuse.engine.fusion.block_kernels import (
+    block_key,
+    block_of,
+    index_of,
+    mark_octants,
+    parent_of,
+    voxel_of,
+)
 from tofuse.engine.fusion.model import ModelBuilder
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import DECODED, RangeView, with_camera_correction
 from tofuse.engine.fusion.tsdf import fitting_voxel, fuse_surface
 from tofuse.engine.fusion.upright import upright
 from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
-from tofuse.engine.fusion import tsdf_kernels as tsdf
-from tofuse.engine.fusion.block_kernels import block_key, block_of, index_of, mark_octants, parent_of, voxel_of
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.refinement.refinement import without_errors
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions
 from whole_volume import volume_around

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry.kdtree import KdTree
-from tofuse.engine.compute.thread_pool import threads
 
 
 def all_distances(points, queries):

@@ -10,13 +10,13 @@ import pytest
 from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.lab.methods.elch import Elch
-from tofuse.lab.methods.lu_milios import LuMilios
 from tofuse.engine.graph.castellani import Castellani
-from tofuse.formats.files.g2o import read_g2o, write_g2o
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
 from tofuse.engine.graph.robust import Settings
+from tofuse.formats.files.g2o import read_g2o, write_g2o
+from tofuse.lab.methods.elch import Elch
+from tofuse.lab.methods.lu_milios import LuMilios
 from walked_graph import walk
 
 OPTIMISERS = [LevenbergMarquardt(), Castellani(), LuMilios(), Elch()]

@@ -7,13 +7,13 @@ import pytest
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation.laps import drifting_laps
 from tofuse.engine.graph.chordal import chordal_poses
 from tofuse.engine.graph.descent import Problem
 from tofuse.engine.graph.gnc import GraduatedNonConvexity
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
 from tofuse.engine.graph.robust import Settings
+from tofuse.lab.simulation.laps import drifting_laps
 from walked_graph import SIGMA, walk
 
 SOMEWHERE = se3.exp(np.array([3.0, -1, 2, 0.5, -2, 1]))

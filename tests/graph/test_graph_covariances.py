@@ -11,7 +11,13 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.graph import branches
 from tofuse.engine.graph.branches import Branches
 from tofuse.engine.graph.build import Measured, build_graph
-from tofuse.engine.graph.covariances import MIN_WEIGHT, GraphCovariances, accepted_only, loop_errors, relative_covariance
+from tofuse.engine.graph.covariances import (
+    MIN_WEIGHT,
+    GraphCovariances,
+    accepted_only,
+    loop_errors,
+    relative_covariance,
+)
 from tofuse.engine.graph.graph import Optimisation, PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
 from walks import round_walk, step_of, true_poses

@@ -10,15 +10,22 @@ import pytest
 
 from corner_views import SHARP, corner
 from tofuse.engine.geometry import se3
-from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.graph.build import Measured, build_graph
 from tofuse.engine.graph.covariances import GraphCovariances
-from tofuse.engine.graph.external_sensors import GravityEdges, OdometryEdges, SensorData, SensorPriors, measure_all, with_sensors
+from tofuse.engine.graph.external_sensors import (
+    GravityEdges,
+    OdometryEdges,
+    SensorData,
+    SensorPriors,
+    measure_all,
+    with_sensors,
+)
 from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.refinement.joint_alignment import refine
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
-from tofuse.engine.stored_views.pair_equations import RefineOptions
+from tofuse.engine.refinement.joint_alignment import refine
 from tofuse.engine.refinement.pose_priors import Priors
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.stored_views.pair_equations import RefineOptions
 from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.engine.views.prepared_view import prepare_view
 

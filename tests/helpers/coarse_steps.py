@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tofuse.engine.frames.recording import Recording
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import Recording
 
 
 def without_multipath(

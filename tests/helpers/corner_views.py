@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.views.surface_options import FineScale, SurfaceOptions
 
 CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)

@@ -11,12 +11,12 @@ from made_recordings import (
     pcd_bytes,
     pcd_points,
 )
-from tofuse.formats.files.geometry_record import GeometryRecord
-from tofuse.formats.files.ply import write_ply
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.formats.files.ply import write_ply
+from tofuse.formats.recordings.native import RecordingWriter
 
 
 def make_native(folder: Path) -> None:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions
 

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from made_rooms import BOXES, CAMERA, Box, at, seen
+from tofuse.apps.results.folder import OutputFolder
+from tofuse.apps.results.output import write_result
 from tofuse.engine.arrays import Float64
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.mapping.config import Config, from_method
 from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.search.search import SearchOptions
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import Opening
-from tofuse.engine.search.search import SearchOptions
-from tofuse.apps.results.folder import OutputFolder
-from tofuse.apps.results.output import write_result
 
 QUICK = SearchOptions("full", full_candidates=15, photometric_candidates=5)
 # Two walks that see the same corner of the room from opposite sides.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.geometry import se3
 
 MIDDLE = np.array([0, 0, 2.0])
 

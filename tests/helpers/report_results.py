@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from tofuse.apps.report.extras import ReportExtras
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.cloud import Cloud, CloudBuilder
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.graph.graph import LoopRecord, PoseGraph
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.apps.report.extras import ReportExtras
 from tofuse.engine.quality.samples import FrameSample
 from tofuse.engine.quality.types import Diagnostics, FrameRecord, Reason, Reconstruction
 

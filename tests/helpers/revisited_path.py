@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from corner_views import corner
-from tofuse.engine.geometry import se3
-from tofuse.engine.tracking.base import Step, Tracker
-from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.engine.alignment.base import Registration
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views.view_store import Spacing, ViewStore
+from tofuse.engine.tracking.base import Step, Tracker
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.surface_options import FineScale, SurfaceOptions
 

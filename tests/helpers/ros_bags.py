@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tofuse.engine.geometry import quaternion
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.geometry import quaternion
 from tofuse.engine.geometry.se3 import exp
 from tofuse.formats.readers import ros
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
 
 CAMERA = Pinhole(160, 120, 130.0, 130.0, 79.5, 59.5)
 

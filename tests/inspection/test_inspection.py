@@ -15,22 +15,22 @@ import made_rooms
 import tofuse
 from coarse_steps import without_multipath
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import InputError, OutputError
-from tofuse.formats.files.geometry_record import GeometryRecord
-from tofuse.formats.files.images import read_image
-from tofuse.formats.files.ply import write_ply
-from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.apps.inspection import channels
 from tofuse.apps.inspection.finding import CODES, Finding
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.apps.inspection.planar import Distortion
 from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.jobs.running import with_findings
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.geometry import se3
 from tofuse.engine.quality.types import SelfCalibration
+from tofuse.formats.files.images import read_image
+from tofuse.formats.files.ply import write_ply
+from tofuse.formats.recordings.native import RecordingWriter
 from wrapped_depth import wrapping
 
 CAMERA = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)

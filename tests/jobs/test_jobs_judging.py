@@ -13,20 +13,19 @@ import pytest
 import tofuse
 from made_phones import make_stray
 from tofuse.apps.cli.program import main
+from tofuse.apps.jobs.judging import device_sentence, poses_for, sentence, with_odometry
+from tofuse.apps.results.folder import FILES
 from tofuse.engine.errors import InputError
+from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.config import from_method
+from tofuse.engine.quality.accuracy import Accuracy
 from tofuse.engine.quality.pose_deviation import deviation
 from tofuse.engine.quality.trajectory import align, displacement
-from tofuse.formats.files.geometry_record import GeometryRecord
-from tofuse.formats.files.trajectory import write_tum
-from tofuse.engine.geometry import se3
-from tofuse.engine.tracking.given import GivenPoses
-from tofuse.engine.mapping.config import from_method
-from tofuse.apps.jobs.judging import device_sentence, poses_for, sentence, with_odometry
-from tofuse.engine.quality.accuracy import Accuracy
 from tofuse.engine.refinement.refinement import NoRefinement
-from tofuse.formats.recordings.phones import POSES_BY
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.apps.results.folder import FILES
+from tofuse.engine.tracking.given import GivenPoses
+from tofuse.formats.files.trajectory import write_tum
 
 
 @pytest.fixture(scope="module")

@@ -14,26 +14,26 @@ import made_sessions
 from made_rooms import OTHER, seen
 from made_sessions import made_result, made_result_of, quick
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.trajectory import read_tum
-from tofuse.engine.fusion.texture import textured
-from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.apps.jobs import merging
-from tofuse.engine.mapping import texturing as paint
 from tofuse.apps.jobs import running as run_module
 from tofuse.apps.jobs.merging import merge_sessions, merged_config
-from tofuse.engine.mapping.progress import Silent
-from tofuse.engine.mapping.reconstruction import reconstruct
 from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.jobs.sessions import read_sessions
-from tofuse.engine.frames.frames import CloudFrame
-from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.formats.recordings.open import Opening
 from tofuse.apps.results.folder import OutputFolder
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import read_run_json
 from tofuse.apps.results.session_words import session_sentences
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.fusion.texture import textured
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping import texturing as paint
+from tofuse.engine.mapping.progress import Silent
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.formats.files.trajectory import read_tum
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import Opening
 from written_run_json import run_json
 
 HERE, THERE = made_sessions.HERE[::2], made_sessions.THERE[::2]

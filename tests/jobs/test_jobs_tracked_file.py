@@ -14,20 +14,21 @@ import pytest
 import tofuse
 from made_rooms import BOXES, at, seen
 from tofuse.apps.cli.program import main
+from tofuse.apps.jobs import running as run
+from tofuse.apps.jobs import tracked_file
+from tofuse.apps.jobs.tracked_file import LoggingTracker, ReplayingTracker, TrackedFile
+from tofuse.apps.results.folder import TRACKED
 from tofuse.engine.errors import Ended, InputError, OutputError
+from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.fusion.cloud import as_cloud
 from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.tracking.base import Step, Tracker
+from tofuse.engine.loops.joining import Joining
 from tofuse.engine.mapping import reconstruction as reconstruct
-from tofuse.apps.jobs import running as run, tracked_file
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.frame_log import FrameLog
-from tofuse.apps.jobs.tracked_file import LoggingTracker, ReplayingTracker, TrackedFile
-from tofuse.engine.loops.joining import Joining
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.search.search import SearchOptions
-from tofuse.apps.results.folder import TRACKED
 from tofuse.engine.quality.types import FrameRecord
+from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.tracking.base import Step, Tracker
 from written_run_json import run_json
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.lab.methods.charts import Chart, Cosines, Quaternion, descend
 from tofuse.engine.graph.graph import Gravity
 from tofuse.engine.graph.levenberg import minimise
 from tofuse.engine.graph.robust import Settings
+from tofuse.lab.methods.charts import Chart, Cosines, Quaternion, descend
 from walked_graph import walk
 
 CHARTS = [Quaternion(), Cosines()]

@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.clouds.robust_motion import Pairs, motion_of
+from tofuse.engine.clouds.robust_motion import consensus as consensus_of
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.lab.methods.features import Features
 from tofuse.lab.methods.keypoints import channel_image, keypoints
 from tofuse.lab.methods.sample_consensus import (
@@ -18,11 +23,6 @@ from tofuse.lab.methods.sample_consensus import (
     information_of,
     weakly_constrained_directions,
 )
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.clouds.robust_motion import Pairs, motion_of
-from tofuse.engine.clouds.robust_motion import consensus as consensus_of
-from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
 
 CAMERA = Pinhole(176, 132, 200.0, 200.0, 87.5, 65.5)
 METHODS = ("samples", "compatible")

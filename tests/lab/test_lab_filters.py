@@ -10,17 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import apply_filters
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.lab.methods.window_median_kernels import window_median
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.lab.methods.filters_amplitude import Amplitude
 from tofuse.lab.methods.filters_box import Box
 from tofuse.lab.methods.filters_mask import Mask
 from tofuse.lab.methods.filters_median import Median, local_median
 from tofuse.lab.methods.filters_neighbour_distance import NeighbourDistance
 from tofuse.lab.methods.filters_temporal import TemporalDeviation, z_deviation
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.lab.methods.window_median_kernels import window_median
 
 NAN = float("nan")
 

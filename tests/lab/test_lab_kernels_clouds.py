@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.lab.methods.cloud_search_kernels import grid_search
-from tofuse.lab.methods.symmetric_kernels import symmetric_sums
 from tofuse.lab.methods.featured_tree import FeaturedKdTree
+from tofuse.lab.methods.symmetric_kernels import symmetric_sums
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from registration_scenes import box_walls, rng
-from tofuse.engine.geometry import se3
 from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.lab.methods.kiss import AdaptiveThreshold, Kiss, first_of_voxels
 from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.geometry import se3
+from tofuse.lab.methods.kiss import AdaptiveThreshold, Kiss, first_of_voxels
 
 
 def room(n, seed):

@@ -10,9 +10,17 @@ from scipy.spatial.distance import cdist
 
 from registration_scenes import bumpy_ball, directions, error, relief, rng, stone, turn, view
 from tofuse.engine import parts
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
+from tofuse.engine.clouds.icp import Icp
 from tofuse.engine.clouds.icp_kernels import transform_points
+from tofuse.engine.clouds.interfaces import Alignment, Matches, Points
+from tofuse.engine.clouds.metrics import PointToPoint
+from tofuse.engine.clouds.rejectors import MaxDistance
+from tofuse.engine.clouds.selectors import All
+from tofuse.engine.clouds.stopping import SmallStep
+from tofuse.engine.clouds.surface_metrics import PointToPlane
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.geometry import se3
 from tofuse.lab.methods.comprehensive import Cicp, Comprehensive
 from tofuse.lab.methods.implicit import Implicit
 from tofuse.lab.methods.least_squares_matching import LeastSquaresMatching
@@ -20,14 +28,6 @@ from tofuse.lab.methods.ndt import Ndt
 from tofuse.lab.methods.neighbourhoods import neighbourhood
 from tofuse.lab.methods.robust_metrics import Adaptive, Graduated, estimate_shape
 from tofuse.lab.methods.squared_distance import SquaredDistance, approximant
-from tofuse.engine.frames.frames import CloudFrame
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.interfaces import Alignment, Matches, Points
-from tofuse.engine.clouds.metrics import PointToPoint
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.selectors import All
-from tofuse.engine.clouds.stopping import SmallStep
-from tofuse.engine.clouds.surface_metrics import PointToPlane
 
 EVERY = [Cicp(0.03), LeastSquaresMatching(0.03), Ndt(0.03)]
 

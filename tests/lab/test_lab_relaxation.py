@@ -7,14 +7,14 @@ import pytest
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.lab.experiments.peaks import chain
-from tofuse.lab.methods.elch import Elch
-from tofuse.lab.methods.lu_milios import LuMilios, solve_linear
 from tofuse.engine.graph.build import Measured, build_graph
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.graph.levenberg import minimise
 from tofuse.engine.graph.robust import Settings
 from tofuse.engine.graph.sparse import PairSystem
+from tofuse.lab.experiments.peaks import chain
+from tofuse.lab.methods.elch import Elch
+from tofuse.lab.methods.lu_milios import LuMilios, solve_linear
 
 
 def ring(n: int, noise: float, seed: int = 0, loops: int = 1) -> tuple[PoseGraph, Float64]:

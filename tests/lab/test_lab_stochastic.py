@@ -9,10 +9,10 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.lab.methods.stochastic import Stochastic
 from tofuse.engine.graph.build import Measured, build_graph
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
+from tofuse.lab.methods.stochastic import Stochastic
 
 
 def grid(side: int, noise: float, seed: int) -> PoseGraph:

@@ -9,8 +9,14 @@ import pytest
 
 from registration_scenes import bumpy_ball, error, relief, rng, stone, turn, view
 from tofuse.engine import parts
+from tofuse.engine.alignment.base import Registrar
+from tofuse.engine.clouds.icp import Icp
+from tofuse.engine.clouds.rejectors import MaxDistance
+from tofuse.engine.clouds.selectors import All, Random
+from tofuse.engine.clouds.stopping import SmallStep
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.config import PACKAGES
 from tofuse.lab.methods.compatibility import AmplitudeCompatibility
 from tofuse.lab.methods.correspondence import ClosestInvariant
 from tofuse.lab.methods.variants import (
@@ -22,12 +28,6 @@ from tofuse.lab.methods.variants import (
     SymmetricIcp,
     Tricp,
 )
-from tofuse.engine.mapping.config import PACKAGES
-from tofuse.engine.alignment.base import Registrar
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.selectors import All, Random
-from tofuse.engine.clouds.stopping import SmallStep
 
 
 def vanilla(resolution, points, steps=100):

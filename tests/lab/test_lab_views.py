@@ -10,15 +10,15 @@ import pytest
 
 from registration_scenes import MIDDLE, directions, relief, rng, turn, view
 from tofuse.engine import parts
-from tofuse.engine.geometry import se3
 from tofuse.engine.clouds.icp_kernels import transform_points
+from tofuse.engine.geometry import se3
+from tofuse.engine.refinement.refinement import RefinementMethod
+from tofuse.engine.stored_views.view_store import Spacing, ViewStore
+from tofuse.engine.views.prepared_view import PreparedView
 from tofuse.lab.methods.bergevin import Bergevin
 from tofuse.lab.methods.multiview import Cloud, Pairs, relax_poses
 from tofuse.lab.methods.pulli import Pulli, distribute_errors
 from tofuse.lab.methods.simultaneous import SmallAngles, WilliamsBennamoun, solve_correspondences
-from tofuse.engine.refinement.refinement import RefinementMethod
-from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.engine.views.prepared_view import PreparedView
 
 METHODS = [Bergevin(), Pulli(), WilliamsBennamoun(), SmallAngles()]
 VIEWS = 8

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from tofuse.lab.simulation.models import CAMERAS, noise_of
 from tofuse.engine.noise.model import NOISE
+from tofuse.lab.simulation.models import CAMERAS, noise_of
 
 
 @pytest.mark.parametrize("name", CAMERAS)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.lab.simulation.scene import SCENES, Scene, build
 from tofuse.lab.simulation.scenes import furniture
 from tofuse.lab.simulation.scenes.composition import Assembly

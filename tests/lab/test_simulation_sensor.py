@@ -7,16 +7,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.models import CAMERAS, camera_model
 from tofuse.lab.simulation.render import RenderedFrame, render
 from tofuse.lab.simulation.scene import Hits, Sequence, build
-from tofuse.formats.recordings.correction_file import corrected_depth
 
 SMALL = Pinhole(44, 36, 57.0, 57.0, 21.5, 17.5)
 # Without blur, so that sums over sub-rays are exact.

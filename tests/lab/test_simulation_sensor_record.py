@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.geometry import se3
 from tofuse.formats.files.images import read_image
 from tofuse.formats.files.ply import read_ply
 from tofuse.formats.files.trajectory import read_tum
-from tofuse.engine.geometry import se3
+from tofuse.formats.readers.native import NativeSource
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan, simulate, simulate_recording
 from tofuse.lab.simulation.scene import build
-from tofuse.formats.readers.native import NativeSource
 
 
 @pytest.fixture(scope="module")

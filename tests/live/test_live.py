@@ -25,14 +25,14 @@ from fake_cameras import (
     infrared_counts,
 )
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import InputError, OutputError
-from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, Rational
 from tofuse.apps.live.device import DeviceError, Stream, device, devices, is_installed
 from tofuse.apps.live.player import Player
 from tofuse.apps.live.recorder import QUEUE_FRAMES, record
-from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, Rational
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.mapping.mapper import Mapper
 
 Install = Callable[..., None]
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from tofuse.engine import parts
+from tofuse.engine.alignment.base import Registration
 from tofuse.engine.arrays import Float64
+from tofuse.engine.clouds.icp import algorithm_1
 from tofuse.engine.errors import InputError, RegistrationError
+from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.engine.graph.build import Measured, build_graph
-from tofuse.formats.files.given_loops import read_loops
 from tofuse.engine.loops.loops import Confirmation, LoopDetector, PriorLoop, mean_error
 from tofuse.engine.loops.nearby import Nearby, yaw
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.engine.frames.frames import CloudFrame
-from tofuse.engine.alignment.base import Registration
-from tofuse.engine.clouds.icp import algorithm_1
+from tofuse.formats.files.given_loops import read_loops
+from tofuse.lab.simulation.peaks import peaks_views
 
 
 def pose(x: float = 0.0, z: float = 0.0, *, heading: float = 0.0, pitch: float = 0.0) -> Float64:

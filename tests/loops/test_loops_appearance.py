@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
 from tofuse.engine.loops.appearance import Appearance
 from tofuse.engine.loops.revisits import Revisits
-from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.search.search import SearchOptions
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.engine.views.descriptor import mutual_dissimilarity, view_descriptor
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 
 CAMERA = Pinhole(96, 72, 78.0, 78.0, 47.5, 35.5)
 ALL = Spacing(angle=0, distance=0)

@@ -6,16 +6,16 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Registration
 from tofuse.engine.geometry import se3
-from tofuse.engine.tracking.base import Step
-from tofuse.engine.mapping.backend import BackEnd
-from tofuse.engine.mapping.config import from_method
-from tofuse.engine.mapping.progress import Stopwatch
 from tofuse.engine.graph.external_sensors import SensorPriors
 from tofuse.engine.graph.graph import LoopRecord
 from tofuse.engine.loops.loops import ClosedLoop
 from tofuse.engine.loops.neighbour_check import degraded_neighbours
-from tofuse.engine.alignment.base import Registration
+from tofuse.engine.mapping.backend import BackEnd
+from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.progress import Stopwatch
+from tofuse.engine.tracking.base import Step
 
 SIGMA = np.array([0.003] * 3 + [0.002] * 3)
 SIDEWAYS = se3.exp(np.array([0.08, 0.0, 0.0, 0.0, 0.0, 0.0]))

@@ -10,18 +10,18 @@ import pytest
 import revisited_path
 from corner_views import corner
 from revisited_path import ALL, DRIFT, pushed
+from tofuse.engine.alignment.base import Registration
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import revisits
 from tofuse.engine.loops.candidates import revisited
 from tofuse.engine.loops.information_gain import InformationGain
 from tofuse.engine.loops.loops import PriorLoop
 from tofuse.engine.loops.revisits import Revisits
-from tofuse.engine.stored_views.view_store import SampledView, ViewStore
-from tofuse.engine.alignment.base import Registration
 from tofuse.engine.search.pose_probability import ACCEPTED
+from tofuse.engine.search.verification import FitQuality
+from tofuse.engine.stored_views.view_store import SampledView, ViewStore
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.engine.search.verification import FitQuality
 
 turn = revisited_path.turn  # the fixture
 

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.quality.trajectory import evaluate_trajectory
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.mapping.adaptation import adapted
+from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.quality.trajectory import evaluate_trajectory
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
-from tofuse.engine.mapping.adaptation import adapted
-from tofuse.engine.mapping.config import from_method
-from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.frames.recording import ArraySource, Recording
 
 WIDTH, HEIGHT = 54, 42
 

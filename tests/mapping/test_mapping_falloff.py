@@ -7,21 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import ray_lengths
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.adaptation import adapted
+from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.falloff import estimate_falloff
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
-from tofuse.engine.mapping.adaptation import adapted
-from tofuse.engine.mapping.config import from_method
-from tofuse.engine.mapping.falloff import estimate_falloff
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
-from tofuse.engine.views.surface_options import SurfaceOptions
 
 
 @pytest.fixture(scope="module")

@@ -12,17 +12,17 @@ import pytest
 from corner_views import corner
 from revisited_path import Drifting, away_and_back
 from tofuse.engine.geometry import se3
-from tofuse.engine.tracking.base import Step
+from tofuse.engine.graph.graph import LoopRecord
+from tofuse.engine.graph.levenberg import LevenbergMarquardt
+from tofuse.engine.loops.loops import ClosedLoop
+from tofuse.engine.loops.revisits import Revisits
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.live_poses import DELAY, LiveLoops, LivePoses
 from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.graph.graph import LoopRecord
-from tofuse.engine.graph.levenberg import LevenbergMarquardt
-from tofuse.engine.loops.loops import ClosedLoop
-from tofuse.engine.refinement.refinement import NoRefinement
-from tofuse.engine.loops.revisits import Revisits
 from tofuse.engine.quality.types import FrameRecord
+from tofuse.engine.refinement.refinement import NoRefinement
+from tofuse.engine.tracking.base import Step
 
 COUNT = 24
 # As uncertain as the drift is large, so that the graph corrects it.

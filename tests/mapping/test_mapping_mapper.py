@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 
 import tofuse
+from tofuse.engine.compute.thread_pool import thread_count
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import thread_count
-from tofuse.lab.methods.filters_temporal import TemporalDeviation
-from tofuse.lab.simulation.peaks import peaks_views
-from tofuse.engine.parts import part
+from tofuse.engine.graph.graph import Optimisation, Optimiser
+from tofuse.engine.loops.loops import PriorLoop
 from tofuse.engine.mapping.config import changed, from_method
 from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.graph.graph import Optimisation, Optimiser
-from tofuse.engine.loops.loops import PriorLoop
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.parts import part
+from tofuse.lab.methods.filters_temporal import TemporalDeviation
+from tofuse.lab.simulation.peaks import peaks_views
 
 # Fine enough for few frames, and fast.
 CONFIG = changed(

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from made_rooms import at, seen
-from tofuse.engine.tracking.base import Step
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.preparation import FilteredFrame
+from tofuse.engine.tracking.base import Step
 
 
 def add(observations, frame, T):

@@ -11,20 +11,19 @@ import pytest
 
 from report_results import lonely
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import InputError
-from tofuse.engine.quality.trajectory import displacement
-from tofuse.engine.geometry import se3
+from tofuse.apps.results.run_json import read_run_json
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.engine.graph.external_sensors import GravityEdges, OdometryEdges
 from tofuse.engine.mapping.config import changed, from_method
 from tofuse.engine.mapping.priors import with_prior
 from tofuse.engine.mapping.reconstruction import device_up, reconstruct
-from tofuse.engine.graph.external_sensors import GravityEdges, OdometryEdges
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.open import open_recording
-from tofuse.formats.recordings.phones import POSES_BY
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.apps.results.run_json import read_run_json
+from tofuse.engine.quality.trajectory import displacement
 from tofuse.engine.quality.types import FrameRecord
+from tofuse.formats.recordings.open import open_recording
 
 # Only the poses matter: the model is coarse.
 COARSE = changed(from_method("default"), {"fusion": {"voxel_m": 0.1}}, where="test")

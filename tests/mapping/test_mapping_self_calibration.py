@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 
 from boxes_in_room import views_in_room
-from tofuse.engine.sensor.camera_errors import CameraErrors
-from tofuse.engine.quality.trajectory import displacement
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.record import simulate
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import changed, from_method
 from tofuse.engine.mapping.progress import Silent
 from tofuse.engine.mapping.reconstruction import reconstruct
 from tofuse.engine.mapping.self_calibration import in_words, self_calibrated
 from tofuse.engine.quality.accuracy import Accuracy
+from tofuse.engine.quality.trajectory import displacement
 from tofuse.engine.refinement.calibration_check import CalibrationCheck
 from tofuse.engine.refinement.refinement import Refinement
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.sensor.camera_errors import CameraErrors
 from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate
 from written_run_json import run_json
 
 CAMERA = Pinhole(8, 6, 10.0, 11.0, 3.5, 2.5)

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tofuse.engine.mapping.assessment import single_link_frames
-from tofuse.engine.mapping.tracked_graph import TrackedGraph
+from tofuse.engine.alignment.base import Link, Registration
 from tofuse.engine.graph.graph import LoopRecord
 from tofuse.engine.loops.merged_components import Join
-from tofuse.engine.alignment.base import Link, Registration
+from tofuse.engine.mapping.assessment import single_link_frames
+from tofuse.engine.mapping.tracked_graph import TrackedGraph
 
 FOUND = Registration(np.eye(4), True, 5, 100, 100, 0.1, 0.01, np.eye(6))
 # Frames 0 to 8, three in each component.

@@ -12,12 +12,20 @@ import numpy as np
 import pytest
 
 from paths import DOCS
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
-from tofuse.engine.noise import noise_kernels as kernels
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.engine.noise.model import NOISE, AmplitudeLaw, ConfidenceLaw, NoiseModel, RangeLaw, incidence_cosine
+from tofuse.engine.noise import noise_kernels as kernels
+from tofuse.engine.noise.model import (
+    NOISE,
+    AmplitudeLaw,
+    ConfidenceLaw,
+    NoiseModel,
+    RangeLaw,
+    incidence_cosine,
+)
+from tofuse.formats.files.noise_file import read_noise, write_noise
 
 CAMERA = Pinhole(40, 30, 30.0, 30.0, 19.5, 14.5)
 DARK = NoiseModel("dark", RangeLaw(0.01, 0.0), AmplitudeLaw(0.0, 2.0), ceiling_m=10.0)
@@ -191,8 +199,8 @@ def test_kernel_writes_only_its_rows() -> None:
 
 def test_json_round_trip(tmp_path: Path) -> None:
     for model in NOISE.values():
-        model.save(tmp_path / "noise.json")
-        assert NoiseModel.load(tmp_path / "noise.json") == model
+        write_noise(tmp_path / "noise.json", model)
+        assert read_noise(tmp_path / "noise.json") == model
 
 
 @pytest.mark.parametrize(
@@ -219,7 +227,7 @@ def test_invalid_values_are_refused_by_name(tmp_path: Path, change: dict, messag
     path = tmp_path / "noise.json"
     path.write_text(json.dumps({**NOISE["sr4000"].to_dict(), **change}))
     with pytest.raises(InputError, match=r"noise\.json") as caught:
-        NoiseModel.load(path)
+        read_noise(path)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -228,7 +236,7 @@ def test_invalid_values_are_refused_by_name(tmp_path: Path, change: dict, messag
 def test_invalid_files(tmp_path: Path, text: str) -> None:
     (tmp_path / "noise.json").write_text(text)
     with pytest.raises(InputError, match=r"noise\.json"):
-        NoiseModel.load(tmp_path / "noise.json")
+        read_noise(tmp_path / "noise.json")
 
 
 def test_documented_file_is_valid() -> None:

@@ -21,23 +21,23 @@ import pytest
 
 import tofuse
 from paths import ROOT
-from tofuse.engine import parts
 from tofuse.apps.cli.parser import DEMO_SCENES, make_parser
-from tofuse.formats.files.trajectory import read_tum
-from tofuse.engine.geometry import se3
-from tofuse.lab import demo
-from tofuse.lab.simulation.models import CAMERAS
-from tofuse.engine.mapping.config import PACKAGES, Config, ViewKind, changed, from_method, methods
 from tofuse.apps.jobs.pair import register_files
-from tofuse.engine.graph.graph import LoopRecord
-from tofuse.formats.export.conversion import convert
-from tofuse.engine.alignment.projective import ProjectiveOptions
-from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.engine.alignment.uncertainty import UncertaintyOptions
 from tofuse.apps.results.pair import FILES as PAIR_FILES
 from tofuse.apps.results.pair import pair_json
+from tofuse.engine import parts
+from tofuse.engine.alignment.projective import ProjectiveOptions
+from tofuse.engine.alignment.uncertainty import UncertaintyOptions
+from tofuse.engine.geometry import se3
+from tofuse.engine.graph.graph import LoopRecord
+from tofuse.engine.mapping.config import PACKAGES, Config, ViewKind, changed, from_method, methods
 from tofuse.engine.quality.types import Component
 from tofuse.engine.quality.verdict import REASONS
+from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.formats.export.conversion import convert
+from tofuse.formats.files.trajectory import read_tum
+from tofuse.lab import demo
+from tofuse.lab.simulation.models import CAMERAS
 from written_run_json import run_json
 
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])

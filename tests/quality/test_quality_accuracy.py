@@ -8,21 +8,28 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.engine.quality.trajectory import displacement
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.record import simulate_recording
-from tofuse.engine.quality import accuracy
-from tofuse.engine.quality.accuracy import Accuracy, ObservedErrors, accuracy_of, covariances_of, degenerate_directions, without_degenerate
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
 from tofuse.engine.graph.build import Measured, build_graph
 from tofuse.engine.graph.covariances import GraphCovariances
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
+from tofuse.engine.quality import accuracy
+from tofuse.engine.quality.accuracy import (
+    Accuracy,
+    ObservedErrors,
+    accuracy_of,
+    covariances_of,
+    degenerate_directions,
+    without_degenerate,
+)
+from tofuse.engine.quality.trajectory import displacement
 from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate_recording
 from walks import round_walk, true_poses
 
 N = 14

@@ -7,9 +7,9 @@ import pytest
 
 from made_rooms import BOXES, at, seen, surface
 from made_sessions import HERE, with_moved
-from tofuse.engine.quality.change_detection import changes
-from tofuse.engine.geometry import se3
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.geometry import se3
+from tofuse.engine.quality.change_detection import changes
 
 # The later session runs parallel to the earlier one.
 FIRST = HERE[::2]

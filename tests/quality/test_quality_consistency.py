@@ -14,17 +14,23 @@ import cv2
 import numpy as np
 import pytest
 
+from tofuse.apps.jobs.evaluating import evaluate
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.quality.consistency import Consistency, SurfaceImage, consistency_of_images, map_consistency, poses_of_frames
-from tofuse.formats.files.trajectory import write_tum
-from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
 from tofuse.engine.compute.thread_pool import threads
-from tofuse.apps.jobs.evaluating import evaluate
+from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
-from tofuse.formats.readers.native import NativeSource
 from tofuse.engine.frames.recording import ArraySource, Recording, evenly_spaced
+from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.quality.consistency import (
+    Consistency,
+    SurfaceImage,
+    consistency_of_images,
+    map_consistency,
+    poses_of_frames,
+)
+from tofuse.formats.files.trajectory import write_tum
+from tofuse.formats.readers.native import NativeSource
 
 # A synthetic room, and poses in it -------------------------------------------------------------
 

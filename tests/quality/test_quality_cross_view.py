@@ -5,11 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.quality.cross_view import CrossViewConsistency, PairConsistency, cross_view_consistency, restore_thinned
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.quality.cross_view import (
+    CrossViewConsistency,
+    PairConsistency,
+    cross_view_consistency,
+    restore_thinned,
+)
 
 CAMERA = Pinhole(80, 60, 90.0, 90.0, 39.5, 29.5)
 CENTRE = np.array([0.0, 0.0, 1.5])

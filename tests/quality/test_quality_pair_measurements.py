@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.geometry import se3
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pair_measurements import measured_pairs
 
 

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from tofuse.engine.quality.consistency import SurfaceImage
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
-from tofuse.engine.quality.view_agreement_kernels import agreement_sums, transform_points
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.quality.consistency import SurfaceImage
+from tofuse.engine.quality.view_agreement_kernels import agreement_sums, transform_points
 
 SIZE = (64, 48, 50.0, 51.0, 31.0, 24.0)
 

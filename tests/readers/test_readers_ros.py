@@ -28,13 +28,13 @@ from ros_bags import (
     orbbec,
     real_sense,
 )
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.images import png_bytes
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, Rational
-from tofuse.engine.geometry.se3 import exp, inverse, log
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
-from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.geometry.se3 import exp, inverse, log
+from tofuse.formats.files.images import png_bytes
 from tofuse.formats.readers.maker_bags import RealSenseSource
+from tofuse.formats.recordings.open import open_recording
 
 KINDS = ("ros1", "ros2", "mcap")
 

@@ -11,10 +11,10 @@ import pytest
 import tofuse
 from made_sens import BASELINE_M, COLORS, DEPTH, HEIGHT, WIDTH, make_sens, pose
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.formats.files.geometry_record import GeometryRecord
-from tofuse.formats.files.las import write_las
-from tofuse.engine.geometry.quaternion import to_matrix
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.geometry.quaternion import to_matrix
+from tofuse.formats.files.las import write_las
 
 
 def image(recording: tofuse.Recording, k: int) -> RangeFrame:

@@ -20,8 +20,8 @@ import made_tof
 from damaged_files import make_native, make_pcd, make_ply, make_slam6d, make_xyz
 from made_recordings import make_7scenes, make_redwood, make_sr4000, make_tum
 from ros_bags import COUNTS, TOPIC, Bag, orbbec, real_sense
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
+from tofuse.engine.errors import InputError
 from tofuse.formats.recordings.open import open_recording, readers
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from tofuse.engine.arrays import Float32, Intp
-from tofuse.engine.errors import UnreadableFrameError
-from tofuse.formats.files.geometry_record import GeometryRecord
-from tofuse.formats.files.ply import write_ply
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Pinhole, Rational
+from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.formats.files.ply import write_ply
 from tofuse.formats.recordings.open import open_recording
 from tofuse.formats.recordings.organised import find_deprojection
 

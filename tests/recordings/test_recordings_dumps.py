@@ -16,11 +16,11 @@ from phone_checks import check_frames, check_lens
 from posed_results import BROWN, made_result
 from posed_results import POSED as EXPORTED
 from posed_results import POSES as EXPORTED_POSES
+from tofuse.apps.export.exporting import export
+from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.formats.files.pgm import parse_pgm
-from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole
 from tofuse.formats.recordings.open import open_recording
-from tofuse.apps.export.exporting import export
 
 
 def test_polycam(tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ import pytest
 import made_exports as made
 from made_exports import BEHIND_M, CAMERA
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.files.ply import read_ply, write_ply
 from tofuse.formats.files.tiff import read_tiff
-from tofuse.engine.frames.frames import CloudFrame
 from tofuse.formats.recordings.open import open_recording
 
 Maker = Callable[[Path], None]

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import made_kinect as made
-from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.formats.readers import azure_kinect
 from tofuse.formats.recordings.camera_file import ColorCamera
 from tofuse.formats.recordings.open import open_recording
-from tofuse.formats.readers import azure_kinect
 
 SIZES = {
     "NFOV_2X2BINNED": (320, 288, 512, 96, 90),

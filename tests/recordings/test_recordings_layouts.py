@@ -9,11 +9,11 @@ import pytest
 
 import tofuse
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, RayTable, points_from_z
-from tofuse.formats.export.conversion import convert_to
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.formats.export.conversion import convert_to
 from tofuse.formats.recordings.rectify import Rectifier, pinhole_of
 
 BARREL = BrownConrady(96, 72, 70.0, 71.0, 46.0, 37.0, k1=-0.25, k2=0.06, p1=0.002)

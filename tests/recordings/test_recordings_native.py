@@ -10,15 +10,23 @@ import numpy as np
 import pytest
 
 from paths import DOCS
+from tofuse.engine.cameras.cameras import (
+    BrownConrady,
+    Camera,
+    Fisheye,
+    Pinhole,
+    Rational,
+    RayTable,
+    points_from_z,
+)
 from tofuse.engine.errors import InputError, OutputError, UnreadableFrameError
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.geometry.se3 import exp
+from tofuse.engine.sensor.depth_correction import DepthCorrection
 from tofuse.formats.files.images import write_png
 from tofuse.formats.files.trajectory import write_tum
-from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable, points_from_z
-from tofuse.engine.geometry.se3 import exp
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.readers.native import NativeSource
-from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.formats.recordings.native import RecordingWriter
 
 PINHOLE = Pinhole(40, 30, 35.0, 36.0, 19.5, 14.5)
 CAMERAS: list[Camera] = [

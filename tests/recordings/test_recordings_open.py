@@ -10,15 +10,15 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.files.images import write_png
 from tofuse.formats.files.ply import write_ply
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording, readers
-from tofuse.engine.frames.recording import ArraySource, Recording
 
 CAMERA = Pinhole(40, 30, 35.0, 36.0, 19.5, 14.5)
 

@@ -20,15 +20,15 @@ from made_recordings import (
     pcd_bytes,
     pcd_points,
 )
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.geometry.se3 import exp
+from tofuse.engine.noise.choice import family_of
 from tofuse.formats.files.images import write_png
 from tofuse.formats.files.ply import write_ply
 from tofuse.formats.files.trajectory import write_tum
-from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
-from tofuse.engine.geometry.se3 import exp
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.noise.choice import family_of
 from tofuse.formats.recordings.open import open_recording
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from tofuse.engine.errors import InputError
-from tofuse.engine.cameras.cameras import Pinhole, RayTable
-from tofuse.engine.geometry.se3 import inverse, transform
 from tofuse.apps.inspection.inspect import inspect_recording
+from tofuse.engine.cameras.cameras import Pinhole, RayTable
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.formats.recordings.open import open_recording
 from tofuse.engine.frames.recording import Recording
+from tofuse.engine.geometry.se3 import inverse, transform
+from tofuse.formats.recordings.open import open_recording
 
 
 def sr4000_blocks(path: Path) -> list[np.ndarray]:

@@ -9,8 +9,15 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.rig import (
+    Disagreement,
+    Rig,
+    RigCamera,
+    read_rig,
+    with_range_added,
+    write_rig,
+)
 from tofuse.lab.simulation.paths import rotation
-from tofuse.formats.recordings.rig import Disagreement, Rig, RigCamera, read_rig, with_range_added, write_rig
 
 
 def made() -> Rig:

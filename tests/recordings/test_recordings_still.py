@@ -10,17 +10,22 @@ import numpy as np
 import pytest
 
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import UnreadableFrameError
-from tofuse.formats.files.images import read_image
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.lab.simulation.record import simulate_recording
+from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
-from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.engine.noise.choice import noise_model_for
-from tofuse.formats.recordings.open import open_recording
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.formats.recordings.still import average_of, average_still, change_between, stationary_intervals
+from tofuse.engine.noise.choice import noise_model_for
 from tofuse.engine.noise.model import NoiseModel, RangeLaw
+from tofuse.formats.files.images import read_image
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import open_recording
+from tofuse.formats.recordings.still import (
+    average_of,
+    average_still,
+    change_between,
+    stationary_intervals,
+)
+from tofuse.lab.simulation.record import simulate_recording
 
 CAMERA = Pinhole(120, 96, 100.0, 100.0, 59.5, 47.5)
 SIGMA = 0.02

@@ -12,8 +12,8 @@ import pytest
 import made_tof
 from made_phones import DEPTH, HEIGHT, WIDTH
 from made_tof import ADI_LENS, adi_frame
-from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.cameras.cameras import Rational
+from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.formats.recordings.open import open_recording
 
 

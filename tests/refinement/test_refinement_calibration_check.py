@@ -9,15 +9,20 @@ import numpy as np
 import pytest
 
 from aligned_surfaces import OPTIONS, path, surfaces
-from tofuse.engine.quality.trajectory import displacement
 from tofuse.engine.geometry import se3
-from tofuse.engine.stored_views import pair_equation_kernels as kernels
-from tofuse.engine.refinement.calibration_check import CalibrationCheck, check_calibration, proposal, significance_of
+from tofuse.engine.quality.trajectory import displacement
+from tofuse.engine.refinement.calibration_check import (
+    CalibrationCheck,
+    check_calibration,
+    proposal,
+    significance_of,
+)
 from tofuse.engine.refinement.camera_response import response
 from tofuse.engine.refinement.joint_alignment import Refined, align_pairs, refine
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, longest_loop
-from tofuse.engine.stored_views.pair_equations import Round
 from tofuse.engine.refinement.pose_priors import Priors
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.stored_views.pair_equations import Round
 from tofuse.engine.stored_views.view_store import SampledView
 
 
@@ -32,7 +37,9 @@ def kept(offset: float, views: int = 12) -> tuple[list[SampledView], Refined]:
 def test_range_offset_raises_alarm(monkeypatch):
     views, refined = kept(0.06)
     # With many pairs, a part of them and of their points is as conclusive.
-    monkeypatch.setattr("tofuse.engine.refinement.calibration_check._MAX_PAIRS", len(refined.pairs) // 2)
+    monkeypatch.setattr(
+        "tofuse.engine.refinement.calibration_check._MAX_PAIRS", len(refined.pairs) // 2
+    )
     some = check_calibration(views, refined, OPTIONS, Priors.none())
     monkeypatch.undo()
     found = check_calibration(views, refined, OPTIONS, Priors.none())

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement import plane_kernels as kernels
-from tofuse.engine.compute.thread_pool import threads
-from tofuse.lab.experiments.bound import mean_distance, mean_distances, pose_covariances
-from tofuse.lab.experiments.peaks import PoseErrors, peaks_bound, peaks_bound_quantiles, run_peaks
-from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.engine.refinement.common_planes import PlaneOptions, refine_clouds
 from tofuse.engine.refinement.plane_refinement import Planes
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.engine.frames.frames import CloudFrame
+from tofuse.lab.experiments.bound import mean_distance, mean_distances, pose_covariances
+from tofuse.lab.experiments.peaks import PoseErrors, peaks_bound, peaks_bound_quantiles, run_peaks
+from tofuse.lab.simulation.peaks import peaks_views
 
 
 def nudged(poses, size, seed=0):

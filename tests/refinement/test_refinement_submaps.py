@@ -11,12 +11,22 @@ from aligned_surfaces import away, drifted, path, surfaces
 from refined_submaps import refined
 from tofuse.engine.compute.spill import Scratch
 from tofuse.engine.geometry import se3
-from tofuse.engine.stored_views import view_store as of_views
 from tofuse.engine.refinement.calibration_check import CalibrationCheck, combine_checks
 from tofuse.engine.refinement.refinement import Joint
 from tofuse.engine.refinement.submaps import partition, submaps
-from tofuse.engine.stored_views.view_store import SampledView, Spacing, ViewStore, candidate_pairs, overlaps
-from tofuse.engine.views.descriptor import mutual_dissimilarity, pairwise_dissimilarity, similar_views
+from tofuse.engine.stored_views import view_store as of_views
+from tofuse.engine.stored_views.view_store import (
+    SampledView,
+    Spacing,
+    ViewStore,
+    candidate_pairs,
+    overlaps,
+)
+from tofuse.engine.views.descriptor import (
+    mutual_dissimilarity,
+    pairwise_dissimilarity,
+    similar_views,
+)
 
 COUNT = 40
 

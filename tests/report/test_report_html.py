@@ -14,22 +14,31 @@ import numpy as np
 import pytest
 
 from report_results import lonely, make_room
-from tofuse.engine.errors import OutputError
-from tofuse.engine.fusion.cloud import Cloud, empty_cloud
-from tofuse.engine.fusion.colors import NO_COLOR, display_colors
-from tofuse.engine.fusion.mesh import Mesh
-from tofuse.engine.fusion.pose_errors import UNKNOWN_M
-from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.graph.graph import LoopRecord
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.apps.report import plots, thumbnails
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.fields import fields
 from tofuse.apps.report.html import write_report
 from tofuse.apps.report.packing import pack
-from tofuse.apps.report.scene import MAX_FACES, PITCH, YAW, Scene, make_scene, opening_yaw, packed, render_thumbnail
+from tofuse.apps.report.scene import (
+    MAX_FACES,
+    PITCH,
+    YAW,
+    Scene,
+    make_scene,
+    opening_yaw,
+    packed,
+    render_thumbnail,
+)
 from tofuse.apps.report.subject import Subject
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.errors import OutputError
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.fusion.cloud import Cloud, empty_cloud
+from tofuse.engine.fusion.colors import NO_COLOR, display_colors
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.pose_errors import UNKNOWN_M
+from tofuse.engine.geometry import se3
+from tofuse.engine.graph.graph import LoopRecord
 from tofuse.engine.quality.samples import FrameSample, FrameSamples
 from tofuse.engine.quality.types import Component, FrameRecord, Reason
 from unpacked import unpack

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from registration_scenes import relief, view
-from tofuse.engine.geometry import se3
-from tofuse.formats.recordings.open import SingleView
-from tofuse.engine.alignment.base import Registration
 from tofuse.apps.report import thumbnails
 from tofuse.apps.report.pair import MAX_POINTS, PairScene, distance_colors, distances, packed, still
 from tofuse.apps.results.pair import LocalView, PairResult
+from tofuse.engine.alignment.base import Registration
+from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.open import SingleView
 from unpacked import unpack
 
 T = se3.exp([0.1, -0.05, 0.02, 0.02, 0.1, -0.05])

@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from made_results import contents, result, torn
-from tofuse.engine.errors import InputError, OutputError
-from tofuse.formats.files.staging import beside
-from tofuse.lab.demo import _check_simulated
 from tofuse.apps.results.folder import OutputFolder, check_output, finish_interrupted, is_result
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import read_run_json
+from tofuse.engine.errors import InputError, OutputError
+from tofuse.formats.files.staging import beside
+from tofuse.lab.demo import _check_simulated
 
 
 @pytest.mark.parametrize("what", ["new", "old", "lock", "component", "file"])

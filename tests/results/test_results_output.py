@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 
 from made_results import contents, result, torn
-from tofuse.engine.errors import InputError, OutputError
-from tofuse.formats.files.pcd import read_pcd
-from tofuse.formats.files.staging import beside
+from tofuse.apps.export.exporting import export
 from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.results import output
-from tofuse.apps.export.exporting import export
 from tofuse.apps.results.folder import OutputFolder, component_number, is_result
 from tofuse.apps.results.loading import load_result
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import frames_in_main_model, plain, read_run_json
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.quality.types import FrameRecord
+from tofuse.formats.files.pcd import read_pcd
+from tofuse.formats.files.staging import beside
 from wavy_surface import waves
 from written_run_json import run_json
 

@@ -12,19 +12,19 @@ import tofuse
 from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.trajectory import read_tum
-from tofuse.engine.geometry import se3
-from tofuse.lab.simulation.rig import camera_ring, relative
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.formats.recordings.rig import Rig, RigCamera, read_rig, write_rig
 from tofuse.apps.report.scene import CAMERA_COLORS
 from tofuse.apps.report.section_parts import upright
 from tofuse.apps.rigs.calibrating import Calibration, calibrate_cameras, moves
 from tofuse.apps.rigs.inputs import Camera, unique_names
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.formats.files.trajectory import read_tum
+from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import open_recording
+from tofuse.formats.recordings.rig import Rig, RigCamera, read_rig, write_rig
+from tofuse.lab.simulation.rig import camera_ring, relative
 
 # Three cameras, neighbours 25 degrees apart.
 STANDS = [

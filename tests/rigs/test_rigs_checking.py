@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tofuse.apps.rigs.checking import compare, compare_in_scene
 from tofuse.engine.geometry import se3
 from tofuse.formats.recordings.rig import Rig, RigCamera
-from tofuse.apps.rigs.checking import compare, compare_in_scene
 
 SIGMA = np.array([0.0006] * 3 + [np.radians(0.03)] * 3)
 

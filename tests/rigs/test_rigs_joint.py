@@ -12,13 +12,13 @@ import pytest
 from scipy.stats import chi2
 
 from rig_scene import looked_at
-from tofuse.engine.geometry import se3
-from tofuse.lab.simulation.rig import camera_ring, relative
-from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.apps.rigs.joint import RigView, disagreements, refine_together
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.apps.rigs.joint import RigView, disagreements, refine_together
+from tofuse.lab.simulation.rig import camera_ring, relative
 
 
 def distorted(frame: RangeFrame, by: np.ndarray) -> RangeFrame:

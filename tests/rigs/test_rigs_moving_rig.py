@@ -7,19 +7,19 @@ import pytest
 
 from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
-from tofuse.lab.simulation.paths import look_at, rotation
-from tofuse.engine.mapping.config import changed, from_method
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.formats.recordings.rig import RigSource
 from tofuse.apps.rigs.calibrating import Calibration, calibrate_cameras
 from tofuse.apps.rigs.hand_eye import HandEye, Track, hand_eye
 from tofuse.apps.rigs.inputs import Camera
 from tofuse.apps.rigs.moving_rig import _initial_offset, _JointViews, _too_uncertain
 from tofuse.apps.rigs.rig_trajectory import refined
 from tofuse.apps.rigs.run import reconstruct_rig
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.config import changed, from_method
+from tofuse.formats.recordings.rig import RigSource
+from tofuse.lab.simulation.paths import look_at, rotation
 
 CLOCK = 0.012
 COUNT = 18

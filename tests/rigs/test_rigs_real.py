@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from tofuse.engine.geometry import se3
-from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.apps.rigs.calibrating import calibrate_cameras
 from tofuse.apps.rigs.inputs import open_cameras
 from tofuse.apps.rigs.joint import RigView, disagreements
+from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views.view_store import SampledView
 
 
 @pytest.mark.slow

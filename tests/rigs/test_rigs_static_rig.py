@@ -9,14 +9,14 @@ import pytest
 
 from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
-from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
-from tofuse.lab.simulation.rig import camera_ring, relative
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.apps.rigs.calibrating import Calibration, calibrate_cameras
 from tofuse.apps.rigs.inputs import Camera
 from tofuse.apps.rigs.static_rig import minimum_cost_lag
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.lab.simulation.rig import camera_ring, relative
 
 STANDS = [
     camera_ring((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + (k - 0.5) * np.radians(25))[0] for k in (0, 1)

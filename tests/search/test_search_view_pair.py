@@ -9,19 +9,19 @@ import pytest
 
 import tofuse
 from made_rooms import BOXES, CAMERA, OTHER, at, seen, surface
-from tofuse.engine.geometry import se3
+from tofuse.engine.alignment.base import PROBABLE
+from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
 from tofuse.engine.search.pair_agreement import Agreement, agreement
-from tofuse.engine.alignment.base import PROBABLE
-from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
 from tofuse.engine.search.pose_probability import ACCEPTED, PoseEvidence
-from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
-from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.engine.search.verification import FitStatistics
 from tofuse.engine.search.view_pair import follow, register_pair
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
 
 # 40 degrees and 0.5 m apart.
 A, B = at(-0.4, 0.3, 0.1), at(-0.1, 0.7, 0.8)

@@ -5,6 +5,7 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.formats.recordings.correction_file import read_correction, write_correction
 
 
 def test_curve_is_linear_between_knots_and_constant_outside() -> None:
@@ -25,9 +26,9 @@ def test_saved_correction_is_loaded(tmp_path, with_pixels) -> None:
     pixel = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32) * 0.01
     one = DepthCorrection(np.linspace(0, 5, 11), np.sin(np.arange(11.0)), pixel)
     one = one if with_pixels else DepthCorrection(one.range_m, one.bias_m)
-    one.save(tmp_path / "correction.npz")
+    write_correction(tmp_path / "correction.npz", one)
     assert [p.name for p in tmp_path.iterdir()] == ["correction.npz"]
-    two = DepthCorrection.load(tmp_path / "correction.npz")
+    two = read_correction(tmp_path / "correction.npz")
     measured = np.full((3, 4), 2.34, np.float32)
     np.testing.assert_array_equal(one.correct(measured), two.correct(measured))
 
@@ -47,7 +48,7 @@ def test_invalid_files_are_refused_in_one_line(tmp_path, arrays, message) -> Non
     path = tmp_path / "correction.npz"
     np.savez(path, **arrays)
     with pytest.raises(InputError, match=message) as error:
-        DepthCorrection.load(path)
+        read_correction(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -57,16 +58,16 @@ def test_invalid_and_missing_npz_files_are_refused(tmp_path, content) -> None:
     path = tmp_path / "correction.npz"
     path.write_bytes(content)
     with pytest.raises(InputError):
-        DepthCorrection.load(path)
+        read_correction(path)
     with pytest.raises(InputError):
-        DepthCorrection.load(tmp_path / "missing.npz")
+        read_correction(tmp_path / "missing.npz")
 
 
 def test_objects_are_not_unpickled(tmp_path) -> None:
     path = tmp_path / "correction.npz"
     np.savez(path, range_m=np.array([{}], object), bias_m=np.zeros(1))
     with pytest.raises(InputError):
-        DepthCorrection.load(path)
+        read_correction(path)
 
 
 def test_images_of_another_size_are_refused() -> None:

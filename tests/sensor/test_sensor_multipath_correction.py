@@ -8,16 +8,21 @@ import numpy as np
 import pytest
 
 from multipath_corner import CAMERA, FLOOR, GAIN, LEFT, PERIOD_M, RIGHT, Seen
-from tofuse.engine.sensor.multipath_correction import Multipath
-from tofuse.engine.filters.raw_amplitude import tof_image
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
+from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.sensor.multipath import (
+    GainEstimator,
+    MultipathEstimate,
+    MultipathModel,
+    ToFImage,
+)
+from tofuse.engine.sensor.multipath_correction import Multipath
+from tofuse.engine.sensor.raw_amplitude import tof_image
 from tofuse.lab.simulation import record
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
-from tofuse.engine.mapping.config import changed, from_method
-from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
-from tofuse.engine.sensor.multipath import GainEstimator, MultipathEstimate, MultipathModel, ToFImage
 
 WALL = ((0.2, 0.1, -0.9747), -2.5)
 

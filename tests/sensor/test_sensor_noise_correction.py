@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.engine.sensor.noise_correction import Noise
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.mapping.adaptation import with_recording_defaults
-from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.mapping.adaptation import with_recording_defaults
+from tofuse.engine.mapping.config import changed, from_method
 from tofuse.engine.noise.model import NOISE, AmplitudeLaw, NoiseModel, RangeLaw
+from tofuse.engine.sensor.noise_correction import Noise
+from tofuse.formats.files.noise_file import write_noise
 
 CAMERA = Pinhole(60, 50, 60.0, 60.0, 29.5, 24.5)
 MINE = NoiseModel("mine", RangeLaw(0.004, 0.003), AmplitudeLaw(0.0, 1.5))
@@ -59,7 +60,7 @@ def test_stated_sigma_and_clouds_are_unchanged():
 
 
 def test_default_method_uses_noise_model_of_recording(tmp_path):
-    MINE.save(tmp_path / "noise.json")
+    write_noise(tmp_path / "noise.json", MINE)
     config = with_recording_defaults(from_method("default"), recording(tmp_path))
     assert model_of(config) == MINE
     # It is preserved by run.json.
@@ -79,7 +80,7 @@ def test_only_known_camera_families_have_noise_model(tmp_path):
 
 
 def test_configured_noise_model_takes_precedence(tmp_path):
-    NOISE["kinect1"].save(tmp_path / "noise.json")
+    write_noise(tmp_path / "noise.json", NOISE["kinect1"])
     config = replace(from_method("default"), corrections=(Noise(MINE),))
     assert model_of(with_recording_defaults(config, recording(tmp_path))) == MINE
 

@@ -10,17 +10,23 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.engine.sensor.unwrap_correction import Unwrap
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.images import write_png
 from tofuse.engine.cameras.cameras import Pinhole, range_from_z
 from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.sensor.unwrap_kernels import NEIGHBOURS, pass_messages
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.record import plan
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.sensor.frequencies import SPEED_OF_LIGHT, combined
-from tofuse.engine.sensor.unwrap import UnwrapOptions, _Blocks, _shift_surfaces, count_periods, on_surface
+from tofuse.engine.sensor.unwrap import (
+    UnwrapOptions,
+    _Blocks,
+    _shift_surfaces,
+    count_periods,
+    on_surface,
+)
+from tofuse.engine.sensor.unwrap_correction import Unwrap
+from tofuse.engine.sensor.unwrap_kernels import NEIGHBOURS, pass_messages
+from tofuse.formats.files.images import write_png
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import plan
 
 PERIOD = 5.0
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.sensor.wrapped import Wrapped
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.mapping.methods import default
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.mapping.methods import default
+from tofuse.engine.sensor.wrapped import Wrapped
 
 PERIOD = 5.0
 CAMERA = Pinhole(176, 144, 229.0, 229.0, 87.5, 71.5)

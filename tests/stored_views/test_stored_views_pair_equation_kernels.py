@@ -9,11 +9,11 @@ import pytest
 
 from corner_views import SHARP, corner, unpack
 from pair_equations import KNOWN, pair_equations
-from tofuse.engine.geometry import se3
+from tofuse.engine.alignment.projective import points_of
 from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.alignment.projective import points_of
 from tofuse.engine.views.surface_options import SurfaceOptions
 
 SETTINGS = (0.05, 1.0, 0.1, 0.01, 4.0, 0.5)  # exposure, scales, slack, robust, cosine

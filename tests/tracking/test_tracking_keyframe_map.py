@@ -9,10 +9,10 @@ import pytest
 
 from made_rooms import OTHER, at, seen, surface
 from tofuse.engine.geometry import se3
-from tofuse.engine.tracking import keyframe_map
-from tofuse.engine.tracking.keyframe_map import Keyframe, KeyframeMap, Relocalizer
 from tofuse.engine.search.search import SearchOptions
 from tofuse.engine.search.verification import FitStatistics
+from tofuse.engine.tracking import keyframe_map
+from tofuse.engine.tracking.keyframe_map import Keyframe, KeyframeMap, Relocalizer
 
 VIEW = surface(seen(at(0, 0.3, 0), 0))
 

@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.tracking import hypotheses, keyframe_map
+from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
-from tofuse.engine.tracking import hypotheses, keyframe_map
-from tofuse.engine.tracking.keyframes import Keyframes
-from tofuse.engine.mapping.config import changed, from_method
-from tofuse.engine.frames.frames import CloudFrame
-from tofuse.formats.recordings.open import open_recording
 
 MODEL = camera_model("sr4000")
 BAD = 4  # index of the corrupted frame

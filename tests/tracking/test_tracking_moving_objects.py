@@ -8,22 +8,27 @@ import cv2
 import numpy as np
 import pytest
 
-from tofuse.engine.geometry import se3
+from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
-from tofuse.engine.tracking import moving_object_kernels as kernels
-from tofuse.engine.geometry.rigid_motion_kernels import distance_and_angle
 from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rigid_motion_kernels import distance_and_angle
+from tofuse.engine.search.pair_agreement import agreement
+from tofuse.engine.tracking import moving_object_kernels as kernels
+from tofuse.engine.tracking.moving_objects import (
+    Moving,
+    MovingObjects,
+    _robust_scale,
+    without_pixels,
+)
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
-from tofuse.engine.tracking.moving_objects import Moving, MovingObjects, _robust_scale, without_pixels
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.search.pair_agreement import agreement
-from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
-from tofuse.engine.views.surface_options import SurfaceOptions
 
 FRAMES = 18
 NEAR = 1.3  # m

@@ -11,13 +11,13 @@ import pytest
 from coarse_steps import without_multipath
 from made_rooms import CAMERA, at, seen
 from tofuse.engine.geometry import se3
+from tofuse.engine.search.verification import FitQuality, FitStatistics
 from tofuse.engine.tracking import selection
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.tracking.motion import FrameTime, MotionModel
 from tofuse.engine.tracking.selection import Selection
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.engine.search.verification import FitQuality, FitStatistics
 
 SHARP = SurfaceOptions(radii=(2,))
 # A camera that translates and turns slowly.
@@ -195,9 +195,9 @@ def test_new_component_continues_motion() -> None:
 @pytest.mark.slow
 def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
     """Steps of 26 cm: a wall fits anywhere, and the objects before it are out of reach."""
-    from tofuse.engine.quality.trajectory import displacement
     from tofuse.engine.mapping.config import changed, from_method
     from tofuse.engine.mapping.reconstruction import reconstruct
+    from tofuse.engine.quality.trajectory import displacement
 
     recording = without_multipath(tmp_path, "rail", "ifm-o3r", every=20, frames=16)
     changes = {"refinement": {"part": "none"}, "fusion": {"voxel_m": 0.1}}
@@ -212,9 +212,9 @@ def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
 @pytest.mark.slow
 def test_starts_along_corridor_correct_short_prediction(tmp_path) -> None:
     """Steps of 14, 37 and 46 cm: the walls fit anywhere, and the prediction is too short."""
-    from tofuse.engine.quality.trajectory import displacement
     from tofuse.engine.mapping.config import changed, from_method
     from tofuse.engine.mapping.reconstruction import reconstruct
+    from tofuse.engine.quality.trajectory import displacement
 
     recording = without_multipath(tmp_path, "corridor", "sr4000", every=12)
     config = changed(from_method("default"), {"fusion": {"voxel_m": 0.1}}, where="test")

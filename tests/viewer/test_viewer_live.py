@@ -12,12 +12,12 @@ from light_report import write_light_report
 
 from browser import changed, chromium, watched
 from tofuse.apps.jobs import running as run_module
-from tofuse.engine.mapping.progress import Silent
-from tofuse.apps.jobs.running import run
 from tofuse.apps.jobs.run_options import Options
-from tofuse.engine.frames.frames import CloudFrame
+from tofuse.apps.jobs.running import run
 from tofuse.apps.viewer.coverage import Coverage
 from tofuse.apps.viewer.server import serve, stop
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.mapping.progress import Silent
 
 needs_viser = pytest.mark.skipif(
     importlib.util.find_spec("viser") is None, reason="viser is not installed"
@@ -57,9 +57,9 @@ class Recorder(Silent):
 @pytest.mark.slow
 @needs_viser
 def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser, monkeypatch):
-    from tofuse.engine.mapping.progress import CombinedProgress
     from tofuse.apps.viewer.live_view import LiveView
     from tofuse.apps.viewer.server import address
+    from tofuse.engine.mapping.progress import CombinedProgress
 
     same = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply")
     quick = {"end": 4, "method": "thesis"}

@@ -18,14 +18,14 @@ import pytest
 from browser import chromium, watched
 from report_results import ROOM, circle, make_room, view
 from tofuse.apps.cli.program import main
-from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.formats.export.conversion import convert
-from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.apps.report.html import write_report
 from tofuse.apps.results.folder import OutputFolder
 from tofuse.apps.results.output import write_result
 from tofuse.apps.viewer.report_server import FrameImages, ReportServer, report_pages
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.formats.export.conversion import convert
 
 CAMERA = Pinhole(64, 48, 64 * 1.4, 64 * 1.4, 32, 24)
 # The world is tilted and the model not shown upright: in other axes, and from rolled cameras.

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
+from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable, ray_lengths
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.views.extended_planes import with_extended_planes
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.projection import Projection
-from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.views.surface_options import FineScale, SurfaceOptions
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
-from tofuse.engine.views import residual_kernels as kernels
-from tofuse.engine.geometry import rigid_motion_kernels as rigid_motions
 from tofuse.engine.alignment import step_kernels as steps
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
+from tofuse.engine.geometry import rigid_motion_kernels as rigid_motions
+from tofuse.engine.geometry import se3
+from tofuse.engine.views import residual_kernels as kernels
 from tofuse.engine.views.projection import Projection
 
 CAMERA = Pinhole(24, 18, 30.0, 30.0, 11.5, 8.5)

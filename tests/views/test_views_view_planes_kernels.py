@@ -9,7 +9,12 @@ import pytest
 
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.engine.compute.partition import median
-from tofuse.engine.views.view_planes_kernels import albedo_image, fit_planes, halve, smooth_and_slope
+from tofuse.engine.views.view_planes_kernels import (
+    albedo_image,
+    fit_planes,
+    halve,
+    smooth_and_slope,
+)
 
 CAMERA = Pinhole(40, 30, 45.0, 45.0, 19.5, 14.5)
 LENS = BrownConrady(40, 30, 45.0, 45.0, 19.5, 14.5, k1=-0.2, k2=0.05, p1=0.01, p2=-0.005)

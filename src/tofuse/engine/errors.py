@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 _MAX_LENGTH = 600  # maximum characters of a problem: text quoted from a file may have any length
@@ -47,3 +48,22 @@ class OutputError(TofuseError):
 
 class RegistrationError(TofuseError):
     """Two views can't be registered (no points, no overlap)."""
+
+
+_REMEDIES = {
+    errno.ENOSPC: "free some space, or choose another folder",
+    errno.EDQUOT: "free some space, or choose another folder",
+    errno.EACCES: "choose a folder that you may write to",
+    errno.EPERM: "choose a folder that you may write to",
+    errno.EROFS: "choose a folder that you may write to",
+    errno.ENOENT: "create its folder first",
+    errno.ENOTDIR: "choose a path whose parents are folders",
+    errno.EISDIR: "choose the path of a file",
+}
+
+
+def output_error(error: OSError, path: str | Path) -> OutputError:
+    """Return the error that `path` can't be written, with reason and remedy."""
+    reason = (error.strerror or str(error)).lower()
+    remedy = _REMEDIES.get(error.errno or 0, "choose another place for it")
+    return OutputError(f"can't be written ({reason})", where=path, remedy=remedy)

@@ -17,23 +17,23 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from tofuse.apps.cli.progress import TerminalProgress
-from tofuse.engine.errors import InputError
-from tofuse.engine.filters.foreground import Foreground
-from tofuse.engine.mapping.adaptation import adapted
-from tofuse.engine.mapping.config import Config, changed, from_method
 from tofuse.apps.jobs.evaluating import Evaluation, evaluate
 from tofuse.apps.jobs.merging import merge as merge_results
-from tofuse.engine.mapping.progress import Progress
-from tofuse.engine.mapping.reconstruction import reconstruct as reconstruct_recording
-from tofuse.engine.mapping.reconstruction import view_kind
 from tofuse.apps.jobs.report_files import write_report_files
 from tofuse.apps.jobs.running import quick_findings, with_findings
-from tofuse.engine.loops.loops import PriorLoop
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.quality.accuracy_card import SEPARATOR, card
 from tofuse.apps.results.folder import OutputFolder
 from tofuse.apps.results.loading import load_result
 from tofuse.apps.results.output import write_result
+from tofuse.engine.errors import InputError
+from tofuse.engine.filters.foreground import Foreground
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.mapping.adaptation import adapted
+from tofuse.engine.mapping.config import Config, changed, from_method
+from tofuse.engine.mapping.progress import Progress
+from tofuse.engine.mapping.reconstruction import reconstruct as reconstruct_recording
+from tofuse.engine.mapping.reconstruction import view_kind
+from tofuse.engine.quality.accuracy_card import SEPARATOR, card
 from tofuse.engine.quality.types import Reconstruction
 
 if TYPE_CHECKING:

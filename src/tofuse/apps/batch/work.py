@@ -19,7 +19,7 @@ from typing import Any
 from tofuse._version import __version__
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
-from tofuse.formats.files.atomic import output_error
+from tofuse.engine.errors import output_error
 from tofuse.formats.files.locking import locked
 
 # Runs the command, and ends when its parent does.

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float64
 from tofuse.apps.calibration.board import Board
-from tofuse.engine.geometry import se3
+from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.geometry import se3
 
 
 def board_pose(camera: Camera, corners: Float64, board: Board) -> tuple[Float64, float] | None:

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.engine.errors import InputError, OutputError
-from tofuse.formats.files.atomic import make_folder, replacing
-from tofuse.formats.files.reading import is_file, is_folder
 from tofuse.engine.cameras.cameras import Camera, RayTable
-from tofuse.formats.recordings.camera_file import SCHEMA, camera_fields, read_json
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import Recording
+from tofuse.formats.files.atomic import make_folder, replacing
+from tofuse.formats.files.reading import is_file, is_folder
+from tofuse.formats.recordings.camera_file import SCHEMA, camera_fields, read_json
 
 _LENS = ("schema", "model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
 _METADATA = (

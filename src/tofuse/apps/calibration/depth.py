@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from tofuse.engine.arrays import Float64, Intp
 from tofuse.apps.calibration.plane_views import PlaneView
-from tofuse.engine.errors import InputError
+from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.errors import InputError
 from tofuse.engine.normal import robust_sigma
 from tofuse.engine.sensor.depth_correction import DepthCorrection
 

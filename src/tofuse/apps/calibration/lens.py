@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from tofuse.engine.arrays import Float64
 from tofuse.apps.calibration.board import Board, board_image, find_corners
 from tofuse.apps.calibration.board_pose import board_pose, pose_of
-from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
+from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Camera, Fisheye, Pinhole
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import Recording, evenly_spaced
+from tofuse.engine.geometry import se3
 
 MIN_VIEWS = 4
 _MAX_FRAMES = 160  # maximum number of frames in which the board is searched

@@ -17,8 +17,8 @@ from tofuse.apps.batch.table import write_table
 from tofuse.apps.batch.workers import LocalWorkers, Workers
 from tofuse.apps.cli.progress import emit, progress_for
 from tofuse.apps.cli.run_arguments import run_arguments
-from tofuse.engine.errors import Ended, InputError, TofuseError
 from tofuse.engine.compute.cores import usable_cores
+from tofuse.engine.errors import Ended, InputError, TofuseError
 
 _RETRIES = 3
 _MAX_LISTED = 10  # recordings without a result that the summary names

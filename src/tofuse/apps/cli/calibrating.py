@@ -12,14 +12,14 @@ from tofuse.apps.calibration.depth import calibrate_depth, compose
 from tofuse.apps.calibration.lens import calibrate_lens
 from tofuse.apps.calibration.lens_files import read_lens_file
 from tofuse.apps.calibration.plane_views import board_planes, scene_planes
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.atomic import make_folder, replacing
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.formats.recordings.camera_file import camera_fields
-from tofuse.formats.recordings.correction_file import read_correction
-from tofuse.formats.recordings.open import Opening, open_recording
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.formats.files.atomic import make_folder, replacing
+from tofuse.formats.recordings.camera_file import camera_fields
+from tofuse.formats.recordings.correction_file import read_correction, write_correction
+from tofuse.formats.recordings.open import Opening, open_recording
 
 # Data for JSON, lines to print, and warnings.
 Summary = tuple[dict[str, Any], list[str], list[str]]
@@ -77,7 +77,7 @@ def depth(arguments: argparse.Namespace) -> Summary:
         correction = fit.correction if previous is None else compose(previous, fit.correction)
         make_folder(arguments.out.parent)
         with replacing(arguments.out) as temporary:
-            correction.save(temporary)
+            write_correction(temporary, correction)
         lines.append(f"written to {arguments.out}")
         if previous is not None:
             lines.append("it includes the correction that the recording already had")

@@ -15,8 +15,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rich.console import Console
 from rich.table import Table
 
-from tofuse.apps.cli.progress import JsonProgress, QuietProgress, TerminalProgress, emit, escaped, progress_for
+from tofuse.apps.cli.progress import (
+    JsonProgress,
+    QuietProgress,
+    TerminalProgress,
+    emit,
+    escaped,
+    progress_for,
+)
 from tofuse.engine.quality.types import Reason, Reconstruction
+from tofuse.formats.files.noise_file import write_noise
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -56,9 +64,9 @@ def _progress_unless_json(
 
 def run(arguments: argparse.Namespace) -> int:
     """``tofuse run``."""
-    from tofuse.engine.errors import InputError
     from tofuse.apps.jobs.running import exit_status
     from tofuse.apps.jobs.running import run as run_pipeline
+    from tofuse.engine.errors import InputError
     from tofuse.formats.recordings.rig import recordings_of, rig_file_in
 
     options = run_options(arguments)
@@ -90,10 +98,10 @@ def run_options(arguments: argparse.Namespace) -> Options:
 
 def _run_into(arguments: argparse.Namespace, options: Options) -> int:
     """Run, then merge the result into an earlier one, which stays unchanged if that fails."""
-    from tofuse.engine.errors import InputError
     from tofuse.apps.jobs.merging import MergeOptions, check_result, merge_files
     from tofuse.apps.jobs.running import exit_status
     from tofuse.apps.jobs.running import run as run_pipeline
+    from tofuse.engine.errors import InputError
 
     into = arguments.into
     if arguments.view:
@@ -125,9 +133,9 @@ def _run_into(arguments: argparse.Namespace, options: Options) -> int:
 
 def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
     """``tofuse run --rig``."""
-    from tofuse.engine.errors import InputError
     from tofuse.apps.jobs.running import exit_status
     from tofuse.apps.rigs.run import run_rig
+    from tofuse.engine.errors import InputError
 
     for name in (
         "view",
@@ -151,11 +159,11 @@ def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
 
 def _run_live(arguments: argparse.Namespace, options: Options) -> int:
     """Run and show the reconstruction live; then show the result until Ctrl-C."""
-    from tofuse.engine.mapping.progress import CombinedProgress
     from tofuse.apps.jobs.running import exit_status
     from tofuse.apps.jobs.running import run as run_pipeline
     from tofuse.apps.viewer.live_view import LiveView
     from tofuse.apps.viewer.server import address, serve, stop
+    from tofuse.engine.mapping.progress import CombinedProgress
 
     server = serve(arguments.port)
     try:
@@ -183,8 +191,8 @@ def view(arguments: argparse.Namespace) -> int:
 
 def _report_server(folder: Path, port: int | None = None) -> ReportServer:
     """Serve the report of a result, with the images of its recording where it still exists."""
-    from tofuse.engine.errors import InputError
     from tofuse.apps.viewer.report_server import FrameImages, ReportServer, report_pages
+    from tofuse.engine.errors import InputError
 
     pages, images = report_pages(folder), None
     try:
@@ -248,8 +256,8 @@ def rig_calibrate(arguments: argparse.Namespace) -> int:
     """``tofuse rig calibrate``."""
     from tofuse.apps.calibration.camera_json import check_new
     from tofuse.apps.cli import rigging
-    from tofuse.formats.recordings.rig import write_rig
     from tofuse.apps.rigs.calibrating import calibrate as calibrate_rig
+    from tofuse.formats.recordings.rig import write_rig
 
     check_new(arguments.out, overwrite=arguments.overwrite)
     with _progress_unless_json(arguments) as progress:
@@ -277,8 +285,8 @@ def rig_calibrate(arguments: argparse.Namespace) -> int:
 def rig_check(arguments: argparse.Namespace) -> int:
     """``tofuse rig check``."""
     from tofuse.apps.cli import rigging
-    from tofuse.formats.recordings.rig import read_rig
     from tofuse.apps.rigs.calibrating import check
+    from tofuse.formats.recordings.rig import read_rig
 
     rig = read_rig(arguments.rig)
     with _progress_unless_json(arguments) as progress:
@@ -352,34 +360,13 @@ def _check_overwrite(arguments: argparse.Namespace) -> None:
         raise InputError("requires --out", where="--overwrite", remedy="pass --out as well")
 
 
-def demo(arguments: argparse.Namespace) -> int:
-    """``tofuse demo``."""
-    from tofuse.engine.compute.thread_pool import threads
-    from tofuse.lab.demo import FAILURE
-    from tofuse.lab.demo import demo as run_demo
-    from tofuse.apps.jobs.running import exit_status
-
-    with progress_for(as_json=arguments.json) as progress, threads(arguments.threads):
-        result = run_demo(
-            FAILURE if arguments.failure else arguments.scene,
-            arguments.out,
-            method=arguments.method,
-            seed=arguments.seed or 0,
-            threads=arguments.threads,
-            overwrite=arguments.overwrite,
-            progress=progress,
-        )
-    print_result(result, arguments.out, as_json=arguments.json)
-    return exit_status(result)
-
-
 def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     """Print a summary of a result, or with `as_json` one JSON line."""
-    from tofuse.engine.quality.accuracy_card import SEPARATOR, card
     from tofuse.apps.results.folder import component_name
-    from tofuse.engine.frames.ranges import in_words
     from tofuse.apps.results.run_json import accuracy_json, plain, reasons_json
     from tofuse.apps.results.session_words import session_sentences
+    from tofuse.engine.frames.ranges import in_words
+    from tofuse.engine.quality.accuracy_card import SEPARATOR, card
 
     d = result.diagnostics
     sessions = session_sentences(result)
@@ -442,38 +429,6 @@ def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
             console.print(f"    {ADVICE[reason.code]}", markup=False, style="dim")
 
 
-def simulate(arguments: argparse.Namespace) -> int:
-    """``tofuse simulate``."""
-    from tofuse.engine.compute.thread_pool import threads
-    from tofuse.lab.demo import simulate_to
-    from tofuse.lab.simulation.passing import Passing
-
-    passing = None
-    if arguments.with_person is not None:
-        passing = Passing("person", arguments.with_person)
-    elif arguments.with_box is not None:
-        passing = Passing("box", arguments.with_box)
-    with progress_for(as_json=False) as progress, threads(arguments.threads):
-        frames = simulate_to(
-            arguments.scene,
-            arguments.out,
-            camera=arguments.camera,
-            seed=arguments.seed or 0,
-            every=arguments.every,
-            frames=arguments.frames,
-            first=arguments.first or 0,
-            texture=not arguments.uniform,
-            passing=passing,
-            without=tuple(w for w in arguments.without.split(",") if w),
-            correction=not arguments.no_correction,
-            imu=arguments.imu,
-            sigma=arguments.sigma,
-            progress=progress,
-        )
-    print(f"{frames} frames in {arguments.out}")
-    return 0
-
-
 def inspect(arguments: argparse.Namespace) -> int:
     """``tofuse inspect``."""
     from tofuse.apps.inspection.inspect import inspect_recording
@@ -522,9 +477,9 @@ def convert(arguments: argparse.Namespace) -> int:
 
 def record(arguments: argparse.Namespace) -> int:
     """``tofuse record``."""
-    from tofuse.engine.errors import InputError
     from tofuse.apps.live.device import device, devices, is_installed
     from tofuse.apps.live.recorder import record as record_stream
+    from tofuse.engine.errors import InputError
 
     console = make_console()
     if arguments.device is None:
@@ -613,7 +568,7 @@ def noise(arguments: argparse.Namespace) -> int:
     recording = Opening.of(arguments.inputs, arguments).open()
     fit = estimate_noise(recording, arguments.name)
     if arguments.out is not None:
-        fit.model.save(arguments.out)
+        write_noise(arguments.out, fit.model)
     if arguments.json:
         emit(fit.to_dict())
         return 0
@@ -637,8 +592,8 @@ def noise(arguments: argparse.Namespace) -> int:
 
 def evaluate(arguments: argparse.Namespace) -> int:
     """``tofuse evaluate``."""
-    from tofuse.engine.quality.trajectory import MAX_GAP_S
     from tofuse.apps.jobs.evaluating import evaluate as evaluate_poses
+    from tofuse.engine.quality.trajectory import MAX_GAP_S
 
     evaluation = evaluate_poses(
         arguments.estimate,
@@ -729,22 +684,4 @@ def export(arguments: argparse.Namespace) -> int:
         overwrite=arguments.overwrite,
     ):
         print(path)
-    return 0
-
-
-def experiments(arguments: argparse.Namespace) -> int:
-    """``tofuse experiments``."""
-    from tofuse.engine.compute.thread_pool import threads
-    from tofuse.lab.experiments.page import run_experiments
-
-    with progress_for(as_json=False) as progress, threads(arguments.threads):
-        page = run_experiments(
-            arguments.out,
-            cases=tuple(c for c in arguments.cases.split(",") if c),
-            seeds=arguments.seeds,
-            seed=arguments.seed or 0,
-            overwrite=arguments.overwrite,
-            progress=progress,
-        )
-    print(f"see {page}")
     return 0

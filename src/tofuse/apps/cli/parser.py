@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -16,6 +17,8 @@ from tofuse.engine.bounds import Bounds
 
 _Number = TypeVar("_Number", int, float)
 
+# Home of the commands of the laboratory, imported by name when one runs.
+_LAB = "tofuse.lab.commands"
 DEMO_SCENES = ("room", "empty-room", "rail", "torso", "box", "peaks")
 EXPORTS = (
     *("pcd", "las", "laz", "e57", "glb", "gltf", "obj", "stl"),
@@ -176,6 +179,7 @@ def _command(
     epilog: str | None = None,
     function: str | None = None,
     reconstructs: bool = False,
+    home: str = "tofuse.apps.cli.commands",
 ) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
@@ -186,9 +190,7 @@ def _command(
     )
 
     def call(arguments: argparse.Namespace) -> int:
-        import tofuse.apps.cli.commands as functions
-
-        run: Callable[[argparse.Namespace], int] = getattr(functions, function or name)
+        run: Callable[[argparse.Namespace], int] = getattr(import_module(home), function or name)
         if not reconstructs:
             return run(arguments)
         from tofuse.engine.compute.ahead import compiling_in_background
@@ -486,6 +488,7 @@ def _demo(commands: Any) -> None:
         "simulate a recording and reconstruct it",
         epilog="The recording is left in DIR/recording, the result in DIR.\n\n" + _EXIT,
         reconstructs=True,
+        home=_LAB,
     )
     what = p.add_mutually_exclusive_group()
     _choice(what, "--scene", DEMO_SCENES, "what to simulate (room)", default="room")
@@ -504,7 +507,7 @@ def _demo(commands: Any) -> None:
 
 
 def _simulate(commands: Any) -> None:
-    p = _command(commands, "simulate", "simulate a recording")
+    p = _command(commands, "simulate", "simulate a recording", home=_LAB)
     _value(p, "scene SCENE", str, ", ".join(DEMO_SCENES))
     _value(p, "--out DIR", Path, "output folder", required=True)
     _value(p, "--camera NAME", str, "camera model (sr4000)", default="sr4000")
@@ -670,7 +673,7 @@ def _export(commands: Any) -> None:
 
 
 def _experiments(commands: Any) -> None:
-    p = _command(commands, "experiments", "reproduce the experiments of the 2010 thesis")
+    p = _command(commands, "experiments", "reproduce the experiments of the 2010 thesis", home=_LAB)
     _value(p, "--out DIR", Path, "folder for the report", required=True)
     _overwrite(p, "existing experiments in DIR")
     _value(p, "--cases NAMES", str, "run only these, separated by commas", default="")

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from tofuse.engine.geometry import se3
-from tofuse.formats.recordings.rig import Rig
 from tofuse.apps.results.run_json import plain
 from tofuse.apps.rigs.calibrating import Calibration
 from tofuse.apps.rigs.checking import CameraMotion
+from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.rig import Rig
 
 
 def tables(rig: Rig) -> list[Table]:

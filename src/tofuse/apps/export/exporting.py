@@ -10,22 +10,22 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.apps.export.colmap import write_colmap
+from tofuse.apps.export.nerfstudio import write_nerfstudio
+from tofuse.apps.results.folder import RESULT, claimed, finish_interrupted, is_result, result_folder
+from tofuse.apps.results.loading import read_cloud, read_mesh
+from tofuse.apps.results.run_json import read_run_json, rotation_up_world, run_json_checked
 from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.texture import baked
+from tofuse.formats.export import exchange
 from tofuse.formats.files.atomic import make_folder
-from tofuse.formats.files.geometry_record import GeometryRecord
 from tofuse.formats.files.images import jpeg_bytes
 from tofuse.formats.files.staging import replacing_folder
 from tofuse.formats.files.stamps import stamp
 from tofuse.formats.files.trajectory import associate, read_tum, write_kitti, write_log
-from tofuse.formats.export import exchange
-from tofuse.engine.fusion.mesh import Mesh
-from tofuse.engine.fusion.texture import baked
-from tofuse.apps.export.colmap import write_colmap
-from tofuse.apps.results.folder import RESULT, claimed, finish_interrupted, is_result, result_folder
-from tofuse.apps.results.loading import read_cloud, read_mesh
-from tofuse.apps.export.nerfstudio import write_nerfstudio
-from tofuse.apps.results.run_json import read_run_json, rotation_up_world, run_json_checked
 
 # Default number of triangles, and the maximum size of a .glb with their texture.
 FACES = 60_000

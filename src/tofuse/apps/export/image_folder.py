@@ -10,22 +10,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Float64, UInt8, UInt16
-from tofuse.engine.sensor.base import Corrector
-from tofuse.engine.sensor.camera_errors import CameraErrors
-from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.formats.files.atomic import make_folder
-from tofuse.formats.files.images import write_png
-from tofuse.engine.fusion.texture import TextureView
-from tofuse.engine.cameras.cameras import Camera, Pinhole, ray_lengths, scaled
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.noise.choice import noise_model_for
-from tofuse.engine.frames.recording import Recording
-from tofuse.formats.recordings.rectify import Rectifier, pinhole_of
-from tofuse.formats.recordings.sources import FileSource
 from tofuse.apps.results.loading import read_cloud
 from tofuse.apps.results.reopening import StoredRecording, reopen, stored_recordings
-from tofuse.apps.results.run_json import frame_covariance, main_poses, read_run_json, run_json_checked
+from tofuse.apps.results.run_json import (
+    frame_covariance,
+    main_poses,
+    read_run_json,
+    run_json_checked,
+)
+from tofuse.engine.arrays import Float32, Float64, UInt8, UInt16
+from tofuse.engine.cameras.cameras import Camera, Pinhole, ray_lengths, scaled
+from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.fusion.texture import TextureView
+from tofuse.engine.noise.choice import noise_model_for
+from tofuse.engine.sensor.base import Corrector
+from tofuse.engine.sensor.camera_errors import CameraErrors
+from tofuse.formats.files.atomic import make_folder
+from tofuse.formats.files.images import write_png
+from tofuse.formats.recordings.rectify import Rectifier, pinhole_of
+from tofuse.formats.recordings.sources import FileSource
 
 DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # m per count
 IMAGES, DEPTH, SIGMA, MASKS = "images", "depth", "sigma", "masks"

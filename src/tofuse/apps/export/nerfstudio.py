@@ -8,13 +8,23 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.apps.export.image_folder import (
+    DEPTH,
+    DEPTH_UNIT_M,
+    IMAGES,
+    MASKS,
+    SIGMA,
+    SIGMA_UNIT_M,
+    ImageFolder,
+    posed_images,
+    subsampled_points,
+)
+from tofuse.engine.cameras.cameras import DISTORTION_ORDER, BrownConrady, Camera, Fisheye, Pinhole
 from tofuse.engine.errors import InputError
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.files.atomic import write_text
-from tofuse.formats.files.geometry_record import GeometryRecord
 from tofuse.formats.files.ply import write_ply
 from tofuse.formats.files.trajectory_formats import OPENGL
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, BrownConrady, Camera, Fisheye, Pinhole
-from tofuse.apps.export.image_folder import DEPTH, DEPTH_UNIT_M, IMAGES, MASKS, SIGMA, SIGMA_UNIT_M, ImageFolder, posed_images, subsampled_points
 
 _FILES = {"file_path": IMAGES, "depth_file_path": DEPTH, "sigma_file_path": SIGMA}
 

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator, Sequence
 import cv2
 import numpy as np
 
-from tofuse.engine.arrays import Float32, Float64
 from tofuse.apps.inspection.finding import Finding, is_significant
 from tofuse.apps.inspection.sample import Sample
+from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 
 # Images are downscaled to this width.

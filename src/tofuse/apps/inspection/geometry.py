@@ -7,11 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import Pinhole, RayTable
 from tofuse.apps.inspection.finding import Finding, is_significant
 from tofuse.apps.inspection.planar import Distortion, fit_distortion
-from tofuse.apps.inspection.sample import VIEW_COLUMNS, Pair, Sample, aligned, aligned_pair, field_of_view, part_starts
+from tofuse.apps.inspection.sample import (
+    VIEW_COLUMNS,
+    Pair,
+    Sample,
+    aligned,
+    aligned_pair,
+    field_of_view,
+    part_starts,
+)
+from tofuse.engine.arrays import Float64
+from tofuse.engine.cameras.cameras import Pinhole, RayTable
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions
 

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.errors import InputError
-from tofuse.engine.cameras.cameras import Pinhole, RayTable
 from tofuse.apps.inspection import channels, geometry, motion_checks, times, values
 from tofuse.apps.inspection.finding import SEVERITIES, Finding
 from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.inspection.values import depths_of
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.cameras.cameras import Pinhole, RayTable
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames.recording import Recording
 from tofuse.engine.noise.choice import family_of
 from tofuse.formats.recordings.open import open_recording
-from tofuse.engine.frames.recording import Recording
 
 # Number of sampled pairs of neighbours, for `inspect` and at the start of a run.
 PAIRS, QUICK_PAIRS = 8, 4

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
 from tofuse.apps.inspection import channels
 from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.sample import Pair, Sample
+from tofuse.engine.arrays import Float64
 
 # Smaller motions count as standing still.
 _STILL_M, _STILL_RAD = 0.01, np.radians(0.5)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tofuse.apps.inspection.values import flying_pixels
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.errors import OutputError
-from tofuse.apps.inspection.values import flying_pixels
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 
 if TYPE_CHECKING:

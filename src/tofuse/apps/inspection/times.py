@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
 from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.sample import Sample, part_starts
+from tofuse.engine.arrays import Float64
 from tofuse.engine.frames.frames import RangeFrame
 
 # Relative tolerance of regular intervals; with a smaller fraction of regular ones the camera was

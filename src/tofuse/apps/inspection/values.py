@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tofuse.engine.arrays import Bool, Float32
 from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.sample import Sample
+from tofuse.engine.arrays import Bool, Float32
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.engine.sensor.unwrap import on_surface
 

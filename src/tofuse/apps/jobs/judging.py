@@ -22,39 +22,42 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from tofuse.apps.results.folder import OutputFolder
+from tofuse.apps.results.output import write_result
+from tofuse.apps.results.run_json import accuracy_json, plain, reasons_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.errors import InputError
-from tofuse.engine.quality.consistency import Consistency, map_consistency
-from tofuse.engine.quality.cross_view import CrossViewConsistency, compare_views, prepare_for_comparison
-from tofuse.engine.quality.pose_deviation import Deviation, fitted
-from tofuse.engine.quality.pose_deviation import deviation as deviation_of
-from tofuse.engine.quality.trajectory import displacement, distances_between
-from tofuse.formats.files.trajectory_formats import TimedPoses, read_poses
-from tofuse.engine.geometry import se3
 from tofuse.engine.compute.thread_pool import threads as use_threads
-from tofuse.engine.tracking.given import GivenPoses
-from tofuse.engine.tracking.motion import FrameTime, find_jumps
-from tofuse.engine.parts import check_number
-from tofuse.engine.quality.checks import accuracy_reasons, cross_view_reasons, tolerance_of
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.ranges import Range, in_words, runs_of
+from tofuse.engine.frames.recording import POSES_BY, Recording, evenly_spaced
+from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import Config, check_views, from_method
 from tofuse.engine.mapping.priors import with_odometry
 from tofuse.engine.mapping.progress import Progress, Silent
 from tofuse.engine.mapping.reconstruction import reconstruct_with_views, view_kind
+from tofuse.engine.parts import check_number
 from tofuse.engine.quality.accuracy import Accuracy, WorstFrame
-from tofuse.engine.quality.pair_measurements import measured_pairs
-from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.formats.recordings.open import Opening, OpeningOptions, read_reference
-from tofuse.formats.recordings.phones import POSES_BY
-from tofuse.engine.frames.recording import Recording, evenly_spaced
-from tofuse.engine.views.prepared_view import PreparedView
 from tofuse.engine.quality.accuracy_card import bound, length
-from tofuse.apps.results.folder import OutputFolder
-from tofuse.apps.results.output import write_result
-from tofuse.engine.frames.ranges import Range, in_words, runs_of
-from tofuse.apps.results.run_json import accuracy_json, plain, reasons_json
+from tofuse.engine.quality.checks import accuracy_reasons, cross_view_reasons, tolerance_of
+from tofuse.engine.quality.consistency import Consistency, map_consistency
+from tofuse.engine.quality.cross_view import (
+    CrossViewConsistency,
+    compare_views,
+    prepare_for_comparison,
+)
+from tofuse.engine.quality.pair_measurements import measured_pairs
+from tofuse.engine.quality.pose_deviation import Deviation, fitted
+from tofuse.engine.quality.pose_deviation import deviation as deviation_of
+from tofuse.engine.quality.trajectory import displacement, distances_between
 from tofuse.engine.quality.types import Reason, Reconstruction, Verdict
 from tofuse.engine.quality.verdict import ranked, verdict_of
+from tofuse.engine.stored_views.view_store import PosedView
+from tofuse.engine.tracking.given import GivenPoses
+from tofuse.engine.tracking.motion import FrameTime, find_jumps
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.formats.files.trajectory_formats import TimedPoses, read_poses
+from tofuse.formats.recordings.open import Opening, OpeningOptions, read_reference
 
 Views = Sequence[PosedView[PreparedView]]
 

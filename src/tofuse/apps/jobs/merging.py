@@ -15,31 +15,31 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.engine.arrays import Float64
-from tofuse.engine.bounds import Bounds
-from tofuse.engine.quality.trajectory import align
-from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import threads as use_threads
-from tofuse.engine.tracking.given import GivenPoses, StatedPose, StatedPoses
-from tofuse.engine.parts import check_number
-from tofuse.engine.mapping.config import Config, from_method
-from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.mapping.texturing import make_texture
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.engine.mapping.reconstruction import push_frames, with_recording_facts
 from tofuse.apps.jobs.run_options import ModelOptions
 from tofuse.apps.jobs.session_pairs import SessionModel, session_changes, session_pairs
 from tofuse.apps.jobs.sessions import Session, read_sessions, sessions_of
-from tofuse.engine.loops.loops import PriorLoop
-from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.frames.recording import Recording, Source
-from tofuse.formats.recordings.sources import JoinedSource
-from tofuse.engine.views.prepared_view import PreparedView
 from tofuse.apps.results.folder import OutputFolder
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.session_words import session_sentences
+from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounds
+from tofuse.engine.compute.thread_pool import threads as use_threads
+from tofuse.engine.frames.recording import Recording, Source
+from tofuse.engine.geometry import se3
+from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.mapping.config import Config, from_method
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.progress import Progress, Silent
+from tofuse.engine.mapping.reconstruction import push_frames, with_recording_facts
+from tofuse.engine.mapping.texturing import make_texture
+from tofuse.engine.parts import check_number
+from tofuse.engine.quality.trajectory import align
 from tofuse.engine.quality.types import Reason, Reconstruction, SessionRecord, in_main_model
 from tofuse.engine.quality.verdict import verdict_of
+from tofuse.engine.stored_views.view_store import PosedView
+from tofuse.engine.tracking.given import GivenPoses, StatedPose, StatedPoses
+from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.formats.recordings.sources import JoinedSource
 
 # Maximum number of view pairs that are registered to join two sessions, and number of searches per
 # session to be joined.

@@ -10,17 +10,17 @@ from time import perf_counter
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.pose import read_pose
-from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.engine.frames.frames import CloudFrame
-from tofuse.formats.recordings.open import SingleView, open_view
-from tofuse.engine.clouds.pair import register
 from tofuse.apps.results.folder import OutputFolder
 from tofuse.apps.results.pair import LocalView, PairResult, pair_folder, write_pair
+from tofuse.engine.arrays import Float64
+from tofuse.engine.clouds.pair import register
+from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.progress import Progress, Silent
+from tofuse.formats.files.pose import read_pose
+from tofuse.formats.recordings.open import SingleView, open_view
 
 # Clouds farther from the origin are centred first: rotation errors would have long lever arms.
 MAX_ORIGIN_DISTANCE_M = 1000.0

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.apps.jobs.judging import device_sentence
+from tofuse.apps.results.folder import RECORDING, component_number
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.errors import UnreadableFrameError
-from tofuse.formats.files.ply import read_ply
 from tofuse.engine.filters.base import apply_filters
-from tofuse.engine.geometry import se3
-from tofuse.engine.parts import name_of
-from tofuse.engine.mapping.config import Config, changed
-from tofuse.apps.jobs.judging import device_sentence
-from tofuse.engine.mapping.reconstruction import past_frames
 from tofuse.engine.frames.frames import CloudFrame, Frame
 from tofuse.engine.frames.recording import Recording
-from tofuse.apps.results.folder import RECORDING, component_number
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.config import Config, changed
+from tofuse.engine.mapping.reconstruction import past_frames
+from tofuse.engine.parts import name_of
 from tofuse.engine.quality.types import Reconstruction
+from tofuse.formats.files.ply import read_ply
 
 _DRAWN_CLOUDS = 12  # views in the report, if they are clouds
 _TRUTH_POINTS = 100_000

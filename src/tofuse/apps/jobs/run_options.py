@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tofuse.engine.filters.raw_amplitude import range_and_amplitude
-from tofuse.engine.errors import InputError
-from tofuse.engine.mapping.config import MIN_MEMORY_MB, Config, ViewKind, changed, from_method, read_changes
-from tofuse.engine.mapping.texturing import TEXTURE
-from tofuse.engine.mapping.priors import Prior
-from tofuse.formats.recordings.open import OpeningOptions
-from tofuse.engine.frames.recording import Recording
 from tofuse.apps.results.run_json import read_run_json
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.mapping.config import MIN_MEMORY_MB, Config, ViewKind, changed, from_method
+from tofuse.engine.mapping.priors import Prior
+from tofuse.engine.mapping.texturing import TEXTURE
+from tofuse.engine.sensor.raw_amplitude import range_and_amplitude
+from tofuse.formats.files.reading import parse_toml, read_text
+from tofuse.formats.recordings.open import OpeningOptions
 
 _SAMPLED = 8  # frames that are checked for the input of --unwrap
 
@@ -155,3 +156,20 @@ def check_guess(options: Options, recording: Recording) -> None:
             where="--guess",
             remedy="put an odometry.txt next to the images, or use --guess previous",
         )
+
+
+def read_changes(path: str | Path) -> dict[str, Any]:
+    """Read the options in a TOML file, or the `config` of a `run.json`.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read or is neither.
+    """
+    path = Path(path)
+    if path.suffix == ".json":
+        config = read_run_json(path).get("config")
+        if not isinstance(config, dict):
+            raise InputError("contains no config", where=path, remedy="pass a run.json of tofuse")
+        return config
+    return parse_toml(read_text(path), where=path)

@@ -14,32 +14,32 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse._version import __version__
-from tofuse.engine.sensor.unwrap_correction import Unwrap
-from tofuse.engine.errors import InputError
-from tofuse.engine.compute.memory import trim_memory
-from tofuse.formats.files.stamps import stamps_of
-from tofuse.engine.fusion.texture import Textured
 from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.inspect import inspect_recording
-from tofuse.engine.mapping.adaptation import adapted
-from tofuse.engine.mapping.config import Config
 from tofuse.apps.jobs.judging import device_sentence
-from tofuse.engine.mapping.texturing import make_texture
-from tofuse.engine.mapping.priors import with_prior
-from tofuse.engine.mapping.progress import Progress, Silent, Stopwatch
-from tofuse.engine.mapping.reconstruction import reconstruct, view_kind
 from tofuse.apps.jobs.report_files import write_report_files
 from tofuse.apps.jobs.run_options import Options, check_guess, check_unwrap, resolve, seed_of
 from tofuse.apps.jobs.tracked_file import TrackedFile
-from tofuse.formats.files.given_loops import read_loops
-from tofuse.engine.loops.loops import PriorLoop
-from tofuse.formats.recordings.open import Opening
-from tofuse.engine.frames.recording import Recording
 from tofuse.apps.results.folder import TRACKED, OutputFolder, check_output
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import plain
+from tofuse.engine.compute.memory import trim_memory
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.fusion.texture import Textured
+from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.mapping.adaptation import adapted
+from tofuse.engine.mapping.config import Config
+from tofuse.engine.mapping.priors import with_prior
+from tofuse.engine.mapping.progress import Progress, Silent, Stopwatch
+from tofuse.engine.mapping.reconstruction import reconstruct, view_kind
+from tofuse.engine.mapping.texturing import make_texture
 from tofuse.engine.quality.types import Reason, Reconstruction, in_main_model
 from tofuse.engine.quality.verdict import ranked, verdict_of
+from tofuse.engine.sensor.unwrap_correction import Unwrap
+from tofuse.formats.files.given_loops import read_loops
+from tofuse.formats.files.stamps import stamps_of
+from tofuse.formats.recordings.open import Opening
 
 
 def run(
@@ -78,7 +78,7 @@ def run(
                 threads=options.threads,
                 loops=job.loops,
                 progress=progress,
-                tracked_file=tracked_file,
+                tracked_frames=tracked_file,
             )
             texture = _texture(job, result, options, progress, watch)
             result = _with_job(result, job, options, watch)

@@ -9,20 +9,30 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, get_args
 
+from tofuse.apps.results.folder import component_name, finish_interrupted, is_result
+from tofuse.apps.results.reopening import (
+    StoredRecording,
+    locate_recording,
+    reopen,
+    stored_recordings,
+)
+from tofuse.apps.results.run_json import (
+    frame_covariance,
+    main_poses,
+    read_run_json,
+    run_json_checked,
+)
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import path_of
-from tofuse.engine.tracking.base import Status
-from tofuse.engine.tracking.given import GivenPoses, StatedPose
-from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.frames.recording import Recording
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config, changed, from_method, kind_of
 from tofuse.engine.mapping.progress import Progress
+from tofuse.engine.tracking.base import Status
+from tofuse.engine.tracking.given import GivenPoses, StatedPose
+from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.formats.files.reading import path_of
 from tofuse.formats.recordings.open import Opening
-from tofuse.engine.frames.recording import Recording
-from tofuse.apps.results.folder import component_name, finish_interrupted, is_result
-from tofuse.apps.results.reopening import StoredRecording, locate_recording, reopen, stored_recordings
-from tofuse.apps.results.run_json import frame_covariance, main_poses, read_run_json, run_json_checked
 
 _REMEDY = "pass the --out of `tofuse run`"
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from types import ModuleType, TracebackType
 from typing import Any, ClassVar, Protocol, Self
 
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import Camera
-from tofuse.engine.parts import discover, from_dict, registered
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
+from tofuse.engine.parts import discover, from_dict, registered
 
 TIMEOUT_S = 2.0  # without a frame until a camera counts as stopped
 

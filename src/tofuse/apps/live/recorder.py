@@ -13,10 +13,10 @@ from typing import Self
 
 import numpy as np
 
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.staging import new_folder
 from tofuse.apps.live.device import DeviceError, Stream
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.files.staging import new_folder
 from tofuse.formats.recordings.native import RecordingWriter
 
 _JOIN_TIMEOUT_S = 5.0  # for a camera's last frame

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
-from tofuse.engine.fusion.pose_errors import UNKNOWN_M
-from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.apps.report import words
 from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import Scene
 from tofuse.apps.report.thumbnails import percentile_range
+from tofuse.engine.arrays import Float64
+from tofuse.engine.fusion.pose_errors import UNKNOWN_M
+from tofuse.engine.normal import OF_95_PERCENT
 
 # Accuracies are stored as bytes on a logarithmic scale from 0.1 mm on, in steps of 4.9 %.
 _MIN_ACCURACY_M = 1e-4

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from tofuse._version import __version__
-from tofuse.formats.files.atomic import write_text
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.policy import secured
 from tofuse.engine.quality.types import Reconstruction
+from tofuse.formats.files.atomic import write_text
 
 # Files of the pages' script; each uses functions of the previous ones.
 SCRIPTS = (

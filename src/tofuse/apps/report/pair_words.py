@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tofuse.apps.results.pair import PairResult
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.apps.results.pair import PairResult
 
 _MIN_AXIS_COSINE = 0.985  # minimum cosine to an axis for a direction to be named after it
 _SMALL_RAD = 1e-6

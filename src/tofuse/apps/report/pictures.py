@@ -9,8 +9,15 @@ from functools import partial
 
 import numpy as np
 
+from tofuse.apps.report.thumbnails import (
+    NO_MEASUREMENT,
+    REMOVED,
+    encode,
+    grey,
+    percentile_range,
+    viridis,
+)
 from tofuse.engine.compute.thread_pool import run_all
-from tofuse.apps.report.thumbnails import NO_MEASUREMENT, REMOVED, encode, grey, percentile_range, viridis
 from tofuse.engine.quality import samples
 from tofuse.engine.quality.samples import FrameSample
 

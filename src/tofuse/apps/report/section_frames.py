@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tofuse.engine.compute.memory import trim_memory
-from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.apps.report import plots, thumbnails, words
 from tofuse.apps.report.pictures import FATES, KINDS, depth_range, draw
 from tofuse.apps.report.section_parts import component_color
 from tofuse.apps.report.subject import ROWS, Subject, Values
+from tofuse.engine.compute.memory import trim_memory
+from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.quality.types import Component, FrameRecord, in_main_model
 
 _STRIP = 600  # cells in the strip of frames

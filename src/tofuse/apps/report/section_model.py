@@ -6,17 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.fusion.pose_errors import UNKNOWN_M
-from tofuse.engine.geometry import se3
-from tofuse.engine.cameras.cameras import Pinhole, RayTable
-from tofuse.engine.normal import OF_95_PERCENT
-from tofuse.engine.frames.frames import RangeFrame
 from tofuse.apps.report import plots, thumbnails, words
 from tofuse.apps.report.fields import fields, normalized_accuracy
 from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import RigCameras, Scene, opening_yaw, packed, render
 from tofuse.apps.report.subject import OUTER, Subject, Values
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.cameras.cameras import Pinhole, RayTable
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.fusion.pose_errors import UNKNOWN_M
+from tofuse.engine.geometry import se3
+from tofuse.engine.normal import OF_95_PERCENT
 
 
 def model(s: Subject) -> Values:

@@ -7,10 +7,16 @@ from collections.abc import Callable
 from typing import Any
 
 from tofuse._version import __version__
-from tofuse.engine.compute.thread_pool import job_pool
-from tofuse.apps.report import section_frames, section_model, section_parts, section_trajectory, words
+from tofuse.apps.report import (
+    section_frames,
+    section_model,
+    section_parts,
+    section_trajectory,
+    words,
+)
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.subject import Subject, Values
+from tofuse.engine.compute.thread_pool import job_pool
 from tofuse.engine.quality.accuracy_card import bound, weakest_frame
 from tofuse.engine.quality.types import Reconstruction
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.scene import Scene, finite_poses, make_scene
+from tofuse.engine.arrays import Float64
 from tofuse.engine.quality.types import Reconstruction
 
 Values = dict[str, Any]

@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tofuse.engine.errors import InputError, OutputError
-from tofuse.formats.files.atomic import UNFINISHED, output_error
+from tofuse.engine.errors import InputError, OutputError, output_error
+from tofuse.formats.files.atomic import UNFINISHED
 from tofuse.formats.files.locking import Claim
 from tofuse.formats.files.reading import path_of, read_text
 from tofuse.formats.files.staging import StagedFolder, beside, finish_replacing, is_interrupted

@@ -7,20 +7,35 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.apps.results.folder import component_name, finish_interrupted, is_result
+from tofuse.apps.results.run_json import (
+    frame_covariance,
+    main_poses,
+    read_run_json,
+    rotation_up_world,
+    run_json_checked,
+)
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.geometry_record import GeometryRecord
+from tofuse.engine.fusion.cloud import Cloud
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.fusion.mesh import Mesh, mesh_of
+from tofuse.engine.graph.external_sensors import SensorRecord
+from tofuse.engine.graph.graph import GraphPart, LoopRecord
+from tofuse.engine.quality.accuracy import Accuracy, WorstFrame
+from tofuse.engine.quality.types import (
+    Component,
+    Diagnostics,
+    FrameRecord,
+    Reason,
+    Reconstruction,
+    SelfCalibration,
+    SessionPair,
+    SessionRecord,
+)
+from tofuse.formats.files.g2o import read_g2o
 from tofuse.formats.files.ply import read_ply
 from tofuse.formats.files.reading import path_of
-from tofuse.engine.fusion.cloud import Cloud
-from tofuse.engine.fusion.mesh import Mesh, mesh_of
-from tofuse.engine.quality.accuracy import Accuracy, WorstFrame
-from tofuse.engine.graph.external_sensors import SensorRecord
-from tofuse.formats.files.g2o import read_g2o
-from tofuse.engine.graph.graph import GraphPart, LoopRecord
 from tofuse.formats.readers.scans import read_las
-from tofuse.apps.results.folder import component_name, finish_interrupted, is_result
-from tofuse.apps.results.run_json import frame_covariance, main_poses, read_run_json, rotation_up_world, run_json_checked
-from tofuse.engine.quality.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction, SelfCalibration, SessionPair, SessionRecord
 
 
 def load_result(folder: str | Path) -> Reconstruction:

@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
+from tofuse.apps.rigs.clocks import Lag, lag_between
+from tofuse.engine.alignment.projective import UNITS
 from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.geometry import se3
-from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
-from tofuse.engine.alignment.projective import UNITS
-from tofuse.apps.rigs.clocks import Lag, lag_between
 
 # Unit of the time offset, as `UNITS` of poses: 1 ms.
 _TIME_UNIT = 1e-3

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
 from tofuse.engine.alignment.uncertainty import bounded_below
+from tofuse.engine.arrays import Float64
 
 # Size of regions of space with equal errors, as a fraction of the depth.
 _REGION = 0.1

@@ -18,19 +18,19 @@ from typing import TypeVar
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import run_all
-from tofuse.engine.stored_views.view_store import SampledView
-from tofuse.engine.frames.recording import evenly_spaced
-from tofuse.engine.search.pair_agreement import AgreementOptions, Comparison
+from tofuse.apps.rigs.joint import JointOptions, RigView, refined_poses
 from tofuse.engine.alignment.base import PROBABLE
+from tofuse.engine.arrays import Float64
+from tofuse.engine.compute.thread_pool import run_all
+from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.geometry import se3
+from tofuse.engine.search.pair_agreement import AgreementOptions, Comparison
 from tofuse.engine.search.pose_probability import ACCEPTED, PoseEvidence
-from tofuse.engine.views.prepared_view import PreparedView
 from tofuse.engine.search.search import DISTINCT_M, Search, SearchOptions, are_distinct_poses
 from tofuse.engine.search.verification import comparable
 from tofuse.engine.search.view_pair import register_pair
-from tofuse.apps.rigs.joint import JointOptions, RigView, refined_poses
+from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.views.prepared_view import PreparedView
 
 V = TypeVar("V")
 

@@ -13,11 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
-from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.views import residual_kernels as kernels
 from tofuse.engine.alignment import step_kernels as steps
-from tofuse.engine.compute.partition import median
 from tofuse.engine.alignment.base import Registration
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.compute.partition import median
+from tofuse.engine.views import residual_kernels as kernels
 from tofuse.engine.views.prepared_view import PreparedView
 
 # A direction is constrained if its sigma is at most 1 cm, or 1 degree.

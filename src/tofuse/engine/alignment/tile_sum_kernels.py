@@ -11,8 +11,30 @@ import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, Int64
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.views.residual_kernels import DIFFERENCE, INLIERS, IS_INLIER, JACOBIAN, LANES, POINT_SIZE, ROWS, SQRT_WEIGHT, STAT, WEIGHT_G, WEIGHT_P, WEIGHTED_RESIDUAL, Residuals, TargetImage, ViewImages, compare_albedos, compare_planes, load_block, project_block, transform_block, write_point
 from tofuse.engine.compute.jit import kernel
+from tofuse.engine.views.residual_kernels import (
+    DIFFERENCE,
+    INLIERS,
+    IS_INLIER,
+    JACOBIAN,
+    LANES,
+    POINT_SIZE,
+    ROWS,
+    SQRT_WEIGHT,
+    STAT,
+    WEIGHT_G,
+    WEIGHT_P,
+    WEIGHTED_RESIDUAL,
+    Residuals,
+    TargetImage,
+    ViewImages,
+    compare_albedos,
+    compare_planes,
+    load_block,
+    project_block,
+    transform_block,
+    write_point,
+)
 
 # Layout of a tile's sums, over the distances of its pixels.
 RESPONSE = 0  # 7: sum of w J, the response of the gradient to an error shared by the tile

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.alignment.projective import ProjectiveOptions
+from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.views.surface_options import SurfaceOptions
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 from weakref import WeakKeyDictionary
 
@@ -427,3 +428,43 @@ def _tangential(xy: Float64, r2: Float64, p1: float, p2: float) -> Float64:
 def _frozen(a: Float32) -> Float32:
     a.flags.writeable = False
     return a
+
+
+_MAX_SKEW_PX = 0.005  # a smaller displacement of pixels by skew is neglected
+
+
+def pinhole_values(K: Float64, height: int, where: str | Path) -> dict[str, float]:
+    """Return fx, fy, cx and cy of a matrix K (3, 3).
+
+    Parameters
+    ----------
+    K
+        The matrix.
+    height
+        Of the images, in pixels: it decides whether a skew is negligible.
+    where
+        The file or argument, for errors.
+
+    Raises
+    ------
+    InputError
+        If it is not such a matrix, or has skew, which a pinhole camera has not.
+    """
+    if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)) or K[1, 0] != 0:
+        raise InputError(
+            f"is not a matrix K: {K.tolist()}" if K.size < 20 else f"has shape {K.shape}",
+            where=where,
+            remedy="use [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the depth images",
+        )
+    if abs(K[0, 1]) * height > _MAX_SKEW_PX * abs(K[1, 1]):
+        raise InputError(
+            f"has a skew of {K[0, 1]:.3g} px",
+            where=where,
+            remedy="use the rays of the pixels (rays, RayTable), or 0 if it is negligible",
+        )
+    return lens_values(K)
+
+
+def lens_values(K: Float64) -> dict[str, float]:
+    """Return fx, fy, cx and cy of a matrix K (3, 3)."""
+    return {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}

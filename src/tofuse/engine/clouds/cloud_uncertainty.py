@@ -20,10 +20,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap
+from tofuse.engine.clouds.pairs import (
+    MIN_PAIRS,
+    SurfacePairs,
+    loss_weights,
+    unobservable_directions,
+)
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import robust_sigma
-from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap
-from tofuse.engine.clouds.pairs import MIN_PAIRS, SurfacePairs, loss_weights, unobservable_directions
 
 # Maximum distance of corresponding points, in resolutions, and minimum cosine between their
 # normals.

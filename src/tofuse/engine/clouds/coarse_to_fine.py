@@ -7,14 +7,9 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.kdtree import KdTree
-from tofuse.engine.parts import part
-from tofuse.engine.frames.frames import CloudFrame, Frame
-from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.clouds.icp import Icp
 from tofuse.engine.clouds.interfaces import Metric
 from tofuse.engine.clouds.pairs import MIN_PAIRS
@@ -25,6 +20,11 @@ from tofuse.engine.clouds.selectors import All, Uniform
 from tofuse.engine.clouds.shape import shape_at
 from tofuse.engine.clouds.stopping import SmallStep
 from tofuse.engine.clouds.surface_metrics import PlaneToPlane
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.parts import part
 
 _SPACING_SAMPLE = 5000
 _MIN_LEVEL_POINTS = 60

@@ -7,16 +7,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Int64
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
 from tofuse.engine.clouds import fpfh_kernels as kernels
-from tofuse.engine.geometry.kdtree import KdTree
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.frames.frames import CloudFrame, Frame
 from tofuse.engine.clouds.coarse_to_fine import spacing
-from tofuse.engine.clouds.robust_motion import Consensus, ConsensusOptions, Motions, Pairs, are_distinct, consensus, motion_of
 from tofuse.engine.clouds.reduce import reduced
+from tofuse.engine.clouds.robust_motion import (
+    Consensus,
+    ConsensusOptions,
+    Motions,
+    Pairs,
+    are_distinct,
+    consensus,
+    motion_of,
+)
 from tofuse.engine.clouds.shape import shape_at
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.kdtree import KdTree
 
 # Defaults of `candidates`.
 POINTS, REACH, NEIGHBOURS = 4000, 5.0, 12

@@ -8,15 +8,20 @@ from typing import Annotated
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
 from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.parts import part
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.alignment.base import Registrar, Registration
-from tofuse.engine.clouds.interfaces import Alignment, History, Matcher, Metric, Points, Rejector, Selector, Stopping
+from tofuse.engine.clouds.interfaces import (
+    Alignment,
+    History,
+    Matcher,
+    Metric,
+    Points,
+    Rejector,
+    Selector,
+    Stopping,
+)
 from tofuse.engine.clouds.matchers import ClosestPoint
 from tofuse.engine.clouds.metrics import PointToPoint
 from tofuse.engine.clouds.rejectors import MaxDistance, Unique
@@ -24,6 +29,10 @@ from tofuse.engine.clouds.remapping import Remapping
 from tofuse.engine.clouds.selectors import Random, at_most
 from tofuse.engine.clouds.shape import NEIGHBOURS
 from tofuse.engine.clouds.stopping import TwoLoops
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import Frame
+from tofuse.engine.geometry import se3
+from tofuse.engine.parts import part
 
 _MIN_POINTS = 3
 

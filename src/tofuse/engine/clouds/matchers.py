@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from tofuse.engine.geometry.kdtree import KdTree
-from tofuse.engine.parts import part
 from tofuse.engine.clouds.interfaces import Alignment, Matcher, Matches, Points, Search
 from tofuse.engine.clouds.shape import tree_of
+from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.parts import part
 
 
 @part("matcher", "closest-point", label="validated")

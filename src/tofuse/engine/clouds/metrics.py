@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import RegistrationError
 from tofuse.engine.clouds.icp_kernels import point_information, weighted_moments
-from tofuse.engine.parts import part
 from tofuse.engine.clouds.interfaces import Alignment, Matches, Metric
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.parts import part
 
 # Relative second singular values below this are rounding errors: the points are collinear.
 _RANK_TOLERANCE = 1e-12

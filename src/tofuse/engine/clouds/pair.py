@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
-from tofuse.engine.compute.blas import one_blas_thread
-from tofuse.engine.parts import check_number
-from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.clouds.any_pair import MIN_POINTS, AnyPair
-from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.compute.blas import one_blas_thread
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.parts import check_number
 
 # Clouds with a larger distance are in different frames.
 _MAX_FRAME_DISTANCE_M = 1e4

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.clouds.icp_kernels import shortest_of_each_target
-from tofuse.engine.parts import part
 from tofuse.engine.clouds.interfaces import Alignment, Matches, Rejector
+from tofuse.engine.parts import part
 
 
 @part("rejector", "max-distance", label="validated")

@@ -9,9 +9,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.parts import part
-from tofuse.engine.frames.frames import Frame
 from tofuse.engine.clouds.interfaces import Selector
+from tofuse.engine.frames.frames import Frame
+from tofuse.engine.parts import part
 
 
 @part("selector", "all", label="validated")

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.parts import part
 from tofuse.engine.clouds.interfaces import History, Stopping
+from tofuse.engine.parts import part
 
 _REPETITION_TOLERANCE = 1e-6
 

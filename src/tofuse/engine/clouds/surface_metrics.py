@@ -10,9 +10,18 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.clouds.cloud_sum_kernels import matrix_sums, plane_sums, plane_to_plane_weights
-from tofuse.engine.parts import part
 from tofuse.engine.clouds.interfaces import Alignment, Matches, Metric
-from tofuse.engine.clouds.pairs import Loss, SurfacePairs, loss_weights, shared_weights, solve, surface_pairs, unobservable_directions, variance_of
+from tofuse.engine.clouds.pairs import (
+    Loss,
+    SurfacePairs,
+    loss_weights,
+    shared_weights,
+    solve,
+    surface_pairs,
+    unobservable_directions,
+    variance_of,
+)
+from tofuse.engine.parts import part
 
 
 class SurfaceMetric(Metric, Protocol):

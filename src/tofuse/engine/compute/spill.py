@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import UInt8
-from tofuse.engine.errors import OutputError
-from tofuse.formats.files.atomic import output_error
 from tofuse.engine.compute.memory import trim_memory
+from tofuse.engine.errors import OutputError, output_error
 
 _TRIM_BYTES = 128 << 20  # evicted between two returns of free memory to the system
 

@@ -9,10 +9,10 @@ from typing import Annotated, ClassVar
 from tofuse.engine.arrays import Bool
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters.base import Filter
-from tofuse.engine.parts import part
 from tofuse.engine.filters.background_model import MovingObject, moving_object
+from tofuse.engine.filters.base import Filter
 from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.parts import part
 
 
 @part("filter", "background")

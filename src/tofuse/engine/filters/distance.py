@@ -10,8 +10,8 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool
 from tofuse.engine.filters.base import Filter, Interval
-from tofuse.engine.parts import part
 from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.parts import part
 
 
 @part("filter", "distance")

@@ -11,8 +11,8 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float32
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.filters.base import Filter
-from tofuse.engine.parts import part
 from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.parts import part
 
 _BINS = 256
 

@@ -11,9 +11,9 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.filters.base import Filter
+from tofuse.engine.frames.frames import Frame
 from tofuse.engine.geometry.kdtree import KdTree
 from tofuse.engine.parts import part
-from tofuse.engine.frames.frames import Frame
 
 # Upper limit of k, which bounds the memory.
 MAX_NEIGHBOURS = 1000

@@ -10,14 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
+from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable, pinhole_values
 from tofuse.engine.errors import InputError
-from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable
-from tofuse.engine.geometry.se3 import check_poses
-from tofuse.engine.parts import check_number
-from tofuse.formats.recordings.camera_file import pinhole_values
+from tofuse.engine.frames.depth_counts import INVALID_DEPTH
 from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.formats.recordings.sources import INVALID_DEPTH
+from tofuse.engine.geometry.se3 import check_poses
+from tofuse.engine.parts import check_number
 
 # The unit of integer depth for nearly all cameras.
 _MILLIMETRES = 1e-3

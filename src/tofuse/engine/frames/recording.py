@@ -13,12 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.compute.thread_pool import job_pool
+from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import Frame, RangeFrame
 
 R = TypeVar("R")
 S = TypeVar("S", bound=np.generic)
+
+# Keys of a source's metadata: the system of the device that `reference` is of, such as ARKit; and
+# the noise model (`engine.noise`) that came with the recording.
+POSES_BY = "poses_by"
+NOISE_MODEL = "noise_model"
 
 
 class Source(Protocol):

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64, Int32, Int64, UInt8
-from tofuse.formats.files.geometry_record import GeometryRecord
-from tofuse.formats.export import exchange
-from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.geometry import se3
 from tofuse.engine.compute.thread_pool import thread_count
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.fusion.exportable import Exportable
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.fusion.options import Fusion
+from tofuse.engine.geometry import se3
 
 _BUFFER_ROWS = 2_000_000
 _NORMAL_NEIGHBOURS = 12  # points in the plane fit of a normal
@@ -23,7 +22,7 @@ _KEY_BITS = 21  # voxels per axis: 2^21, that is 21 km at 1 cm
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class Cloud(Exportable):
     """Points in the world frame.
 
     Attributes
@@ -63,18 +62,6 @@ class Cloud:
         """Return the record relative to `offset`, float32."""
         scalars = {"views": self.views} | ({} if self.sigma is None else {"sigma": self.sigma})
         return GeometryRecord(self.points, normals=self.normals, color=self.color, scalars=scalars)
-
-    def save(self, path: str | Path) -> None:
-        """Write the cloud to a path ending in .ply, .pcd, .las, .laz or .e57."""
-        exchange.save(self.record(), path)
-
-    def to_trimesh(self) -> Any:
-        """Return a `trimesh.PointCloud` in the world frame."""
-        return exchange.to_trimesh(self.record())
-
-    def to_open3d(self) -> Any:
-        """Return an `open3d.geometry.PointCloud` in the world frame."""
-        return exchange.to_open3d(self.record())
 
     @property
     def diagonal_m(self) -> float:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64
-from tofuse.engine.fusion.stored_views import Views
-from tofuse.engine.geometry import se3
 from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.fusion.stored_views import Views
 from tofuse.engine.fusion.tsdf_kernels import max_informative_depth
+from tofuse.engine.geometry import se3
 
 _CHUNKS = 16
 _ROUNDING = 1.001  # margin for single precision

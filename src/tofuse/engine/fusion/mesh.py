@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, Intp, UInt8
-from tofuse.formats.files.geometry_record import GeometryRecord
-from tofuse.formats.export import exchange
 from tofuse.engine.fusion.cloud import Cloud
+from tofuse.engine.fusion.clustering_kernels import (
+    flatten_groups,
+    has_area,
+    number_keys,
+    quadric_sums,
+    union_faces,
+)
 from tofuse.engine.fusion.colors import has_color
 from tofuse.engine.fusion.edge_collapse import collapse_edges, with_distinct_corners
-from tofuse.engine.fusion.clustering_kernels import flatten_groups, has_area, number_keys, quadric_sums, union_faces
+from tofuse.engine.fusion.exportable import Exportable
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 
 # Damping of a merged vertex towards the centroid, relative to the planes around it.
 _DAMPING = 0.02
@@ -31,7 +35,7 @@ _MAX_OPPOSITE_COSINE = -0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class Mesh(Exportable):
     """Triangles in the world frame.
 
     Attributes
@@ -76,18 +80,6 @@ class Mesh:
         """Return the record relative to `offset`, float32."""
         scalars = {"views": self.views, "sigma": self.sigma}
         return GeometryRecord(self.vertices, self.faces, self.normals, self.color, scalars=scalars)
-
-    def save(self, path: str | Path) -> None:
-        """Write the mesh to a path ending in .glb, .gltf, .ply, .obj or .stl."""
-        exchange.save(self.record(), path)
-
-    def to_trimesh(self) -> Any:
-        """Return a `trimesh.Trimesh` in the world frame."""
-        return exchange.to_trimesh(self.record())
-
-    def to_open3d(self) -> Any:
-        """Return an `open3d.geometry.TriangleMesh` in the world frame."""
-        return exchange.to_open3d(self.record())
 
     def cloud(self) -> Cloud:
         """Return the vertices as a cloud."""

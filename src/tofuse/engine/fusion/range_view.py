@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Bool, Float32, Int8, UInt8, UInt16
 from tofuse.engine.cameras.cameras import ray_lengths
 from tofuse.engine.compute.partition import median
-from tofuse.engine.fusion.tsdf_kernels import StoredView, mark_jumps, pack_view, shrink_to_planes
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.fusion.tsdf_kernels import StoredView, mark_jumps, pack_view, shrink_to_planes
 from tofuse.engine.views.extended_planes import with_extended_planes
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.projection import Projection

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from tofuse.engine.compute.spill import Spill
-from tofuse.engine.fusion.range_view import RangeView, with_camera_correction
 from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.fusion.range_view import RangeView, with_camera_correction
 
 
 @dataclass(frozen=True)

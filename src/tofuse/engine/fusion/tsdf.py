@@ -11,6 +11,15 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, UInt16
 from tofuse.engine.compute.spill import Spill
+from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.fusion.block_kernels import (
+    EDGE,
+    VOXELS,
+    Blocks,
+    index_of,
+    mark_octants,
+    neighbours_of,
+)
 from tofuse.engine.fusion.frusta import Frusta
 from tofuse.engine.fusion.layout import CUBE_SPACING, REACH_SIGMAS, Layout, Region, cubes_near
 from tofuse.engine.fusion.mesh import Mesh
@@ -18,11 +27,16 @@ from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import DECODED, RangeView
 from tofuse.engine.fusion.stitching import Piece, stitch, to_rgb
 from tofuse.engine.fusion.stored_views import Views, summaries
-from tofuse.engine.geometry import se3
-from tofuse.engine.fusion.block_kernels import EDGE, VOXELS, Blocks, index_of, mark_octants, neighbours_of
 from tofuse.engine.fusion.surface_net_kernels import Vertices, make_faces, make_vertices, mark_cells
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.fusion.tsdf_kernels import Batch, Camera, Decoding, apply_free_space, integrate, unpack_view
+from tofuse.engine.fusion.tsdf_kernels import (
+    Batch,
+    Camera,
+    Decoding,
+    apply_free_space,
+    integrate,
+    unpack_view,
+)
+from tofuse.engine.geometry import se3
 
 _CHUNKS = 16
 _BATCH = 16  # views

@@ -11,9 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int8, Int32, Int64, UInt8, UInt16
-from tofuse.engine.fusion.block_kernels import EDGE, EMPTY, HALF, VOXELS, Blocks, block_key, block_of
-from tofuse.engine.compute.jit import kernel
 from tofuse.engine.cameras.projection_kernels import project_ray
+from tofuse.engine.compute.jit import kernel
+from tofuse.engine.fusion.block_kernels import (
+    EDGE,
+    EMPTY,
+    HALF,
+    VOXELS,
+    Blocks,
+    block_key,
+    block_of,
+)
 
 MAX_VIEWS = 65535  # at which a voxel's counter of views saturates
 # Maximum number of lookup cells that are inspected to classify a block as a whole.

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.errors import InputError
 from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.errors import InputError
 
 # With fewer queries a second thread costs more than it gains.
 _MIN_PARALLEL = 4000

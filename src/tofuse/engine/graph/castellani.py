@@ -23,9 +23,9 @@ from scipy.sparse.linalg import splu
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.engine.parts import part
 from tofuse.engine.graph.graph import Optimisation, Optimiser, PoseGraph
 from tofuse.engine.graph.levenberg import check_motions
+from tofuse.engine.parts import part
 
 Normalisation = Literal["thesis", "fusiello"]
 

@@ -7,10 +7,10 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Registration
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.alignment.base import Registration
 
 # Squared error of an edge, in units of its information, up to which it may be rounding.
 ROUNDING = 1e-12

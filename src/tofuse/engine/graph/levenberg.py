@@ -11,12 +11,12 @@ from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.parts import part
 from tofuse.engine.graph.branches import Branches
 from tofuse.engine.graph.graph import GraphPart, Optimisation, Optimiser, PoseGraph
 from tofuse.engine.graph.robust import Robust, Settings
 from tofuse.engine.graph.solver import Solution, solve
 from tofuse.engine.graph.sparse import parts_of, sparsify
+from tofuse.engine.parts import part
 
 _RIGID = 1e-3  # largest deviation of a rotation from orthonormal
 _MAX_POSITION_M = 1e9  # larger coordinates are corrupt

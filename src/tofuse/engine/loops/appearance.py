@@ -9,7 +9,12 @@ import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.views.descriptor import dissimilarity, mutual_dissimilarity, pairwise_dissimilarity, similar_views
+from tofuse.engine.views.descriptor import (
+    dissimilarity,
+    mutual_dissimilarity,
+    pairwise_dissimilarity,
+    similar_views,
+)
 
 # Pairs whose views differ by at most this many positions are similar, and at most this many of them
 # are chosen: two can confirm each other, more would displace other loops.

@@ -10,12 +10,20 @@ import numpy as np
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.compute.spill import Spill
 from tofuse.engine.geometry import se3
-from tofuse.engine.loops.appearance import MAX_VIEW_DISTANCE, Appearance
 from tofuse.engine.graph.covariances import relative_covariance
+from tofuse.engine.loops.appearance import MAX_VIEW_DISTANCE, Appearance
 from tofuse.engine.loops.information_gain import InformationGain
-from tofuse.engine.stored_views.view_store import CoarseView, HasCoarseView, PosedView, Spilled, SpilledCoarseView, overlaps, sampled_points
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.stored_views.view_store import (
+    CoarseView,
+    HasCoarseView,
+    PosedView,
+    Spilled,
+    SpilledCoarseView,
+    overlaps,
+    sampled_points,
+)
 from tofuse.engine.views.descriptor import view_descriptor
+from tofuse.engine.views.prepared_view import PreparedView
 
 Pair = tuple[int, int]  # frames (i, j), i < j
 LoopView = PosedView[PreparedView]

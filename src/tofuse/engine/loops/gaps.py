@@ -12,13 +12,13 @@ from functools import cached_property
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Link, Registration
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.geometry.rigid_motion_kernels import retract, twist_between
 from tofuse.engine.normal import SIGMA_OF_MEDIAN
-from tofuse.engine.tracking.motion import HANDHELD
 from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.alignment.base import Link, Registration
+from tofuse.engine.tracking.motion import HANDHELD
 from tofuse.engine.views.prepared_view import PreparedView
 
 View = PosedView[PreparedView]

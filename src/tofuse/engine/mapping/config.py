@@ -4,26 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tofuse.engine import parts
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.sensor.base import Correction
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import parse_toml, read_text
 from tofuse.engine.filters.base import Filter
+from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.tracking.base import Odometry
-from tofuse.engine.mapping.budget import voxels_mb
 from tofuse.engine.graph.external_sensors import ExternalSensor
 from tofuse.engine.graph.graph import Optimiser
 from tofuse.engine.loops.joining import Joining
 from tofuse.engine.loops.loops import LoopDetector
+from tofuse.engine.mapping.budget import voxels_mb
 from tofuse.engine.refinement.refinement import NoRefinement, RefinementMethod
-from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.search.search import SearchOptions
-from tofuse.apps.results.run_json import read_run_json
+from tofuse.engine.sensor.base import Correction
+from tofuse.engine.tracking.base import Odometry
 
 ViewKind = Literal["range", "cloud"]
 
@@ -99,11 +96,13 @@ class Config(Bounded):
 
 
 PACKAGES = (
-    "tofuse.engine.sensor",
     "tofuse.engine.filters",
+    "tofuse.engine.sensor",
     "tofuse.engine.clouds",
     "tofuse.engine.tracking",
     "tofuse.engine.graph",
+    "tofuse.engine.loops",
+    "tofuse.engine.refinement",
     "tofuse.lab.methods",
 )
 
@@ -145,23 +144,6 @@ def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config
     merged = _merge(config.to_dict(), _divided(changes))
     result: Config = parts.from_dict(Config, merged, where=where)
     return result
-
-
-def read_changes(path: str | Path) -> dict[str, Any]:
-    """Read the options in a TOML file, or the `config` of a `run.json`.
-
-    Raises
-    ------
-    InputError
-        If the file can't be read or is neither.
-    """
-    path = Path(path)
-    if path.suffix == ".json":
-        config = read_run_json(path).get("config")
-        if not isinstance(config, dict):
-            raise InputError("contains no config", where=path, remedy="pass a run.json of tofuse")
-        return config
-    return parse_toml(read_text(path), where=path)
 
 
 def _divided(changes: Mapping[str, Any]) -> Mapping[str, Any]:

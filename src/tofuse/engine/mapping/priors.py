@@ -13,10 +13,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.mapping.config import Config
+from tofuse.engine.frames.recording import POSES_BY, Recording, Source
 from tofuse.engine.graph.external_sensors import GravityEdges, OdometryEdges
-from tofuse.formats.recordings.phones import POSES_BY
-from tofuse.engine.frames.recording import Recording, Source
+from tofuse.engine.mapping.config import Config
 
 Prior = Literal["auto", "none", "device"]
 

@@ -6,29 +6,43 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import accumulate
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames.recording import POSES_BY, Recording
+from tofuse.engine.loops.loops import PriorLoop
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config, ViewKind, from_method, kind_of
+from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.progress import Progress, Silent
 from tofuse.engine.mapping.self_calibration import self_calibrated
-from tofuse.apps.jobs.tracked_file import TrackedFile
-from tofuse.engine.loops.loops import PriorLoop
-from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.frames.frames import Frame
-from tofuse.formats.recordings.phones import ARKIT_UP, POSES_BY
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.views.prepared_view import PreparedView
 from tofuse.engine.quality.types import Reconstruction
+from tofuse.engine.stored_views.view_store import PosedView
+from tofuse.engine.tracking.base import Tracker
+from tofuse.engine.views.prepared_view import PreparedView
 
 # Number of frames read and prepared in advance; each takes a multiple of its images' size.
 _PREFETCHED_FRAMES = 4
+# Opposite to gravity, in the world frame of ARKit's poses.
+_ARKIT_UP = np.array([0.0, 1.0, 0.0])
+
+
+class TrackedFrames(Protocol):
+    """Stores the tracked frames of a job, or provides those of an interrupted one."""
+
+    def tracker(self, tracker: Tracker) -> Tracker:
+        """Return the tracker to use in place of another one."""
+        ...
+
+    def finish(self, log: FrameLog) -> None:
+        """Take the log of all frames after tracking."""
+        ...
 
 
 def reconstruct(
@@ -39,7 +53,7 @@ def reconstruct(
     threads: int | None = None,
     loops: Sequence[PriorLoop] = (),
     progress: Progress | None = None,
-    tracked_file: TrackedFile | None = None,
+    tracked_frames: TrackedFrames | None = None,
 ) -> Reconstruction:
     """Reconstruct a recording: trajectory, pose graph, fused cloud, diagnostics.
 
@@ -59,7 +73,7 @@ def reconstruct(
         Given loops, in frame indices.
     progress
         Receives stages, frames and notes.
-    tracked_file
+    tracked_frames
         Stores the tracked frames, or provides those of an interrupted job with the same recording,
         configuration and seed.
 
@@ -73,14 +87,14 @@ def reconstruct(
     config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
     config = adapted(config, recording, threads, progress)
 
-    def reconstruct_with(config: Config, tracked_file: TrackedFile | None) -> Reconstruction:
+    def reconstruct_with(config: Config, tracked_frames: TrackedFrames | None) -> Reconstruction:
         # BLAS results depend on its number of threads; those of our kernels don't.
         with threadpool_limits(1):
-            mapper = _track(recording, config, seed, threads, loops, progress, tracked_file)
+            mapper = _track(recording, config, seed, threads, loops, progress, tracked_frames)
             result = mapper.finish()
         return _with_facts(result, recording, config)
 
-    result = reconstruct_with(config, tracked_file)
+    result = reconstruct_with(config, tracked_frames)
     if not config.self_calibration:
         return result
     return self_calibrated(result, config, lambda config: reconstruct_with(config, None), progress)
@@ -107,13 +121,13 @@ def _track(
     threads: int | None,
     loops: Sequence[PriorLoop],
     progress: Progress,
-    tracked_file: TrackedFile | None = None,
+    tracked_frames: TrackedFrames | None = None,
 ) -> Mapper:
     """Push all frames to a new mapper."""
     progress.stage("tracking", len(recording))
     tracker = config.odometry.start(seed, config.search)
-    if tracked_file is not None:
-        tracker = tracked_file.tracker(tracker)
+    if tracked_frames is not None:
+        tracker = tracked_frames.tracker(tracker)
     mapper = Mapper(
         config, seed=seed, threads=threads, loops=loops, progress=progress, tracker=tracker
     )
@@ -124,8 +138,8 @@ def _track(
             where=recording.path,
             remedy="check that the files are complete, or use --format",
         )
-    if tracked_file is not None:
-        tracked_file.finish(mapper.log)
+    if tracked_frames is not None:
+        tracked_frames.finish(mapper.log)
     return mapper
 
 
@@ -242,7 +256,7 @@ def device_up(recording: Recording, result: Reconstruction) -> Float64 | None:
         return None
     rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
     candidates = [
-        result.trajectory[rows[index], :3, :3] @ T_device_camera[:3, :3].T @ ARKIT_UP
+        result.trajectory[rows[index], :3, :3] @ T_device_camera[:3, :3].T @ _ARKIT_UP
         for index, T_device_camera in zip(
             recording.indices.tolist(), recording.reference, strict=True
         )

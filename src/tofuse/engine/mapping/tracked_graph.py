@@ -9,15 +9,15 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.tracking.prediction import Prediction, degenerate_runs, with_prediction
-from tofuse.engine.mapping.frame_log import Entry
-from tofuse.engine.quality.accuracy import degenerate_directions, without_degenerate
 from tofuse.engine.graph.build import Measured, build_graph
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.loops.loops import ClosedLoop
 from tofuse.engine.loops.merged_components import Join
+from tofuse.engine.mapping.frame_log import Entry
+from tofuse.engine.quality.accuracy import degenerate_directions, without_degenerate
 from tofuse.engine.refinement.refinement import Refinement
 from tofuse.engine.stored_views.view_store import ViewStore
+from tofuse.engine.tracking.prediction import Prediction, degenerate_runs, with_prediction
 from tofuse.engine.views.prepared_view import PreparedView
 
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.formats.files.reading import is_file, is_folder
-from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames.recording import NOISE_MODEL, Recording
 from tofuse.engine.noise.model import NOISE, AmplitudeLaw, NoiseModel
+from tofuse.engine.normal import MEDIAN_OF_NORMAL
 
 # Keywords in a sensor's name, in lower case, the more specific ones first.
 _SENSOR_KEYWORDS = (
@@ -42,18 +40,13 @@ _MAX_RATIO = 3.0  # of observed to predicted noise
 def noise_model_for(recording: Recording) -> NoiseModel:
     """Choose the noise model of a recording.
 
-    A noise.json in its folder comes first, then the sensor's name, then the size of the
+    One that came with the recording comes first, then the sensor's name, then the size of the
     images. Amplitude counts have no common unit: where the noise predicted from amplitude differs
     by more than a factor of three from that between neighbouring pixels, the amplitude law is
     rescaled by an unknown gain.
-
-    Raises
-    ------
-    InputError
-        If there is an invalid noise.json.
     """
-    stored = _in_folder(recording)
-    if stored is not None:
+    stored = recording.metadata.get(NOISE_MODEL)
+    if isinstance(stored, NoiseModel):
         return stored
     frames = _sampled_frames(recording)
     model = NOISE[family_of(recording, frames[0] if frames else None)]
@@ -75,13 +68,6 @@ def family_of(recording: Recording, frame: RangeFrame | None) -> str:
     if family == "iphone" and frame.amplitude_image is not None:
         return "unknown"  # iPhones have no amplitude
     return family
-
-
-def _in_folder(recording: Recording) -> NoiseModel | None:
-    folder = Path(recording.path)
-    if is_folder(folder) and is_file(folder / "noise.json"):
-        return NoiseModel.load(folder / "noise.json")
-    return None
 
 
 def _sampled_frames(recording: Recording) -> list[RangeFrame]:

@@ -14,22 +14,18 @@ amplitude are described by a table over their levels of confidence, or over the 
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, fields, is_dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.atomic import write_text
-from tofuse.formats.files.reading import read_text
 from tofuse.engine.cameras.cameras import Camera, ray_lengths
-from tofuse.engine.noise import noise_kernels as kernels
 from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.errors import InputError
+from tofuse.engine.noise import noise_kernels as kernels
 from tofuse.engine.parts import from_dict, to_dict
 
 Law = Literal["range", "amplitude", "confidence", "camera"]
@@ -253,27 +249,6 @@ class NoiseModel(Bounded):
         model: Self = from_dict(cls, data, where=where)
         _check_finite(model, where)
         return model
-
-    def save(self, path: str | Path) -> None:
-        """Write a noise.json; raise OutputError if that's impossible."""
-        write_text(path, json.dumps(self.to_dict(), indent=1) + "\n")
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a noise.json.
-
-        Raises
-        ------
-        InputError
-            If it can't be read, or is invalid.
-        """
-        try:
-            data = json.loads(read_text(path, limit=1 << 20))
-        except (ValueError, RecursionError) as error:
-            raise InputError(
-                f"is broken JSON ({error})", where=path, remedy="write it again by `tofuse noise`"
-            ) from error
-        return cls.from_dict(data, where=str(path))
 
 
 def incidence_cosine(frame: NoisyImage) -> Float32 | None:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
 from tofuse.engine.compute.thread_pool import run_chunks
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.geometry import se3
 from tofuse.engine.search.pair_agreement import AgreementOptions, agreement
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions

@@ -21,13 +21,19 @@ from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.refinement.camera_response import response
-from tofuse.engine.refinement.joint_alignment import AlignedViews, Refined, align_views, refine, spread_evenly
+from tofuse.engine.refinement.joint_alignment import (
+    AlignedViews,
+    Refined,
+    align_views,
+    refine,
+    spread_evenly,
+)
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap
-from tofuse.engine.stored_views.pair_equations import RefineOptions
 from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.refinement.split_half import aligned_motion
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.stored_views.pair_equations import RefineOptions
 from tofuse.engine.stored_views.view_store import SampledView
 
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are

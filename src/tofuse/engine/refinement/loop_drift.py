@@ -9,8 +9,8 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.refinement.joint_alignment import Refined, align_pairs, align_views
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views.pair_equations import RefineOptions, Round
 from tofuse.engine.stored_views.view_store import SampledView
 

@@ -10,14 +10,26 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.geometry import se3
-from tofuse.engine.parts import part
-from tofuse.engine.graph.build import Measured
-from tofuse.engine.refinement.common_planes import SUPPORT_NOISE, Aligned, PlaneOptions, refine_clouds
-from tofuse.engine.graph.external_sensors import SensorPriors
-from tofuse.engine.refinement.refinement import MAX_LOSS, Refinement, RefinementMethod, Refiner, accepted_with, with_unsupported_views_fixed
-from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.engine.frames.frames import Frame
+from tofuse.engine.geometry import se3
+from tofuse.engine.graph.build import Measured
+from tofuse.engine.graph.external_sensors import SensorPriors
+from tofuse.engine.parts import part
+from tofuse.engine.refinement.common_planes import (
+    SUPPORT_NOISE,
+    Aligned,
+    PlaneOptions,
+    refine_clouds,
+)
+from tofuse.engine.refinement.refinement import (
+    MAX_LOSS,
+    Refinement,
+    RefinementMethod,
+    Refiner,
+    accepted_with,
+    with_unsupported_views_fixed,
+)
+from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.engine.views.prepared_view import PreparedView
 
 

@@ -12,20 +12,32 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute.spill import Spill
+from tofuse.engine.frames.frames import Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.stored_views import pair_equation_kernels as kernels
-from tofuse.engine.parts import part
 from tofuse.engine.graph.build import Measured
-from tofuse.engine.refinement.calibration_check import CalibrationCheck, check_calibration, combine_checks
 from tofuse.engine.graph.external_sensors import SensorPriors
+from tofuse.engine.parts import part
+from tofuse.engine.refinement.calibration_check import (
+    CalibrationCheck,
+    check_calibration,
+    combine_checks,
+)
 from tofuse.engine.refinement.joint_alignment import Refined, refine
 from tofuse.engine.refinement.loop_drift import loop_gap
-from tofuse.engine.stored_views.pair_equations import RefineOptions
 from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.refinement.split_half import split_half_errors
 from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps, support_fell
-from tofuse.engine.stored_views.view_store import CoarseView, PosedView, SampledView, Spilled, SpilledCoarseView, ViewStore, sampled_points
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.stored_views.pair_equations import RefineOptions
+from tofuse.engine.stored_views.view_store import (
+    CoarseView,
+    PosedView,
+    SampledView,
+    Spilled,
+    SpilledCoarseView,
+    ViewStore,
+    sampled_points,
+)
 from tofuse.engine.views.prepared_view import PreparedView
 
 CameraError = Literal["offset", "scale", "focal"]

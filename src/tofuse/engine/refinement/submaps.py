@@ -15,16 +15,27 @@ from typing import TypeVar
 
 import numpy as np
 
+from tofuse.engine.alignment.projective import UNITS
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.refinement.joint_alignment import Refined, Support, refine, spread_evenly, support_of
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
-from tofuse.engine.stored_views.pair_equations import RefineOptions
+from tofuse.engine.refinement.joint_alignment import (
+    Refined,
+    Support,
+    refine,
+    spread_evenly,
+    support_of,
+)
 from tofuse.engine.refinement.pose_priors import Priors
-from tofuse.engine.stored_views.view_store import HasCoarseView, SampledView, overlaps, world_centroids
-from tofuse.engine.alignment.projective import UNITS
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.stored_views.pair_equations import RefineOptions
+from tofuse.engine.stored_views.view_store import (
+    HasCoarseView,
+    SampledView,
+    overlaps,
+    world_centroids,
+)
 
 A = TypeVar("A")
 

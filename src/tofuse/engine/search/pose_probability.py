@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.search.pair_agreement import Agreement
-from tofuse.engine.alignment.base import Registration
 
 # Tolerances of a right pose: fraction of the depth, and rad.
 RIGHT_FRACTION, RIGHT_RAD = 0.05, float(np.radians(4.0))

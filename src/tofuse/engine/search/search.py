@@ -14,17 +14,24 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from tofuse.engine.alignment.projective import Level, ProjectiveOptions, Target, align
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.compute.thread_pool import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
-from tofuse.engine.compute.thread_pool import run_all
-from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, Comparison
 from tofuse.engine.search.floor import find_floors
+from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, Comparison
+from tofuse.engine.search.search_grid import (
+    MIN_POINTS,
+    ResampledView,
+    full_poses,
+    planar_poses,
+    refine_poses,
+    resampled,
+)
 from tofuse.engine.views.prepared_view import PreparedView
-from tofuse.engine.alignment.projective import Level, ProjectiveOptions, Target, align
 from tofuse.engine.views.rough import with_rough_planes
-from tofuse.engine.search.search_grid import MIN_POINTS, ResampledView, full_poses, planar_poses, refine_poses, resampled
 
 Mode = Literal["auto", "both", "planar", "full"]
 

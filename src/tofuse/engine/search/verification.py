@@ -15,11 +15,11 @@ from typing import Literal
 
 import numpy as np
 
+from tofuse.engine.alignment.projective import Aligned, Level
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.search.pair_agreement import AgreementOptions
-from tofuse.engine.alignment.projective import Aligned, Level
 
 # Statistics of an alignment, all logarithms: odds of an outlier, odds of a point in free space, the
 # noise scale, and the standard deviation of the log albedo.

@@ -13,16 +13,30 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Registration
+from tofuse.engine.alignment.projective import (
+    UNITS,
+    Aligned,
+    ProjectiveOptions,
+    Target,
+    align,
+    registration_of,
+)
+from tofuse.engine.alignment.uncertainty import UncertaintyOptions, covariance
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, agreement
-from tofuse.engine.alignment.base import Registration
 from tofuse.engine.search.pose_probability import CERTAIN, CONTRADICTION, PoseEvidence
-from tofuse.engine.views.prepared_view import PreparedView
-from tofuse.engine.alignment.projective import UNITS, Aligned, ProjectiveOptions, Target, align, registration_of
 from tofuse.engine.search.search import Candidate, Match, Search, SearchOptions, are_distinct_poses
-from tofuse.engine.alignment.uncertainty import UncertaintyOptions, covariance
-from tofuse.engine.search.verification import COARSE, PATIENT, FitStatistics, are_inverse, comparable, usual_tolerances
+from tofuse.engine.search.verification import (
+    COARSE,
+    PATIENT,
+    FitStatistics,
+    are_inverse,
+    comparable,
+    usual_tolerances,
+)
+from tofuse.engine.views.prepared_view import PreparedView
 
 # Few iterations near a guess; otherwise enough for a step of a third of the view.
 _FEW_ITERATIONS = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)

@@ -10,10 +10,10 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.sensor.base import Correction, Corrector
 from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable, ray_lengths
-from tofuse.engine.parts import part
 from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.parts import part
+from tofuse.engine.sensor.base import Correction, Corrector
 
 # Options of each error and of its standard deviation, by the names of the calibration check.
 FIELDS = {

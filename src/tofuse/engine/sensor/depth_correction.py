@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.atomic import replacing
-from tofuse.formats.files.npz import read_npz
-
-_MAX_BYTES = 1 << 30
-KEYS = ("range_m", "bias_m", "pixel_bias_m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,40 +86,6 @@ class DepthCorrection:
             bias = bias + self.pixel_bias_m
         out = np.where(measured > 0, measured - bias, 0)
         return np.maximum(out, 0).astype(np.float32)
-
-    def save(self, path: str | Path) -> None:
-        """Write an .npz with the keys range_m, bias_m and, where known, pixel_bias_m."""
-        path = Path(path)
-        arrays: dict[str, NDArray[np.floating]] = {"range_m": self.range_m, "bias_m": self.bias_m}
-        if self.pixel_bias_m is not None:
-            arrays["pixel_bias_m"] = self.pixel_bias_m
-        with replacing(path) as part, part.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-
-    @classmethod
-    def load(cls, path: str | Path) -> DepthCorrection:
-        """Read what `save` writes.
-
-        Raises
-        ------
-        InputError
-            If the file can't be read, or a key is missing or has an invalid array.
-        """
-        try:
-            arrays = read_npz(path, limit=_MAX_BYTES, names=frozenset(KEYS))
-        except InputError as error:
-            raise InputError(
-                error.problem,
-                where=path,
-                remedy="write it by DepthCorrection.save, or delete it to go without",
-            ) from error
-        for key in KEYS[:2]:
-            if key not in arrays:
-                raise InputError(f"has no {key}", where=path, remedy=f"use the keys {list(KEYS)}")
-        try:
-            return cls(arrays["range_m"], arrays["bias_m"], arrays.get("pixel_bias_m"))
-        except InputError as error:
-            raise InputError(error.problem, where=path, remedy=error.remedy) from error
 
 
 def _check_numbers(name: str, array: NDArray[np.generic]) -> None:

@@ -21,11 +21,17 @@ from typing import Literal
 import numpy as np
 
 from tofuse.engine.arrays import Complex128, Float32, Float64
+from tofuse.engine.compute.thread_pool import run_chunks
 from tofuse.engine.sensor import multipath_kernels as kernels
 from tofuse.engine.sensor.multipath_kernels import W, X, Y
-from tofuse.engine.compute.thread_pool import run_chunks
 from tofuse.engine.sensor.multipath_map import OffscreenCells, ReflectorMap
-from tofuse.engine.sensor.multipath_surfaces import Surfaces, block_nodes, fit_planes, ray_ranges, visible_sources
+from tofuse.engine.sensor.multipath_surfaces import (
+    Surfaces,
+    block_nodes,
+    fit_planes,
+    ray_ranges,
+    visible_sources,
+)
 
 Bounces = Literal["one", "all"]
 

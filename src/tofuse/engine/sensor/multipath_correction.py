@@ -9,12 +9,18 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.sensor.base import Correction, Corrector
-from tofuse.engine.filters.raw_amplitude import modulation_period, tof_image
-from tofuse.engine.parts import part
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
-from tofuse.engine.sensor.multipath import Bounces, GainEstimator, MultipathEstimate, MultipathModel, ToFImage
+from tofuse.engine.parts import part
+from tofuse.engine.sensor.base import Correction, Corrector
+from tofuse.engine.sensor.multipath import (
+    Bounces,
+    GainEstimator,
+    MultipathEstimate,
+    MultipathModel,
+    ToFImage,
+)
 from tofuse.engine.sensor.multipath_map import ReflectorMap
+from tofuse.engine.sensor.raw_amplitude import modulation_period, tof_image
 
 
 @part("correction", "multipath", label="validated")

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.sensor.base import Correction, Corrector
-from tofuse.engine.parts import part
 from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.noise.model import NoiseModel
+from tofuse.engine.parts import part
+from tofuse.engine.sensor.base import Correction, Corrector
 
 
 @part("correction", "noise")

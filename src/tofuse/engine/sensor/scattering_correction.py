@@ -12,12 +12,12 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.sensor.base import Correction, Corrector
-from tofuse.engine.filters.raw_amplitude import frame_phasor, phasor, tof_image
 from tofuse.engine.errors import InputError
-from tofuse.engine.parts import part
 from tofuse.engine.filters.background_model import moving_object
 from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.parts import part
+from tofuse.engine.sensor.base import Correction, Corrector
+from tofuse.engine.sensor.raw_amplitude import frame_phasor, phasor, tof_image
 from tofuse.engine.sensor.scattering import Scattering, estimate_fractions
 
 # Smallest ratio of direct to measured light of a pixel that is corrected.

@@ -10,10 +10,10 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.filters.raw_amplitude import pixel_pitch, range_and_amplitude
 from tofuse.engine.filters.base import Filter
-from tofuse.engine.parts import part
 from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.parts import part
+from tofuse.engine.sensor.raw_amplitude import pixel_pitch, range_and_amplitude
 from tofuse.engine.sensor.unwrap import UnwrapOptions, count_periods, white_amplitude
 
 # Number of pixels of a view from which white is estimated, and dark pixels are counted.

@@ -13,11 +13,46 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int64
-from tofuse.engine.views import residual_kernels as pose_sums
-from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.views.residual_kernels import ALBEDO, ALBEDO_SLOPE, BINS, CHI2, DISTANCE, FREE_SPACE, HAS_PLANE, INLIERS, IS_INLIER, JACOBIAN, LANES, NORMAL, PLANE, POINT, POINT_ALBEDO, POINT_ALBEDO_SLOPE, ROWS, SIGMA, SQRT_WEIGHT, STAT, VARIANCE, WEIGHTED_RESIDUAL, XN, YN, Residuals, TargetImage, Z, add_products, compare_albedos, compare_planes, histogram_bin, load_block, project_block, transform_block
-from tofuse.engine.compute.jit import kernel
 from tofuse.engine.cameras.projection_kernels import MIN_DEPTH, jacobian_row, nearest_pixel
+from tofuse.engine.compute import tukey_kernels as tukey
+from tofuse.engine.compute.jit import kernel
+from tofuse.engine.views import residual_kernels as pose_sums
+from tofuse.engine.views.residual_kernels import (
+    ALBEDO,
+    ALBEDO_SLOPE,
+    BINS,
+    CHI2,
+    DISTANCE,
+    FREE_SPACE,
+    HAS_PLANE,
+    INLIERS,
+    IS_INLIER,
+    JACOBIAN,
+    LANES,
+    NORMAL,
+    PLANE,
+    POINT,
+    POINT_ALBEDO,
+    POINT_ALBEDO_SLOPE,
+    ROWS,
+    SIGMA,
+    SQRT_WEIGHT,
+    STAT,
+    VARIANCE,
+    WEIGHTED_RESIDUAL,
+    XN,
+    YN,
+    Residuals,
+    TargetImage,
+    Z,
+    add_products,
+    compare_albedos,
+    compare_planes,
+    histogram_bin,
+    load_block,
+    project_block,
+    transform_block,
+)
 
 # Camera errors, in the order of the unknowns.
 OFFSET = 0  # to be added to the range, m

@@ -12,7 +12,13 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.compute.jit import kernel
-from tofuse.engine.stored_views.pair_equation_kernels import GRADIENT, PATCH_RESIDUAL, PATCH_WEIGHT, PRODUCTS, UNKNOWNS
+from tofuse.engine.stored_views.pair_equation_kernels import (
+    GRADIENT,
+    PATCH_RESIDUAL,
+    PATCH_WEIGHT,
+    PRODUCTS,
+    UNKNOWNS,
+)
 
 
 @kernel

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tofuse.engine.alignment.projective import UNITS, span
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.alignment.projective import UNITS, span
 
 # Constrained dimensions that an rms needs; with fewer, sigma is a fraction of the typical motion.
 _MIN_CONSTRAINED = 30.0

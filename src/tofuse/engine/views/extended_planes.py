@@ -9,11 +9,18 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Int32
 from tofuse.engine.compute.partition import median
-from tofuse.engine.views.plane_extension_kernels import extend_planes
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.views.plane_extension_kernels import extend_planes
 from tofuse.engine.views.prepared_view import PreparedView
 from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.engine.views.view_planes import edge_pixels_by_noise, fitted_planes, inverse, scale_at, shared_sigma, with_shared_error
+from tofuse.engine.views.view_planes import (
+    edge_pixels_by_noise,
+    fitted_planes,
+    inverse,
+    scale_at,
+    shared_sigma,
+    with_shared_error,
+)
 
 # Pixels whose noise exceeds the typical one by this ratio get planes of their own, if they are at
 # least this fraction of a view.

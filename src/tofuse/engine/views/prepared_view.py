@@ -9,14 +9,27 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Float32
-from tofuse.engine.views.residual_kernels import TargetImage, ViewImages, make_target
 from tofuse.engine.compute.partition import median
 from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.views.view_planes_kernels import albedo_image, halve, smooth_and_slope
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.views.projection import Projection, projection_of
+from tofuse.engine.views.residual_kernels import TargetImage, ViewImages, make_target
 from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.engine.views.view_planes import edge_pixels, fitted_planes, inverse, noise_law, noise_scale, pixels_with_plane, row_chunks, scale_at, shared_sigma, stated_sigma, typical_noise, with_shared_error
+from tofuse.engine.views.view_planes import (
+    edge_pixels,
+    fitted_planes,
+    inverse,
+    noise_law,
+    noise_scale,
+    pixels_with_plane,
+    row_chunks,
+    scale_at,
+    shared_sigma,
+    stated_sigma,
+    typical_noise,
+    with_shared_error,
+)
+from tofuse.engine.views.view_planes_kernels import albedo_image, halve, smooth_and_slope
 
 # Sparse images are not halved below this width and height.
 _MIN_SIDE = 16

@@ -15,11 +15,11 @@ from tofuse.engine.arrays import Bool, Float32, UInt8
 from tofuse.engine.cameras.cameras import ray_lengths
 from tofuse.engine.compute.partition import median
 from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.views.view_planes_kernels import fit_planes
-from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.views.projection import Projection
 from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes_kernels import fit_planes
 
 # Rows of a chunk: many, as chunks cost synchronisation and their windows overlap; fixed, so that
 # the result does not depend on the number of threads.

@@ -13,20 +13,20 @@ from typing import Any, Literal
 import numpy as np
 
 from tofuse.engine.arrays import UInt8
+from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.frames.depth_counts import MAX_COUNTS
+from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.frames.recording import Recording
+from tofuse.engine.sensor.depth_correction import DepthCorrection
 from tofuse.formats.files.atomic import make_folder, write_text
 from tofuse.formats.files.images import write_png
 from tofuse.formats.files.staging import new_folder
 from tofuse.formats.files.trajectory import write_log, write_tum
-from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable
-from tofuse.formats.recordings.camera_file import SCHEMA, camera_fields
-from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
-from tofuse.formats.recordings.native import RecordingWriter, same_distortion
 from tofuse.formats.readers.native import NativeSource
-from tofuse.engine.frames.recording import Recording
+from tofuse.formats.recordings.camera_file import SCHEMA, camera_fields
+from tofuse.formats.recordings.native import RecordingWriter, same_distortion
 from tofuse.formats.recordings.rectify import Rectifier, pinhole_of
-from tofuse.formats.recordings.sources import MAX_COUNTS
-from tofuse.engine.sensor.depth_correction import DepthCorrection
 
 FINEST_UNIT_M = 1e-4
 MIN_SIGMA_UNIT_M = 1e-5

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tofuse.engine.errors import OutputError
+from tofuse.engine.errors import output_error
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer as Buffer
@@ -23,24 +23,6 @@ if TYPE_CHECKING:
 UNFINISHED = ".tofuse-"  # prefix of temporary names, which a killed run leaves behind
 
 _counter = itertools.count()
-
-_REMEDIES = {
-    errno.ENOSPC: "free some space, or choose another folder",
-    errno.EDQUOT: "free some space, or choose another folder",
-    errno.EACCES: "choose a folder that you may write to",
-    errno.EPERM: "choose a folder that you may write to",
-    errno.EROFS: "choose a folder that you may write to",
-    errno.ENOENT: "create its folder first",
-    errno.ENOTDIR: "choose a path whose parents are folders",
-    errno.EISDIR: "choose the path of a file",
-}
-
-
-def output_error(error: OSError, path: str | Path) -> OutputError:
-    """Return the error that `path` can't be written, with reason and remedy."""
-    reason = (error.strerror or str(error)).lower()
-    remedy = _REMEDIES.get(error.errno or 0, "choose another place for it")
-    return OutputError(f"can't be written ({reason})", where=path, remedy=remedy)
 
 
 @contextmanager

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.errors import InputError
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.files.atomic import replacing
-from tofuse.formats.files.geometry_record import GeometryRecord
 from tofuse.formats.files.reading import required_package
 
 _NORMALS = "http://www.libe57.org/E57_EXT_surface_normals.txt"

@@ -14,10 +14,10 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.atomic import replacing
-from tofuse.formats.files.reading import read_text
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.graph.graph import PoseGraph
+from tofuse.formats.files.atomic import replacing
+from tofuse.formats.files.reading import read_text
 
 VERTEX = "VERTEX_SE3:QUAT"
 EDGE = "EDGE_SE3:QUAT"

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.files.atomic import replacing, write_bytes
-from tofuse.formats.files.geometry_record import GeometryRecord
 
 _HEADER_BYTES, _FIELD_BYTES = 375, 192
 _SCALE_M = 1e-4  # rounds by half of that; 31 bits of it span 200 km

@@ -12,8 +12,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from tofuse.engine.errors import OutputError
-from tofuse.formats.files.atomic import output_error
+from tofuse.engine.errors import OutputError, output_error
 
 # The holder describes itself behind the first byte, which others can't read on Windows.
 _NOTE_OFFSET, _MAX_NOTE_BYTES = 1, 200

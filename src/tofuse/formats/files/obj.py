@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.files.atomic import write_bytes, write_text
-from tofuse.formats.files.geometry_record import GeometryRecord
 
 
 def write_obj(path: str | Path, mesh: GeometryRecord) -> None:

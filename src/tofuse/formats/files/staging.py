@@ -17,8 +17,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Self
 
-from tofuse.engine.errors import OutputError
-from tofuse.formats.files.atomic import UNFINISHED, output_error, sync, sync_tree
+from tofuse.engine.errors import OutputError, output_error
+from tofuse.formats.files.atomic import UNFINISHED, sync, sync_tree
 from tofuse.formats.files.locking import Claim
 
 

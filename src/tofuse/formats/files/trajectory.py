@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
+from tofuse.engine.geometry.quaternion import from_matrix, length, to_pose
+from tofuse.engine.geometry.se3 import MAX_COORDINATE_M
 from tofuse.formats.files.atomic import write_text
 from tofuse.formats.files.reading import read_text
 from tofuse.formats.files.tables import exact
-from tofuse.engine.geometry.quaternion import from_matrix, length, to_pose
-from tofuse.engine.geometry.se3 import MAX_COORDINATE_M
 
 ASSOCIATION_LIMIT_S = 0.02
 

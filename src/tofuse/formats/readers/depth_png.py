@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.errors import InputError
+from tofuse.engine.parts import part
 from tofuse.formats.files.images import read_header
 from tofuse.formats.files.reading import files_with, is_file
-from tofuse.engine.parts import part
 from tofuse.formats.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.formats.recordings.sources import DepthImageSource
 

@@ -14,12 +14,22 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhole, RayTable
+from tofuse.engine.errors import InputError
 from tofuse.engine.geometry.quaternion import to_pose
 from tofuse.engine.geometry.se3 import check_pose, inverse, orthonormalise
 from tofuse.engine.parts import part
-from tofuse.formats.recordings.bags import GREY, BagSource, Info, Track, bag_kind, camera_info, first_message, open_bag, open_container
+from tofuse.formats.recordings.bags import (
+    GREY,
+    BagSource,
+    Info,
+    Track,
+    bag_kind,
+    camera_info,
+    first_message,
+    open_bag,
+    open_container,
+)
 from tofuse.formats.recordings.camera_file import ColorCamera, checked_lens
 from tofuse.formats.recordings.lenses import forward_brown, inverse_brown, simplest_lens
 from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff

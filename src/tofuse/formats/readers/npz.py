@@ -10,15 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Camera, RayTable, pinhole_values
 from tofuse.engine.errors import InputError
+from tofuse.engine.frames.depth_counts import depth_from_numbers
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.parts import part
 from tofuse.formats.files.npz import read_npz
 from tofuse.formats.files.reading import read_head
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Camera, RayTable
-from tofuse.engine.parts import part
-from tofuse.formats.recordings.camera_file import AMPLITUDE_KINDS, MAX_SLOPE, checked_lens, load_camera, pinhole_values
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.recordings.camera_file import (
+    AMPLITUDE_KINDS,
+    MAX_SLOPE,
+    checked_lens,
+    load_camera,
+)
 from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, file_of, required_file
-from tofuse.formats.recordings.sources import FileSource, check_timestamps, depth_from_numbers, finite_float32, read_matrix_pose
+from tofuse.formats.recordings.sources import (
+    FileSource,
+    check_timestamps,
+    finite_float32,
+    read_matrix_pose,
+)
 
 MAX_BYTES = 1 << 30
 _IMAGES = {"amplitude": 3, "confidence": 3, "sigma": 3, "color": 4}

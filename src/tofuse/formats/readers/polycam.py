@@ -8,13 +8,21 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64, UInt8
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.recording import POSES_BY
+from tofuse.engine.parts import part
 from tofuse.formats.files.images import first_size
 from tofuse.formats.files.reading import files_with, if_file, is_file, is_folder
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.parts import part
 from tofuse.formats.recordings.camera_file import image_size, number_in, read_json
-from tofuse.formats.recordings.phones import CONFIDENCE_MAX, POSES_BY, PhoneSource, arkit_pose, lens
-from tofuse.formats.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera, required
+from tofuse.formats.recordings.phones import CONFIDENCE_MAX, PhoneSource, arkit_pose, lens
+from tofuse.formats.recordings.reader import (
+    PER_FRAME,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    refuse_camera,
+    required,
+)
 from tofuse.formats.recordings.sources import cameras_of, poses_from_files
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]

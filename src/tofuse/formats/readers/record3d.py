@@ -12,19 +12,37 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
+from tofuse.engine.frames.depth_counts import depth_from_numbers
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import POSES_BY
+from tofuse.engine.geometry import quaternion
+from tofuse.engine.parts import part
 from tofuse.formats.files.exr import parse_exr
 from tofuse.formats.files.images import as_color, parse_image
 from tofuse.formats.files.lzfse import lzfse_decompress
-from tofuse.formats.files.reading import files_named, input_error, is_file, is_folder, read_bytes, required_package
-from tofuse.engine.geometry import quaternion
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.parts import part
+from tofuse.formats.files.reading import (
+    files_named,
+    input_error,
+    is_file,
+    is_folder,
+    read_bytes,
+    required_package,
+)
 from tofuse.formats.recordings.camera_file import image_size, number_in, numbers_in, read_json
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.phones import ARKIT_AXES, CONFIDENCE_MAX, POSES_BY, SENSOR, lens, resized
-from tofuse.formats.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, begins_with, file_of, refuse_camera, required
-from tofuse.formats.recordings.sources import FileSource, depth_from_numbers
+from tofuse.formats.recordings.phones import ARKIT_AXES, CONFIDENCE_MAX, SENSOR, lens, resized
+from tofuse.formats.recordings.reader import (
+    PER_FRAME,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    begins_with,
+    file_of,
+    refuse_camera,
+    required,
+)
+from tofuse.formats.recordings.sources import FileSource
 
 MAX_MEMBER_BYTES = 1 << 26
 _MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")

@@ -8,13 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
+from tofuse.engine.parts import part
 from tofuse.formats.files.images import first_size
 from tofuse.formats.files.reading import files_with, is_file, is_folder, read_text
 from tofuse.formats.files.trajectory_formats import read_poses
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.parts import part
-from tofuse.formats.recordings.camera_file import checked_pinhole, image_size, number_in, numbers_in, read_json
+from tofuse.formats.recordings.camera_file import (
+    checked_pinhole,
+    image_size,
+    number_in,
+    numbers_in,
+    read_json,
+)
 from tofuse.formats.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
 from tofuse.formats.recordings.sources import DepthImageSource
 

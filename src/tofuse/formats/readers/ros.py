@@ -8,15 +8,33 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float32, UInt8
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import Camera, Pinhole
-from tofuse.engine.parts import part
-from tofuse.formats.recordings.bags import COLORS, ENCODINGS, GREY, MAX_GAP_S, REMEDY, BagSource, Track, Transforms, bag_kind, cloud, color_image, decompressed, decompressed_color, frame_name, image, lens
-from tofuse.formats.recordings.camera_file import ColorCamera, check_size
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.depth_counts import depth_from_numbers
 from tofuse.engine.frames.frames import Frame
+from tofuse.engine.parts import part
+from tofuse.formats.recordings.bags import (
+    COLORS,
+    ENCODINGS,
+    GREY,
+    MAX_GAP_S,
+    REMEDY,
+    BagSource,
+    Track,
+    Transforms,
+    bag_kind,
+    cloud,
+    color_image,
+    decompressed,
+    decompressed_color,
+    frame_name,
+    image,
+    lens,
+)
+from tofuse.formats.recordings.camera_file import ColorCamera, check_size
 from tofuse.formats.recordings.organised import SAMPLES, common_camera, organised_frame
 from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.formats.recordings.sources import cloud_frame, depth_from_numbers, library_errors
+from tofuse.formats.recordings.sources import cloud_frame, library_errors
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"

@@ -10,14 +10,21 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
+from tofuse.engine.parts import part
 from tofuse.formats.files.images import first_size
 from tofuse.formats.files.reading import files_named, if_file, is_file
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.parts import part
 from tofuse.formats.recordings.camera_file import numbers_in, read_json
 from tofuse.formats.recordings.phones import IMAGE_SIZE, PhoneSource, arkit_pose, lens
-from tofuse.formats.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera, required
+from tofuse.formats.recordings.reader import (
+    PER_FRAME,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    refuse_camera,
+    required,
+)
 from tofuse.formats.recordings.sources import interpolated, poses_of
 
 _DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)

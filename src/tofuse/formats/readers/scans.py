@@ -13,13 +13,34 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import read_head, required_package
+from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry.quaternion import to_pose
 from tofuse.engine.parts import part
-from tofuse.formats.recordings.cloud_sequence import CloudFileSource, find_shift, map_shift, note_shift, required_files, sniff_clouds
-from tofuse.engine.frames.frames import CloudFrame
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, begins_with, file_of, refuse_camera, required_file
-from tofuse.formats.recordings.sources import FileSource, cloud_frame, library_errors, poses_of, read_matrix_pose
+from tofuse.formats.files.reading import read_head, required_package
+from tofuse.formats.recordings.cloud_sequence import (
+    CloudFileSource,
+    find_shift,
+    map_shift,
+    note_shift,
+    required_files,
+    sniff_clouds,
+)
+from tofuse.formats.recordings.reader import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    begins_with,
+    file_of,
+    refuse_camera,
+    required_file,
+)
+from tofuse.formats.recordings.sources import (
+    FileSource,
+    cloud_frame,
+    library_errors,
+    poses_of,
+    read_matrix_pose,
+)
 
 MAX_POINTS = 100_000_000
 _E57 = b"ASTM-E57"

@@ -13,14 +13,29 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, UInt8, UInt16
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.images import as_color, parse_image
-from tofuse.formats.files.reading import input_error
+from tofuse.engine.frames.depth_counts import depth_from_counts
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry.se3 import inverse
 from tofuse.engine.parts import part
+from tofuse.formats.files.images import as_color, parse_image
+from tofuse.formats.files.reading import input_error
 from tofuse.formats.recordings.camera_file import ColorCamera, checked_pinhole
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, begins_with, file_of, required_file
-from tofuse.formats.recordings.sources import FileSource, check_timestamps, depth_from_counts, poses_of, read_matrix_pose, read_part, sampled_color
+from tofuse.formats.recordings.reader import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    begins_with,
+    file_of,
+    required_file,
+)
+from tofuse.formats.recordings.sources import (
+    FileSource,
+    check_timestamps,
+    poses_of,
+    read_matrix_pose,
+    read_part,
+    sampled_color,
+)
 
 VERSION = 4
 RAW, ZLIB, OCCI = 0, 1, 2  # compression of depth

@@ -8,12 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import is_file, read_head, read_text
 from tofuse.engine.cameras.cameras import RayTable
-from tofuse.engine.parts import part
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, files_at, refuse_camera, required
+from tofuse.engine.parts import part
+from tofuse.formats.files.reading import is_file, read_head, read_text
+from tofuse.formats.recordings.reader import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    files_at,
+    refuse_camera,
+    required,
+)
 from tofuse.formats.recordings.sources import FileSource, interpolated
 
 FRAME_RATE_HZ = 32.0

@@ -8,15 +8,22 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import quaternion
+from tofuse.engine.parts import part
 from tofuse.formats.files.images import first_size
 from tofuse.formats.files.reading import files_with, is_file, is_folder
 from tofuse.formats.files.tables import read_columns, read_numbers
 from tofuse.formats.files.video import Video
-from tofuse.engine.geometry import quaternion
-from tofuse.engine.parts import part
 from tofuse.formats.recordings.imu import gravity_at
 from tofuse.formats.recordings.phones import IMAGE_SIZE, PhoneSource, lens
-from tofuse.formats.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera, required
+from tofuse.formats.recordings.reader import (
+    PER_FRAME,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    refuse_camera,
+    required,
+)
 from tofuse.formats.recordings.sources import interpolated
 
 FRAME_RATE_HZ = 60.0

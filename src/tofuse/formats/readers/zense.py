@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.formats.files.images import first_size
-from tofuse.formats.files.reading import files_with, is_file, is_folder, parse_toml, read_text
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.parts import part
+from tofuse.formats.files.images import first_size
+from tofuse.formats.files.reading import files_with, is_file, is_folder, parse_toml, read_text
 from tofuse.formats.recordings.camera_file import checked_lens, image_size, number_in
 from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, required
 from tofuse.formats.recordings.sources import DepthImageSource

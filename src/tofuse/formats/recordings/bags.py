@@ -15,15 +15,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.images import as_color, parse_image
-from tofuse.formats.files.reading import files_with, is_file, is_folder, list_folder, read_head, required_package
-from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Pinhole
-from tofuse.formats.recordings.camera_file import check_size, checked_lens
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.depth_counts import depth_from_counts
 from tofuse.engine.frames.frames import Frame
+from tofuse.engine.geometry import quaternion, se3
+from tofuse.formats.files.images import as_color, parse_image
+from tofuse.formats.files.reading import (
+    files_with,
+    is_file,
+    is_folder,
+    list_folder,
+    read_head,
+    required_package,
+)
+from tofuse.formats.recordings.camera_file import check_size, checked_lens
 from tofuse.formats.recordings.reader import ReaderOptions
-from tofuse.formats.recordings.sources import FileSource, depth_from_counts, finite_float32, library_errors, sampled_color
+from tofuse.formats.recordings.sources import (
+    FileSource,
+    finite_float32,
+    library_errors,
+    sampled_color,
+)
 
 REMEDY = "check the bag, or reindex it"
 MAX_GAP_S = 0.02  # between the images of one frame

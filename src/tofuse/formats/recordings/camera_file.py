@@ -13,11 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.cameras.cameras import (
+    DISTORTION_ORDER,
+    MODELS,
+    Camera,
+    Pinhole,
+    RayTable,
+    lens_values,
+)
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import input_error, is_file, read_text
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable
-from tofuse.engine.geometry.se3 import check_pose
 from tofuse.engine.frames.frames import AmplitudeKind, DepthKind
+from tofuse.engine.geometry.se3 import check_pose
+from tofuse.formats.files.reading import input_error, is_file, read_text
 
 # Limits for any camera: a frame per month to a million per second; ambiguity ranges of modulation
 # at 15 GHz to 1.5 kHz.
@@ -26,7 +33,6 @@ _PERIODS_M = (0.01, 1e5)
 
 SCHEMA = 1
 MAX_SLOPE = 1e4  # of a ray: 89.99 degrees off the axis
-MAX_SKEW_PX = 0.005  # a smaller displacement of pixels by skew is neglected
 AMPLITUDE_KINDS = ("raw", "range_compensated", "ir")
 
 _METRES = "the metres of one count, such as 0.001"
@@ -491,42 +497,6 @@ def image_size(width: float, height: float, where: str | Path) -> tuple[int, int
     return int(width), int(height)
 
 
-def pinhole_values(K: Float64, height: int, where: str | Path) -> dict[str, float]:
-    """Return fx, fy, cx and cy of a matrix K (3, 3).
-
-    Parameters
-    ----------
-    K
-        The matrix.
-    height
-        Of the images, in pixels: it decides whether a skew is negligible.
-    where
-        The file or argument, for errors.
-
-    Raises
-    ------
-    InputError
-        If it is not such a matrix, or has skew, which a pinhole camera has not.
-    """
-    if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)) or K[1, 0] != 0:
-        raise InputError(
-            f"is not a matrix K: {K.tolist()}" if K.size < 20 else f"has shape {K.shape}",
-            where=where,
-            remedy="use [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the depth images",
-        )
-    if abs(K[0, 1]) * height > MAX_SKEW_PX * abs(K[1, 1]):
-        raise InputError(
-            f"has a skew of {K[0, 1]:.3g} px",
-            where=where,
-            remedy="use the rays of the pixels (rays, RayTable), or 0 if it is negligible",
-        )
-    return _lens_values(K)
-
-
-def _lens_values(K: Float64) -> dict[str, float]:
-    return {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
-
-
 def checked_lens(
     cls: type[Pinhole], size: tuple[int, int], values: dict[str, float], where: str | Path
 ) -> Pinhole:
@@ -579,7 +549,7 @@ def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pin
     InputError
         See `checked_lens`.
     """
-    return checked_lens(Pinhole, size, _lens_values(K), where)
+    return checked_lens(Pinhole, size, lens_values(K), where)
 
 
 def _color(get: _Fields) -> ColorCamera | None:

@@ -2,33 +2,48 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
+import numpy as np
+
 from tofuse.engine.arrays import Float32
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import Camera, range_from_z, z_from_range
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import DepthKind
 from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.formats.files.atomic import replacing
+from tofuse.formats.files.npz import read_npz
 
 _MAX_BYTES = 1 << 30
 
 
-def read_correction(path: Path) -> DepthCorrection:
-    """Read a correction.npz; InputError if it is invalid, or decompresses to an absurd size."""
+KEYS = ("range_m", "bias_m", "pixel_bias_m")
+
+
+def write_correction(path: str | Path, correction: DepthCorrection) -> None:
+    """Write an .npz with the keys range_m, bias_m and, where known, pixel_bias_m."""
+    arrays = {"range_m": correction.range_m, "bias_m": correction.bias_m}
+    if correction.pixel_bias_m is not None:
+        arrays["pixel_bias_m"] = correction.pixel_bias_m
+    with replacing(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def read_correction(path: str | Path) -> DepthCorrection:
+    """Read what `write_correction` writes; InputError if it is invalid or absurdly large."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(item.file_size for item in archive.infolist())
-    except (OSError, ValueError, zipfile.BadZipFile):
-        size = 0  # reported by the loader
+        arrays = read_npz(path, limit=_MAX_BYTES, names=frozenset(KEYS))
+    except InputError as error:
+        raise InputError(
+            error.problem, where=path, remedy="write it again, or delete it to go without"
+        ) from error
+    for key in KEYS[:2]:
+        if key not in arrays:
+            raise InputError(f"has no {key}", where=path, remedy=f"use the keys {list(KEYS)}")
     try:
-        if size <= _MAX_BYTES:
-            return DepthCorrection.load(path)
-    except MemoryError:
-        pass
-    raise InputError(
-        "decompresses to more than a correction can be", where=path, remedy="write it again"
-    )
+        return DepthCorrection(arrays["range_m"], arrays["bias_m"], arrays.get("pixel_bias_m"))
+    except InputError as error:
+        raise InputError(error.problem, where=path, remedy=error.remedy) from error
 
 
 def corrected_depth(

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.engine.errors import InputError
 from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, BrownConrady, Pinhole, RayTable
+from tofuse.engine.errors import InputError
 from tofuse.formats.recordings.camera_file import checked_lens
 
 

@@ -12,18 +12,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Float32, UInt16
+from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.frames.depth_counts import INVALID_DEPTH, MAX_COUNTS
+from tofuse.engine.frames.frames import (
+    SATURATED_AMPLITUDE,
+    CloudFrame,
+    DepthKind,
+    Frame,
+    RangeFrame,
+)
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.sensor.depth_correction import DepthCorrection
 from tofuse.formats.files.atomic import make_folder, replacing, write_text
-from tofuse.formats.files.geometry_record import GeometryRecord
 from tofuse.formats.files.images import write_png
 from tofuse.formats.files.ply import write_ply
 from tofuse.formats.files.tables import exact, write_columns
 from tofuse.formats.files.trajectory import write_tum
-from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable
 from tofuse.formats.recordings.camera_file import SCHEMA, camera_fields
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, DepthKind, Frame, RangeFrame
-from tofuse.formats.recordings.sources import INVALID_DEPTH, MAX_COUNTS
-from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.formats.recordings.correction_file import write_correction
 
 # Columns of frames.csv that give each frame its own lens.
 LENS_COLUMNS = ("fx", "fy", "cx", "cy")
@@ -253,7 +260,7 @@ class RecordingWriter:
                 write_tum(self.folder / f"{name}.txt", self._times, poses)
         if correction is not None:
             with replacing(self.folder / "correction.npz") as temporary:
-                correction.save(temporary)
+                write_correction(temporary, correction)
         if imu is not None:
             write_columns(self.folder / "imu.csv", imu)
         if self._lenses:

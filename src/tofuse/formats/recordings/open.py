@@ -13,13 +13,14 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.formats.files.reading import input_error, is_folder, list_folder, path_of
-from tofuse.formats.files.trajectory_formats import TimedPoses, read_poses
-from tofuse.engine.parts import discover, name_of, registered
-from tofuse.formats.recordings.cloud_sequence import describe_shift
 from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames.recording import NOISE_MODEL, Recording, Source
+from tofuse.engine.parts import discover, name_of, registered
+from tofuse.formats.files.noise_file import read_noise
+from tofuse.formats.files.reading import input_error, is_file, is_folder, list_folder, path_of
+from tofuse.formats.files.trajectory_formats import TimedPoses, read_poses
+from tofuse.formats.recordings.cloud_sequence import describe_shift
 from tofuse.formats.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.engine.frames.recording import Recording, Source
 from tofuse.formats.recordings.rig import RigSource, read_rig, recordings_of, rig_file_in
 from tofuse.formats.recordings.sources import JoinedSource, LimitedSource
 from tofuse.formats.recordings.still import average_still
@@ -100,6 +101,9 @@ def open_recording(
     if len(sources) > 1:
         source = JoinedSource(sources, _short_names([item.path for item in located]))
     _check_usable(source, paths[0])
+    noise_file = Path(paths[0]) / "noise.json"
+    if len(paths) == 1 and is_folder(paths[0]) and is_file(noise_file):
+        source.metadata[NOISE_MODEL] = read_noise(noise_file)
     if min_depth is not None or max_depth is not None:
         source = LimitedSource(
             source, min_depth or 0.0, float("inf") if max_depth is None else max_depth

@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.images import read_color, read_image
 from tofuse.engine.cameras.cameras import Pinhole, scaled
-from tofuse.formats.recordings.camera_file import checked_pinhole
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.depth_counts import depth_from_counts
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.sources import FileSource, depth_from_counts, read_matrix_pose
+from tofuse.engine.frames.recording import POSES_BY
+from tofuse.formats.files.images import read_color, read_image
+from tofuse.formats.recordings.camera_file import checked_pinhole
+from tofuse.formats.recordings.sources import FileSource, read_matrix_pose
 
 # ARKit's camera looks along -z with y up.
 ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 SENSOR = "iPhone or iPad LiDAR (direct ToF)"
 # Key of the metadata: the program that estimated the recorded poses.
-POSES_BY = "poses_by"
-ARKIT_UP = np.array([0.0, 1.0, 0.0])  # opposite to gravity, in the world frame of its poses
 IMAGE_SIZE = (1920, 1440)  # of ARKit's colour images, to which its intrinsics refer
 CONFIDENCE_MAX = 2.0
 

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.errors import InputError
-from tofuse.formats.files.atomic import write_text
-from tofuse.formats.files.reading import if_file
 from tofuse.engine.cameras.cameras import ray_lengths
-from tofuse.engine.geometry.se3 import check_pose
-from tofuse.formats.recordings.camera_file import number_in, numbers_in, read_json
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.frames.recording import Recording
+from tofuse.engine.geometry.se3 import check_pose
+from tofuse.formats.files.atomic import write_text
+from tofuse.formats.files.reading import if_file
+from tofuse.formats.recordings.camera_file import number_in, numbers_in, read_json
 
 SCHEMA = 1
 FILE_NAME = "rig.json"

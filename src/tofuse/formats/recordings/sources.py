@@ -13,18 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
+from tofuse.engine.cameras.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.frames.depth_counts import depth_from_counts
+from tofuse.engine.frames.frames import AmplitudeKind, CloudFrame, DepthKind, Frame, RangeFrame
+from tofuse.engine.frames.recording import Source
+from tofuse.engine.geometry.se3 import MAX_COORDINATE_M, check_pose, orthonormalise
 from tofuse.formats.files.images import check_first_size, read_color, read_image
 from tofuse.formats.files.ply import read_ply
 from tofuse.formats.files.reading import input_error, is_file
 from tofuse.formats.files.tables import read_numbers
 from tofuse.formats.files.trajectory import associated_poses, read_tum
-from tofuse.engine.cameras.cameras import Camera, Pinhole
-from tofuse.engine.geometry.se3 import MAX_COORDINATE_M, check_pose, orthonormalise
 from tofuse.formats.recordings.camera_file import CameraFile, ColorCamera, check_size, load_camera
-from tofuse.engine.frames.frames import AmplitudeKind, CloudFrame, DepthKind, Frame, RangeFrame
 from tofuse.formats.recordings.reader import ReaderOptions
-from tofuse.engine.frames.recording import Source
 
 T = TypeVar("T")
 
@@ -403,30 +404,6 @@ class LimitedSource:
             return frame.keep((frame.z >= self.min_depth) & (frame.z <= self.max_depth))
         distance = np.linalg.norm(frame.points - frame.origin, axis=1)
         return frame.keep((distance >= self.min_depth) & (distance <= self.max_depth))
-
-
-INVALID_DEPTH = 65535
-MAX_COUNTS = 65535
-
-
-def depth_from_counts(counts: NDArray[np.generic], unit_m: float) -> Float32:
-    """Return depth in m (float32) of stored counts (H, W); 0 and 65535 give 0."""
-    depth = counts.astype(np.float32) * np.float32(unit_m)
-    depth[counts == INVALID_DEPTH] = 0
-    return depth
-
-
-def depth_from_numbers(numbers: NDArray[np.generic], unit_m: float) -> Float32:
-    """Return depth in m (float32) of stored integers or floats (H, W) in units of `unit_m`.
-
-    Depth that is not finite or implausibly large is 0, and so are integers of 65535.
-    """
-    with np.errstate(all="ignore"):
-        depth = numbers.astype(np.float32) * np.float32(unit_m)
-        depth[~(np.abs(depth) < MAX_COORDINATE_M)] = 0
-    if numbers.dtype.kind in "ui":
-        depth[numbers == INVALID_DEPTH] = 0
-    return depth
 
 
 # A point is occluded if another one in its cell is nearer by more than this fraction.

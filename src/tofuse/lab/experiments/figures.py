@@ -7,10 +7,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tofuse.apps.report import plots
+from tofuse.apps.report.plots import (
+    AFTER,
+    BAD,
+    BEFORE,
+    GRID,
+    INK,
+    MUTED,
+    REFERENCE,
+    make_figure,
+    svg,
+)
 from tofuse.engine.arrays import Float64
 from tofuse.lab.experiments.peaks import AXES, PeaksRun, PeaksSweep
-from tofuse.apps.report import plots
-from tofuse.apps.report.plots import AFTER, BAD, BEFORE, GRID, INK, MUTED, REFERENCE, make_figure, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.quality.trajectory import evaluate_trajectory
 from tofuse.engine.geometry import se3
+from tofuse.engine.quality.trajectory import evaluate_trajectory
 
 _MAX_FIT_POINTS = 20_000  # max points of a wall fit
 

@@ -16,14 +16,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse._version import __version__
+from tofuse.apps.results.folder import Contract, OutputFolder, read_json_object
+from tofuse.apps.results.run_json import plain
 from tofuse.engine.errors import InputError
+from tofuse.engine.mapping.progress import Progress, Silent
 from tofuse.lab.experiments import sections
 from tofuse.lab.experiments.cases import CASES, DRAWS, METHODS, CaseResult, Run, run_case
 from tofuse.lab.experiments.peaks import AXES, SIGMAS_M, PeaksSweep, sweep_peaks
 from tofuse.lab.experiments.statements import JudgedStatement, Results, judge_all
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.apps.results.folder import Contract, OutputFolder, read_json_object
-from tofuse.apps.results.run_json import plain
 
 if TYPE_CHECKING:
     from jinja2 import Template

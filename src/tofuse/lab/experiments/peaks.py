@@ -8,7 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
+from tofuse.engine.clouds.icp import algorithm_1
+from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph.build import Measured, build_graph
+from tofuse.engine.graph.castellani import Castellani
+from tofuse.engine.graph.graph import Optimiser, PoseGraph
+from tofuse.engine.mapping.methods import default
+from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.refinement.plane_refinement import Planes
+from tofuse.engine.stored_views.view_store import Spacing, ViewStore
+from tofuse.engine.tracking.sequential import Sequential
 from tofuse.lab.experiments.bound import (
     joint_covariance,
     mean_distance,
@@ -22,17 +33,6 @@ from tofuse.lab.simulation.peaks import (
     peaks_views,
     peaks_visible,
 )
-from tofuse.engine.tracking.sequential import Sequential
-from tofuse.engine.mapping.methods import default
-from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.graph.build import Measured, build_graph
-from tofuse.engine.graph.castellani import Castellani
-from tofuse.engine.graph.graph import Optimiser, PoseGraph
-from tofuse.engine.refinement.plane_refinement import Planes
-from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
-from tofuse.engine.clouds.icp import algorithm_1
 
 SIGMAS_M = tuple(k / 100 for k in range(1, 11))
 AXES = ("x", "y", "z", "yaw", "pitch", "roll")

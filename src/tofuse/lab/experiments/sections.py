@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.apps.report import thumbnails
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.lab.experiments import figures
@@ -15,7 +16,6 @@ from tofuse.lab.experiments.cases import GUESSES, METHODS, CaseResult, Model, Ru
 from tofuse.lab.experiments.peaks import PeaksSweep
 from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.lab.simulation.scenes import box, room
-from tofuse.apps.report import thumbnails
 
 _EXAMPLE_SIGMA = 0.09
 

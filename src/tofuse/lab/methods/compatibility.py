@@ -10,8 +10,8 @@ import numpy as np
 
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.parts import part
 from tofuse.engine.clouds.interfaces import Alignment, Matches, Rejector
+from tofuse.engine.parts import part
 
 
 @part("rejector", "normal", label="validated")

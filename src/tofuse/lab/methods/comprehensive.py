@@ -8,14 +8,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from tofuse.engine.geometry.kdtree import KdTree
-from tofuse.lab.methods.variants import Variant
-from tofuse.engine.parts import part
 from tofuse.engine.clouds.icp import Icp
 from tofuse.engine.clouds.interfaces import Alignment, Matcher, Matches, Points, Search
 from tofuse.engine.clouds.metrics import PointToPoint
 from tofuse.engine.clouds.selectors import All, Random
 from tofuse.engine.clouds.stopping import SmallStep
+from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.parts import part
+from tofuse.lab.methods.variants import Variant
 
 # Initial number of neighbours per query, doubled when all are matched.
 _INITIAL_NEIGHBOURS = 8

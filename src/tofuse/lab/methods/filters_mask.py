@@ -15,8 +15,8 @@ from tofuse.engine.arrays import Bool
 from tofuse.engine.bounds import Bounded, NotEmpty
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter
-from tofuse.engine.parts import part
 from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.parts import part
 
 
 @part("filter", "mask")

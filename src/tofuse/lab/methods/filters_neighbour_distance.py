@@ -12,8 +12,8 @@ from tofuse.engine.arrays import Bool
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.filters.base import Filter
 from tofuse.engine.filters.neighbours import MAX_NEIGHBOURS, mean_neighbour_distance
-from tofuse.engine.parts import part
 from tofuse.engine.frames.frames import Frame
+from tofuse.engine.parts import part
 
 
 @part("filter", "neighbour_distance")

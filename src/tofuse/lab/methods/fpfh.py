@@ -7,14 +7,14 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.lab.methods.sample_consensus import Method, SampleOptions, registration_of
-from tofuse.engine.parts import part
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
 from tofuse.engine.clouds.fpfh import NEIGHBOURS, POINTS, REACH, candidates
+from tofuse.engine.frames.frames import Frame
+from tofuse.engine.parts import part
+from tofuse.lab.methods.sample_consensus import Method, SampleOptions, registration_of
 
 
 @part("registration", "fpfh")

@@ -7,16 +7,16 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
-from tofuse.lab.methods.neighbourhoods import neighbourhood
-from tofuse.engine.parts import part
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.clouds.interfaces import Points
 from tofuse.engine.clouds.selectors import All, at_most
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import Frame
+from tofuse.engine.geometry import se3
+from tofuse.engine.parts import part
+from tofuse.lab.methods.neighbourhoods import neighbourhood
 
 _MIN_POINTS = 8
 # Max side length of a triangle in resolutions; longer ones bridge a gap.

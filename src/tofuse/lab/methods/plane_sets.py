@@ -9,14 +9,14 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.search.pair_agreement import agreement
-from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.search.plane_detection import Plane, detect_planes
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions

@@ -9,9 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.clouds.icp import Icp
+from tofuse.engine.clouds.icp_kernels import transform_points
+from tofuse.engine.clouds.rejectors import MaxDistance
+from tofuse.engine.clouds.selectors import All
+from tofuse.engine.clouds.stopping import SmallStep
+from tofuse.engine.clouds.surface_metrics import PointToPlane
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.geometry import se3
-from tofuse.engine.clouds.icp_kernels import transform_points
+from tofuse.engine.parts import part
 from tofuse.lab.methods.compatibility import Boundary
 from tofuse.lab.methods.multiview import (
     Cloud,
@@ -20,12 +26,6 @@ from tofuse.lab.methods.multiview import (
     optimal_rotation,
     resolution_of,
 )
-from tofuse.engine.parts import part
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.selectors import All
-from tofuse.engine.clouds.stopping import SmallStep
-from tofuse.engine.clouds.surface_metrics import PointToPlane
 
 # Approximate number of concrete pairs per registered pair of views, and max updates of a view.
 _PAIRS_PER_CONSTRAINT, _MAX_UPDATES = 200, 200

@@ -14,12 +14,20 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Registration
+from tofuse.engine.alignment.projective import UNITS
 from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.bounds import Bounds
+from tofuse.engine.clouds.robust_motion import (
+    MIN_PAIRS,
+    Consensus,
+    ConsensusOptions,
+    Motions,
+    Pairs,
+    motions_of,
+    squared_residuals,
+)
 from tofuse.engine.geometry import se3
-from tofuse.engine.alignment.base import Registration
-from tofuse.engine.clouds.robust_motion import MIN_PAIRS, Consensus, ConsensusOptions, Motions, Pairs, motions_of, squared_residuals
-from tofuse.engine.alignment.projective import UNITS
 
 Method = Literal["samples", "compatible"]
 

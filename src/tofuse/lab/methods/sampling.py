@@ -9,12 +9,12 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.parts import part
-from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.clouds.interfaces import Selector
 from tofuse.engine.clouds.selectors import Random
 from tofuse.engine.clouds.shape import NEIGHBOURS, normals_at
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.parts import part
 
 
 @part("selector", "random-each-iteration", label="validated")

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
 from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.lab.methods.multiview import Cloud, Pairs, RelaxationMethod, optimal_rotation
+from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
+from tofuse.lab.methods.multiview import Cloud, Pairs, RelaxationMethod, optimal_rotation
 
 # Weight of the fixed first view relative to all pairs.
 _GAUGE_WEIGHT = 1e6

@@ -9,11 +9,11 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_sum_kernels import matrix_sums
-from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
-from tofuse.engine.parts import part
 from tofuse.engine.clouds.interfaces import Alignment, Matches
 from tofuse.engine.clouds.pairs import SurfacePairs, solve, surface_pairs
 from tofuse.engine.clouds.surface_metrics import PointToPlane, SurfaceMetric
+from tofuse.engine.parts import part
+from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
 
 
 @part("metric", "squared-distance", label="validated")

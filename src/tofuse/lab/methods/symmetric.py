@@ -8,13 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
 from tofuse.engine.clouds.cloud_sum_kernels import plane_sums
-from tofuse.lab.methods.symmetric_kernels import symmetric_sums
-from tofuse.engine.parts import part
 from tofuse.engine.clouds.interfaces import Alignment, Matches
-from tofuse.engine.clouds.pairs import Loss, SurfacePairs, loss_weights, solve, surface_pairs, variance_of
+from tofuse.engine.clouds.pairs import (
+    Loss,
+    SurfacePairs,
+    loss_weights,
+    solve,
+    surface_pairs,
+    variance_of,
+)
 from tofuse.engine.clouds.surface_metrics import SurfaceMetric
+from tofuse.engine.geometry import se3
+from tofuse.engine.parts import part
+from tofuse.lab.methods.symmetric_kernels import symmetric_sums
 
 
 @part("metric", "symmetric", label="validated")

@@ -8,14 +8,9 @@ from typing import Annotated, Protocol
 
 import numpy as np
 
+from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.lab.methods.compatibility import Trimmed
-from tofuse.lab.methods.correspondence import ClosestCompatible, ClosestInvariant, Invariant
-from tofuse.lab.methods.symmetric import Symmetric
-from tofuse.engine.parts import part
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.clouds.icp import Icp
 from tofuse.engine.clouds.interfaces import Metric
 from tofuse.engine.clouds.metrics import PointToPoint
@@ -23,6 +18,11 @@ from tofuse.engine.clouds.rejectors import MaxDistance, Unique
 from tofuse.engine.clouds.selectors import All, at_most
 from tofuse.engine.clouds.stopping import SmallStep
 from tofuse.engine.clouds.surface_metrics import PlaneToPlane, PointToPlane
+from tofuse.engine.frames.frames import Frame
+from tofuse.engine.parts import part
+from tofuse.lab.methods.compatibility import Trimmed
+from tofuse.lab.methods.correspondence import ClosestCompatible, ClosestInvariant, Invariant
+from tofuse.lab.methods.symmetric import Symmetric
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.geometry import se3
 from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.geometry import se3
 
 CAMERAS = 20
 RADIUS_M = 10.0

@@ -10,11 +10,16 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.geometry import se3
+from tofuse.engine.sensor.depth_correction import DepthCorrection
 from tofuse.formats.files.atomic import make_folder
-from tofuse.formats.files.geometry_record import GeometryRecord
 from tofuse.formats.files.images import write_png
 from tofuse.formats.files.ply import write_ply
-from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.correction_file import corrected_depth
+from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.accelerometer import accelerations
@@ -23,11 +28,6 @@ from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.passing import Passing, add_distractor
 from tofuse.lab.simulation.peaks import peaks_cameras, peaks_points, peaks_views
 from tofuse.lab.simulation.render import RenderedFrame, render
-from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.sensor.depth_correction import DepthCorrection
 
 # Called with the number of frames done and the total.
 Progress = Callable[[int, int], None]

@@ -8,12 +8,12 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Complex128, Float32, Float64, UInt16
 from tofuse.engine.cameras.cameras import ray_lengths
+from tofuse.engine.frames.depth_counts import INVALID_DEPTH, depth_from_counts
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.lab.simulation import optics, sensor
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.simulation.scene import Scene, Sequence
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.recordings.sources import INVALID_DEPTH, depth_from_counts
 
 _DEFAULT = Effects()
 _FLAG_THRESHOLD_M = 0.003

@@ -8,16 +8,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
 from tofuse.engine.cameras.cameras import ray_lengths
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
+from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.paths import Path, look_at, rotation
 from tofuse.lab.simulation.record import RecordingPlan
-from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import ArraySource, Recording
 
 _DEFAULT = Effects()
 

@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float32, Float64, Int32, Int64
+from tofuse.engine.compute.thread_pool import run_chunks
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.compute.thread_pool import run_chunks
 from tofuse.lab.simulation import bvh_kernels as bvh
-from tofuse.lab.simulation.shading_kernels import Rays, Shading, Textures, Triangles, shade_hits
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation import texture
 from tofuse.lab.simulation.mesh import Mesh
 from tofuse.lab.simulation.paths import Path
+from tofuse.lab.simulation.shading_kernels import Rays, Shading, Textures, Triangles, shade_hits
 from tofuse.lab.simulation.texture import Material
 
 # Small enough to occupy all threads, large enough to amortise the overhead of a chunk.

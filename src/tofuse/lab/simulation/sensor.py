@@ -16,11 +16,11 @@ from functools import cache
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Complex128, Float32, Float64, UInt8
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.models import CameraModel
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE
 from tofuse.engine.sensor.depth_correction import DepthCorrection
 from tofuse.engine.sensor.frequencies import SPEED_OF_LIGHT
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.models import CameraModel
 
 TAPS = 4
 

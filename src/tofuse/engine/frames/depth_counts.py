@@ -1,0 +1,32 @@
+"""Depth stored as counts of 16 bits, or as other numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.engine.arrays import Float32
+from tofuse.engine.geometry.se3 import MAX_COORDINATE_M
+
+INVALID_DEPTH = 65535
+MAX_COUNTS = 65535
+
+
+def depth_from_counts(counts: NDArray[np.generic], unit_m: float) -> Float32:
+    """Return depth in m (float32) of stored counts (H, W); 0 and 65535 give 0."""
+    depth = counts.astype(np.float32) * np.float32(unit_m)
+    depth[counts == INVALID_DEPTH] = 0
+    return depth
+
+
+def depth_from_numbers(numbers: NDArray[np.generic], unit_m: float) -> Float32:
+    """Return depth in m (float32) of stored integers or floats (H, W) in units of `unit_m`.
+
+    Depth that is not finite or implausibly large is 0, and so are integers of 65535.
+    """
+    with np.errstate(all="ignore"):
+        depth = numbers.astype(np.float32) * np.float32(unit_m)
+        depth[~(np.abs(depth) < MAX_COORDINATE_M)] = 0
+    if numbers.dtype.kind in "ui":
+        depth[numbers == INVALID_DEPTH] = 0
+    return depth

@@ -1,0 +1,79 @@
+"""The commands of the laboratory: ``tofuse demo``, ``simulate`` and ``experiments``."""
+
+from __future__ import annotations
+
+import argparse
+
+from tofuse.apps.cli.commands import print_result
+from tofuse.apps.cli.progress import progress_for
+
+
+def demo(arguments: argparse.Namespace) -> int:
+    """``tofuse demo``."""
+    from tofuse.apps.jobs.running import exit_status
+    from tofuse.engine.compute.thread_pool import threads
+    from tofuse.lab.demo import FAILURE
+    from tofuse.lab.demo import demo as run_demo
+
+    with progress_for(as_json=arguments.json) as progress, threads(arguments.threads):
+        result = run_demo(
+            FAILURE if arguments.failure else arguments.scene,
+            arguments.out,
+            method=arguments.method,
+            seed=arguments.seed or 0,
+            threads=arguments.threads,
+            overwrite=arguments.overwrite,
+            progress=progress,
+        )
+    print_result(result, arguments.out, as_json=arguments.json)
+    return exit_status(result)
+
+
+def simulate(arguments: argparse.Namespace) -> int:
+    """``tofuse simulate``."""
+    from tofuse.engine.compute.thread_pool import threads
+    from tofuse.lab.demo import simulate_to
+    from tofuse.lab.simulation.passing import Passing
+
+    passing = None
+    if arguments.with_person is not None:
+        passing = Passing("person", arguments.with_person)
+    elif arguments.with_box is not None:
+        passing = Passing("box", arguments.with_box)
+    with progress_for(as_json=False) as progress, threads(arguments.threads):
+        frames = simulate_to(
+            arguments.scene,
+            arguments.out,
+            camera=arguments.camera,
+            seed=arguments.seed or 0,
+            every=arguments.every,
+            frames=arguments.frames,
+            first=arguments.first or 0,
+            texture=not arguments.uniform,
+            passing=passing,
+            without=tuple(w for w in arguments.without.split(",") if w),
+            correction=not arguments.no_correction,
+            imu=arguments.imu,
+            sigma=arguments.sigma,
+            progress=progress,
+        )
+    print(f"{frames} frames in {arguments.out}")
+    return 0
+
+
+def experiments(arguments: argparse.Namespace) -> int:
+    """``tofuse experiments``."""
+    from tofuse.engine.compute.thread_pool import threads
+    from tofuse.lab.experiments.page import run_experiments
+
+    with progress_for(as_json=False) as progress, threads(arguments.threads):
+        page = run_experiments(
+            arguments.out,
+            cases=tuple(c for c in arguments.cases.split(",") if c),
+            seeds=arguments.seeds,
+            seed=arguments.seed or 0,
+            overwrite=arguments.overwrite,
+            progress=progress,
+        )
+    print(f"see {page}")
+    return 0
