@@ -2,6 +2,6 @@
 
 import sys
 
-from tofuse.apps.cli.program import console
+from tofuse.apps.cli import console
 
 sys.exit(console())

@@ -25,7 +25,7 @@ from fake_cameras import (
     infrared_counts,
 )
 from tofuse.apps.cli.program import main
-from tofuse.apps.live.device import DeviceError, Stream, device, devices, is_installed
+from tofuse.apps.live.device import DeviceError, Stream, device_named, is_installed, known_devices
 from tofuse.apps.live.player import Player
 from tofuse.apps.live.recorder import QUEUE_FRAMES, record
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, Rational
@@ -56,7 +56,7 @@ def check_depth(frame: RangeFrame, k: int, unit_m: float) -> None:
 def test_realsense_stream(install: Install) -> None:
     package = FakeRealSense()
     install(package)
-    with device("realsense", {}).open() as stream:
+    with device_named("realsense", {}).open() as stream:
         frames = [stream.read(k) for k in range(3)]
         with pytest.raises(DeviceError, match="sent no frame"):
             list(stream)
@@ -74,7 +74,7 @@ def test_realsense_stereo_has_no_amplitude(install: Install) -> None:
     """The infrared image of a stereo camera has another viewpoint."""
     package = FakeRealSense(line="D400", model="brown_conrady")
     install(package)
-    with device("realsense", {}).open() as stream:
+    with device_named("realsense", {}).open() as stream:
         frame = stream.read(0)
     assert package.enabled == ["depth"]
     assert frame.amplitude_image is None
@@ -84,7 +84,7 @@ def test_realsense_stereo_has_no_amplitude(install: Install) -> None:
 
 def test_realsense_inverse_distortion_maps_pixel_to_ray(install: Install) -> None:
     install(FakeRealSense(model="inverse_brown_conrady"))
-    with device("realsense", {}).open() as stream:
+    with device_named("realsense", {}).open() as stream:
         rays = stream.settings.camera.rays()
     x, y = (20 - 15.2) / 30.0, (5 - 11.9) / 31.0
     r2 = x * x + y * y
@@ -100,19 +100,21 @@ def test_realsense_errors_are_reported(install: Install) -> None:
     package = FakeRealSense(model="ftheta")
     install(package)
     with pytest.raises(DeviceError, match="lens of the model ftheta"):
-        device("realsense", {}).open()
+        device_named("realsense", {}).open()
     assert package.stopped == 1  # not left running
     package.plugged_in = False
     with pytest.raises(DeviceError, match="no camera is connected"):
-        device("realsense", {}).open()
+        device_named("realsense", {}).open()
     with pytest.raises(DeviceError, match="no camera f999 is connected"):
-        device("realsense", {"serial": "f999"}).open()
+        device_named("realsense", {"serial": "f999"}).open()
 
 
 def test_azure_kinect_stream(install: Install) -> None:
     package = FakeK4A()
     install(package)
-    with device("azure-kinect", {"mode": "WFOV_2X2BINNED", "frame_rate_hz": "30"}).open() as stream:
+    with device_named(
+        "azure-kinect", {"mode": "WFOV_2X2BINNED", "frame_rate_hz": "30"}
+    ).open() as stream:
         assert package.config.depth_mode.name == "WFOV_2X2BINNED"
         assert package.config.camera_fps.name == "FPS_30"
         frame = stream.read(7)  # frame 0 gave the size, and frame 1 has no depth
@@ -126,15 +128,15 @@ def test_azure_kinect_stream(install: Install) -> None:
     )  # fmt: skip
     assert package.stopped == 1
     with pytest.raises(DeviceError, match="does not start"):
-        device("azure-kinect", {"device": "1"}).open()
+        device_named("azure-kinect", {"device": "1"}).open()
     with pytest.raises(DeviceError, match="use 5, 15 or 30"):
-        device("azure-kinect", {"frame_rate_hz": "20"}).open()
+        device_named("azure-kinect", {"frame_rate_hz": "20"}).open()
 
 
 def test_orbbec_stream(install: Install) -> None:
     package = FakeOrbbec()
     install(package)
-    with device("orbbec", {}).open() as stream:
+    with device_named("orbbec", {}).open() as stream:
         frame = stream.read(0)
         with pytest.raises(DeviceError, match="sent no frame"):
             list(stream)
@@ -148,7 +150,7 @@ def test_orbbec_stream(install: Install) -> None:
 
 def test_orbbec_without_infrared(install: Install) -> None:
     install(FakeOrbbec(infrared=False, rational=False))
-    with device("orbbec", {}).open() as stream:
+    with device_named("orbbec", {}).open() as stream:
         assert stream.read(0).amplitude_image is None
     assert type(stream.settings.camera) is Pinhole
     assert stream.settings.amplitude_kind is None
@@ -157,7 +159,7 @@ def test_orbbec_without_infrared(install: Install) -> None:
 @pytest.mark.parametrize("converted", [True, False])
 def test_ifm_stream(install: Install, converted: bool) -> None:
     install(*fake_ifm3d(converted=converted).values())
-    with device("ifm-o3r", {}).open() as stream:
+    with device_named("ifm-o3r", {}).open() as stream:
         frame = stream.read(0)
     assert frame.depth_kind == "range"
     assert frame.depth[0, 0] == 0  # flagged
@@ -166,29 +168,29 @@ def test_ifm_stream(install: Install, converted: bool) -> None:
     assert stream.settings.frame_rate_hz == 20
     assert stream.settings.camera.rays().shape == (HEIGHT, WIDTH, 2)
     with pytest.raises(DeviceError, match="does not start"):
-        device("ifm-o3r", {"address": "0.0.0.0"}).open()
+        device_named("ifm-o3r", {"address": "0.0.0.0"}).open()
 
 
 def test_invalid_options_and_missing_packages_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert set(devices()) == {"azure-kinect", "ifm-o3r", "orbbec", "realsense"}
+    assert set(known_devices()) == {"azure-kinect", "ifm-o3r", "orbbec", "realsense"}
     with pytest.raises(InputError, match="no camera 'webcam'"):
-        device("webcam", {})
+        device_named("webcam", {})
     with pytest.raises(InputError, match="unknown option 'serail'"):
-        device("realsense", {"serail": "1"})
+        device_named("realsense", {"serail": "1"})
     with pytest.raises(InputError, match="use a whole number"):
-        device("realsense", {"width": "wide"})
+        device_named("realsense", {"width": "wide"})
     with pytest.raises(InputError, match="use true or false"):
-        device("orbbec", {"infrared": "1"})
-    for name, kind in devices().items():
+        device_named("orbbec", {"infrared": "1"})
+    for name, kind in known_devices().items():
         monkeypatch.setitem(sys.modules, kind.package[1], None)  # as if not installed
         with pytest.raises(DeviceError, match=f"pip install {kind.package[0]}"):
-            device(name, {}).open()
+            device_named(name, {}).open()
 
 
 def test_recorded_frames_match_stream(install: Install, tmp_path: Path) -> None:
     install(*fake_ifm3d(frames=5).values())
     counts: list[int] = []
-    with device("ifm-o3r", {}).open() as stream:
+    with device_named("ifm-o3r", {}).open() as stream:
         done = record(stream, tmp_path / "a", frames=3, progress=counts.append)
     assert (done.frames, done.dropped, done.ended_by) == (3, 0, "asked")
     assert counts == [1, 2, 3]
@@ -205,7 +207,7 @@ def test_recorded_frames_match_stream(install: Install, tmp_path: Path) -> None:
 
 def test_failing_camera_keeps_recorded_frames(install: Install, tmp_path: Path) -> None:
     install(FakeRealSense(frames=4))
-    with device("realsense", {}).open() as stream:
+    with device_named("realsense", {}).open() as stream:
         done = record(stream, tmp_path / "a", seconds=60)
     assert done.frames == 4
     assert "sent no frame" in done.ended_by
@@ -214,13 +216,16 @@ def test_failing_camera_keeps_recorded_frames(install: Install, tmp_path: Path) 
 
 def test_record_duration_follows_camera_clock(install: Install, tmp_path: Path) -> None:
     install(FakeRealSense(frames=5))
-    with device("realsense", {}).open() as stream:
+    with device_named("realsense", {}).open() as stream:
         assert record(stream, tmp_path / "a", seconds=0.05).frames == 2
 
 
 def test_camera_without_frames_leaves_no_recording(install: Install, tmp_path: Path) -> None:
     install(FakeRealSense(frames=0))
-    with device("realsense", {}).open() as stream, pytest.raises(DeviceError, match="no frame"):
+    with (
+        device_named("realsense", {}).open() as stream,
+        pytest.raises(DeviceError, match="no frame"),
+    ):
         record(stream, tmp_path / "a")
     assert not list(tmp_path.iterdir())
 
@@ -228,7 +233,10 @@ def test_camera_without_frames_leaves_no_recording(install: Install, tmp_path: P
 def test_record_rejects_non_empty_folder(install: Install, tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
     install(FakeRealSense())
-    with device("realsense", {}).open() as stream, pytest.raises(OutputError, match="isn't empty"):
+    with (
+        device_named("realsense", {}).open() as stream,
+        pytest.raises(OutputError, match="isn't empty"),
+    ):
         record(stream, tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
 
@@ -253,7 +261,7 @@ class Endless(Stream):
 
 def test_slow_disk_drops_and_counts_frames(install: Install, tmp_path: Path) -> None:
     install(FakeRealSense())
-    with device("realsense", {}).open() as camera:
+    with device_named("realsense", {}).open() as camera:
         stream = Endless(camera.settings, many=3 * QUEUE_FRAMES)
 
     def wait_for_disk(frames: int) -> None:
@@ -278,8 +286,10 @@ def test_record_command(
     assert "Azure Kinect" in capsys.readouterr().out
     assert main(["record"]) == 0
     listed = capsys.readouterr().out
-    assert all(name in listed for name in devices())
-    assert ("not installed" in listed) == any(not is_installed(kind) for kind in devices().values())
+    assert all(name in listed for name in known_devices())
+    assert ("not installed" in listed) == any(
+        not is_installed(kind) for kind in known_devices().values()
+    )
     assert main(["record", "azure-kinect"]) == 2
     assert "--out: is missing" in capsys.readouterr().err
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from tofuse.apps.cli.commands import print_result
-from tofuse.apps.cli.progress import progress_for
+from tofuse.apps.cli import print_result, progress_for
 
 
 def demo(arguments: argparse.Namespace) -> int:
     """``tofuse demo``."""
-    from tofuse.apps.jobs.running import exit_status
-    from tofuse.engine.compute.thread_pool import threads
+    from tofuse.apps.jobs import exit_status
+    from tofuse.engine.compute import threads
     from tofuse.lab.demo import FAILURE
     from tofuse.lab.demo import demo as run_demo
 
@@ -31,9 +30,9 @@ def demo(arguments: argparse.Namespace) -> int:
 
 def simulate(arguments: argparse.Namespace) -> int:
     """``tofuse simulate``."""
-    from tofuse.engine.compute.thread_pool import threads
+    from tofuse.engine.compute import threads
     from tofuse.lab.demo import simulate_to
-    from tofuse.lab.simulation.passing import Passing
+    from tofuse.lab.simulation import Passing
 
     passing = None
     if arguments.with_person is not None:
@@ -63,8 +62,8 @@ def simulate(arguments: argparse.Namespace) -> int:
 
 def experiments(arguments: argparse.Namespace) -> int:
     """``tofuse experiments``."""
-    from tofuse.engine.compute.thread_pool import threads
-    from tofuse.lab.experiments.page import run_experiments
+    from tofuse.engine.compute import threads
+    from tofuse.lab.experiments import run_experiments
 
     with progress_for(as_json=False) as progress, threads(arguments.threads):
         page = run_experiments(

@@ -9,17 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tofuse.apps.jobs.run_options import Options, resolve
-from tofuse.apps.jobs.running import run
-from tofuse.apps.results.folder import RECORDING, OutputFolder, is_result
+from tofuse.apps.jobs import Options, resolve, run
+from tofuse.apps.results import RECORDING, OutputFolder, is_result
 from tofuse.engine.errors import OutputError
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.engine.quality.types import Reconstruction
-from tofuse.formats.files.atomic import write_text
-from tofuse.formats.files.staging import replacing_folder
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.passing import Passing
-from tofuse.lab.simulation.record import simulate
+from tofuse.engine.mapping import Progress, Silent
+from tofuse.engine.quality import Reconstruction
+from tofuse.formats.files import replacing_folder, write_text
+from tofuse.lab.simulation import Effects, Passing, simulate
 
 # Settings of the thesis per scene (section 4.1): points beyond the object are removed.
 _SCENE_OPTIONS: dict[str, dict[str, Any]] = {

@@ -16,28 +16,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.cli.progress import TerminalProgress
-from tofuse.apps.jobs.evaluating import Evaluation, evaluate
-from tofuse.apps.jobs.merging import merge as merge_results
-from tofuse.apps.jobs.report_files import write_report_files
-from tofuse.apps.jobs.running import quick_findings, with_findings
-from tofuse.apps.results.folder import OutputFolder
-from tofuse.apps.results.loading import load_result
-from tofuse.apps.results.output import write_result
+from tofuse.apps.cli import TerminalProgress
+from tofuse.apps.jobs import Evaluation, evaluate, quick_findings, with_findings, write_report_files
+from tofuse.apps.jobs import merge as merge_results
+from tofuse.apps.results import OutputFolder, load_result, write_result
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters.foreground import Foreground
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.loops.loops import PriorLoop
-from tofuse.engine.mapping.adaptation import adapted
-from tofuse.engine.mapping.config import Config, changed, from_method
-from tofuse.engine.mapping.progress import Progress
-from tofuse.engine.mapping.reconstruction import reconstruct as reconstruct_recording
-from tofuse.engine.mapping.reconstruction import view_kind
-from tofuse.engine.quality.accuracy_card import SEPARATOR, card
-from tofuse.engine.quality.types import Reconstruction
+from tofuse.engine.filters import Foreground
+from tofuse.engine.frames import Recording
+from tofuse.engine.loops import PriorLoop
+from tofuse.engine.mapping import Config, Progress, adapted, changed, from_method, view_kind
+from tofuse.engine.mapping import reconstruct as reconstruct_recording
+from tofuse.engine.quality import SEPARATOR, Reconstruction, card
 
 if TYPE_CHECKING:
-    from tofuse.apps.viewer.report_server import ReportServer
+    from tofuse.apps.viewer import ReportServer
 
 
 _THUMBNAIL = (420, 262)  # pixels
@@ -107,8 +99,7 @@ class Result(Reconstruction):
         return Path(folder)
 
     def _write_report(self, result: Reconstruction, folder: Path) -> None:
-        from tofuse.apps.report.extras import ReportExtras
-        from tofuse.apps.report.html import write_report
+        from tofuse.apps.report import ReportExtras, write_report
 
         if self.source is not None:
             config = self.fitted or adapted(_configuration(self.config, self.source), self.source)
@@ -169,7 +160,7 @@ class Result(Reconstruction):
         open_browser
             Whether to open the page in the browser.
         """
-        from tofuse.apps.viewer.report_server import FrameImages, ReportServer, report_pages
+        from tofuse.apps.viewer import FrameImages, ReportServer, report_pages
 
         images = None if self.source is None else FrameImages([(0, self.source)])
         with tempfile.TemporaryDirectory(prefix="tofuse-") as temporary:
@@ -200,8 +191,7 @@ class Result(Reconstruction):
         )
 
     def _repr_html_(self) -> str:
-        from tofuse.apps.report import thumbnails
-        from tofuse.apps.report.scene import make_scene, render
+        from tofuse.apps.report import make_scene, render, thumbnails
 
         rows = {f.index: k for k, f in enumerate(self.diagnostics.frames)}
         scene = make_scene(self, rows)
@@ -236,7 +226,7 @@ class Plot:
 
     def save(self, path: str | Path) -> None:
         """Write an HTML page with the drawings to a path."""
-        from tofuse.formats.files.atomic import write_text
+        from tofuse.formats.files import write_text
 
         write_text(path, f'<!doctype html><meta charset="utf-8">{self._repr_html_()}\n')
 

@@ -14,7 +14,7 @@ from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.work import Task, work
 from tofuse.apps.batch.workers import Workers
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import read_text
+from tofuse.formats.files import read_text
 
 _TIMEOUT_S = 10.0  # of requests to a scheduler
 _POLL_S = 1.0  # interval at which the workers are counted

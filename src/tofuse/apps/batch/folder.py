@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 
 from tofuse.apps.batch.jobs import Job
 from tofuse.engine.errors import OutputError
-from tofuse.formats.files.atomic import make_folder, write_text
+from tofuse.formats.files import make_folder, write_text
 
 _UNFINISHED = ".tofuse-"  # files of a run that is in progress or was killed; `results.folder`
 

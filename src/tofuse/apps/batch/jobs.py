@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import name_order, parse_toml, read_head, read_text
-from tofuse.formats.files.stamps import stamps_of
+from tofuse.formats.files import name_order, parse_toml, read_head, read_text, stamps_of
 
 RESERVED = ("batch.csv", "batch.html", "jobs")  # names in the output folder not for jobs
 # Other files are recordings if they are binary, or a reader recognises them.
@@ -135,7 +134,7 @@ def _is_list(path: Path) -> bool:
         return True
     if b"\0" in read_head(path, _HEAD_BYTES):
         return False
-    from tofuse.formats.recordings.open import is_recording
+    from tofuse.formats.recordings import is_recording
 
     return not is_recording(path)
 

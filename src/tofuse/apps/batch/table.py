@@ -11,8 +11,7 @@ from urllib.parse import quote
 
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
-from tofuse.formats.files.atomic import write_text
-from tofuse.formats.files.locking import locked
+from tofuse.formats.files import locked, write_text
 
 COLUMNS = (
     "name",
@@ -98,7 +97,7 @@ def _csv(ended: Sequence[tuple[Job, Record]]) -> str:
 def _html(
     ended: Sequence[tuple[Job, Record]], total: int, running: int, folder: BatchFolder
 ) -> str:
-    from tofuse.apps.report.html import page
+    from tofuse.apps.report import page
 
     rows = [_row(job, record, folder) for job, record in ended]
     counts = Counter(row.tone for row in rows)
@@ -125,7 +124,7 @@ def _html(
 
 
 def _row(job: Job, record: Record, folder: BatchFolder) -> Row:
-    from tofuse.engine.quality.accuracy_card import length
+    from tofuse.engine.quality import length
 
     done = record.state == "done"
     accuracy = ""

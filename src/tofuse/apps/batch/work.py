@@ -20,7 +20,7 @@ from tofuse._version import __version__
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
 from tofuse.engine.errors import output_error
-from tofuse.formats.files.locking import locked
+from tofuse.formats.files import locked
 
 # Runs the command, and ends when its parent does.
 _MODULE = "tofuse.apps.cli.job"

@@ -11,7 +11,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame
 
 # Small images are enlarged to this width, by at most this factor, as the detector needs large
 # squares.

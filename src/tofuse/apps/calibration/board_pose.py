@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tofuse.apps.calibration.board import Board
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.cameras import Camera
 from tofuse.engine.geometry import se3
 
 

@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.engine.cameras.cameras import Camera, RayTable
+from tofuse.engine.cameras import Camera, RayTable
 from tofuse.engine.errors import InputError, OutputError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import Recording
-from tofuse.formats.files.atomic import make_folder, replacing
-from tofuse.formats.files.reading import is_file, is_folder
-from tofuse.formats.recordings.camera_file import SCHEMA, camera_fields, read_json
+from tofuse.engine.frames import RangeFrame, Recording
+from tofuse.formats.files import is_file, is_folder, make_folder, replacing
+from tofuse.formats.recordings import SCHEMA, camera_fields, read_json
 
 _LENS = ("schema", "model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
 _METADATA = (

@@ -19,10 +19,10 @@ from scipy.sparse import csr_array, diags_array
 
 from tofuse.apps.calibration.plane_views import PlaneView
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.normal import robust_sigma
-from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.engine.sensor import DepthCorrection
 
 _KNOT_SPACING_M = 0.04
 _MAX_KNOTS = 200

@@ -13,9 +13,9 @@ from scipy.optimize import least_squares
 from tofuse.apps.calibration.board import Board, board_image, find_corners
 from tofuse.apps.calibration.board_pose import board_pose, pose_of
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Camera, Fisheye, Pinhole
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Fisheye, Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import Recording, evenly_spaced
+from tofuse.engine.frames import Recording, evenly_spaced
 from tofuse.engine.geometry import se3
 
 MIN_VIEWS = 4

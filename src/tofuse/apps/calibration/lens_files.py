@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Pinhole, pinhole_values
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole, pinhole_values
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import read_text
-from tofuse.formats.recordings.camera_file import checked_lens, image_size
+from tofuse.formats.files import read_text
+from tofuse.formats.recordings import checked_lens, image_size
 
 _MAX_BYTES = 64 << 20
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"

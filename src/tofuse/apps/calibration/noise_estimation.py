@@ -12,14 +12,19 @@ from scipy.optimize import nnls
 from scipy.stats import chi2
 
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.cameras.cameras import ray_lengths
+from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.noise.choice import noise_model_for
-from tofuse.engine.noise.model import AmplitudeLaw, ConfidenceLaw, Law, NoiseModel, RangeLaw
+from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame, Recording
+from tofuse.engine.noise import (
+    AmplitudeLaw,
+    ConfidenceLaw,
+    Law,
+    NoiseModel,
+    RangeLaw,
+    noise_model_for,
+)
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
-from tofuse.formats.recordings.still import stationary_intervals
+from tofuse.formats.recordings import stationary_intervals
 
 MIN_FRAMES = 3
 _MIN_PIXELS = 40  # in a bin

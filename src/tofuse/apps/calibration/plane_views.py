@@ -10,16 +10,13 @@ import numpy as np
 from tofuse.apps.calibration.board import Board, board_image, find_corners
 from tofuse.apps.calibration.board_pose import board_pose
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.cameras.cameras import Camera, points_from_z, ray_lengths
+from tofuse.engine.cameras import Camera, points_from_z, ray_lengths
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.noise.choice import noise_model_for
-from tofuse.engine.noise.model import NoiseModel
-from tofuse.engine.search.plane_detection import detect_planes
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.noise import NoiseModel, noise_model_for
+from tofuse.engine.search import detect_planes
+from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 _MAX_FRAMES = 60  # maximum number of frames
 # Largest distance of a pixel from its plane: systematic error in m, plus noise in sigmas.

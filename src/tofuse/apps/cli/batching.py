@@ -10,14 +10,21 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from difflib import get_close_matches
 
-from tofuse.apps.batch.batch import pending, run_batch, status_of
-from tofuse.apps.batch.folder import BatchFolder, Record
-from tofuse.apps.batch.jobs import Job, read_jobs
-from tofuse.apps.batch.table import write_table
-from tofuse.apps.batch.workers import LocalWorkers, Workers
+from tofuse.apps.batch import (
+    BatchFolder,
+    Job,
+    LocalWorkers,
+    Record,
+    Workers,
+    pending,
+    read_jobs,
+    run_batch,
+    status_of,
+    write_table,
+)
 from tofuse.apps.cli.progress import emit, progress_for
 from tofuse.apps.cli.run_arguments import run_arguments
-from tofuse.engine.compute.cores import usable_cores
+from tofuse.engine.compute import usable_cores
 from tofuse.engine.errors import Ended, InputError, TofuseError
 
 _RETRIES = 3
@@ -115,7 +122,7 @@ def _run(
 def _workers(arguments: argparse.Namespace, jobs: int) -> tuple[Workers, int]:
     """The workers, and the number of threads of each job."""
     if arguments.scheduler is not None:
-        from tofuse.apps.batch.cluster import DaskWorkers
+        from tofuse.apps.batch import DaskWorkers
 
         # A worker has a thread per core that it may use, and each thread does one job.
         return DaskWorkers(arguments.scheduler), arguments.threads or 1

@@ -6,20 +6,29 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tofuse.apps.calibration.board import Board
-from tofuse.apps.calibration.camera_json import recording_fields, write_camera_json
-from tofuse.apps.calibration.depth import calibrate_depth, compose
-from tofuse.apps.calibration.lens import calibrate_lens
-from tofuse.apps.calibration.lens_files import read_lens_file
-from tofuse.apps.calibration.plane_views import board_planes, scene_planes
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.apps.calibration import (
+    Board,
+    board_planes,
+    calibrate_depth,
+    calibrate_lens,
+    compose,
+    read_lens_file,
+    recording_fields,
+    scene_planes,
+    write_camera_json,
+)
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.sensor.depth_correction import DepthCorrection
-from tofuse.formats.files.atomic import make_folder, replacing
-from tofuse.formats.recordings.camera_file import camera_fields
-from tofuse.formats.recordings.correction_file import read_correction, write_correction
-from tofuse.formats.recordings.open import Opening, open_recording
+from tofuse.engine.frames import Recording
+from tofuse.engine.sensor import DepthCorrection
+from tofuse.formats.files import make_folder, replacing
+from tofuse.formats.recordings import (
+    Opening,
+    camera_fields,
+    open_recording,
+    read_correction,
+    write_correction,
+)
 
 # Data for JSON, lines to print, and warnings.
 Summary = tuple[dict[str, Any], list[str], list[str]]

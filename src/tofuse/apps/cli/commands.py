@@ -23,14 +23,14 @@ from tofuse.apps.cli.progress import (
     escaped,
     progress_for,
 )
-from tofuse.engine.quality.types import Reason, Reconstruction
-from tofuse.formats.files.noise_file import write_noise
+from tofuse.engine.quality import Reason, Reconstruction
+from tofuse.formats.files import write_noise
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-    from tofuse.apps.jobs.run_options import Options
-    from tofuse.apps.viewer.report_server import ReportServer
+    from tofuse.apps.jobs import Options
+    from tofuse.apps.viewer import ReportServer
 
 _Options = TypeVar("_Options", bound="DataclassInstance")
 
@@ -64,10 +64,10 @@ def _progress_unless_json(
 
 def run(arguments: argparse.Namespace) -> int:
     """``tofuse run``."""
-    from tofuse.apps.jobs.running import exit_status
-    from tofuse.apps.jobs.running import run as run_pipeline
+    from tofuse.apps.jobs import exit_status
+    from tofuse.apps.jobs import run as run_pipeline
     from tofuse.engine.errors import InputError
-    from tofuse.formats.recordings.rig import recordings_of, rig_file_in
+    from tofuse.formats.recordings import recordings_of, rig_file_in
 
     options = run_options(arguments)
     if arguments.rig is None and len(arguments.inputs) == 1:
@@ -91,16 +91,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 def run_options(arguments: argparse.Namespace) -> Options:
     """Return the options of ``tofuse run``."""
-    from tofuse.apps.jobs.run_options import Options
+    from tofuse.apps.jobs import Options
 
     return from_arguments(Options, arguments)
 
 
 def _run_into(arguments: argparse.Namespace, options: Options) -> int:
     """Run, then merge the result into an earlier one, which stays unchanged if that fails."""
-    from tofuse.apps.jobs.merging import MergeOptions, check_result, merge_files
-    from tofuse.apps.jobs.running import exit_status
-    from tofuse.apps.jobs.running import run as run_pipeline
+    from tofuse.apps.jobs import MergeOptions, check_result, exit_status, merge_files
+    from tofuse.apps.jobs import run as run_pipeline
     from tofuse.engine.errors import InputError
 
     into = arguments.into
@@ -133,8 +132,8 @@ def _run_into(arguments: argparse.Namespace, options: Options) -> int:
 
 def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
     """``tofuse run --rig``."""
-    from tofuse.apps.jobs.running import exit_status
-    from tofuse.apps.rigs.run import run_rig
+    from tofuse.apps.jobs import exit_status
+    from tofuse.apps.rigs import run_rig
     from tofuse.engine.errors import InputError
 
     for name in (
@@ -159,11 +158,10 @@ def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
 
 def _run_live(arguments: argparse.Namespace, options: Options) -> int:
     """Run and show the reconstruction live; then show the result until Ctrl-C."""
-    from tofuse.apps.jobs.running import exit_status
-    from tofuse.apps.jobs.running import run as run_pipeline
-    from tofuse.apps.viewer.live_view import LiveView
-    from tofuse.apps.viewer.server import address, serve, stop
-    from tofuse.engine.mapping.progress import CombinedProgress
+    from tofuse.apps.jobs import exit_status
+    from tofuse.apps.jobs import run as run_pipeline
+    from tofuse.apps.viewer import LiveView, address, serve, stop
+    from tofuse.engine.mapping import CombinedProgress
 
     server = serve(arguments.port)
     try:
@@ -191,7 +189,7 @@ def view(arguments: argparse.Namespace) -> int:
 
 def _report_server(folder: Path, port: int | None = None) -> ReportServer:
     """Serve the report of a result, with the images of its recording where it still exists."""
-    from tofuse.apps.viewer.report_server import FrameImages, ReportServer, report_pages
+    from tofuse.apps.viewer import FrameImages, ReportServer, report_pages
     from tofuse.engine.errors import InputError
 
     pages, images = report_pages(folder), None
@@ -229,9 +227,9 @@ def batch(arguments: argparse.Namespace) -> int:
 def register(arguments: argparse.Namespace) -> int:
     """``tofuse register``."""
     from tofuse.apps.cli import registering
-    from tofuse.apps.jobs.pair import PairOptions, exit_status, register_files
-    from tofuse.apps.report.pair_words import decision
-    from tofuse.apps.results.pair import pair_json
+    from tofuse.apps.jobs import PairOptions, pair_exit_status, register_files
+    from tofuse.apps.report import decision
+    from tofuse.apps.results import pair_json
 
     _check_overwrite(arguments)
     options = from_arguments(PairOptions, arguments)
@@ -239,7 +237,7 @@ def register(arguments: argparse.Namespace) -> int:
         result = register_files(arguments.source, arguments.target, options, progress)
     if arguments.json:
         emit({**pair_json(result), "out": None if options.out is None else str(options.out)})
-        return exit_status(result)
+        return pair_exit_status(result)
     console = make_console()
     head, tail = decision(result)
     color = _STATUS_COLORS[result.registration.believed]
@@ -249,15 +247,15 @@ def register(arguments: argparse.Namespace) -> int:
     _print_warnings(console, pair_json(result)["warnings"])
     if options.out is not None:
         console.print(f"see {options.out / 'report.html'}", markup=False)
-    return exit_status(result)
+    return pair_exit_status(result)
 
 
 def rig_calibrate(arguments: argparse.Namespace) -> int:
     """``tofuse rig calibrate``."""
-    from tofuse.apps.calibration.camera_json import check_new
+    from tofuse.apps.calibration import check_new
     from tofuse.apps.cli import rigging
-    from tofuse.apps.rigs.calibrating import calibrate as calibrate_rig
-    from tofuse.formats.recordings.rig import write_rig
+    from tofuse.apps.rigs import calibrate as calibrate_rig
+    from tofuse.formats.recordings import write_rig
 
     check_new(arguments.out, overwrite=arguments.overwrite)
     with _progress_unless_json(arguments) as progress:
@@ -285,8 +283,8 @@ def rig_calibrate(arguments: argparse.Namespace) -> int:
 def rig_check(arguments: argparse.Namespace) -> int:
     """``tofuse rig check``."""
     from tofuse.apps.cli import rigging
-    from tofuse.apps.rigs.calibrating import check
-    from tofuse.formats.recordings.rig import read_rig
+    from tofuse.apps.rigs import check
+    from tofuse.formats.recordings import read_rig
 
     rig = read_rig(arguments.rig)
     with _progress_unless_json(arguments) as progress:
@@ -310,8 +308,8 @@ def rig_check(arguments: argparse.Namespace) -> int:
 
 def judge(arguments: argparse.Namespace) -> int:
     """``tofuse judge``."""
-    from tofuse.apps.jobs.judging import JudgeOptions, judge_files, sentence
-    from tofuse.apps.results.run_json import plain
+    from tofuse.apps.jobs import JudgeOptions, judge_files, sentence
+    from tofuse.apps.results import plain
 
     _check_overwrite(arguments)
     options = from_arguments(JudgeOptions, arguments)
@@ -342,8 +340,7 @@ def judge(arguments: argparse.Namespace) -> int:
 
 def merge(arguments: argparse.Namespace) -> int:
     """``tofuse merge``."""
-    from tofuse.apps.jobs.merging import MergeOptions, merge_files
-    from tofuse.apps.jobs.running import exit_status
+    from tofuse.apps.jobs import MergeOptions, exit_status, merge_files
 
     options = from_arguments(MergeOptions, arguments, seed=arguments.seed or 0)
     with progress_for(as_json=arguments.json) as progress:
@@ -362,11 +359,15 @@ def _check_overwrite(arguments: argparse.Namespace) -> None:
 
 def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     """Print a summary of a result, or with `as_json` one JSON line."""
-    from tofuse.apps.results.folder import component_name
-    from tofuse.apps.results.run_json import accuracy_json, plain, reasons_json
-    from tofuse.apps.results.session_words import session_sentences
-    from tofuse.engine.frames.ranges import in_words
-    from tofuse.engine.quality.accuracy_card import SEPARATOR, card
+    from tofuse.apps.results import (
+        accuracy_json,
+        component_name,
+        plain,
+        reasons_json,
+        session_sentences,
+    )
+    from tofuse.engine.frames import in_words
+    from tofuse.engine.quality import SEPARATOR, card
 
     d = result.diagnostics
     sessions = session_sentences(result)
@@ -420,7 +421,7 @@ def _print_warnings(console: Console, warnings: Iterable[str]) -> None:
 
 
 def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
-    from tofuse.engine.quality.verdict import ADVICE, REASONS, ranked
+    from tofuse.engine.quality import ADVICE, REASONS, ranked
 
     for reason in ranked(reasons):
         level = REASONS[reason.code][0]
@@ -431,8 +432,8 @@ def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
 
 def inspect(arguments: argparse.Namespace) -> int:
     """``tofuse inspect``."""
-    from tofuse.apps.inspection.inspect import inspect_recording
-    from tofuse.formats.recordings.open import Opening
+    from tofuse.apps.inspection import inspect_recording
+    from tofuse.formats.recordings import Opening
 
     recording = Opening.of(arguments.inputs, arguments).open()
     inspection = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
@@ -460,9 +461,9 @@ def inspect(arguments: argparse.Namespace) -> int:
 
 def convert(arguments: argparse.Namespace) -> int:
     """``tofuse convert``."""
-    from tofuse.formats.export.conversion import convert as convert_recording
-    from tofuse.formats.export.conversion import convert_to
-    from tofuse.formats.recordings.open import Opening
+    from tofuse.formats.export import convert as convert_recording
+    from tofuse.formats.export import convert_to
+    from tofuse.formats.recordings import Opening
 
     recording = Opening.of(arguments.inputs, arguments).open()
     if arguments.to == "native":
@@ -477,14 +478,14 @@ def convert(arguments: argparse.Namespace) -> int:
 
 def record(arguments: argparse.Namespace) -> int:
     """``tofuse record``."""
-    from tofuse.apps.live.device import device, devices, is_installed
-    from tofuse.apps.live.recorder import record as record_stream
+    from tofuse.apps.live import device_named, is_installed, known_devices
+    from tofuse.apps.live import record as record_stream
     from tofuse.engine.errors import InputError
 
     console = make_console()
     if arguments.device is None:
         table = Table("camera", "needs", "")
-        for name, kind in devices().items():
+        for name, kind in known_devices().items():
             installed = "installed" if is_installed(kind) else "not installed"
             table.add_row(name, f"pip install {kind.package[0]}", installed)
         console.print(table)
@@ -493,7 +494,7 @@ def record(arguments: argparse.Namespace) -> int:
         raise InputError("is missing", where="--out", remedy="pass a new folder")
     options = dict(part.partition("=")[::2] for part in arguments.set)
     with (
-        device(arguments.device, options).open() as stream,
+        device_named(arguments.device, options).open() as stream,
         _stop_on_signal() as stopped,
         progress_for(as_json=False) as progress,
     ):
@@ -536,7 +537,7 @@ def _stop_on_signal() -> Iterator[threading.Event]:
 
 def calibrate(arguments: argparse.Namespace) -> int:
     """``tofuse calibrate``."""
-    from tofuse.apps.calibration.camera_json import check_new
+    from tofuse.apps.calibration import check_new
     from tofuse.apps.cli import calibrating
 
     if arguments.out is not None:
@@ -559,9 +560,8 @@ def calibrate(arguments: argparse.Namespace) -> int:
 
 def noise(arguments: argparse.Namespace) -> int:
     """``tofuse noise``."""
-    from tofuse.apps.calibration.camera_json import check_new
-    from tofuse.apps.calibration.noise_estimation import estimate_noise
-    from tofuse.formats.recordings.open import Opening
+    from tofuse.apps.calibration import check_new, estimate_noise
+    from tofuse.formats.recordings import Opening
 
     if arguments.out is not None:
         check_new(arguments.out, overwrite=arguments.overwrite)
@@ -592,8 +592,8 @@ def noise(arguments: argparse.Namespace) -> int:
 
 def evaluate(arguments: argparse.Namespace) -> int:
     """``tofuse evaluate``."""
-    from tofuse.apps.jobs.evaluating import evaluate as evaluate_poses
-    from tofuse.engine.quality.trajectory import MAX_GAP_S
+    from tofuse.apps.jobs import evaluate as evaluate_poses
+    from tofuse.engine.quality import MAX_GAP_S
 
     evaluation = evaluate_poses(
         arguments.estimate,
@@ -635,9 +635,9 @@ def evaluate(arguments: argparse.Namespace) -> int:
 
 def optimize(arguments: argparse.Namespace) -> int:
     """``tofuse optimize``."""
-    from tofuse.apps.calibration.camera_json import check_new
-    from tofuse.engine.mapping.config import changed, from_method
-    from tofuse.formats.files.g2o import read_g2o, write_g2o
+    from tofuse.apps.calibration import check_new
+    from tofuse.engine.mapping import changed, from_method
+    from tofuse.formats.files import read_g2o, write_g2o
 
     check_new(arguments.out, overwrite=arguments.overwrite)
     config = from_method("default", "range")
@@ -672,7 +672,7 @@ def optimize(arguments: argparse.Namespace) -> int:
 
 def export(arguments: argparse.Namespace) -> int:
     """``tofuse export``."""
-    from tofuse.apps.export.exporting import export as export_result
+    from tofuse.apps.export import export as export_result
 
     for path in export_result(
         arguments.result,

@@ -47,10 +47,9 @@ def _job(picture: str, run_arguments: Sequence[str]) -> int:
     from tofuse.apps.cli.commands import print_result, run_options
     from tofuse.apps.cli.parser import make_parser
     from tofuse.apps.cli.progress import QuietProgress, emit
-    from tofuse.apps.jobs.running import exit_status, run
-    from tofuse.apps.report.scene import make_scene, render_thumbnail
-    from tofuse.apps.report.thumbnails import encode
-    from tofuse.formats.files.atomic import write_bytes
+    from tofuse.apps.jobs import exit_status, run
+    from tofuse.apps.report import encode, make_scene, render_thumbnail
+    from tofuse.formats.files import write_bytes
 
     arguments = make_parser().parse_args(["run", *run_arguments])
     with QuietProgress() as progress:

@@ -30,7 +30,7 @@ def check_machine(threads: int | None = None) -> None:
     if limit is None:
         return
     if threads is None:
-        from tofuse.engine.compute.cores import usable_cores
+        from tofuse.engine.compute import usable_cores
 
         threads = usable_cores()
     needed = _MIN_BYTES + _BYTES_PER_THREAD * max(0, threads - _INCLUDED_THREADS)

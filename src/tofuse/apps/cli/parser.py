@@ -193,7 +193,7 @@ def _command(
         run: Callable[[argparse.Namespace], int] = getattr(import_module(home), function or name)
         if not reconstructs:
             return run(arguments)
-        from tofuse.engine.compute.ahead import compiling_in_background
+        from tofuse.engine.compute import compiling_in_background
 
         with compiling_in_background():
             return run(arguments)
@@ -694,7 +694,7 @@ def _page(p: Any) -> None:
 
 
 def _bytes(text: str) -> int:
-    from tofuse.apps.batch.jobs import parse_bytes
+    from tofuse.apps.batch import parse_bytes
 
     try:
         return parse_bytes(text)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from tofuse.apps.report.pair_words import lines
-from tofuse.apps.results.pair import PairResult
+from tofuse.apps.report import lines
+from tofuse.apps.results import PairResult
 
 _NAME_WIDTH = 14  # width of the column of names
 

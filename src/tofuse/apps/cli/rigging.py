@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from tofuse.apps.results.run_json import plain
-from tofuse.apps.rigs.calibrating import Calibration
-from tofuse.apps.rigs.checking import CameraMotion
+from tofuse.apps.results import plain
+from tofuse.apps.rigs import Calibration, CameraMotion
 from tofuse.engine.geometry import se3
-from tofuse.formats.recordings.rig import Rig
+from tofuse.formats.recordings import Rig
 
 
 def tables(rig: Rig) -> list[Table]:

@@ -6,11 +6,10 @@ from pathlib import Path
 
 from tofuse.apps.export.image_folder import ImageFolder, posed_images, subsampled_points
 from tofuse.engine.arrays import Float32, UInt8
-from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, Rational
+from tofuse.engine.cameras import BrownConrady, Fisheye, Pinhole, Rational
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.formats.files.atomic import make_folder, write_text
-from tofuse.formats.files.tables import exact
+from tofuse.formats.files import exact, make_folder, write_text
 
 # COLMAP's name of a lens model, and its parameters after fx, fy, cx, cy.
 _MODELS: dict[type, tuple[str, tuple[str, ...]]] = {

@@ -12,20 +12,32 @@ import numpy as np
 
 from tofuse.apps.export.colmap import write_colmap
 from tofuse.apps.export.nerfstudio import write_nerfstudio
-from tofuse.apps.results.folder import RESULT, claimed, finish_interrupted, is_result, result_folder
-from tofuse.apps.results.loading import read_cloud, read_mesh
-from tofuse.apps.results.run_json import read_run_json, rotation_up_world, run_json_checked
+from tofuse.apps.results import (
+    RESULT,
+    claimed,
+    finish_interrupted,
+    is_result,
+    read_cloud,
+    read_mesh,
+    read_run_json,
+    result_folder,
+    rotation_up_world,
+    run_json_checked,
+)
 from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError, OutputError
-from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.engine.fusion.mesh import Mesh
-from tofuse.engine.fusion.texture import baked
+from tofuse.engine.fusion import GeometryRecord, Mesh, baked
 from tofuse.formats.export import exchange
-from tofuse.formats.files.atomic import make_folder
-from tofuse.formats.files.images import jpeg_bytes
-from tofuse.formats.files.staging import replacing_folder
-from tofuse.formats.files.stamps import stamp
-from tofuse.formats.files.trajectory import associate, read_tum, write_kitti, write_log
+from tofuse.formats.files import (
+    associate,
+    jpeg_bytes,
+    make_folder,
+    read_tum,
+    replacing_folder,
+    stamp,
+    write_kitti,
+    write_log,
+)
 
 # Default number of triangles, and the maximum size of a .glb with their texture.
 FACES = 60_000

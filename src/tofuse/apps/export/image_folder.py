@@ -10,27 +10,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.apps.results.loading import read_cloud
-from tofuse.apps.results.reopening import StoredRecording, reopen, stored_recordings
-from tofuse.apps.results.run_json import (
+from tofuse.apps.results import (
+    StoredRecording,
     frame_covariance,
     main_poses,
+    read_cloud,
     read_run_json,
+    reopen,
     run_json_checked,
+    stored_recordings,
 )
 from tofuse.engine.arrays import Float32, Float64, UInt8, UInt16
-from tofuse.engine.cameras.cameras import Camera, Pinhole, ray_lengths, scaled
+from tofuse.engine.cameras import Camera, Pinhole, ray_lengths, scaled
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.fusion.texture import TextureView
-from tofuse.engine.noise.choice import noise_model_for
-from tofuse.engine.sensor.base import Corrector
-from tofuse.engine.sensor.camera_errors import CameraErrors
-from tofuse.formats.files.atomic import make_folder
-from tofuse.formats.files.images import write_png
-from tofuse.formats.recordings.rectify import Rectifier, pinhole_of
-from tofuse.formats.recordings.sources import FileSource
+from tofuse.engine.frames import RangeFrame, Recording
+from tofuse.engine.fusion import TextureView
+from tofuse.engine.noise import noise_model_for
+from tofuse.engine.sensor import CameraErrors, Corrector
+from tofuse.formats.files import make_folder, write_png
+from tofuse.formats.recordings import FileSource, Rectifier, pinhole_of
 
 DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # m per count
 IMAGES, DEPTH, SIGMA, MASKS = "images", "depth", "sigma", "masks"

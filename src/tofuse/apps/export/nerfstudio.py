@@ -19,12 +19,10 @@ from tofuse.apps.export.image_folder import (
     posed_images,
     subsampled_points,
 )
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, BrownConrady, Camera, Fisheye, Pinhole
+from tofuse.engine.cameras import DISTORTION_ORDER, BrownConrady, Camera, Fisheye, Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.formats.files.atomic import write_text
-from tofuse.formats.files.ply import write_ply
-from tofuse.formats.files.trajectory_formats import OPENGL
+from tofuse.engine.fusion import GeometryRecord
+from tofuse.formats.files import OPENGL, write_ply, write_text
 
 _FILES = {"file_path": IMAGES, "depth_file_path": DEPTH, "sigma_file_path": SIGMA}
 

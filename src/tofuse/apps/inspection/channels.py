@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.apps.inspection.finding import Finding, is_significant
 from tofuse.apps.inspection.sample import Sample
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
 
 # Images are downscaled to this width.
 _COLUMNS = 160

@@ -19,9 +19,8 @@ from tofuse.apps.inspection.sample import (
     part_starts,
 )
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import Pinhole, RayTable
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.cameras import Pinhole, RayTable
+from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Tolerance and maximum standard deviation of the exponent: 0, or 1 or -1 for the wrong kind.
 _KIND_TOLERANCE, _MAX_KIND_SIGMA = 0.3, 0.12

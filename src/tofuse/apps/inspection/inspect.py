@@ -16,12 +16,11 @@ from tofuse.apps.inspection.finding import SEVERITIES, Finding
 from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.inspection.values import depths_of
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.cameras import Pinhole, RayTable
+from tofuse.engine.cameras import Pinhole, RayTable
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.noise.choice import family_of
-from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.frames import Frame, RangeFrame, Recording
+from tofuse.engine.noise import family_of
+from tofuse.formats.recordings import open_recording
 
 # Number of sampled pairs of neighbours, for `inspect` and at the start of a run.
 PAIRS, QUICK_PAIRS = 8, 4

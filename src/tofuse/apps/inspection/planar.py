@@ -34,7 +34,7 @@ from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.normal import robust_sigma
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.views import PreparedView
 
 Model = Literal["kind", "z", "range"]
 

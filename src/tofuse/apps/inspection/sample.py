@@ -10,15 +10,13 @@ import numpy as np
 from scipy import ndimage
 
 from tofuse.apps.inspection.planar import Distortion, Region, fit_distortion, regions_of
-from tofuse.engine.alignment.projective import Aligned, Level, ProjectiveOptions, Target, align
+from tofuse.engine.alignment import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.errors import UnreadableFrameError
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.frames.recording import Recording, evenly_spaced
+from tofuse.engine.frames import Frame, RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.search.view_points import landing_pixels
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.search import landing_pixels
+from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Faults affect the full image; a higher resolution would only take longer.
 VIEW_COLUMNS = 128

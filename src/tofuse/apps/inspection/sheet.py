@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.apps.inspection.values import flying_pixels
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.errors import OutputError
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 
 if TYPE_CHECKING:
     from tofuse.apps.inspection.inspect import Inspection

@@ -9,7 +9,7 @@ import numpy as np
 from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.sample import Sample, part_starts
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame
 
 # Relative tolerance of regular intervals; with a smaller fraction of regular ones the camera was
 # triggered manually, and gaps are meaningless.

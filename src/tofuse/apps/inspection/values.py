@@ -9,8 +9,8 @@ import numpy as np
 from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.sample import Sample
 from tofuse.engine.arrays import Bool, Float32
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
-from tofuse.engine.sensor.unwrap import on_surface
+from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.engine.sensor import on_surface
 
 # Range of typical distances of ToF cameras, m.
 _MIN_DISTANCE_M, _MAX_DISTANCE_M = 0.15, 12.0

@@ -9,19 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.apps.results.folder import is_result
-from tofuse.apps.results.run_json import frame_clock, read_run_json, run_json_checked
+from tofuse.apps.results import frame_clock, is_result, read_run_json, run_json_checked
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames import Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.consistency import Consistency, map_consistency, poses_of_frames
-from tofuse.engine.quality.trajectory import TrajectoryError, evaluate_trajectory
-from tofuse.engine.quality.types import Reconstruction
-from tofuse.engine.sensor.base import Corrector
-from tofuse.engine.sensor.camera_errors import CameraErrors
-from tofuse.formats.files.trajectory_formats import Clock, TimedPoses, read_poses
-from tofuse.formats.recordings.open import open_recording, read_reference
+from tofuse.engine.quality import (
+    Consistency,
+    Reconstruction,
+    TrajectoryError,
+    evaluate_trajectory,
+    map_consistency,
+    poses_of_frames,
+)
+from tofuse.engine.sensor import CameraErrors, Corrector
+from tofuse.formats.files import Clock, TimedPoses, read_poses
+from tofuse.formats.recordings import open_recording, read_reference
 
 Poses = str | Path | Float64 | Reconstruction
 

@@ -22,42 +22,54 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.results.folder import OutputFolder
-from tofuse.apps.results.output import write_result
-from tofuse.apps.results.run_json import accuracy_json, plain, reasons_json
+from tofuse.apps.results import OutputFolder, accuracy_json, plain, reasons_json, write_result
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.compute.thread_pool import threads as use_threads
+from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.ranges import Range, in_words, runs_of
-from tofuse.engine.frames.recording import POSES_BY, Recording, evenly_spaced
+from tofuse.engine.frames import POSES_BY, Range, Recording, evenly_spaced, in_words, runs_of
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import Config, check_views, from_method
-from tofuse.engine.mapping.priors import with_odometry
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.engine.mapping.reconstruction import reconstruct_with_views, view_kind
-from tofuse.engine.parts import check_number
-from tofuse.engine.quality.accuracy import Accuracy, WorstFrame
-from tofuse.engine.quality.accuracy_card import bound, length
-from tofuse.engine.quality.checks import accuracy_reasons, cross_view_reasons, tolerance_of
-from tofuse.engine.quality.consistency import Consistency, map_consistency
-from tofuse.engine.quality.cross_view import (
-    CrossViewConsistency,
-    compare_views,
-    prepare_for_comparison,
+from tofuse.engine.mapping import (
+    Config,
+    Progress,
+    Silent,
+    check_views,
+    from_method,
+    reconstruct_with_views,
+    view_kind,
+    with_odometry,
 )
-from tofuse.engine.quality.pair_measurements import measured_pairs
-from tofuse.engine.quality.pose_deviation import Deviation, fitted
-from tofuse.engine.quality.pose_deviation import deviation as deviation_of
-from tofuse.engine.quality.trajectory import displacement, distances_between
-from tofuse.engine.quality.types import Reason, Reconstruction, Verdict
-from tofuse.engine.quality.verdict import ranked, verdict_of
-from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.tracking.given import GivenPoses
-from tofuse.engine.tracking.motion import FrameTime, find_jumps
-from tofuse.engine.views.prepared_view import PreparedView
-from tofuse.formats.files.trajectory_formats import TimedPoses, read_poses
-from tofuse.formats.recordings.open import Opening, OpeningOptions, read_reference
+from tofuse.engine.parts import check_number
+from tofuse.engine.quality import (
+    Accuracy,
+    Consistency,
+    CrossViewConsistency,
+    Deviation,
+    Reason,
+    Reconstruction,
+    Verdict,
+    WorstFrame,
+    accuracy_reasons,
+    bound,
+    compare_views,
+    cross_view_reasons,
+    displacement,
+    distances_between,
+    fitted,
+    length,
+    map_consistency,
+    measured_pairs,
+    prepare_for_comparison,
+    ranked,
+    tolerance_of,
+    verdict_of,
+)
+from tofuse.engine.quality import deviation as deviation_of
+from tofuse.engine.stored_views import PosedView
+from tofuse.engine.tracking import FrameTime, GivenPoses, find_jumps
+from tofuse.engine.views import PreparedView
+from tofuse.formats.files import TimedPoses, read_poses
+from tofuse.formats.recordings import Opening, OpeningOptions, read_reference
 
 Views = Sequence[PosedView[PreparedView]]
 
@@ -313,8 +325,7 @@ def _write(
     judgement: Judgement, trajectory: Path, recording: Recording, folder: OutputFolder
 ) -> None:
     """Write the refined result, with `judge.json` and the judgement as headline of the report."""
-    from tofuse.apps.report.extras import ReportExtras
-    from tofuse.apps.report.html import write_report
+    from tofuse.apps.report import ReportExtras, write_report
 
     def report(result: Reconstruction, path: Path) -> None:
         headline = sentence(judgement, trajectory.name) if result is judgement.refined else ""

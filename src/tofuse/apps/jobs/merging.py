@@ -18,28 +18,36 @@ from threadpoolctl import threadpool_limits
 from tofuse.apps.jobs.run_options import ModelOptions
 from tofuse.apps.jobs.session_pairs import SessionModel, session_changes, session_pairs
 from tofuse.apps.jobs.sessions import Session, read_sessions, sessions_of
-from tofuse.apps.results.folder import OutputFolder
-from tofuse.apps.results.output import write_result
-from tofuse.apps.results.session_words import session_sentences
+from tofuse.apps.results import OutputFolder, session_sentences, write_result
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.compute.thread_pool import threads as use_threads
-from tofuse.engine.frames.recording import Recording, Source
+from tofuse.engine.compute import threads as use_threads
+from tofuse.engine.frames import Recording, Source
 from tofuse.engine.geometry import se3
-from tofuse.engine.loops.loops import PriorLoop
-from tofuse.engine.mapping.config import Config, from_method
-from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.engine.mapping.reconstruction import push_frames, with_recording_facts
-from tofuse.engine.mapping.texturing import make_texture
+from tofuse.engine.loops import PriorLoop
+from tofuse.engine.mapping import (
+    Config,
+    Mapper,
+    Progress,
+    Silent,
+    from_method,
+    make_texture,
+    push_frames,
+    with_recording_facts,
+)
 from tofuse.engine.parts import check_number
-from tofuse.engine.quality.trajectory import align
-from tofuse.engine.quality.types import Reason, Reconstruction, SessionRecord, in_main_model
-from tofuse.engine.quality.verdict import verdict_of
-from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.tracking.given import GivenPoses, StatedPose, StatedPoses
-from tofuse.engine.views.prepared_view import PreparedView
-from tofuse.formats.recordings.sources import JoinedSource
+from tofuse.engine.quality import (
+    Reason,
+    Reconstruction,
+    SessionRecord,
+    align,
+    in_main_model,
+    verdict_of,
+)
+from tofuse.engine.stored_views import PosedView
+from tofuse.engine.tracking import GivenPoses, StatedPose, StatedPoses
+from tofuse.engine.views import PreparedView
+from tofuse.formats.recordings import JoinedSource
 
 # Maximum number of view pairs that are registered to join two sessions, and number of searches per
 # session to be joined.
@@ -328,8 +336,7 @@ def _merge_into(
 
 
 def _report(result: Reconstruction, folder: Path) -> None:
-    from tofuse.apps.report.extras import ReportExtras
-    from tofuse.apps.report.html import write_report
+    from tofuse.apps.report import ReportExtras, write_report
 
     names = ", ".join(session.name for session in result.sessions)
     extras = ReportExtras(

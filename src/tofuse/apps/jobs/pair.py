@@ -10,17 +10,16 @@ from time import perf_counter
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.results.folder import OutputFolder
-from tofuse.apps.results.pair import LocalView, PairResult, pair_folder, write_pair
+from tofuse.apps.results import LocalView, OutputFolder, PairResult, pair_folder, write_pair
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds.pair import register
-from tofuse.engine.compute.thread_pool import threads
+from tofuse.engine.clouds import register
+from tofuse.engine.compute import threads
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.frames import CloudFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.formats.files.pose import read_pose
-from tofuse.formats.recordings.open import SingleView, open_view
+from tofuse.engine.mapping import Progress, Silent
+from tofuse.formats.files import read_pose
+from tofuse.formats.recordings import SingleView, open_view
 
 # Clouds farther from the origin are centred first: rotation errors would have long lever arms.
 MAX_ORIGIN_DISTANCE_M = 1000.0
@@ -80,7 +79,7 @@ def register_files(
     return result
 
 
-def exit_status(result: PairResult) -> int:
+def pair_exit_status(result: PairResult) -> int:
     """Return 0 if the pose is accepted, 3 if not or if it can't be verified."""
     return 0 if result.registration.believed else 3
 
@@ -167,7 +166,7 @@ def _shifted(view: SingleView, center: Float64) -> LocalView:
 
 def _write(result: PairResult, folder: OutputFolder) -> None:
     def page(result: PairResult, path: Path) -> None:
-        from tofuse.apps.report.pair import write_pair_report
+        from tofuse.apps.report import write_pair_report
 
         write_pair_report(result, path)
 

@@ -8,18 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.apps.jobs.judging import device_sentence
-from tofuse.apps.results.folder import RECORDING, component_number
+from tofuse.apps.results import RECORDING, component_number
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.errors import UnreadableFrameError
-from tofuse.engine.filters.base import apply_filters
-from tofuse.engine.frames.frames import CloudFrame, Frame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.filters import apply_filters
+from tofuse.engine.frames import CloudFrame, Frame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import Config, changed
-from tofuse.engine.mapping.reconstruction import past_frames
+from tofuse.engine.mapping import Config, changed, past_frames
 from tofuse.engine.parts import name_of
-from tofuse.engine.quality.types import Reconstruction
-from tofuse.formats.files.ply import read_ply
+from tofuse.engine.quality import Reconstruction
+from tofuse.formats.files import read_ply
 
 _DRAWN_CLOUDS = 12  # views in the report, if they are clouds
 _TRUTH_POINTS = 100_000
@@ -29,8 +27,7 @@ def write_report_files(
     recording: Recording, config: Config, result: Reconstruction, folder: Path
 ) -> None:
     """Write `report.html` into a folder."""
-    from tofuse.apps.report.extras import ReportExtras
-    from tofuse.apps.report.html import write_report
+    from tofuse.apps.report import ReportExtras, write_report
 
     title = _title(Path(recording.path)) or recording.path
     truth = truth_points(recording)

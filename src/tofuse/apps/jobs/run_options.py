@@ -6,15 +6,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tofuse.apps.results.run_json import read_run_json
+from tofuse.apps.results import read_run_json
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.mapping.config import MIN_MEMORY_MB, Config, ViewKind, changed, from_method
-from tofuse.engine.mapping.priors import Prior
-from tofuse.engine.mapping.texturing import TEXTURE
-from tofuse.engine.sensor.raw_amplitude import range_and_amplitude
-from tofuse.formats.files.reading import parse_toml, read_text
-from tofuse.formats.recordings.open import OpeningOptions
+from tofuse.engine.frames import Recording
+from tofuse.engine.mapping import (
+    MIN_MEMORY_MB,
+    TEXTURE,
+    Config,
+    Prior,
+    ViewKind,
+    changed,
+    from_method,
+)
+from tofuse.engine.sensor import range_and_amplitude
+from tofuse.formats.files import parse_toml, read_text
+from tofuse.formats.recordings import OpeningOptions
 
 _SAMPLED = 8  # frames that are checked for the input of --unwrap
 

@@ -14,32 +14,32 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse._version import __version__
-from tofuse.apps.inspection.finding import Finding
-from tofuse.apps.inspection.inspect import inspect_recording
+from tofuse.apps.inspection import Finding, inspect_recording
 from tofuse.apps.jobs.judging import device_sentence
 from tofuse.apps.jobs.report_files import write_report_files
 from tofuse.apps.jobs.run_options import Options, check_guess, check_unwrap, resolve, seed_of
 from tofuse.apps.jobs.tracked_file import TrackedFile
-from tofuse.apps.results.folder import TRACKED, OutputFolder, check_output
-from tofuse.apps.results.output import write_result
-from tofuse.apps.results.run_json import plain
-from tofuse.engine.compute.memory import trim_memory
+from tofuse.apps.results import TRACKED, OutputFolder, check_output, plain, write_result
+from tofuse.engine.compute import trim_memory
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.fusion.texture import Textured
-from tofuse.engine.loops.loops import PriorLoop
-from tofuse.engine.mapping.adaptation import adapted
-from tofuse.engine.mapping.config import Config
-from tofuse.engine.mapping.priors import with_prior
-from tofuse.engine.mapping.progress import Progress, Silent, Stopwatch
-from tofuse.engine.mapping.reconstruction import reconstruct, view_kind
-from tofuse.engine.mapping.texturing import make_texture
-from tofuse.engine.quality.types import Reason, Reconstruction, in_main_model
-from tofuse.engine.quality.verdict import ranked, verdict_of
-from tofuse.engine.sensor.unwrap_correction import Unwrap
-from tofuse.formats.files.given_loops import read_loops
-from tofuse.formats.files.stamps import stamps_of
-from tofuse.formats.recordings.open import Opening
+from tofuse.engine.frames import Recording
+from tofuse.engine.fusion import Textured
+from tofuse.engine.loops import PriorLoop
+from tofuse.engine.mapping import (
+    Config,
+    Progress,
+    Silent,
+    Stopwatch,
+    adapted,
+    make_texture,
+    reconstruct,
+    view_kind,
+    with_prior,
+)
+from tofuse.engine.quality import Reason, Reconstruction, in_main_model, ranked, verdict_of
+from tofuse.engine.sensor import Unwrap
+from tofuse.formats.files import read_loops, stamps_of
+from tofuse.formats.recordings import Opening
 
 
 def run(

@@ -8,14 +8,20 @@ from itertools import combinations
 
 import numpy as np
 
-from tofuse.apps.results.session_words import MAX_STATED_PROBABILITY
+from tofuse.apps.results import MAX_STATED_PROBABILITY
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.recording import evenly_spaced
-from tofuse.engine.quality.change_detection import changes
-from tofuse.engine.quality.cross_view import CrossViewConsistency, compare_views
-from tofuse.engine.quality.types import Reconstruction, SessionChange, SessionPair, SessionRecord
-from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.frames import evenly_spaced
+from tofuse.engine.quality import (
+    CrossViewConsistency,
+    Reconstruction,
+    SessionChange,
+    SessionPair,
+    SessionRecord,
+    changes,
+    compare_views,
+)
+from tofuse.engine.stored_views import PosedView
+from tofuse.engine.views import PreparedView
 
 View = PosedView[PreparedView]
 

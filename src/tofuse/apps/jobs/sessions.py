@@ -9,30 +9,26 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, get_args
 
-from tofuse.apps.results.folder import component_name, finish_interrupted, is_result
-from tofuse.apps.results.reopening import (
+from tofuse.apps.results import (
     StoredRecording,
-    locate_recording,
-    reopen,
-    stored_recordings,
-)
-from tofuse.apps.results.run_json import (
+    component_name,
+    finish_interrupted,
     frame_covariance,
+    is_result,
+    locate_recording,
     main_poses,
     read_run_json,
+    reopen,
     run_json_checked,
+    stored_recordings,
 )
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.mapping.adaptation import adapted
-from tofuse.engine.mapping.config import Config, changed, from_method, kind_of
-from tofuse.engine.mapping.progress import Progress
-from tofuse.engine.tracking.base import Status
-from tofuse.engine.tracking.given import GivenPoses, StatedPose
-from tofuse.engine.tracking.keyframes import Keyframes
-from tofuse.formats.files.reading import path_of
-from tofuse.formats.recordings.open import Opening
+from tofuse.engine.frames import Recording
+from tofuse.engine.mapping import Config, Progress, adapted, changed, from_method, kind_of
+from tofuse.engine.tracking import GivenPoses, Keyframes, StatedPose, Status
+from tofuse.formats.files import path_of
+from tofuse.formats.recordings import Opening
 
 _REMEDY = "pass the --out of `tofuse run`"
 

@@ -19,17 +19,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.alignment.base import Link, Registration
+from tofuse.engine.alignment import Link, Registration
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.errors import InputError, OutputError
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.mapping.frame_log import FrameLog
-from tofuse.engine.tracking.base import Step, Tracker
-from tofuse.engine.tracking.motion import FrameTime
-from tofuse.engine.tracking.moving_objects import at_size, without_pixels
-from tofuse.engine.views.prepared_view import PreparedView
-from tofuse.formats.files.atomic import replacing
-from tofuse.formats.files.npz import Arrays, read_npz
+from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.mapping import FrameLog
+from tofuse.engine.tracking import FrameTime, Step, Tracker, at_size, without_pixels
+from tofuse.engine.views import PreparedView
+from tofuse.formats.files import Arrays, read_npz, replacing
 
 # Tracking that took less, in s, is repeated.
 _MIN_TRACKING_S = 10.0

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from types import ModuleType, TracebackType
 from typing import Any, ClassVar, Protocol, Self
 
-from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
+from tofuse.engine.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.parts import discover, from_dict, registered
 
 TIMEOUT_S = 2.0  # without a frame until a camera counts as stopped
@@ -116,7 +116,7 @@ class Device(Protocol):
         ...
 
 
-def device(name: str, options: Mapping[str, str]) -> Device:
+def device_named(name: str, options: Mapping[str, str]) -> Device:
     """Return a kind of camera by its name, with options as text.
 
     Raises
@@ -124,7 +124,7 @@ def device(name: str, options: Mapping[str, str]) -> Device:
     InputError
         For an unknown camera or option, or a value of the wrong type.
     """
-    kinds = devices()
+    kinds = known_devices()
     if name not in kinds:
         raise InputError(
             f"there is no camera {name!r}", where="record", remedy=f"use one of {list(kinds)}"
@@ -150,7 +150,7 @@ def _read(text: str, kind: str, where: str) -> object:
     return text
 
 
-def devices() -> dict[str, type[Any]]:
+def known_devices() -> dict[str, type[Any]]:
     """Return the known kinds of camera by name."""
     discover("tofuse.apps.live.devices")
     return registered("device")

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames import Frame, Recording
 
 
 @dataclass

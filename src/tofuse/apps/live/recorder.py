@@ -15,9 +15,9 @@ import numpy as np
 
 from tofuse.apps.live.device import DeviceError, Stream
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.files.staging import new_folder
-from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.engine.frames import RangeFrame
+from tofuse.formats.files import new_folder
+from tofuse.formats.recordings import RecordingWriter
 
 _JOIN_TIMEOUT_S = 5.0  # for a camera's last frame
 QUEUE_FRAMES = 64  # maximum number that may wait for the disk

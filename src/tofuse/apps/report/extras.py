@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.frames.frames import CloudFrame, Frame
-from tofuse.formats.recordings.rig import Rig
+from tofuse.engine.frames import CloudFrame, Frame
+from tofuse.formats.recordings import Rig
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import Scene
 from tofuse.apps.report.thumbnails import percentile_range
 from tofuse.engine.arrays import Float64
-from tofuse.engine.fusion.pose_errors import UNKNOWN_M
+from tofuse.engine.fusion import UNKNOWN_M
 from tofuse.engine.normal import OF_95_PERCENT
 
 # Accuracies are stored as bytes on a logarithmic scale from 0.1 mm on, in steps of 4.9 %.

@@ -12,10 +12,10 @@ from tofuse.apps.report import pair_words, thumbnails, words
 from tofuse.apps.report.html import script, write_page
 from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.apps.report.scene import Scene, extreme_points, random_subset, render, spacing_of
-from tofuse.apps.results.pair import LocalView, PairResult
+from tofuse.apps.results import LocalView, PairResult
 from tofuse.engine.arrays import Float64, Intp, UInt8
-from tofuse.engine.clouds.shape import normals_at
-from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.clouds import normals_at
+from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
 
 COLORS = {"source": (240, 160, 60), "target": (90, 176, 245)}

@@ -17,9 +17,8 @@ from tofuse.apps.report.thumbnails import (
     percentile_range,
     viridis,
 )
-from tofuse.engine.compute.thread_pool import run_all
-from tofuse.engine.quality import samples
-from tofuse.engine.quality.samples import FrameSample
+from tofuse.engine.compute import run_all
+from tofuse.engine.quality import FrameSample, samples
 
 # Kinds of images, in the order in which they are shown, and their titles.
 KINDS = {"color": "Colour", "range": "Range", "amplitude": "Amplitude", "fate": "Use of pixels"}

@@ -11,11 +11,9 @@ import numpy as np
 from tofuse.apps.report import thumbnails
 from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
-from tofuse.engine.fusion.cloud import Cloud
-from tofuse.engine.fusion.colors import display_colors
-from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion import Cloud, Mesh, display_colors
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.types import Reconstruction
+from tofuse.engine.quality import Reconstruction
 
 MAX_POINTS = 150_000
 MAX_FACES = 300_000

@@ -10,9 +10,9 @@ from tofuse.apps.report import plots, thumbnails, words
 from tofuse.apps.report.pictures import FATES, KINDS, depth_range, draw
 from tofuse.apps.report.section_parts import component_color
 from tofuse.apps.report.subject import ROWS, Subject, Values
-from tofuse.engine.compute.memory import trim_memory
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.quality.types import Component, FrameRecord, in_main_model
+from tofuse.engine.compute import trim_memory
+from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.quality import Component, FrameRecord, in_main_model
 
 _STRIP = 600  # cells in the strip of frames
 _THUMBNAIL, _FILTER = (220, 165), (320, 240)  # px

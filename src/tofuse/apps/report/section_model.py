@@ -12,9 +12,9 @@ from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import RigCameras, Scene, opening_yaw, packed, render
 from tofuse.apps.report.subject import OUTER, Subject, Values
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.cameras import Pinhole, RayTable
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.fusion.pose_errors import UNKNOWN_M
+from tofuse.engine.cameras import Pinhole, RayTable
+from tofuse.engine.frames import RangeFrame
+from tofuse.engine.fusion import UNKNOWN_M
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import OF_95_PERCENT
 

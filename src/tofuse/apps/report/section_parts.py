@@ -7,14 +7,12 @@ import numpy as np
 from tofuse.apps.report import plots, words
 from tofuse.apps.report.subject import ROWS, Subject, Values
 from tofuse.apps.report.thumbnails import css
-from tofuse.apps.results.folder import component_name
-from tofuse.apps.results.output import CHANGE_COLORS
-from tofuse.apps.results.session_words import probability_text
+from tofuse.apps.results import CHANGE_COLORS, component_name, probability_text
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.ranges import numbers
+from tofuse.engine.frames import numbers
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.types import Component, SessionChange, SessionPair
-from tofuse.formats.recordings.rig import RigCamera
+from tofuse.engine.quality import Component, SessionChange, SessionPair
+from tofuse.formats.recordings import RigCamera
 
 _COLORS = 6  # of components in the style sheet; further ones reuse them
 _MAX_PAIRS = 10  # of cameras with a distance in the picture of a rig

@@ -8,8 +8,7 @@ from tofuse.apps.report import plots, words
 from tofuse.apps.report.subject import Subject, Values
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.refinement.calibration_check import proposal
-from tofuse.engine.refinement.refinement import Refinement
+from tofuse.engine.refinement import Refinement, proposal
 
 _AXES = ("x (right)", "y (down)", "z (forward)", "rotation")
 

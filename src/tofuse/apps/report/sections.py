@@ -16,9 +16,8 @@ from tofuse.apps.report import (
 )
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.subject import Subject, Values
-from tofuse.engine.compute.thread_pool import job_pool
-from tofuse.engine.quality.accuracy_card import bound, weakest_frame
-from tofuse.engine.quality.types import Reconstruction
+from tofuse.engine.compute import job_pool
+from tofuse.engine.quality import Reconstruction, bound, weakest_frame
 
 Section = Callable[[Subject], Values | None]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.apps.report.splat_kernels import nearest_points
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 
 # A grey that differs from both ends of the colour map.
 NO_MEASUREMENT = (128, 128, 132)

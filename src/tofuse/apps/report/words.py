@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.engine.frames.ranges import Range, in_words, size
-from tofuse.engine.quality.types import Reason, Reconstruction
-from tofuse.engine.quality.verdict import ADVICE, REASONS, ranked
+from tofuse.engine.frames import Range, in_words, size
+from tofuse.engine.quality import ADVICE, REASONS, Reason, Reconstruction, ranked
 
 STATUSES = ("tracked", "predicted", "lost", "skipped")
 

@@ -14,10 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tofuse.engine.errors import InputError, OutputError, output_error
-from tofuse.formats.files.atomic import UNFINISHED
-from tofuse.formats.files.locking import Claim
-from tofuse.formats.files.reading import path_of, read_text
-from tofuse.formats.files.staging import StagedFolder, beside, finish_replacing, is_interrupted
+from tofuse.formats.files import (
+    UNFINISHED,
+    Claim,
+    StagedFolder,
+    beside,
+    finish_replacing,
+    is_interrupted,
+    path_of,
+    read_text,
+)
 
 TRACKED = f"{UNFINISHED}tracked.npz"  # tracked frames of an interrupted run
 RECORDING = "recording"  # written by `tofuse demo` next to its result, and kept with it

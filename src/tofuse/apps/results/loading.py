@@ -16,13 +16,10 @@ from tofuse.apps.results.run_json import (
     run_json_checked,
 )
 from tofuse.engine.errors import InputError
-from tofuse.engine.fusion.cloud import Cloud
-from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.engine.fusion.mesh import Mesh, mesh_of
-from tofuse.engine.graph.external_sensors import SensorRecord
-from tofuse.engine.graph.graph import GraphPart, LoopRecord
-from tofuse.engine.quality.accuracy import Accuracy, WorstFrame
-from tofuse.engine.quality.types import (
+from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh, mesh_of
+from tofuse.engine.graph import GraphPart, LoopRecord, SensorRecord
+from tofuse.engine.quality import (
+    Accuracy,
     Component,
     Diagnostics,
     FrameRecord,
@@ -31,11 +28,10 @@ from tofuse.engine.quality.types import (
     SelfCalibration,
     SessionPair,
     SessionRecord,
+    WorstFrame,
 )
-from tofuse.formats.files.g2o import read_g2o
-from tofuse.formats.files.ply import read_ply
-from tofuse.formats.files.reading import path_of
-from tofuse.formats.readers.scans import read_las
+from tofuse.formats.files import path_of, read_g2o, read_ply
+from tofuse.formats.readers import read_las
 
 
 def load_result(folder: str | Path) -> Reconstruction:

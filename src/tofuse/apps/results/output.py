@@ -11,18 +11,10 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.apps.results.folder import OutputFolder, component_name
 from tofuse.apps.results.run_json import write_run_json
-from tofuse.engine.compute.thread_pool import job_pool
-from tofuse.engine.fusion.colors import display_colors
-from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.engine.fusion.mesh import Mesh
-from tofuse.engine.fusion.texture import Textured
-from tofuse.engine.quality.types import Reconstruction
-from tofuse.formats.files.g2o import write_g2o
-from tofuse.formats.files.glb import write_glb
-from tofuse.formats.files.images import png_bytes
-from tofuse.formats.files.obj import write_obj
-from tofuse.formats.files.ply import write_ply
-from tofuse.formats.files.trajectory import write_tum
+from tofuse.engine.compute import job_pool
+from tofuse.engine.fusion import GeometryRecord, Mesh, Textured, display_colors
+from tofuse.engine.quality import Reconstruction
+from tofuse.formats.files import png_bytes, write_g2o, write_glb, write_obj, write_ply, write_tum
 
 # Colours of surfaces that changed between sessions, distinguishable by colour-blind people.
 CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}

@@ -15,16 +15,13 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.apps.results.folder import Contract, OutputFolder, read_json_object
 from tofuse.apps.results.run_json import plain
-from tofuse.engine.alignment.base import Registration
+from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.frames import Frame
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.formats.files.atomic import write_text
-from tofuse.formats.files.ply import write_ply
-from tofuse.formats.files.pose import pose_text
-from tofuse.formats.recordings.cloud_sequence import MAP_COORDINATES_M
-from tofuse.formats.recordings.open import SingleView
+from tofuse.formats.files import pose_text, write_ply, write_text
+from tofuse.formats.recordings import MAP_COORDINATES_M, SingleView
 
 MARKER = "registration.json"
 FILES = ("transform.txt", "aligned.ply", "report.html", MARKER)

@@ -11,8 +11,8 @@ import numpy as np
 
 from tofuse.apps.results.folder import RECORDING
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import Recording
-from tofuse.formats.recordings.open import Opening
+from tofuse.engine.frames import Recording
+from tofuse.formats.recordings import Opening
 
 # Frames whose times differ by more are not of the same recording, s.
 _MAX_TIME_DIFFERENCE = 1e-6

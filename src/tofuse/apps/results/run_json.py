@@ -16,12 +16,9 @@ from tofuse.apps.results.folder import is_result
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.accuracy import Accuracy
-from tofuse.engine.quality.types import FrameRecord, Reason, Reconstruction, SelfCalibration
-from tofuse.engine.refinement.calibration_check import CalibrationCheck
-from tofuse.engine.refinement.refinement import Refinement
-from tofuse.formats.files.reading import damage_reported, parsed, read_text
-from tofuse.formats.files.trajectory import read_tum
+from tofuse.engine.quality import Accuracy, FrameRecord, Reason, Reconstruction, SelfCalibration
+from tofuse.engine.refinement import CalibrationCheck, Refinement
+from tofuse.formats.files import damage_reported, parsed, read_text, read_tum
 
 
 def write_run_json(path: Path, result: Reconstruction) -> None:

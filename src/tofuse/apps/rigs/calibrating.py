@@ -14,10 +14,10 @@ from tofuse.apps.rigs.checking import CameraMotion, compare_in_scene
 from tofuse.apps.rigs.inputs import Camera, open_cameras
 from tofuse.apps.rigs.moving_rig import MovingRig, calibrate_moving
 from tofuse.apps.rigs.static_rig import StaticRig, calibrate_static, is_static
-from tofuse.engine.compute.thread_pool import threads as using_threads
+from tofuse.engine.compute import threads as using_threads
 from tofuse.engine.errors import InputError
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.formats.recordings.rig import Disagreement, Rig, RigCamera
+from tofuse.engine.mapping import Progress, Silent
+from tofuse.formats.recordings import Disagreement, Rig, RigCamera
 
 Motion = Literal["auto", "still", "moving"]
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from tofuse.apps.rigs.clocks import Lag, lag_between
-from tofuse.engine.alignment.projective import UNITS
+from tofuse.engine.alignment import UNITS
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.errors import RegistrationError

@@ -8,14 +8,11 @@ from functools import cached_property
 from pathlib import Path
 
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters.base import apply_filters
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.mapping.adaptation import with_recording_defaults
-from tofuse.engine.mapping.config import Config, from_method
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.formats.recordings.open import open_recording
+from tofuse.engine.filters import apply_filters
+from tofuse.engine.frames import RangeFrame, Recording
+from tofuse.engine.mapping import Config, from_method, with_recording_defaults
+from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
+from tofuse.formats.recordings import open_recording
 
 _MAX_CAMERAS = 64
 

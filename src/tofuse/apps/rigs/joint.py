@@ -17,14 +17,12 @@ import numpy as np
 
 from tofuse.apps.rigs import rig_residual_kernels as kernels
 from tofuse.apps.rigs.joint_covariance import by_region, correlated, inverse_slope
-from tofuse.engine.alignment.projective import UNITS
+from tofuse.engine.alignment import UNITS
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.compute.thread_pool import run_chunks
 from tofuse.engine.geometry import se3
-from tofuse.engine.stored_views import shared_error
-from tofuse.engine.stored_views.pair_equations import Round
-from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.stored_views import Round, SampledView, shared_error
 
 # Unknowns of a camera: its pose, in units of 1 cm and 1 degree, and its depth offset, in cm.
 _SIZE = 7

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.alignment.uncertainty import bounded_below
+from tofuse.engine.alignment import bounded_below
 from tofuse.engine.arrays import Float64
 
 # Size of regions of space with equal errors, as a fraction of the depth.

@@ -16,17 +16,12 @@ from tofuse.apps.rigs.inputs import Camera
 from tofuse.apps.rigs.joint import disagreements_of
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError, RegistrationError
-from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.quality.types import Reconstruction
-from tofuse.engine.refinement.joint_alignment import refine
-from tofuse.engine.refinement.pose_priors import Priors
-from tofuse.engine.refinement.refinement import propagate_poses
-from tofuse.engine.refinement.split_half import refined_by_halves
-from tofuse.engine.stored_views.pair_equations import RefineOptions
-from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.mapping import Progress, Silent, reconstruct
+from tofuse.engine.quality import Reconstruction
+from tofuse.engine.refinement import Priors, propagate_poses, refine, refined_by_halves
+from tofuse.engine.stored_views import RefineOptions, SampledView
 
 # Number of views of each camera that are refined jointly, and of their points.
 _VIEWS, _POINTS = 70, 1500

@@ -19,18 +19,25 @@ from typing import TypeVar
 import numpy as np
 
 from tofuse.apps.rigs.joint import JointOptions, RigView, refined_poses
-from tofuse.engine.alignment.base import PROBABLE
+from tofuse.engine.alignment import PROBABLE
 from tofuse.engine.arrays import Float64
-from tofuse.engine.compute.thread_pool import run_all
-from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.compute import run_all
+from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.search.pair_agreement import AgreementOptions, Comparison
-from tofuse.engine.search.pose_probability import ACCEPTED, PoseEvidence
-from tofuse.engine.search.search import DISTINCT_M, Search, SearchOptions, are_distinct_poses
-from tofuse.engine.search.verification import comparable
-from tofuse.engine.search.view_pair import register_pair
-from tofuse.engine.stored_views.view_store import SampledView
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.search import (
+    ACCEPTED,
+    DISTINCT_M,
+    AgreementOptions,
+    Comparison,
+    PoseEvidence,
+    Search,
+    SearchOptions,
+    are_distinct_poses,
+    comparable,
+    register_pair,
+)
+from tofuse.engine.stored_views import SampledView
+from tofuse.engine.views import PreparedView
 
 V = TypeVar("V")
 

@@ -9,17 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.projection_kernels import MIN_DEPTH, nearest_pixel
-from tofuse.engine.compute.jit import kernel
-from tofuse.engine.views.residual_kernels import (
-    DISTANCE,
-    NORMAL,
-    PLANE,
-    POINT,
-    SIGMA,
-    VARIANCE,
-    TargetImage,
-)
+from tofuse.engine.cameras import MIN_DEPTH, nearest_pixel
+from tofuse.engine.compute import kernel
+from tofuse.engine.views import DISTANCE, NORMAL, PLANE, POINT, SIGMA, VARIANCE, TargetImage
 
 # Columns of a row: signed distance from the target's plane in m and its variance (0: no
 # correspondence), the target's normal in the source's frame, the source's own normal, the corrected

@@ -16,19 +16,20 @@ from tofuse.apps.rigs.inputs import Camera
 from tofuse.apps.rigs.joint import disagreements_of
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.build import Measured
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.quality.types import Reconstruction
-from tofuse.engine.refinement.joint_alignment import Bodies, refine
-from tofuse.engine.refinement.refinement import pairwise_measurements, propagate_poses
-from tofuse.engine.refinement.submaps import support_fell
-from tofuse.engine.stored_views.pair_equations import RefineOptions
-from tofuse.engine.stored_views.view_store import SampledView, Spacing
-from tofuse.formats.recordings.rig import RigCamera, RigSource
+from tofuse.engine.graph import Measured
+from tofuse.engine.mapping import Progress, Silent, reconstruct
+from tofuse.engine.quality import Reconstruction
+from tofuse.engine.refinement import (
+    Bodies,
+    pairwise_measurements,
+    propagate_poses,
+    refine,
+    support_fell,
+)
+from tofuse.engine.stored_views import RefineOptions, SampledView, Spacing
+from tofuse.formats.recordings import RigCamera, RigSource
 
 # Median distance between the surfaces of two cameras, m, and number of pixels, by pair a < b.
 SurfaceDistances = dict[tuple[int, int], tuple[float, int]]

@@ -9,34 +9,33 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.jobs.run_options import Options, resolve
-from tofuse.apps.results.folder import OutputFolder
-from tofuse.apps.results.output import write_result
+from tofuse.apps.jobs import Options, resolve
+from tofuse.apps.results import OutputFolder, write_result
 from tofuse.apps.rigs.calibrating import Motion, cameras_of, moves
 from tofuse.apps.rigs.checking import CameraMotion, compare
 from tofuse.apps.rigs.inputs import Camera
 from tofuse.apps.rigs.joint import RigView, disagreements, refine_together
 from tofuse.apps.rigs.rig_trajectory import track_rig
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.compute.thread_pool import threads as using_threads
+from tofuse.engine.compute import threads as using_threads
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.build import Measured
-from tofuse.engine.loops.nearby import Nearby
-from tofuse.engine.mapping.config import Config
-from tofuse.engine.mapping.priors import with_odometry
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.quality.accuracy import UNOBSERVED_ERROR_FACTOR
-from tofuse.engine.quality.types import Reason, Reconstruction
-from tofuse.engine.quality.verdict import ranked, verdict_of
-from tofuse.engine.refinement.refinement import AlreadyRefined, NoRefinement
-from tofuse.engine.stored_views.view_store import SampledView
-from tofuse.engine.tracking.given import GivenPoses
-from tofuse.formats.files.trajectory import write_tum
-from tofuse.formats.recordings.rig import Disagreement, Rig, RigSource, read_rig, recordings_of
+from tofuse.engine.graph import Measured
+from tofuse.engine.loops import Nearby
+from tofuse.engine.mapping import Config, Progress, Silent, reconstruct, with_odometry
+from tofuse.engine.quality import (
+    UNOBSERVED_ERROR_FACTOR,
+    Reason,
+    Reconstruction,
+    ranked,
+    verdict_of,
+)
+from tofuse.engine.refinement import AlreadyRefined, NoRefinement
+from tofuse.engine.stored_views import SampledView
+from tofuse.engine.tracking import GivenPoses
+from tofuse.formats.files import write_tum
+from tofuse.formats.recordings import Disagreement, Rig, RigSource, read_rig, recordings_of
 
 # No loops are searched: poses of the rig are final.
 _NO_LOOPS = Nearby(min_gap=1_000_000)
@@ -310,8 +309,7 @@ def _with_rig_reason(result: Reconstruction, displaced: Sequence[CameraMotion]) 
 
 
 def _write(rig_result: RigResult, recording: Recording, folder: OutputFolder) -> None:
-    from tofuse.apps.report.extras import ReportExtras
-    from tofuse.apps.report.html import write_report
+    from tofuse.apps.report import ReportExtras, write_report
 
     def report(result: Reconstruction, target: Path) -> None:
         source = recording.source

@@ -24,16 +24,15 @@ from tofuse.apps.rigs.joint import (
 from tofuse.apps.rigs.placing import Placement, place
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters.background_model import BackgroundSurface, background_surface
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.filters import BackgroundSurface, background_surface
+from tofuse.engine.frames import RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.progress import Progress
-from tofuse.engine.noise.choice import noise_model_for
+from tofuse.engine.mapping import Progress
+from tofuse.engine.noise import noise_model_for
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
-from tofuse.engine.stored_views.view_store import SampledView
-from tofuse.engine.views.prepared_view import PreparedView
-from tofuse.formats.recordings.still import average_of, change_between
+from tofuse.engine.stored_views import SampledView
+from tofuse.engine.views import PreparedView
+from tofuse.formats.recordings import average_of, change_between
 
 # A camera is static if this fraction of its pixels measure the same surface in this fraction of the
 # sampled frames.

@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tofuse.apps.report.thumbnails import data_uri, depth_image, depth_limits, subsample, viridis
-from tofuse.apps.report.words import length
+from tofuse.apps.report import data_uri, depth_image, depth_limits, length, subsample, viridis
 from tofuse.apps.viewer.coverage import Coverage
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.quaternion import from_matrix
+from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.geometry import from_matrix, se3
 from tofuse.engine.normal import OF_95_PERCENT
-from tofuse.engine.quality.types import FrameRecord
+from tofuse.engine.quality import FrameRecord
 
 if TYPE_CHECKING:
     from viser import ViserServer

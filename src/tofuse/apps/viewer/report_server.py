@@ -14,14 +14,20 @@ from pathlib import Path
 from threading import Lock, Thread
 from typing import Any, Self
 
-from tofuse.apps.report.thumbnails import depth_image, depth_limits, encode, grey
-from tofuse.apps.results.folder import component_number, finish_interrupted, is_result
-from tofuse.apps.results.reopening import reopen, stored_recordings
-from tofuse.apps.results.run_json import read_run_json, run_json_checked
+from tofuse.apps.report import depth_image, depth_limits, encode, grey
+from tofuse.apps.results import (
+    component_number,
+    finish_interrupted,
+    is_result,
+    read_run_json,
+    reopen,
+    run_json_checked,
+    stored_recordings,
+)
 from tofuse.apps.viewer.server import HOST, choose_port, is_same_origin
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import Recording
-from tofuse.formats.files.reading import read_bytes
+from tofuse.engine.frames import Recording
+from tofuse.formats.files import read_bytes
 
 _FRAME = re.compile(r"/frame/(\d{1,9})\.png", re.ASCII)
 _HTML, _PNG, _PLY = "text/html; charset=utf-8", "image/png", "application/octet-stream"

@@ -14,9 +14,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING, Any
 
-from tofuse.apps.report.policy import script_hashes
+from tofuse.apps.report import script_hashes
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import required_package
+from tofuse.formats.files import required_package
 
 if TYPE_CHECKING:
     from viser import ViserServer

@@ -8,7 +8,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 
 # Minimum probability of a pose that other evidence may confirm.

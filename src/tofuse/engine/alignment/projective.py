@@ -16,9 +16,9 @@ import numpy as np
 from tofuse.engine.alignment import step_kernels as steps
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.compute.partition import median
+from tofuse.engine.compute import median
+from tofuse.engine.views import PreparedView
 from tofuse.engine.views import residual_kernels as kernels
-from tofuse.engine.views.prepared_view import PreparedView
 
 # A direction is constrained if its sigma is at most 1 cm, or 1 degree.
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)

@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.projection_kernels import jacobian_row
-from tofuse.engine.compute.jit import kernel
-from tofuse.engine.views.residual_kernels import NORMAL, POINT, POINT_ALBEDO, SIGMA
+from tofuse.engine.cameras import jacobian_row
+from tofuse.engine.compute import kernel
+from tofuse.engine.views import NORMAL, POINT, POINT_ALBEDO, SIGMA
 
 
 @kernel

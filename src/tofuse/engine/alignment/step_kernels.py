@@ -8,16 +8,10 @@ import numpy as np
 
 from tofuse.engine.alignment.spurious_information_kernels import spurious_information
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.compute.jit import kernel
-from tofuse.engine.geometry.rigid_motion_kernels import compose, retract, twist_between
+from tofuse.engine.compute import kernel
+from tofuse.engine.geometry import compose, retract, twist_between
+from tofuse.engine.views import Residuals, TargetImage, accumulate, bin_edge, normal_equations
 from tofuse.engine.views import residual_kernels as sums
-from tofuse.engine.views.residual_kernels import (
-    Residuals,
-    TargetImage,
-    accumulate,
-    bin_edge,
-    normal_equations,
-)
 
 # Number of points from which the spurious information is estimated.
 SAMPLE_SIZE = 500

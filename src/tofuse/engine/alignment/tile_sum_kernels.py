@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, Int64
+from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.compute.jit import kernel
-from tofuse.engine.views.residual_kernels import (
+from tofuse.engine.views import (
     DIFFERENCE,
     INLIERS,
     IS_INLIER,

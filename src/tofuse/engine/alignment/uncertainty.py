@@ -26,10 +26,9 @@ import numpy as np
 from tofuse.engine.alignment import tile_sum_kernels as kernels
 from tofuse.engine.alignment.projective import UNITS, Aligned, ProjectiveOptions, Target
 from tofuse.engine.arrays import Float64
-from tofuse.engine.compute.partition import median
-from tofuse.engine.geometry.rigid_motion_kernels import distance_and_angle
-from tofuse.engine.views.prepared_view import PreparedView
-from tofuse.engine.views.residual_kernels import Residuals
+from tofuse.engine.compute import median
+from tofuse.engine.geometry import distance_and_angle
+from tofuse.engine.views import PreparedView, Residuals
 
 _UPPER7 = np.triu_indices(7)
 # Everything here is in units of 1 cm and 1 degree, so that eigenvalues can be compared.

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tofuse.engine.alignment.projective import ProjectiveOptions
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views import SurfaceOptions
 
 
 @dataclass(frozen=True)

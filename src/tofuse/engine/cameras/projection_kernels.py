@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 
 MIN_DEPTH = 0.02  # m; points nearer to a camera are not projected
 

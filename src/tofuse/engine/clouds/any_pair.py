@@ -9,20 +9,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registrar, Registration
-from tofuse.engine.alignment.uncertainty import UncertaintyOptions
+from tofuse.engine.alignment import Registrar, Registration, UncertaintyOptions
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_pair import follow_clouds, register_clouds, with_cloud_information
 from tofuse.engine.clouds.fpfh import candidates
 from tofuse.engine.clouds.viewpoint import as_image, viewpoint_of
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.engine.search.verification import comparable
-from tofuse.engine.search.view_pair import follow, register_pair
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.search import comparable, follow, register_pair
+from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 MIN_POINTS = 10
 # For recorded views with a wide baseline, which multipath distorts individually.

@@ -15,10 +15,9 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.clouds.shape import Shape, shape_at, tree_of
 from tofuse.engine.clouds.viewpoint import RangeSphere, Viewpoint, viewpoint_of
-from tofuse.engine.frames.frames import CloudFrame, Frame
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.kdtree import KdTree
-from tofuse.engine.search.pair_agreement import Agreement
+from tofuse.engine.frames import CloudFrame, Frame
+from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.search import Agreement
 
 # Points of each plane fit.
 NEIGHBOURS = 12

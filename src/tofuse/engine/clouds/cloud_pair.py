@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registration
+from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
@@ -28,10 +28,9 @@ from tofuse.engine.clouds.selectors import All, Uniform
 from tofuse.engine.clouds.stopping import SmallStep
 from tofuse.engine.clouds.surface_metrics import PointToPlane
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.search.pair_agreement import Agreement
-from tofuse.engine.search.pose_probability import CERTAIN, CLOUDS, PoseEvidence
+from tofuse.engine.search import CERTAIN, CLOUDS, Agreement, PoseEvidence
 
 # Maximum number of points of each averaged view.
 _POINTS = 10_000

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 
 # Neighbourhoods with a smaller ratio of their two largest variances are lines without a normal.
 _LINE_RATIO = 1e-8

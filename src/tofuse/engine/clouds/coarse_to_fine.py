@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.clouds.icp import Icp
@@ -21,9 +21,8 @@ from tofuse.engine.clouds.shape import shape_at
 from tofuse.engine.clouds.stopping import SmallStep
 from tofuse.engine.clouds.surface_metrics import PlaneToPlane
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import CloudFrame, Frame
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.frames import CloudFrame, Frame
+from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.parts import part
 
 _SPACING_SAMPLE = 5000

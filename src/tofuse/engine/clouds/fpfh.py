@@ -20,14 +20,13 @@ from tofuse.engine.clouds.robust_motion import (
     motion_of,
 )
 from tofuse.engine.clouds.shape import shape_at
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import CloudFrame, Frame
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.frames import CloudFrame, Frame
+from tofuse.engine.geometry import KdTree, se3
 
 # Defaults of `candidates`.
-POINTS, REACH, NEIGHBOURS = 4000, 5.0, 12
+POINTS, REACH, FPFH_NEIGHBOURS = 4000, 5.0, 12
 _BINS = 11
 # Resolution of the averaged views in spacings of the points: averages are less noisy than samples.
 _COARSER = 2.0
@@ -53,7 +52,7 @@ def candidates(
     *,
     points: int = POINTS,
     reach: float = REACH,
-    neighbours: int = NEIGHBOURS,
+    neighbours: int = FPFH_NEIGHBOURS,
     signed: bool = False,
     options: ConsensusOptions | None = None,
     motions: Motions | None = None,

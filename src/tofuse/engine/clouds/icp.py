@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.clouds.icp_kernels import transform_points
@@ -30,7 +30,7 @@ from tofuse.engine.clouds.selectors import Random, at_most
 from tofuse.engine.clouds.shape import NEIGHBOURS
 from tofuse.engine.clouds.stopping import TwoLoops
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 

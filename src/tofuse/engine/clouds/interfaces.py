@@ -17,7 +17,7 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.clouds.shape import NEIGHBOURS, Shape, normals_at, shape_at
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame
 
 
 @dataclass(frozen=True, eq=False)

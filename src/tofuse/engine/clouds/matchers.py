@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.clouds.interfaces import Alignment, Matcher, Matches, Points, Search
 from tofuse.engine.clouds.shape import tree_of
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.geometry import KdTree
 from tofuse.engine.parts import part
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.clouds.any_pair import MIN_POINTS, AnyPair
-from tofuse.engine.compute.blas import one_blas_thread
+from tofuse.engine.compute import one_blas_thread
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number
 

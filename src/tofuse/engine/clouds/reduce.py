@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, Intp
-from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.frames import CloudFrame, Frame
 
 # Maximum number of cubes with a unique index in float64.
 _MAX_CELLS = 2.0**52

@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Int64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.clouds.interfaces import Selector
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame
 from tofuse.engine.parts import part
 
 

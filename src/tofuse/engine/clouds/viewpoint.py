@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, Intp
-from tofuse.engine.cameras.cameras import Camera, Pinhole
-from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.cameras import Camera, Pinhole
+from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.geometry import KdTree
 
 # Maximum number of points, of samples among them, and of neighbours for the local density.
 _MAX_POINTS, _SAMPLES, _NEIGHBOURS = 50_000, 2000, 8

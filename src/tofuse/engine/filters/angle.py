@@ -11,11 +11,11 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.cameras.cameras import unknown_rays
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.cameras import unknown_rays
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.filters.base import Filter
 from tofuse.engine.filters.neighbourhood_kernels import is_steeper
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
 
 

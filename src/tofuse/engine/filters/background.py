@@ -11,7 +11,7 @@ from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.background_model import MovingObject, moving_object
 from tofuse.engine.filters.base import Filter
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
 
 

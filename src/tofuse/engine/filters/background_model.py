@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 
 # A surface exists where this fraction of the frames, and this number, agree on its depth.

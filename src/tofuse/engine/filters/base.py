@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Protocol
 
 from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame
 from tofuse.engine.parts import name_of
 
 

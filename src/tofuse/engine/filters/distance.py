@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool
 from tofuse.engine.filters.base import Filter, Interval
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
 
 

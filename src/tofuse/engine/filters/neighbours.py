@@ -11,8 +11,8 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.filters.base import Filter
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.frames import Frame
+from tofuse.engine.geometry import KdTree
 from tofuse.engine.parts import part
 
 # Upper limit of k, which bounds the memory.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32
-from tofuse.engine.geometry.se3 import MAX_COORDINATE_M
+from tofuse.engine.geometry import MAX_COORDINATE_M
 
 INVALID_DEPTH = 65535
 MAX_COUNTS = 65535

@@ -15,15 +15,9 @@ from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.cameras.cameras import (
-    Camera,
-    points_from_z,
-    range_from_z,
-    unknown_rays,
-    z_from_range,
-)
+from tofuse.engine.cameras import Camera, points_from_z, range_from_z, unknown_rays, z_from_range
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry.se3 import MAX_COORDINATE_M
+from tofuse.engine.geometry import MAX_COORDINATE_M
 from tofuse.engine.parts import check_number
 
 DepthKind = Literal["z", "range"]

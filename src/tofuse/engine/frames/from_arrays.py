@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable, pinhole_values
+from tofuse.engine.cameras import Camera, Pinhole, RayTable, pinhole_values
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.depth_counts import INVALID_DEPTH
 from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.geometry.se3 import check_poses
+from tofuse.engine.geometry import check_poses
 from tofuse.engine.parts import check_number
 
 # The unit of integer depth for nearly all cameras.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.compute.thread_pool import job_pool
+from tofuse.engine.compute import job_pool
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import Frame, RangeFrame
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, Int32
-from tofuse.engine.cameras.projection_kernels import project_ray
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.cameras import project_ray
+from tofuse.engine.compute import kernel
 
 NO_TRIANGLE = -1
 

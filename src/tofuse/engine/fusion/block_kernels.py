@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Int32, Int64, UInt8, UInt16
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 
 EDGE = 8  # voxels along the edge of a block
 VOXELS = EDGE**3

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64, Int32, Int64, UInt8
-from tofuse.engine.compute.thread_pool import thread_count
-from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.compute import thread_count
+from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.fusion.exportable import Exportable
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.fusion.options import Fusion

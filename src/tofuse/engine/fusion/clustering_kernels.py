@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 from tofuse.engine.fusion.block_kernels import EMPTY, slot_of
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.fusion.stored_views import Views
 from tofuse.engine.fusion.tsdf_kernels import max_informative_depth
 from tofuse.engine.geometry import se3

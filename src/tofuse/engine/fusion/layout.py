@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Int32, Int64
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.fusion.block_kernels import EDGE, EMPTY, HALF, VOXELS, insert_keys
 from tofuse.engine.fusion.range_view import RangeView
 from tofuse.engine.fusion.stored_views import Views, summaries

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.compute.spill import Spill
-from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.compute import Spill
+from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import RangeView
 from tofuse.engine.fusion.stored_views import StoredClouds, StoredViews
 from tofuse.engine.fusion.tsdf import fitting_voxel, fuse_surface
-from tofuse.engine.refinement.refinement import without_errors
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.refinement import without_errors
+from tofuse.engine.views import PreparedView
 
 _SKETCH_VIEWS, _SKETCH_PIXELS = 60, 6000  # views in a sketch, and approximate pixels of each
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.fusion.cloud import Cloud
 from tofuse.engine.fusion.model import Model
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.geometry import KdTree, se3
 
 # They vary slowly over the surface: size of its cells, as a fraction of the model's diagonal.
 _CELL_FRACTION = 0.01

@@ -10,15 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Int8, UInt8, UInt16
-from tofuse.engine.cameras.cameras import ray_lengths
-from tofuse.engine.compute.partition import median
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.cameras import ray_lengths
+from tofuse.engine.compute import median
+from tofuse.engine.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.tsdf_kernels import StoredView, mark_jumps, pack_view, shrink_to_planes
-from tofuse.engine.views.extended_planes import with_extended_planes
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.projection import Projection
-from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.engine.views.view_planes import dilated
+from tofuse.engine.views import (
+    PreparedView,
+    Projection,
+    SurfaceOptions,
+    dilated,
+    prepare_view,
+    with_extended_planes,
+)
 
 # Weights, in 1/m^2, are stored as logarithms: six steps per octave, from 2^-14 on.
 _STEPS_PER_OCTAVE, _MIN_LOG2 = 6.0, -14.0

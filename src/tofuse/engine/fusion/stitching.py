@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Int32, Int64, UInt8
-from tofuse.engine.compute.spill import Spill
+from tofuse.engine.compute import Spill
 from tofuse.engine.fusion.cloud import grey_of
 from tofuse.engine.fusion.clustering_kernels import flatten_groups, union_faces
 from tofuse.engine.fusion.mesh import Mesh

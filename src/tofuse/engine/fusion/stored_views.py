@@ -6,8 +6,8 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from tofuse.engine.compute.spill import Spill
-from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.compute import Spill
+from tofuse.engine.frames import CloudFrame
 from tofuse.engine.fusion.range_view import RangeView, with_camera_correction
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, Int32, Int64
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 from tofuse.engine.fusion.block_kernels import EDGE, VOXELS, Blocks, block_of, voxel_index, voxel_of
 
 _SIDE = EDGE + 1

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, UInt8
-from tofuse.engine.cameras.cameras import ray_lengths
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.cameras import ray_lengths
+from tofuse.engine.compute import run_chunks
+from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.fusion.atlas import MARGIN, Atlas, unwrap
 from tofuse.engine.fusion.atlas_kernels import (
     NO_TRIANGLE,
@@ -24,9 +24,8 @@ from tofuse.engine.fusion.atlas_kernels import (
 from tofuse.engine.fusion.cloud import grey_of
 from tofuse.engine.fusion.colors import NO_COLOR, display_colors, has_color
 from tofuse.engine.fusion.mesh import Mesh
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.kdtree import KdTree
-from tofuse.engine.views.projection import Projection
+from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.views import Projection
 
 # Depth tolerance of the visibility test: m, plus a fraction of the depth.
 _TOLERANCE_M, _TOLERANCE_FRACTION = 0.02, 0.02

@@ -10,8 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, UInt16
-from tofuse.engine.compute.spill import Spill
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import Spill, run_chunks
 from tofuse.engine.fusion.block_kernels import (
     EDGE,
     VOXELS,

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int8, Int32, Int64, UInt8, UInt16
-from tofuse.engine.cameras.projection_kernels import project_ray
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.cameras import project_ray
+from tofuse.engine.compute import kernel
 from tofuse.engine.fusion.block_kernels import (
     EDGE,
     EMPTY,

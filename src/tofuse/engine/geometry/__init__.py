@@ -1,1 +1,26 @@
 """."""
+
+from typing import TYPE_CHECKING
+
+from tofuse._faces import face
+
+if TYPE_CHECKING:
+    from tofuse.engine.geometry import quaternion, se3
+    from tofuse.engine.geometry.kdtree import KdTree, checked_points
+    from tofuse.engine.geometry.places import PlaceCounts
+    from tofuse.engine.geometry.quaternion import from_matrix, length, to_pose
+    from tofuse.engine.geometry.rigid_motion_kernels import (
+        compose,
+        distance_and_angle,
+        retract,
+        twist_between,
+    )
+    from tofuse.engine.geometry.se3 import (
+        MAX_COORDINATE_M,
+        check_pose,
+        check_poses,
+        inverse,
+        orthonormalise,
+    )
+
+__getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import InputError
 
 # With fewer queries a second thread costs more than it gains.

@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import splu
 
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.compute.blas import one_blas_thread
+from tofuse.engine.compute import one_blas_thread
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import supernode_kernels as kernels
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 
 # Maximum width of a panel, in blocks, as its diagonal triangle is factorised without BLAS.
 _MAX_WIDTH = 32

@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.views.descriptor import (
+from tofuse.engine.views import (
     dissimilarity,
     mutual_dissimilarity,
     pairwise_dissimilarity,

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.compute.spill import Spill
+from tofuse.engine.compute import Spill
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.covariances import relative_covariance
+from tofuse.engine.graph import relative_covariance
 from tofuse.engine.loops.appearance import MAX_VIEW_DISTANCE, Appearance
 from tofuse.engine.loops.information_gain import InformationGain
-from tofuse.engine.stored_views.view_store import (
+from tofuse.engine.stored_views import (
     CoarseView,
     HasCoarseView,
     PosedView,
@@ -22,8 +22,7 @@ from tofuse.engine.stored_views.view_store import (
     overlaps,
     sampled_points,
 )
-from tofuse.engine.views.descriptor import view_descriptor
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.views import PreparedView, view_descriptor
 
 Pair = tuple[int, int]  # frames (i, j), i < j
 LoopView = PosedView[PreparedView]

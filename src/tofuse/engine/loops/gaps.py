@@ -12,14 +12,13 @@ from functools import cached_property
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Link, Registration
+from tofuse.engine.alignment import Link, Registration
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.rigid_motion_kernels import retract, twist_between
+from tofuse.engine.geometry import retract, se3, twist_between
 from tofuse.engine.normal import SIGMA_OF_MEDIAN
-from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.tracking.motion import HANDHELD
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.stored_views import PosedView
+from tofuse.engine.tracking import HANDHELD
+from tofuse.engine.views import PreparedView
 
 View = PosedView[PreparedView]
 

@@ -8,10 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Link, Registration
-from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
+from tofuse.engine.alignment import Link, ProjectiveOptions, Registration, Target, align
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.gaps import (
     CONVERGENCE,
@@ -27,16 +26,17 @@ from tofuse.engine.loops.merged_components import (
     MergedComponents,
     transformed,
 )
-from tofuse.engine.search.pair_agreement import Agreement, agreement
-from tofuse.engine.search.pose_probability import CONTRADICTION
-from tofuse.engine.search.search import are_distinct_poses
-from tofuse.engine.search.verification import (
+from tofuse.engine.search import (
+    CONTRADICTION,
     MAX_OVERLAP_DISTANCE,
     PATIENT,
+    Agreement,
     FitStatistics,
+    agreement,
+    are_distinct_poses,
+    follow,
     usual_tolerances,
 )
-from tofuse.engine.search.view_pair import follow
 
 # View pairs that verify a join, besides those of the links; and their smallest overlap.
 VERIFY, _OVERLAP = 8, 0.2

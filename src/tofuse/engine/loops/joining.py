@@ -19,20 +19,23 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Link
+from tofuse.engine.alignment import Link
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.bridges import cut_edges
+from tofuse.engine.graph import cut_edges
 from tofuse.engine.loops.gaps import TrackedComponent, View, extrapolated, odometry_over
 from tofuse.engine.loops.join_checks import VERIFY, JoinChecks, link_of
 from tofuse.engine.loops.merged_components import Join, JoinKind, MergedComponent, MergedComponents
 from tofuse.engine.loops.pairwise_consistency import maximum_consistent_set
-from tofuse.engine.search.pose_probability import logistic
-from tofuse.engine.search.search import DISTINCT_M, SearchOptions
-from tofuse.engine.search.verification import MAX_OVERLAP_DISTANCE
-from tofuse.engine.search.view_pair import register_pair
-from tofuse.engine.views.descriptor import (
+from tofuse.engine.search import (
+    DISTINCT_M,
+    MAX_OVERLAP_DISTANCE,
+    SearchOptions,
+    logistic,
+    register_pair,
+)
+from tofuse.engine.views import (
     mutual_dissimilarity,
     pairwise_dissimilarity,
     similar_views,

@@ -8,16 +8,16 @@ from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.clouds.icp import algorithm_1
+from tofuse.engine.clouds import algorithm_1
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.graph.graph import LoopRecord
-from tofuse.engine.search.search import SearchOptions
-from tofuse.engine.stored_views.view_store import ViewStore
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.frames import Frame
+from tofuse.engine.graph import LoopRecord
+from tofuse.engine.search import SearchOptions
+from tofuse.engine.stored_views import ViewStore
+from tofuse.engine.views import PreparedView
 
 # Separates the random streams of loops from those of other stages that register the same pair.
 SEED_STAGE = 2

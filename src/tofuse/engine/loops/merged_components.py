@@ -11,12 +11,12 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from tofuse.engine.alignment.base import Link
+from tofuse.engine.alignment import Link
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.bridges import sides_without
+from tofuse.engine.graph import sides_without
 from tofuse.engine.loops.gaps import TrackedComponent, View
-from tofuse.engine.search.search import DISTINCT_M, DISTINCT_RAD
+from tofuse.engine.search import DISTINCT_M, DISTINCT_RAD
 
 JoinKind = Literal["links", "motion", "odometry"]
 

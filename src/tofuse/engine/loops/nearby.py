@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.loops import (
     ClosedLoop,
@@ -22,9 +22,9 @@ from tofuse.engine.loops.loops import (
     in_order,
 )
 from tofuse.engine.parts import part
-from tofuse.engine.search.search import SearchOptions
-from tofuse.engine.stored_views.view_store import ViewStore
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.search import SearchOptions
+from tofuse.engine.stored_views import ViewStore
+from tofuse.engine.views import PreparedView
 
 
 @part("loops", "nearby", label="validated")

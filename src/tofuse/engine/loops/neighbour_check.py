@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.search.pair_agreement import MIN_LEAD, Comparison
-from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.search import MIN_LEAD, Comparison
+from tofuse.engine.stored_views import PosedView
+from tofuse.engine.views import PreparedView
 
 
 def degraded_neighbours(

@@ -10,14 +10,13 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registration
-from tofuse.engine.alignment.projective import Level, ProjectiveOptions, Target, align
+from tofuse.engine.alignment import Level, ProjectiveOptions, Registration, Target, align
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.compute.thread_pool import run_all
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.compute import run_all
+from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import LoopRecord
+from tofuse.engine.graph import LoopRecord
 from tofuse.engine.loops.appearance import Appearance
 from tofuse.engine.loops.candidates import MAX_OVERLAP_BETWEEN, CandidateSelector, LoopView, Pair
 from tofuse.engine.loops.loops import (
@@ -29,11 +28,9 @@ from tofuse.engine.loops.loops import (
     in_order,
 )
 from tofuse.engine.parts import part
-from tofuse.engine.search.search import DISTINCT_M, SearchOptions
-from tofuse.engine.search.verification import FitStatistics
-from tofuse.engine.search.view_pair import follow, register_pair
-from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.search import DISTINCT_M, FitStatistics, SearchOptions, follow, register_pair
+from tofuse.engine.stored_views import Spacing, ViewStore
+from tofuse.engine.views import PreparedView
 
 # The trajectory has drifted when a loop closes. Neighbouring pixels share their noise, so that all
 # of them have hardly more information than every second one.

@@ -8,24 +8,19 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.engine.alignment.view_options import ViewOptions
-from tofuse.engine.compute.thread_pool import threads as use_threads
-from tofuse.engine.filters.base import Filter
-from tofuse.engine.filters.confidence import Confidence
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.alignment import ViewOptions
+from tofuse.engine.compute import threads as use_threads
+from tofuse.engine.filters import Confidence, Filter
+from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.mapping.config import Config, check_views, kind_of
 from tofuse.engine.mapping.falloff import RANGE, estimate_falloff
 from tofuse.engine.mapping.progress import Progress, Silent
 from tofuse.engine.mapping.trial import Prepare, trial
-from tofuse.engine.noise.choice import noise_model_for
-from tofuse.engine.noise.model import NOISE, NoiseModel
+from tofuse.engine.noise import NOISE, NoiseModel, noise_model_for
 from tofuse.engine.parts import name_of
-from tofuse.engine.sensor.base import Correction
-from tofuse.engine.sensor.noise_correction import Noise
-from tofuse.engine.tracking.given import GivenPoses
-from tofuse.engine.tracking.keyframes import Keyframes
-from tofuse.engine.views.prepared_view import RAW_RANGE_FALLOFF
+from tofuse.engine.sensor import Correction, Noise
+from tofuse.engine.tracking import GivenPoses, Keyframes
+from tofuse.engine.views import RAW_RANGE_FALLOFF
 
 # Number of evenly spaced frames: enough for the background behind an object that turns once.
 _SAMPLE_FRAMES = 30

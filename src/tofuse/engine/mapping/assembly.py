@@ -6,18 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.frames.ranges import runs
+from tofuse.engine.compute import threads
+from tofuse.engine.frames import runs
 from tofuse.engine.geometry import se3
-from tofuse.engine.loops.joining import Group
-from tofuse.engine.loops.loops import PriorLoop
-from tofuse.engine.loops.merged_components import Join, JoinKind
+from tofuse.engine.loops import Group, Join, JoinKind, PriorLoop
 from tofuse.engine.mapping.backend import BackEnd
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog, poses_in_world
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.progress import Progress, Stopwatch
-from tofuse.engine.quality.types import Component, Reconstruction
+from tofuse.engine.quality import Component, Reconstruction
 
 # An unconnected component gets its own model if it has more frames than this.
 _MAX_WITHOUT_MODEL = 5

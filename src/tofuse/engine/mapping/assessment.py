@@ -8,14 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.fusion.model import Model
-from tofuse.engine.fusion.pose_errors import with_pose_errors
-from tofuse.engine.graph.bridges import cut_edges
-from tofuse.engine.graph.covariances import GraphCovariances
-from tofuse.engine.graph.external_sensors import SensorPriors, with_sensors
-from tofuse.engine.graph.graph import LoopRecord, PoseGraph
-from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.frames import RangeFrame
+from tofuse.engine.fusion import Model, with_pose_errors
+from tofuse.engine.graph import (
+    GraphCovariances,
+    LoopRecord,
+    PoseGraph,
+    SensorPriors,
+    cut_edges,
+    with_sensors,
+)
+from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.observations import Observations
@@ -23,16 +26,25 @@ from tofuse.engine.mapping.stage_results import Optimised, Refined
 from tofuse.engine.mapping.tracked_graph import TrackedGraph
 from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.parts import name_of
-from tofuse.engine.quality.accuracy import Accuracy, ObservedErrors, accuracy_of, covariances_of
-from tofuse.engine.quality.checks import Evidence, judge
-from tofuse.engine.quality.cross_view import CrossViewConsistency, cross_view_consistency
-from tofuse.engine.quality.trajectory import displacement
-from tofuse.engine.quality.types import Component, FrameRecord, Reason, Verdict
-from tofuse.engine.quality.verdict import ranked
-from tofuse.engine.refinement.calibration_check import CalibrationCheck
-from tofuse.engine.refinement.refinement import Refinement
-from tofuse.engine.sensor.camera_errors import CameraErrors
-from tofuse.engine.tracking.given import GivenPoses
+from tofuse.engine.quality import (
+    Accuracy,
+    Component,
+    CrossViewConsistency,
+    Evidence,
+    FrameRecord,
+    ObservedErrors,
+    Reason,
+    Verdict,
+    accuracy_of,
+    covariances_of,
+    cross_view_consistency,
+    displacement,
+    judge,
+    ranked,
+)
+from tofuse.engine.refinement import CalibrationCheck, Refinement
+from tofuse.engine.sensor import CameraErrors
+from tofuse.engine.tracking import GivenPoses
 
 
 @dataclass(frozen=True, eq=False)

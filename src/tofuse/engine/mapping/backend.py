@@ -8,15 +8,20 @@ from dataclasses import replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.compute.memory import trim_memory
-from tofuse.engine.fusion.cloud import Cloud
-from tofuse.engine.fusion.model import Model
-from tofuse.engine.graph.covariances import MIN_WEIGHT, GraphCovariances, accepted_only
-from tofuse.engine.graph.external_sensors import SensorPriors, measure_all, with_sensors
-from tofuse.engine.graph.graph import LoopRecord, Optimisation, PoseGraph
-from tofuse.engine.loops.loops import ClosedLoop, PriorLoop
-from tofuse.engine.loops.merged_components import Join
-from tofuse.engine.loops.neighbour_check import degraded_neighbours
+from tofuse.engine.compute import trim_memory
+from tofuse.engine.fusion import Cloud, Model
+from tofuse.engine.graph import (
+    MIN_WEIGHT,
+    GraphCovariances,
+    LoopRecord,
+    Optimisation,
+    PoseGraph,
+    SensorPriors,
+    accepted_only,
+    measure_all,
+    with_sensors,
+)
+from tofuse.engine.loops import ClosedLoop, Join, PriorLoop, degraded_neighbours
 from tofuse.engine.mapping.assessment import Assessment
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
@@ -24,7 +29,7 @@ from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.progress import Progress, Stopwatch
 from tofuse.engine.mapping.stage_results import Optimised, Refined, VisualEvidence
 from tofuse.engine.mapping.tracked_graph import TrackedGraph
-from tofuse.engine.quality.types import Component, Diagnostics, Reconstruction
+from tofuse.engine.quality import Component, Diagnostics, Reconstruction
 
 # Maximum number of repeated loop searches along a long trajectory.
 _MAX_SEARCHES = 2

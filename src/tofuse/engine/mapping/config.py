@@ -9,18 +9,16 @@ from typing import Annotated, Any, Literal
 from tofuse.engine import parts
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters.base import Filter
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.graph.external_sensors import ExternalSensor
-from tofuse.engine.graph.graph import Optimiser
-from tofuse.engine.loops.joining import Joining
-from tofuse.engine.loops.loops import LoopDetector
+from tofuse.engine.filters import Filter
+from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.fusion import Fusion
+from tofuse.engine.graph import ExternalSensor, Optimiser
+from tofuse.engine.loops import Joining, LoopDetector
 from tofuse.engine.mapping.budget import voxels_mb
-from tofuse.engine.refinement.refinement import NoRefinement, RefinementMethod
-from tofuse.engine.search.search import SearchOptions
-from tofuse.engine.sensor.base import Correction
-from tofuse.engine.tracking.base import Odometry
+from tofuse.engine.refinement import NoRefinement, RefinementMethod
+from tofuse.engine.search import SearchOptions
+from tofuse.engine.sensor import Correction
+from tofuse.engine.tracking import Odometry
 
 ViewKind = Literal["range", "cloud"]
 

@@ -25,16 +25,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
-from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align, points_of
+from tofuse.engine.alignment import ProjectiveOptions, Target, align, points_of
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.mapping.pooling import pooled
-from tofuse.engine.search.verification import PATIENT
-from tofuse.engine.search.view_points import landing_pixels
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.residual_kernels import POINT, POINT_ALBEDO
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.search import PATIENT, landing_pixels
+from tofuse.engine.views import POINT, POINT_ALBEDO, PreparedView, SurfaceOptions, prepare_view
 
 Prepare = Callable[[Frame], Frame]
 

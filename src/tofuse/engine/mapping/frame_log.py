@@ -7,18 +7,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Link
+from tofuse.engine.alignment import Link
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.external_sensors import SensorData
-from tofuse.engine.loops.gaps import TrackedComponent
+from tofuse.engine.graph import SensorData
+from tofuse.engine.loops import TrackedComponent
 from tofuse.engine.mapping.config import ViewKind, kind_of
-from tofuse.engine.quality.types import FrameRecord
-from tofuse.engine.stored_views.view_store import ViewStore
-from tofuse.engine.tracking.base import Step
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.quality import FrameRecord
+from tofuse.engine.stored_views import ViewStore
+from tofuse.engine.tracking import Step
+from tofuse.engine.views import PreparedView
 
 
 class FrameSequence:

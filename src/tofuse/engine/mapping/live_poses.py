@@ -9,15 +9,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Link
+from tofuse.engine.alignment import Link
 from tofuse.engine.arrays import Float64
-from tofuse.engine.compute.thread_pool import job_pool
+from tofuse.engine.compute import job_pool
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import Optimiser
-from tofuse.engine.loops.loops import ClosedLoop, Loops
+from tofuse.engine.graph import Optimiser
+from tofuse.engine.loops import ClosedLoop, Loops
 from tofuse.engine.mapping.frame_log import FrameLog, poses_in_world
 from tofuse.engine.mapping.tracked_graph import TrackedGraph
-from tofuse.engine.tracking.base import Step
+from tofuse.engine.tracking import Step
 
 # The loops of a search take effect this number of frames after its start, even if it finished
 # earlier, so that poses are the same on every machine. A slow machine waits for it.

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.compute.memory import trim_memory
-from tofuse.engine.compute.thread_pool import serial_chunks, thread_count, threads
+from tofuse.engine.compute import serial_chunks, thread_count, threads, trim_memory
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
-from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.assembly import Assembly
 from tofuse.engine.mapping.config import Config, check_views, from_method, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog, FrameSequence, record_of
@@ -20,11 +19,10 @@ from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.preparation import FilteredFrame, Preparation, Prepared
 from tofuse.engine.mapping.progress import Progress, Silent, Stopwatch
 from tofuse.engine.parts import check_number
-from tofuse.engine.quality.types import FrameRecord, Reconstruction
-from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.tracking.base import Step, Tracker
-from tofuse.engine.tracking.motion import FrameTime
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.quality import FrameRecord, Reconstruction
+from tofuse.engine.stored_views import PosedView
+from tofuse.engine.tracking import FrameTime, Step, Tracker
+from tofuse.engine.views import PreparedView
 
 
 class Mapper:

@@ -4,27 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from tofuse.engine.clouds.any_pair import AnyPair
-from tofuse.engine.clouds.icp import algorithm_1
-from tofuse.engine.filters.angle import NeighbourhoodAngle
-from tofuse.engine.filters.confidence import Confidence
-from tofuse.engine.filters.neighbours import NeighbourFraction
-from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.graph.castellani import Castellani
-from tofuse.engine.graph.external_sensors import GravityEdges
-from tofuse.engine.graph.levenberg import LevenbergMarquardt
-from tofuse.engine.loops.loops import Confirmation
-from tofuse.engine.loops.nearby import Nearby
-from tofuse.engine.loops.revisits import Revisits
+from tofuse.engine.clouds import AnyPair, algorithm_1
+from tofuse.engine.filters import Confidence, NeighbourFraction, NeighbourhoodAngle
+from tofuse.engine.fusion import Fusion
+from tofuse.engine.graph import Castellani, GravityEdges, LevenbergMarquardt
+from tofuse.engine.loops import Confirmation, Nearby, Revisits
 from tofuse.engine.mapping.config import Config, ViewKind
-from tofuse.engine.refinement.plane_refinement import Planes
-from tofuse.engine.refinement.refinement import Joint
-from tofuse.engine.sensor.multipath_correction import Multipath
-from tofuse.engine.sensor.noise_correction import Noise
-from tofuse.engine.sensor.wrapped import Wrapped
-from tofuse.engine.tracking.keyframes import Keyframes
-from tofuse.engine.tracking.pairwise import Pairwise
-from tofuse.engine.tracking.sequential import Sequential
+from tofuse.engine.refinement import Joint, Planes
+from tofuse.engine.sensor import Multipath, Noise, Wrapped
+from tofuse.engine.tracking import Keyframes, Pairwise, Sequential
 
 
 def thesis(kind: ViewKind) -> Config:

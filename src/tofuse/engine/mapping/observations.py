@@ -9,21 +9,18 @@ from functools import partial
 
 import numpy as np
 
-from tofuse.engine.cameras.cameras import ray_lengths
-from tofuse.engine.compute.spill import Scratch, Spill
-from tofuse.engine.compute.thread_pool import job_pool, thread_count
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.fusion.cloud import as_cloud
-from tofuse.engine.fusion.model import ModelBuilder
-from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.cameras import ray_lengths
+from tofuse.engine.compute import Scratch, Spill, job_pool, thread_count
+from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.fusion import ModelBuilder, as_cloud
+from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.budget import checked_bytes, views_bytes
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.preparation import FilteredFrame
-from tofuse.engine.quality.cross_view import restore_thinned
-from tofuse.engine.quality.samples import FrameSample, FrameSamples
-from tofuse.engine.stored_views.view_store import Spacing, Spilled, ViewStore
-from tofuse.engine.tracking.base import Step
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.quality import FrameSample, FrameSamples, restore_thinned
+from tofuse.engine.stored_views import Spacing, Spilled, ViewStore
+from tofuse.engine.tracking import Step
+from tofuse.engine.views import PreparedView
 
 _MAX_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
 _CHECKED_IMAGES = 60  # images of the final comparison

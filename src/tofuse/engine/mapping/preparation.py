@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters.base import Removal, apply_filters
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.filters import Removal, apply_filters
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.mapping.config import Config, check_views
-from tofuse.engine.tracking.base import Tracker
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.tracking import Tracker
+from tofuse.engine.views import PreparedView
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,8 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import POSES_BY, Recording, Source
-from tofuse.engine.graph.external_sensors import GravityEdges, OdometryEdges
+from tofuse.engine.frames import POSES_BY, Recording, Source
+from tofuse.engine.graph import GravityEdges, OdometryEdges
 from tofuse.engine.mapping.config import Config
 
 Prior = Literal["auto", "none", "device"]

@@ -9,8 +9,8 @@ from time import perf_counter
 from typing import Protocol
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.quality.types import FrameRecord
+from tofuse.engine.frames import Frame
+from tofuse.engine.quality import FrameRecord
 
 
 class Progress(Protocol):

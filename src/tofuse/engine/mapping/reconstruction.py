@@ -13,19 +13,18 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.frames.recording import POSES_BY, Recording
-from tofuse.engine.loops.loops import PriorLoop
+from tofuse.engine.frames import POSES_BY, Frame, Recording
+from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config, ViewKind, from_method, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.progress import Progress, Silent
 from tofuse.engine.mapping.self_calibration import self_calibrated
-from tofuse.engine.quality.types import Reconstruction
-from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.tracking.base import Tracker
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.quality import Reconstruction
+from tofuse.engine.stored_views import PosedView
+from tofuse.engine.tracking import Tracker
+from tofuse.engine.views import PreparedView
 
 # Number of frames read and prepared in advance; each takes a multiple of its images' size.
 _PREFETCHED_FRAMES = 4

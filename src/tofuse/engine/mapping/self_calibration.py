@@ -18,12 +18,17 @@ import numpy as np
 
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.progress import Progress
-from tofuse.engine.quality.accuracy_card import length
-from tofuse.engine.quality.types import Diagnostics, Reason, Reconstruction, SelfCalibration
-from tofuse.engine.quality.verdict import ranked
-from tofuse.engine.refinement.calibration_check import CalibrationCheck
-from tofuse.engine.refinement.calibration_check import in_words as errors_in_words
-from tofuse.engine.sensor.camera_errors import FIELDS, CameraErrors
+from tofuse.engine.quality import (
+    Diagnostics,
+    Reason,
+    Reconstruction,
+    SelfCalibration,
+    length,
+    ranked,
+)
+from tofuse.engine.refinement import CalibrationCheck
+from tofuse.engine.refinement import in_words as errors_in_words
+from tofuse.engine.sensor import FIELDS, CameraErrors
 
 # The first estimate uses poses that the error has distorted, the second one does not.
 _ROUNDS = 2

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.graph.external_sensors import SensorPriors
-from tofuse.engine.graph.graph import Optimisation, PoseGraph
-from tofuse.engine.loops.loops import ClosedLoop
-from tofuse.engine.refinement.refinement import Refinement
+from tofuse.engine.graph import Optimisation, PoseGraph, SensorPriors
+from tofuse.engine.loops import ClosedLoop
+from tofuse.engine.refinement import Refinement
 
 
 @dataclass(frozen=True, eq=False)

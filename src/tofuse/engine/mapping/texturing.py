@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.engine.compute.thread_pool import threads as use_threads
+from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import UnreadableFrameError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.fusion.texture import Textured, TextureView, textured
+from tofuse.engine.frames import RangeFrame, Recording
+from tofuse.engine.fusion import Textured, TextureView, textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.engine.quality.types import Reconstruction
-from tofuse.engine.sensor.camera_errors import CameraErrors
+from tofuse.engine.quality import Reconstruction
+from tofuse.engine.sensor import CameraErrors
 
 # Maximum number of views and of textured triangles: more improve little, and unwrap slowly.
 _VIEWS, _FACES = 60, 60_000

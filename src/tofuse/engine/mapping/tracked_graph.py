@@ -9,16 +9,14 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.graph.build import Measured, build_graph
-from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.loops.loops import ClosedLoop
-from tofuse.engine.loops.merged_components import Join
+from tofuse.engine.graph import Measured, PoseGraph, build_graph
+from tofuse.engine.loops import ClosedLoop, Join
 from tofuse.engine.mapping.frame_log import Entry
-from tofuse.engine.quality.accuracy import degenerate_directions, without_degenerate
-from tofuse.engine.refinement.refinement import Refinement
-from tofuse.engine.stored_views.view_store import ViewStore
-from tofuse.engine.tracking.prediction import Prediction, degenerate_runs, with_prediction
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.quality import degenerate_directions, without_degenerate
+from tofuse.engine.refinement import Refinement
+from tofuse.engine.stored_views import ViewStore
+from tofuse.engine.tracking import Prediction, degenerate_runs, with_prediction
+from tofuse.engine.views import PreparedView
 
 
 @dataclass(frozen=True, eq=False)

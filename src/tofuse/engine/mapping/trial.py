@@ -21,15 +21,13 @@ from functools import cached_property
 import numpy as np
 from scipy.special import stdtrit
 
-from tofuse.engine.alignment.projective import Aligned, Level, ProjectiveOptions, Target, align
+from tofuse.engine.alignment import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.engine.arrays import Float32, Float64, Intp
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.pooling import pooled
 from tofuse.engine.normal import robust_sigma
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Views per run, each run being one sample; and starts of the runs as fractions of the recording.
 _VIEWS = 4

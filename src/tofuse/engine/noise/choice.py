@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import NOISE_MODEL, Recording
+from tofuse.engine.frames import NOISE_MODEL, RangeFrame, Recording
 from tofuse.engine.noise.model import NOISE, AmplitudeLaw, NoiseModel
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 

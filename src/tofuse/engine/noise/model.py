@@ -22,8 +22,8 @@ import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.cameras.cameras import Camera, ray_lengths
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.cameras import Camera, ray_lengths
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import InputError
 from tofuse.engine.noise import noise_kernels as kernels
 from tofuse.engine.parts import from_dict, to_dict

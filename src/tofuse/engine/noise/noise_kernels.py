@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 
 BY_RANGE, BY_AMPLITUDE, BY_CONFIDENCE, BY_CAMERA = 0, 1, 2, 3
 SATURATED = 65535.0

@@ -17,15 +17,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import bdtrc, gammaincinv
 
-from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align, span
+from tofuse.engine.alignment import UNITS, ProjectiveOptions, Target, align, span
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.compute import run_chunks
+from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.covariances import GraphCovariances
-from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.stored_views.view_store import PosedView
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.graph import GraphCovariances, PoseGraph
+from tofuse.engine.stored_views import PosedView
+from tofuse.engine.views import PreparedView
 
 _LEVEL = 0.95
 # Evenly spaced poses that the rms is computed from, and the least certain ones in addition.

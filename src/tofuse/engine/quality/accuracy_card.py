@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tofuse.engine.frames.ranges import in_words, runs_of
+from tofuse.engine.frames import in_words, runs_of
 from tofuse.engine.quality.accuracy import Accuracy
 from tofuse.engine.quality.types import Reason, Reconstruction
 from tofuse.engine.quality.verdict import ADVICE, ranked

@@ -24,14 +24,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.compute import run_chunks
+from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
-from tofuse.engine.search.pair_agreement import nearest_depth
-from tofuse.engine.search.search_kernels import ViewPoints
-from tofuse.engine.search.view_points import landing_pixels, sampled_points
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.search import ViewPoints, landing_pixels, nearest_depth, sampled_points
+from tofuse.engine.views import PreparedView
 
 Kind = Literal["appeared", "vanished"]
 

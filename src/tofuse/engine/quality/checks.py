@@ -8,21 +8,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registration
+from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.ranges import Range, in_words, is_single, runs, runs_of, size, union
+from tofuse.engine.frames import Range, in_words, is_single, runs, runs_of, size, union
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.covariances import loop_errors
-from tofuse.engine.graph.external_sensors import SensorRecord
-from tofuse.engine.graph.graph import LoopRecord, Optimisation
+from tofuse.engine.graph import LoopRecord, Optimisation, SensorRecord, loop_errors
 from tofuse.engine.quality.accuracy import Accuracy
 from tofuse.engine.quality.accuracy_card import length
 from tofuse.engine.quality.cross_view import CrossViewConsistency
 from tofuse.engine.quality.types import Component, FrameRecord, Reason, Verdict, in_main_model
 from tofuse.engine.quality.verdict import ranked, verdict_of
-from tofuse.engine.refinement.calibration_check import proposal
-from tofuse.engine.refinement.refinement import Refinement
-from tofuse.engine.tracking.motion import FrameTime, find_jumps
+from tofuse.engine.refinement import Refinement, proposal
+from tofuse.engine.tracking import FrameTime, find_jumps
 
 # Inlier fraction below which a registration is weak.
 WEAK_INLIER_FRACTION = 0.05

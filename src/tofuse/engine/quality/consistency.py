@@ -28,11 +28,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.cameras import Camera, Fisheye, Pinhole
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.cameras import Camera, Fisheye, Pinhole
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import Recording, evenly_spaced
+from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory import finite_or_none
 from tofuse.engine.quality.view_agreement_kernels import (
@@ -40,7 +39,7 @@ from tofuse.engine.quality.view_agreement_kernels import (
     project_by_lens,
     transform_points,
 )
-from tofuse.engine.sensor.base import Corrector
+from tofuse.engine.sensor import Corrector
 
 MAX_COLUMNS = 320
 MIN_DEPTH, MAX_DEPTH = 0.1, 12.0  # m

@@ -17,13 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.compute import run_chunks
+from tofuse.engine.frames import RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.search.pair_agreement import AgreementOptions, agreement
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.search import AgreementOptions, agreement
+from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Points per image, and the width of the images that they are compared with.
 _POINTS = 700

@@ -6,18 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
-from tofuse.engine.alignment.uncertainty import covariance
+from tofuse.engine.alignment import UNITS, ProjectiveOptions, Target, align, covariance
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.build import Measured, build_graph
-from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph import Measured, PoseGraph, build_graph
 from tofuse.engine.quality.accuracy import without_degenerate
-from tofuse.engine.refinement.joint_alignment import spread_evenly
-from tofuse.engine.stored_views.pair_equations import RefineOptions
-from tofuse.engine.stored_views.view_store import PosedView, SampledView, overlaps
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.refinement import spread_evenly
+from tofuse.engine.stored_views import PosedView, RefineOptions, SampledView, overlaps
+from tofuse.engine.views import PreparedView
 
 _ALIGNMENT = ProjectiveOptions()
 # Pairs are selected as in joint refinement.

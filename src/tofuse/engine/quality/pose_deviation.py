@@ -25,14 +25,10 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import fdtri, gammaincinv  # scipy.stats takes long to import
 
-from tofuse.engine.alignment.projective import UNITS
+from tofuse.engine.alignment import UNITS
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.covariances import GraphCovariances
-from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.graph.robust import Settings
-from tofuse.engine.graph.solver import Solution, solve
-from tofuse.engine.graph.sparse import PairSystem
+from tofuse.engine.graph import GraphCovariances, PairSystem, PoseGraph, Settings, Solution, solve
 from tofuse.engine.quality.accuracy import ObservedErrors, accuracy_of
 from tofuse.engine.quality.trajectory import align
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, UInt8
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame
 
 MAX_SAMPLES, MAX_LOST_SAMPLES = 160, 40  # of all frames, and of lost ones in addition
 MAX_WIDTH = 192  # pixels

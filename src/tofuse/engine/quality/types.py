@@ -10,18 +10,15 @@ from typing import Any, Literal
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.frames.ranges import Range
-from tofuse.engine.fusion.cloud import Cloud
-from tofuse.engine.fusion.mesh import Mesh
-from tofuse.engine.fusion.upright import T_up_world
-from tofuse.engine.graph.external_sensors import SensorRecord
-from tofuse.engine.graph.graph import GraphPart, LoopRecord, PoseGraph
-from tofuse.engine.loops.merged_components import Join
+from tofuse.engine.frames import Range
+from tofuse.engine.fusion import Cloud, Mesh, T_up_world
+from tofuse.engine.graph import GraphPart, LoopRecord, PoseGraph, SensorRecord
+from tofuse.engine.loops import Join
 from tofuse.engine.quality.accuracy import Accuracy
 from tofuse.engine.quality.change_detection import Change
 from tofuse.engine.quality.samples import FrameSample
-from tofuse.engine.refinement.refinement import Refinement
-from tofuse.engine.tracking.base import Status
+from tofuse.engine.refinement import Refinement
+from tofuse.engine.tracking import Status
 
 Verdict = Literal["good", "degraded", "failed"]
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 
 
 @kernel

@@ -32,9 +32,8 @@ from tofuse.engine.refinement.joint_alignment import (
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap
 from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.refinement.split_half import aligned_motion
+from tofuse.engine.stored_views import RefineOptions, SampledView
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
-from tofuse.engine.stored_views.pair_equations import RefineOptions
-from tofuse.engine.stored_views.view_store import SampledView
 
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
 # calibrated to better than that. Makers specify depth offsets of up to a centimetre.

@@ -10,15 +10,15 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.pose_priors import DAMPING, Priors, weak_prior
-from tofuse.engine.stored_views import pair_equation_kernels as kernels
-from tofuse.engine.stored_views.pair_equations import (
+from tofuse.engine.stored_views import (
     RefineOptions,
+    SampledView,
     directed_pairs,
     evaluate,
     rescale,
     without_exposure,
 )
-from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,11 +16,10 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Int64, Intp
-from tofuse.engine.clouds.reduce import extent
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.kdtree import KdTree
-from tofuse.engine.graph.sparse import Factor, PairSystem
+from tofuse.engine.clouds import extent
+from tofuse.engine.compute import run_chunks
+from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.graph import Factor, PairSystem
 from tofuse.engine.refinement import plane_kernels as kernels
 
 # Iterations of moving cells to the centroids of their points, which aligns them with the surface.

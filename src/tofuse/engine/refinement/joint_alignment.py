@@ -14,28 +14,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.engine.alignment.projective import UNITS
+from tofuse.engine.alignment import UNITS
 from tofuse.engine.arrays import Float64, Int64, Intp
-from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import robust
-from tofuse.engine.graph.descent import vertical
-from tofuse.engine.graph.graph import Gravity
-from tofuse.engine.graph.sparse import PairSystem
+from tofuse.engine.graph import Gravity, PairSystem, robust, vertical
 from tofuse.engine.refinement.pose_priors import DAMPING, WEAK, Priors, weak_prior
-from tofuse.engine.stored_views import pair_equation_kernels as kernels
-from tofuse.engine.stored_views.pair_equations import (
+from tofuse.engine.stored_views import (
     DirectedPairs,
     RefineOptions,
     Round,
+    SampledView,
     depends_on_patches,
     directed_pairs,
     discount_shared,
     evaluate,
+    overlaps,
     rescale,
     without_exposure,
 )
-from tofuse.engine.stored_views.view_store import SampledView, overlaps
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
 _ERROR_UNIT = 0.01  # of the camera's errors, for their weak prior and convergence
 # Overlaps are recomputed after a larger motion, in units of 1 cm and 1 degree.

@@ -10,9 +10,8 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.joint_alignment import Refined, align_pairs, align_views
+from tofuse.engine.stored_views import RefineOptions, Round, SampledView
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
-from tofuse.engine.stored_views.pair_equations import RefineOptions, Round
-from tofuse.engine.stored_views.view_store import SampledView
 
 # Iterations of an estimate of camera errors, which may be far from the initial poses.
 COARSE_TO_FINE = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(12, 0.0, 0.0))

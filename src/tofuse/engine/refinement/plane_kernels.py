@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.cameras.projection_kernels import jacobian_row
-from tofuse.engine.clouds.cloud_shape_kernels import symmetric_eigen
+from tofuse.engine.cameras import jacobian_row
+from tofuse.engine.clouds import symmetric_eigen
+from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.compute.jit import kernel
 
 _MIN_PIVOT = 1e-9
 

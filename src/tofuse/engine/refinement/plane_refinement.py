@@ -10,10 +10,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.build import Measured
-from tofuse.engine.graph.external_sensors import SensorPriors
+from tofuse.engine.graph import Measured, SensorPriors
 from tofuse.engine.parts import part
 from tofuse.engine.refinement.common_planes import (
     SUPPORT_NOISE,
@@ -29,8 +28,8 @@ from tofuse.engine.refinement.refinement import (
     accepted_with,
     with_unsupported_views_fixed,
 )
-from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.stored_views import Spacing, ViewStore
+from tofuse.engine.views import PreparedView
 
 
 @part("refinement", "planes")

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.engine.alignment.projective import UNITS
+from tofuse.engine.alignment import UNITS
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import Gravity
-from tofuse.engine.graph.sparse import PairSystem
+from tofuse.engine.graph import Gravity, PairSystem
 
 WEAK = 1e-3  # information of a weak prior in `UNITS`
 DAMPING = 1e-6  # fraction of the diagonal that is added to it

@@ -11,11 +11,10 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.compute.spill import Spill
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.compute import Spill
+from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.build import Measured
-from tofuse.engine.graph.external_sensors import SensorPriors
+from tofuse.engine.graph import Measured, SensorPriors
 from tofuse.engine.parts import part
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
@@ -27,18 +26,18 @@ from tofuse.engine.refinement.loop_drift import loop_gap
 from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.refinement.split_half import split_half_errors
 from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps, support_fell
-from tofuse.engine.stored_views import pair_equation_kernels as kernels
-from tofuse.engine.stored_views.pair_equations import RefineOptions
-from tofuse.engine.stored_views.view_store import (
+from tofuse.engine.stored_views import (
     CoarseView,
     PosedView,
+    RefineOptions,
     SampledView,
     Spilled,
     SpilledCoarseView,
     ViewStore,
     sampled_points,
 )
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.views import PreparedView
 
 CameraError = Literal["offset", "scale", "focal"]
 

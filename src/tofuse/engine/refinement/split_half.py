@@ -23,9 +23,7 @@ from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.joint_alignment import Refined, align_views
 from tofuse.engine.refinement.pose_priors import Priors
-from tofuse.engine.stored_views.pair_equations import RefineOptions, Round
-from tofuse.engine.stored_views.shared_error import ACROSS, DOWN
-from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.stored_views import ACROSS, DOWN, RefineOptions, Round, SampledView
 
 # The poses are near the solution of each half.
 _ROUNDS = (Round(5, 0.0, 0.0),)

@@ -15,11 +15,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from tofuse.engine.alignment.projective import UNITS
+from tofuse.engine.alignment import UNITS
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.graph.levenberg import LevenbergMarquardt
+from tofuse.engine.graph import LevenbergMarquardt, PoseGraph
 from tofuse.engine.refinement.joint_alignment import (
     Refined,
     Support,
@@ -28,14 +27,14 @@ from tofuse.engine.refinement.joint_alignment import (
     support_of,
 )
 from tofuse.engine.refinement.pose_priors import Priors
-from tofuse.engine.stored_views import pair_equation_kernels as kernels
-from tofuse.engine.stored_views.pair_equations import RefineOptions
-from tofuse.engine.stored_views.view_store import (
+from tofuse.engine.stored_views import (
     HasCoarseView,
+    RefineOptions,
     SampledView,
     overlaps,
     world_centroids,
 )
+from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
 A = TypeVar("A")
 

@@ -10,7 +10,7 @@ from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.search import search_kernels as kernels
 from tofuse.engine.search.plane_detection import fit_plane
 from tofuse.engine.search.view_points import sampled_points
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.views import PreparedView
 
 
 @dataclass(frozen=True, eq=False)

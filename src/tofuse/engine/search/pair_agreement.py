@@ -8,14 +8,13 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.compute.partition import median
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import median, run_chunks
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.search import search_kernels as kernels
 from tofuse.engine.search.search_kernels import ViewPoints
 from tofuse.engine.search.view_points import sampled_points
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.views import PreparedView
 
 # Smallest difference between the scores of different poses, as a fraction of the points.
 MIN_LEAD = 0.03

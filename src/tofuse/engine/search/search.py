@@ -14,10 +14,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from tofuse.engine.alignment.projective import Level, ProjectiveOptions, Target, align
+from tofuse.engine.alignment import Level, ProjectiveOptions, Target, align
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.compute.thread_pool import run_all
+from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
 from tofuse.engine.search.floor import find_floors
@@ -30,8 +30,7 @@ from tofuse.engine.search.search_grid import (
     refine_poses,
     resampled,
 )
-from tofuse.engine.views.prepared_view import PreparedView
-from tofuse.engine.views.rough import with_rough_planes
+from tofuse.engine.views import PreparedView, with_rough_planes
 
 Mode = Literal["auto", "both", "planar", "full"]
 

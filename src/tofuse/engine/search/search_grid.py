@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.compute import run_chunks
+from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
 from tofuse.engine.search.floor import Floor
 from tofuse.engine.search.pair_agreement import nearest_depth
 from tofuse.engine.search.view_points import sampled_points
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.views import PreparedView
 
 # Steps of the two grids: rad, and as a fraction of the depth. Projective ICP converges from
 # neighbouring poses of either; six dimensions allow only a coarser one.

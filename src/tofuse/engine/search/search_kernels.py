@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, Int32, Int64
-from tofuse.engine.cameras.projection_kernels import jacobian_row, nearest_pixel
+from tofuse.engine.cameras import jacobian_row, nearest_pixel
+from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.compute.jit import kernel
-from tofuse.engine.geometry.rigid_motion_kernels import retract
+from tofuse.engine.geometry import retract
 
 # m; points nearer to the camera are not projected.
 _MIN_DEPTH = 0.05

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from tofuse.engine.alignment.projective import Aligned, Level
+from tofuse.engine.alignment import Aligned, Level
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import MEDIAN_OF_NORMAL

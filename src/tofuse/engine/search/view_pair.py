@@ -13,16 +13,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registration
-from tofuse.engine.alignment.projective import (
+from tofuse.engine.alignment import (
     UNITS,
     Aligned,
     ProjectiveOptions,
+    Registration,
     Target,
+    UncertaintyOptions,
     align,
+    covariance,
     registration_of,
 )
-from tofuse.engine.alignment.uncertainty import UncertaintyOptions, covariance
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, agreement
@@ -36,7 +37,7 @@ from tofuse.engine.search.verification import (
     comparable,
     usual_tolerances,
 )
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.views import PreparedView
 
 # Few iterations near a guess; otherwise enough for a step of a third of the view.
 _FEW_ITERATIONS = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)

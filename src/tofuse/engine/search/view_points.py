@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.alignment.projective import points_of
+from tofuse.engine.alignment import points_of
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.search.search_kernels import ViewPoints
-from tofuse.engine.views.prepared_view import PreparedView
-from tofuse.engine.views.residual_kernels import NORMAL, POINT, POINT_ALBEDO, SIGMA
+from tofuse.engine.views import NORMAL, POINT, POINT_ALBEDO, SIGMA, PreparedView
 
 
 def sampled_points(view: PreparedView, count: int) -> ViewPoints:

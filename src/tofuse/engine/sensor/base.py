@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import ClassVar, Protocol
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame
 
 
 class Corrector(Protocol):

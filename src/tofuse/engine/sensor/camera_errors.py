@@ -10,8 +10,8 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable, ray_lengths
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.cameras import Camera, Pinhole, RayTable, ray_lengths
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
 from tofuse.engine.sensor.base import Correction, Corrector
 

@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 
 from tofuse.engine.arrays import Complex128, Float32, Float64
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.sensor import multipath_kernels as kernels
 from tofuse.engine.sensor.multipath_kernels import W, X, Y
 from tofuse.engine.sensor.multipath_map import OffscreenCells, ReflectorMap

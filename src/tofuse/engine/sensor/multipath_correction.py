@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.engine.parts import part
 from tofuse.engine.sensor.base import Correction, Corrector
 from tofuse.engine.sensor.multipath import (

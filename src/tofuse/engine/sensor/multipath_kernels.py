@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Complex128, Float32, Float64
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 
 X, Y, W, AMPLITUDE, AREA, A, B, C, COLUMNS = range(9)
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.noise.model import NoiseModel
+from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.noise import NoiseModel
 from tofuse.engine.parts import part
 from tofuse.engine.sensor.base import Correction, Corrector
 

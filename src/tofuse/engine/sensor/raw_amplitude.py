@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Complex128, Float32
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.engine.sensor.multipath import ToFImage
 from tofuse.engine.sensor.multipath_surfaces import FALLOFF
 

@@ -13,8 +13,8 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters.background_model import moving_object
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.filters import moving_object
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
 from tofuse.engine.sensor.base import Correction, Corrector
 from tofuse.engine.sensor.raw_amplitude import frame_phasor, phasor, tof_image

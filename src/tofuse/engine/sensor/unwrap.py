@@ -26,7 +26,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Intp
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.sensor.unwrap_kernels import pass_messages
 
 # Fraction of pixels that may be brighter than white, due to gloss and noise.

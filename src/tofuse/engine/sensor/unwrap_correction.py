@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
 from tofuse.engine.sensor.base import Correction, Corrector
 from tofuse.engine.sensor.raw_amplitude import pixel_pitch, range_and_amplitude

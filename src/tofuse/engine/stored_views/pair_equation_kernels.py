@@ -13,11 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int64
-from tofuse.engine.cameras.projection_kernels import MIN_DEPTH, jacobian_row, nearest_pixel
+from tofuse.engine.cameras import MIN_DEPTH, jacobian_row, nearest_pixel
+from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.compute.jit import kernel
-from tofuse.engine.views import residual_kernels as pose_sums
-from tofuse.engine.views.residual_kernels import (
+from tofuse.engine.views import (
     ALBEDO,
     ALBEDO_SLOPE,
     BINS,
@@ -53,6 +52,7 @@ from tofuse.engine.views.residual_kernels import (
     project_block,
     transform_block,
 )
+from tofuse.engine.views import residual_kernels as pose_sums
 
 # Camera errors, in the order of the unknowns.
 OFFSET = 0  # to be added to the range, m

@@ -14,13 +14,13 @@ import numpy as np
 
 from tofuse.engine.alignment import step_kernels as steps
 from tofuse.engine.arrays import Float64, Int64, Intp
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
 from tofuse.engine.stored_views.shared_error_kernels import marginalise_shared_errors
 from tofuse.engine.stored_views.view_store import SampledView
-from tofuse.engine.views.residual_kernels import POINT_SIZE
+from tofuse.engine.views import POINT_SIZE
 
 _PAIRS_A_CHUNK = 8
 # Approximate number of pairs from which the disagreement of patches is estimated.

@@ -17,10 +17,10 @@ from functools import cache
 
 import numpy as np
 
-from tofuse.engine.alignment.projective import UNITS
+from tofuse.engine.alignment import UNITS
 from tofuse.engine.arrays import Float32, Float64, Int64
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
-from tofuse.engine.views.projection import Projection
+from tofuse.engine.views import Projection
 
 # Patches in a row, and rows of patches; correlation length of errors (to 1/e) as a fraction of the
 # image's width, as in the tracker's covariance.

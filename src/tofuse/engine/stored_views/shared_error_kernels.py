@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 from tofuse.engine.stored_views.pair_equation_kernels import (
     GRADIENT,
     PATCH_RESIDUAL,

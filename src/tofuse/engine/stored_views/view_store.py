@@ -11,17 +11,13 @@ from weakref import finalize
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tofuse.engine.alignment.projective import points_of
+from tofuse.engine.alignment import points_of
 from tofuse.engine.arrays import Float32, Float64, Int64, Intp
-from tofuse.engine.compute.spill import Scratch, Spill
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.places import PlaceCounts
+from tofuse.engine.compute import Scratch, Spill, run_chunks
+from tofuse.engine.geometry import PlaceCounts, se3
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
-from tofuse.engine.views.prepared_view import PreparedView
-from tofuse.engine.views.projection import Projection
-from tofuse.engine.views.residual_kernels import POINT, POINT_SIZE, SIGMA, TargetImage
+from tofuse.engine.views import POINT, POINT_SIZE, SIGMA, PreparedView, Projection, TargetImage
 
 # For estimates of the overlap: points of a view, and width of its image.
 _OVERLAP_POINTS = 150

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Protocol
 
-from tofuse.engine.alignment.base import Link, Registration
+from tofuse.engine.alignment import Link, Registration
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.frames import Frame
+from tofuse.engine.search import SearchOptions
 from tofuse.engine.tracking.motion import FrameTime
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.views import PreparedView
 
 Status = Literal["tracked", "predicted", "lost", "skipped"]
 

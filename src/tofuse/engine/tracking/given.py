@@ -8,21 +8,25 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registration
-from tofuse.engine.alignment.projective import Target, align, registration_of
-from tofuse.engine.alignment.uncertainty import covariance
-from tofuse.engine.alignment.view_options import ViewOptions
+from tofuse.engine.alignment import (
+    Registration,
+    Target,
+    ViewOptions,
+    align,
+    covariance,
+    registration_of,
+)
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.search import SearchOptions
 from tofuse.engine.tracking.base import Odometry, Status, Step, Tracker
 from tofuse.engine.tracking.keyframe_map import Keyframe, KeyframeMap
 from tofuse.engine.tracking.moving_objects import MIN_MOVING_FRACTION, MovingObjects, at_size
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
+from tofuse.engine.views import PreparedView, prepare_view
 
 
 @part("odometry", "given")

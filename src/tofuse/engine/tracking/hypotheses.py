@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.engine.alignment.projective import Aligned, Level, ProjectiveOptions, Target, align
+from tofuse.engine.alignment import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.search.verification import PATIENT, FitQuality, comparable
+from tofuse.engine.search import PATIENT, FitQuality, comparable
 from tofuse.engine.tracking.keyframe_map import Keyframe
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.tracking.motion import FrameTime
 from tofuse.engine.tracking.moving_objects import MIN_MOVING_FRACTION, Moving, without_pixels
 from tofuse.engine.tracking.tracker_state import TrackerState
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.views import PreparedView
 
 # Minimum score of a rotated start relative to the unrotated one: a flat wall fits under any.
 _MIN_ROTATED_SCORE_RATIO = 1.03

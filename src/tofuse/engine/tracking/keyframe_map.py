@@ -7,15 +7,19 @@ from functools import cached_property
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Link, Registration
-from tofuse.engine.alignment.projective import Target
+from tofuse.engine.alignment import Link, Registration, Target
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.search.search import DISTINCT_M, SearchOptions, are_distinct_poses
-from tofuse.engine.search.verification import MAX_OVERLAP_DISTANCE, FitStatistics, comparable
-from tofuse.engine.search.view_pair import register_pair
-from tofuse.engine.views.descriptor import dissimilarity, view_descriptor
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.search import (
+    DISTINCT_M,
+    MAX_OVERLAP_DISTANCE,
+    FitStatistics,
+    SearchOptions,
+    are_distinct_poses,
+    comparable,
+    register_pair,
+)
+from tofuse.engine.views import PreparedView, dissimilarity, view_descriptor
 
 # Maximum number of keyframes, so that memory is constant.
 CAPACITY = 40

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Link, Registration
-from tofuse.engine.alignment.projective import registration_of
-from tofuse.engine.alignment.uncertainty import covariance
+from tofuse.engine.alignment import Link, Registration, covariance, registration_of
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.search.search import SearchOptions
-from tofuse.engine.search.verification import FitStatistics
+from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.search import FitStatistics, SearchOptions
 from tofuse.engine.tracking.base import Status, Step, Tracker
 from tofuse.engine.tracking.hypotheses import Hypotheses, Hypothesis
 from tofuse.engine.tracking.keyframe_map import Keyframe, KeyframeMap, Relocalizer
@@ -20,7 +17,7 @@ from tofuse.engine.tracking.motion import FrameTime
 from tofuse.engine.tracking.moving_objects import MIN_MOVING_FRACTION, at_size
 from tofuse.engine.tracking.selection import Selection
 from tofuse.engine.tracking.tracker_state import TrackerState
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
+from tofuse.engine.views import PreparedView, prepare_view
 
 
 class KeyframeTracker(Tracker):

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-from tofuse.engine.alignment.view_options import ViewOptions
+from tofuse.engine.alignment import ViewOptions
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.parts import part
-from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.search import SearchOptions
 from tofuse.engine.tracking.base import Odometry, Tracker
 
 Guess = Literal["identity", "previous", "odometry"]

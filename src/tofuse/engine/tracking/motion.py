@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.rigid_motion_kernels import distance_and_angle, retract, twist_between
+from tofuse.engine.geometry import distance_and_angle, retract, se3, twist_between
 
 # Minimum of the gate, m and rad: handheld cameras at 5 to 30 frames a second stay below. At lower
 # rates the same acceleration of 3 m/s^2 moves them further, by the square of the time since the

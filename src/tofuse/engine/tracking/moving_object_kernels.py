@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
-from tofuse.engine.cameras.projection_kernels import MIN_DEPTH, in_image, project_ray
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.cameras import MIN_DEPTH, in_image, project_ray
+from tofuse.engine.compute import kernel
 
 # Outcomes of a comparison.
 NONE = 0  # no depth, or none in the other view at the projection

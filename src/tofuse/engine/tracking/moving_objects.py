@@ -20,12 +20,11 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int64, UInt8
-from tofuse.engine.compute.partition import median
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.compute import median, run_chunks
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.tracking import moving_object_kernels as kernels
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.views import PreparedView
 
 # The image is divided into cells of n x n pixels, in at most this number of columns; one pixel of
 # each is compared.

@@ -8,21 +8,19 @@ from typing import Annotated
 
 import numpy as np
 
-from tofuse.engine.alignment.base import PROBABLE, Link, Registration
+from tofuse.engine.alignment import PROBABLE, Link, Registration
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.any_pair import AnyPair
-from tofuse.engine.clouds.reduce import extent
+from tofuse.engine.clouds import AnyPair, extent
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.engine.search.pose_probability import CERTAIN
-from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.search import CERTAIN, SearchOptions
 from tofuse.engine.tracking.base import Odometry, Step, Tracker
 from tofuse.engine.tracking.motion import FrameTime, MotionModel
 from tofuse.engine.tracking.sequential import SEED_STAGE
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.views import PreparedView
 
 # The prediction replaces the search once it has agreed with 2 of the last 3 searches.
 _MIN_CONFIRMED = 2

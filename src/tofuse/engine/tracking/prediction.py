@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.engine.alignment.projective import UNITS, span
+from tofuse.engine.alignment import UNITS, span
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import se3
 

@@ -8,11 +8,18 @@ from typing import Literal
 
 import numpy as np
 
-from tofuse.engine.alignment.projective import UNITS
+from tofuse.engine.alignment import UNITS
 from tofuse.engine.geometry import se3
-from tofuse.engine.search.pair_agreement import MIN_LEAD, AgreementOptions, agreement
-from tofuse.engine.search.search import DISTINCT_M, DISTINCT_RAD
-from tofuse.engine.search.verification import FitKind, fine_tolerances, usual_tolerances
+from tofuse.engine.search import (
+    DISTINCT_M,
+    DISTINCT_RAD,
+    MIN_LEAD,
+    AgreementOptions,
+    FitKind,
+    agreement,
+    fine_tolerances,
+    usual_tolerances,
+)
 from tofuse.engine.tracking.hypotheses import Hypotheses, Hypothesis
 from tofuse.engine.tracking.motion import is_small
 

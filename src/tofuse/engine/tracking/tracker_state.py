@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from tofuse.engine.search.verification import FitStatistics
+from tofuse.engine.search import FitStatistics
 from tofuse.engine.tracking.keyframe_map import Keyframe, KeyframeMap, Relocalizer
 from tofuse.engine.tracking.motion import MotionModel
 from tofuse.engine.tracking.moving_objects import MovingObjects

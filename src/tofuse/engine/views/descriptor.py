@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from tofuse.engine.arrays import Float32, Float64, Intp
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.views.prepared_view import PreparedView
 
 _ROWS, _COLUMNS = 9, 12

@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Int32
-from tofuse.engine.compute.partition import median
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.compute import median
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.views.plane_extension_kernels import extend_planes
 from tofuse.engine.views.prepared_view import PreparedView
 from tofuse.engine.views.surface_options import SurfaceOptions

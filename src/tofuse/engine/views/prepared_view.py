@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Float32
-from tofuse.engine.compute.partition import median
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.compute import median, run_chunks
+from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.views.projection import Projection, projection_of
 from tofuse.engine.views.residual_kernels import TargetImage, ViewImages, make_target
 from tofuse.engine.views.surface_options import SurfaceOptions

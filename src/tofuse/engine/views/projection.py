@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64
-from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.cameras import Camera
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.projection_kernels import MIN_DEPTH, nearest_pixel, project_rays
+from tofuse.engine.cameras import MIN_DEPTH, nearest_pixel, project_rays
+from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.compute.jit import kernel
 
 # Columns of a source point: position in m, unit normal, sigma of z relative to z, log albedo
 # (NaN where unknown) and its gradient with respect to the position, 1/m.

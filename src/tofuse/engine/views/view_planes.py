@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, UInt8
-from tofuse.engine.cameras.cameras import ray_lengths
-from tofuse.engine.compute.partition import median
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.cameras import ray_lengths
+from tofuse.engine.compute import median, run_chunks
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.views.projection import Projection
 from tofuse.engine.views.surface_options import SurfaceOptions

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int64
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 
 _SUMS = 12
 

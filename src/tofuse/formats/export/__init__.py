@@ -1,1 +1,11 @@
 """."""
+
+from typing import TYPE_CHECKING
+
+from tofuse._faces import face
+
+if TYPE_CHECKING:
+    from tofuse.formats.export import exchange
+    from tofuse.formats.export.conversion import convert, convert_to
+
+__getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -13,20 +13,27 @@ from typing import Any, Literal
 import numpy as np
 
 from tofuse.engine.arrays import UInt8
-from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable
+from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames.depth_counts import MAX_COUNTS
-from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.sensor.depth_correction import DepthCorrection
-from tofuse.formats.files.atomic import make_folder, write_text
-from tofuse.formats.files.images import write_png
-from tofuse.formats.files.staging import new_folder
-from tofuse.formats.files.trajectory import write_log, write_tum
-from tofuse.formats.readers.native import NativeSource
-from tofuse.formats.recordings.camera_file import SCHEMA, camera_fields
-from tofuse.formats.recordings.native import RecordingWriter, same_distortion
-from tofuse.formats.recordings.rectify import Rectifier, pinhole_of
+from tofuse.engine.frames import MAX_COUNTS, CloudFrame, Frame, RangeFrame, Recording
+from tofuse.engine.sensor import DepthCorrection
+from tofuse.formats.files import (
+    make_folder,
+    new_folder,
+    write_log,
+    write_png,
+    write_text,
+    write_tum,
+)
+from tofuse.formats.readers import NativeSource
+from tofuse.formats.recordings import (
+    SCHEMA,
+    RecordingWriter,
+    Rectifier,
+    camera_fields,
+    pinhole_of,
+    same_distortion,
+)
 
 FINEST_UNIT_M = 1e-4
 MIN_SIGMA_UNIT_M = 1e-5

@@ -11,16 +11,20 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.fusion.colors import display_colors
-from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.formats.files.atomic import write_bytes
-from tofuse.formats.files.e57 import write_e57
-from tofuse.formats.files.glb import write_glb, write_gltf
-from tofuse.formats.files.las import write_las, write_laz
-from tofuse.formats.files.obj import write_obj
-from tofuse.formats.files.pcd import write_pcd
-from tofuse.formats.files.ply import write_ply
-from tofuse.formats.files.reading import path_of, required_package
+from tofuse.engine.fusion import GeometryRecord, display_colors
+from tofuse.formats.files import (
+    path_of,
+    required_package,
+    write_bytes,
+    write_e57,
+    write_glb,
+    write_gltf,
+    write_las,
+    write_laz,
+    write_obj,
+    write_pcd,
+    write_ply,
+)
 
 # From x right, y down, z forward into glTF's x right, y up, z towards the viewer.
 _R_GLTF_WORLD = np.diag([1.0, -1.0, -1.0])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.errors import InputError
-from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.formats.files.atomic import replacing
 from tofuse.formats.files.reading import required_package
 

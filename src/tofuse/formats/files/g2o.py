@@ -15,7 +15,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion
-from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph import PoseGraph
 from tofuse.formats.files.atomic import replacing
 from tofuse.formats.files.reading import read_text
 

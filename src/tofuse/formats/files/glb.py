@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import UInt8, UInt16
-from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.formats.files.atomic import write_bytes, write_text
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.formats.files.atomic import replacing, write_bytes
 
 _HEADER_BYTES, _FIELD_BYTES = 375, 192

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from tofuse.engine.errors import InputError
-from tofuse.engine.noise.model import NoiseModel
+from tofuse.engine.noise import NoiseModel
 from tofuse.formats.files.atomic import write_text
 from tofuse.formats.files.reading import read_text
 

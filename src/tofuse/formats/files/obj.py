@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.formats.files.atomic import write_bytes, write_text
 
 

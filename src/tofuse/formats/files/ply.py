@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Int32, UInt8
 from tofuse.engine.errors import InputError
-from tofuse.engine.fusion.geometry_record import GeometryRecord, stacked
+from tofuse.engine.fusion import GeometryRecord, stacked
 from tofuse.formats.files.atomic import replacing
 from tofuse.formats.files.reading import read_bytes
 

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry.quaternion import length, to_pose
-from tofuse.engine.geometry.se3 import check_pose
+from tofuse.engine.geometry import check_pose, length, to_pose
 from tofuse.formats.files.reading import read_text
 from tofuse.formats.files.tables import exact
 

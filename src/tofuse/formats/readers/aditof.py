@@ -12,15 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64, UInt16
-from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import depth_from_counts
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import evenly_spaced
+from tofuse.engine.frames import RangeFrame, depth_from_counts, evenly_spaced
 from tofuse.engine.parts import part
-from tofuse.formats.files.reading import input_error, is_file
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, files_at
-from tofuse.formats.recordings.sources import FileSource, read_part
+from tofuse.formats.files import input_error, is_file
+from tofuse.formats.recordings import FileSource, Reader, ReaderOptions, Sniff, files_at, read_part
 
 HEADER_BYTES = 128
 # Width, height, kind of output, bits of depth, of brightness and of confidence, 11 other bytes,

@@ -9,14 +9,19 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float32, UInt8
-from tofuse.engine.frames.depth_counts import depth_from_numbers
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame, depth_from_numbers
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import read_raw
-from tofuse.formats.files.reading import files_named, is_file
-from tofuse.formats.recordings.camera_file import camera_file_of, check_size
-from tofuse.formats.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
-from tofuse.formats.recordings.sources import FileSource
+from tofuse.formats.files import files_named, is_file, read_raw
+from tofuse.formats.recordings import (
+    UNCERTAIN,
+    FileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    camera_file_of,
+    check_size,
+    required,
+)
 
 # Width and height in pixels, and the time at which the file was written in ms.
 _NAME = re.compile(r"(depth|confidence)_(\d{1,5})_(\d{1,5})_f32_(\d{1,15})\.raw")

@@ -14,24 +14,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, UInt8, UInt16
-from tofuse.engine.cameras.cameras import Camera, Rational, RayTable
+from tofuse.engine.cameras import Camera, Rational, RayTable
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.geometry.se3 import check_pose, orthonormalise
+from tofuse.engine.frames import RangeFrame
+from tofuse.engine.geometry import check_pose, orthonormalise
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import as_color, parse_image
-from tofuse.formats.files.matroska import MAGIC, Block, Matroska, Track
-from tofuse.formats.files.trajectory import associate
-from tofuse.formats.recordings.camera_file import ColorCamera
-from tofuse.formats.recordings.reader import (
+from tofuse.formats.files import MAGIC, Block, Matroska, Track, as_color, associate, parse_image
+from tofuse.formats.recordings import (
+    ColorCamera,
+    FileSource,
     Reader,
     ReaderOptions,
     Sniff,
     begins_with,
     file_of,
     required_file,
+    sampled_color,
 )
-from tofuse.formats.recordings.sources import FileSource, sampled_color
 
 
 @dataclass(frozen=True)

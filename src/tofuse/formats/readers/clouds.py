@@ -7,17 +7,28 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import CloudFrame, Frame
+from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.parts import part
-from tofuse.formats.files.pcd import Pcd, read_pcd
-from tofuse.formats.files.reading import read_text
-from tofuse.formats.files.tables import parse_numbers, read_numbers
-from tofuse.formats.recordings.cloud_sequence import CloudFileSource, required_files, sniff_clouds
-from tofuse.formats.recordings.organised import SAMPLES, common_camera, find_raster, organised_frame
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.formats.recordings.sources import cloud_frame, ply_frame, poses_from_files, to_float32
+from tofuse.formats.files import Pcd, parse_numbers, read_numbers, read_pcd, read_text
+from tofuse.formats.recordings import (
+    SAMPLES,
+    CloudFileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    cloud_frame,
+    common_camera,
+    find_raster,
+    organised_frame,
+    ply_frame,
+    poses_from_files,
+    refuse_camera,
+    required_files,
+    sniff_clouds,
+    to_float32,
+)
 
 
 @part("reader", "ply", label="validated")

@@ -6,14 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import read_color, read_raw
-from tofuse.formats.files.reading import files_named, if_file, is_file
-from tofuse.formats.recordings.camera_file import camera_file_of
-from tofuse.formats.recordings.phones import resized
-from tofuse.formats.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
-from tofuse.formats.recordings.sources import FileSource
+from tofuse.formats.files import files_named, if_file, is_file, read_color, read_raw
+from tofuse.formats.recordings import (
+    UNCERTAIN,
+    FileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    camera_file_of,
+    required,
+    resized,
+)
 
 _SUFFIXES = ("_depth16.bin", ".depth16")
 _BITS = 13

@@ -8,10 +8,8 @@ import numpy as np
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import read_header
-from tofuse.formats.files.reading import files_with, is_file
-from tofuse.formats.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.formats.recordings.sources import DepthImageSource
+from tofuse.formats.files import files_with, is_file, read_header
+from tofuse.formats.recordings import CERTAIN, DepthImageSource, Reader, ReaderOptions, Sniff
 
 
 @part("reader", "depth-png")

@@ -10,27 +10,29 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float32, UInt8
-from tofuse.engine.cameras.cameras import Camera
+from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.engine.geometry.se3 import MAX_COORDINATE_M
+from tofuse.engine.frames import RangeFrame
+from tofuse.engine.fusion import GeometryRecord
+from tofuse.engine.geometry import MAX_COORDINATE_M
 from tofuse.engine.parts import part
-from tofuse.formats.files.pcd import read_pcd
-from tofuse.formats.files.ply import read_ply
-from tofuse.formats.files.reading import is_file, is_folder, read_text
-from tofuse.formats.files.tables import parse_numbers
-from tofuse.formats.recordings.cloud_sequence import CloudFileSource, required_files
-from tofuse.formats.recordings.organised import (
+from tofuse.formats.files import is_file, is_folder, parse_numbers, read_pcd, read_ply, read_text
+from tofuse.formats.recordings import (
     SAMPLES,
+    CloudFileSource,
     Raster,
+    Reader,
+    ReaderOptions,
+    Sniff,
     common_camera,
+    files_at,
     find_raster,
     organised_frame,
     ray_origin_offset,
+    refuse_camera,
+    required_files,
+    to_float32,
 )
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, files_at, refuse_camera
-from tofuse.formats.recordings.sources import to_float32
 
 _SUFFIXES = (".ply", ".csv", ".pcd")
 _AMPLITUDES = ("intensity", "amplitude", "i")

@@ -10,19 +10,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import depth_from_counts
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import POSES_BY
+from tofuse.engine.frames import POSES_BY, RangeFrame, depth_from_counts
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import read_raw
-from tofuse.formats.files.pgm import parse_pgm
-from tofuse.formats.files.reading import input_error, is_file, is_folder, list_folder
-from tofuse.formats.files.tables import read_numbers
-from tofuse.formats.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.formats.recordings.sources import FileSource, poses_of, read_matrix_pose, read_part
+from tofuse.formats.files import (
+    input_error,
+    is_file,
+    is_folder,
+    list_folder,
+    parse_pgm,
+    read_numbers,
+    read_raw,
+)
+from tofuse.formats.recordings import (
+    PER_FRAME,
+    FileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    poses_of,
+    read_matrix_pose,
+    read_part,
+    refuse_camera,
+)
 
 # The streams by preference, with their ambiguity range in m.
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}

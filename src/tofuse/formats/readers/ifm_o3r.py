@@ -14,27 +14,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.files.pcic import BEGIN, Chunk, chunk_image, pcic_frames
-from tofuse.formats.files.reading import read_bytes, read_head, required_package
-from tofuse.formats.recordings.camera_file import MAX_SLOPE
-from tofuse.formats.recordings.reader import (
+from tofuse.formats.files import (
+    BEGIN,
+    Chunk,
+    chunk_image,
+    pcic_frames,
+    read_bytes,
+    read_head,
+    required_package,
+)
+from tofuse.formats.recordings import (
+    MAX_SLOPE,
+    FileSource,
     Reader,
     ReaderOptions,
     Sniff,
     begins_with,
     file_of,
-    refuse_camera,
-    required_file,
-)
-from tofuse.formats.recordings.sources import (
-    FileSource,
     finite_float32,
     interpolated,
     library_errors,
+    refuse_camera,
+    required_file,
 )
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420

@@ -8,14 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import first_size
-from tofuse.formats.files.reading import files_named, is_file, is_folder, list_folder, read_text
-from tofuse.formats.recordings.camera_file import checked_pinhole
-from tofuse.formats.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
-from tofuse.formats.recordings.sources import DepthImageSource
+from tofuse.formats.files import files_named, first_size, is_file, is_folder, list_folder, read_text
+from tofuse.formats.recordings import (
+    UNCERTAIN,
+    DepthImageSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    checked_pinhole,
+    required,
+)
 
 _DEPTH = re.compile(r"([0-9]{1,9})_depth\.png", re.IGNORECASE)
 # Camera of an image, and its scale relative to the calibration, by the image size.

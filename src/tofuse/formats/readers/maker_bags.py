@@ -14,25 +14,29 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhole, RayTable
+from tofuse.engine.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry.quaternion import to_pose
-from tofuse.engine.geometry.se3 import check_pose, inverse, orthonormalise
+from tofuse.engine.geometry import check_pose, inverse, orthonormalise, to_pose
 from tofuse.engine.parts import part
-from tofuse.formats.recordings.bags import (
+from tofuse.formats.recordings import (
     GREY,
     BagSource,
+    ColorCamera,
     Info,
+    Reader,
+    ReaderOptions,
+    Sniff,
     Track,
     bag_kind,
     camera_info,
+    checked_lens,
     first_message,
+    forward_brown,
+    inverse_brown,
     open_bag,
     open_container,
+    simplest_lens,
 )
-from tofuse.formats.recordings.camera_file import ColorCamera, checked_lens
-from tofuse.formats.recordings.lenses import forward_brown, inverse_brown, simplest_lens
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff
 
 
 def topics(path: Path) -> frozenset[str]:

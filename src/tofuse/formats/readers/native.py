@@ -11,35 +11,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.cameras import Camera, Pinhole, range_from_z, z_from_range
+from tofuse.engine.cameras import Camera, Pinhole, range_from_z, z_from_range
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import depth_from_counts
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame, depth_from_counts
 from tofuse.engine.parts import part
-from tofuse.engine.sensor.depth_correction import DepthCorrection
-from tofuse.engine.sensor.frequencies import DISAGREEMENT, SPEED_OF_LIGHT, combined
-from tofuse.formats.files.images import check_first_size, read_color, read_image
-from tofuse.formats.files.reading import files_with, is_file, is_folder, list_folder, read_text
-from tofuse.formats.files.tables import read_columns
-from tofuse.formats.recordings.camera_file import (
-    CameraFile,
-    checked_lens,
-    load_camera,
-    read_camera_file,
-    read_rays,
+from tofuse.engine.sensor import DISAGREEMENT, SPEED_OF_LIGHT, DepthCorrection, combined
+from tofuse.formats.files import (
+    check_first_size,
+    files_with,
+    is_file,
+    is_folder,
+    list_folder,
+    read_color,
+    read_columns,
+    read_image,
+    read_text,
 )
-from tofuse.formats.recordings.correction_file import corrected_depth, read_correction
-from tofuse.formats.recordings.imu import gravity_at
-from tofuse.formats.recordings.native import LENS_COLUMNS
-from tofuse.formats.recordings.reader import (
+from tofuse.formats.recordings import (
     CERTAIN,
+    LENS_COLUMNS,
     UNCERTAIN,
+    CameraFile,
+    FileSource,
     Reader,
     ReaderOptions,
     Sniff,
+    cameras_of,
+    checked_lens,
+    corrected_depth,
+    gravity_at,
+    load_camera,
+    ply_frame,
+    read_camera_file,
+    read_correction,
+    read_rays,
     required,
+    sampled_color,
 )
-from tofuse.formats.recordings.sources import FileSource, cameras_of, ply_frame, sampled_color
 
 _IMAGES = (".png", ".jpg", ".jpeg")
 

@@ -10,18 +10,26 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import depth_from_counts, depth_from_numbers
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame, depth_from_counts, depth_from_numbers
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import read_color, read_image
-from tofuse.formats.files.reading import is_file, name_order, read_head
-from tofuse.formats.files.trajectory_formats import OPENGL
-from tofuse.formats.recordings.camera_file import checked_lens, image_size, number_in, read_json
-from tofuse.formats.recordings.phones import resized
-from tofuse.formats.recordings.reader import PER_FRAME, Reader, ReaderOptions, Sniff, refuse_camera
-from tofuse.formats.recordings.sources import FileSource, poses_of, read_matrix_pose
+from tofuse.formats.files import OPENGL, is_file, name_order, read_color, read_head, read_image
+from tofuse.formats.recordings import (
+    PER_FRAME,
+    FileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    checked_lens,
+    image_size,
+    number_in,
+    poses_of,
+    read_json,
+    read_matrix_pose,
+    refuse_camera,
+    resized,
+)
 
 NAME = "transforms.json"
 _DEPTH = ("depth_file_path", "depth_path")

@@ -10,25 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Camera, RayTable, pinhole_values
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, RayTable, pinhole_values
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import depth_from_numbers
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame, depth_from_numbers
 from tofuse.engine.parts import part
-from tofuse.formats.files.npz import read_npz
-from tofuse.formats.files.reading import read_head
-from tofuse.formats.recordings.camera_file import (
+from tofuse.formats.files import read_head, read_npz
+from tofuse.formats.recordings import (
     AMPLITUDE_KINDS,
     MAX_SLOPE,
-    checked_lens,
-    load_camera,
-)
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, file_of, required_file
-from tofuse.formats.recordings.sources import (
     FileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
     check_timestamps,
+    checked_lens,
+    file_of,
     finite_float32,
+    load_camera,
     read_matrix_pose,
+    required_file,
 )
 
 MAX_BYTES = 1 << 30

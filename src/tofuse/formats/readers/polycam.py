@@ -8,22 +8,27 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64, UInt8
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.frames.recording import POSES_BY
+from tofuse.engine.cameras import Pinhole
+from tofuse.engine.frames import POSES_BY
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import first_size
-from tofuse.formats.files.reading import files_with, if_file, is_file, is_folder
-from tofuse.formats.recordings.camera_file import image_size, number_in, read_json
-from tofuse.formats.recordings.phones import CONFIDENCE_MAX, PhoneSource, arkit_pose, lens
-from tofuse.formats.recordings.reader import (
+from tofuse.formats.files import files_with, first_size, if_file, is_file, is_folder
+from tofuse.formats.recordings import (
+    CONFIDENCE_MAX,
     PER_FRAME,
+    PhoneSource,
     Reader,
     ReaderOptions,
     Sniff,
+    arkit_pose,
+    cameras_of,
+    image_size,
+    number_in,
+    phone_lens,
+    poses_from_files,
+    read_json,
     refuse_camera,
     required,
 )
-from tofuse.formats.recordings.sources import cameras_of, poses_from_files
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 _LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and 255
@@ -94,7 +99,7 @@ def _lens(metadata: dict[str, Any], size: tuple[int, int], path: Path) -> Pinhol
         metadata, ("fx", "fy", "cx", "cy", "width", "height"), path
     )
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return lens(K, image_size(width, height, f"{path}: width"), size, path)
+    return phone_lens(K, image_size(width, height, f"{path}: width"), size, path)
 
 
 def _pose(metadata: dict[str, Any], path: Path) -> Float64:

@@ -12,37 +12,43 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import depth_from_numbers
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import POSES_BY
+from tofuse.engine.frames import POSES_BY, RangeFrame, depth_from_numbers
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
-from tofuse.formats.files.exr import parse_exr
-from tofuse.formats.files.images import as_color, parse_image
-from tofuse.formats.files.lzfse import lzfse_decompress
-from tofuse.formats.files.reading import (
+from tofuse.formats.files import (
+    as_color,
     files_named,
     input_error,
     is_file,
     is_folder,
+    lzfse_decompress,
+    parse_exr,
+    parse_image,
     read_bytes,
     required_package,
 )
-from tofuse.formats.recordings.camera_file import image_size, number_in, numbers_in, read_json
-from tofuse.formats.recordings.phones import ARKIT_AXES, CONFIDENCE_MAX, SENSOR, lens, resized
-from tofuse.formats.recordings.reader import (
+from tofuse.formats.recordings import (
+    ARKIT_AXES,
+    CONFIDENCE_MAX,
     PER_FRAME,
+    SENSOR,
+    FileSource,
     Reader,
     ReaderOptions,
     Sniff,
     begins_with,
     file_of,
+    image_size,
+    number_in,
+    numbers_in,
+    phone_lens,
+    read_json,
     refuse_camera,
     required,
+    resized,
 )
-from tofuse.formats.recordings.sources import FileSource
 
 MAX_MEMBER_BYTES = 1 << 26
 _MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")
@@ -247,7 +253,7 @@ class _Metadata:
     def lens(self, size: tuple[int, int]) -> Pinhole:
         K = numbers_in(self.data, "K", self.where, (3, 3), _REMEDY).T
         full_size = image_size(self._number("w"), self._number("h"), f"{self.where}: w")
-        return lens(K, full_size, size, f"{self.where}: K")
+        return phone_lens(K, full_size, size, f"{self.where}: K")
 
     def frame_rate(self) -> float:
         rate = self._number("fps", 60.0)

@@ -8,21 +8,23 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import first_size
-from tofuse.formats.files.reading import files_with, is_file, is_folder, read_text
-from tofuse.formats.files.trajectory_formats import read_poses
-from tofuse.formats.recordings.camera_file import (
+from tofuse.formats.files import files_with, first_size, is_file, is_folder, read_poses, read_text
+from tofuse.formats.recordings import (
+    UNCERTAIN,
+    DepthImageSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
     checked_pinhole,
     image_size,
     number_in,
     numbers_in,
     read_json,
+    required,
 )
-from tofuse.formats.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
-from tofuse.formats.recordings.sources import DepthImageSource
 
 # Open3D's PinholeCameraIntrinsicParameters.PrimeSenseDefault.
 SENSOR, SIZE = "PrimeSense (structured light)", (640, 480)

@@ -8,33 +8,38 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float32, UInt8
-from tofuse.engine.cameras.cameras import Camera, Pinhole
+from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import depth_from_numbers
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame, depth_from_numbers
 from tofuse.engine.parts import part
-from tofuse.formats.recordings.bags import (
+from tofuse.formats.recordings import (
     COLORS,
     ENCODINGS,
     GREY,
     MAX_GAP_S,
     REMEDY,
+    SAMPLES,
     BagSource,
+    ColorCamera,
+    Reader,
+    ReaderOptions,
+    Sniff,
     Track,
     Transforms,
     bag_kind,
+    check_size,
     cloud,
+    cloud_frame,
     color_image,
+    common_camera,
     decompressed,
     decompressed_color,
     frame_name,
     image,
     lens,
+    library_errors,
+    organised_frame,
 )
-from tofuse.formats.recordings.camera_file import ColorCamera, check_size
-from tofuse.formats.recordings.organised import SAMPLES, common_camera, organised_frame
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.formats.recordings.sources import cloud_frame, library_errors
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"

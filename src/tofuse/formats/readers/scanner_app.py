@@ -10,22 +10,26 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import first_size
-from tofuse.formats.files.reading import files_named, if_file, is_file
-from tofuse.formats.recordings.camera_file import numbers_in, read_json
-from tofuse.formats.recordings.phones import IMAGE_SIZE, PhoneSource, arkit_pose, lens
-from tofuse.formats.recordings.reader import (
+from tofuse.formats.files import files_named, first_size, if_file, is_file
+from tofuse.formats.recordings import (
+    IMAGE_SIZE,
     PER_FRAME,
+    PhoneSource,
     Reader,
     ReaderOptions,
     Sniff,
+    arkit_pose,
+    interpolated,
+    numbers_in,
+    phone_lens,
+    poses_of,
+    read_json,
     refuse_camera,
     required,
 )
-from tofuse.formats.recordings.sources import interpolated, poses_of
 
 _DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
 _REMEDY = "export the recording again"
@@ -98,7 +102,7 @@ class _FrameMetadata:
                 width, height = 2 * np.diag(K)[:2] / np.diag(P)[:2]
             if 100 < width < 16384 and 100 < height < 16384:
                 image = (round(float(width)), round(float(height)))
-        return lens(K, image, size, f"{self.path}: intrinsics")
+        return phone_lens(K, image, size, f"{self.path}: intrinsics")
 
     def pose(self) -> Float64 | None:
         if "cameraPoseARFrame" not in self.data:

@@ -13,33 +13,29 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import CloudFrame
-from tofuse.engine.geometry.quaternion import to_pose
+from tofuse.engine.frames import CloudFrame
+from tofuse.engine.geometry import to_pose
 from tofuse.engine.parts import part
-from tofuse.formats.files.reading import read_head, required_package
-from tofuse.formats.recordings.cloud_sequence import (
+from tofuse.formats.files import read_head, required_package
+from tofuse.formats.recordings import (
     CloudFileSource,
-    find_shift,
-    map_shift,
-    note_shift,
-    required_files,
-    sniff_clouds,
-)
-from tofuse.formats.recordings.reader import (
+    FileSource,
     Reader,
     ReaderOptions,
     Sniff,
     begins_with,
-    file_of,
-    refuse_camera,
-    required_file,
-)
-from tofuse.formats.recordings.sources import (
-    FileSource,
     cloud_frame,
+    file_of,
+    find_shift,
     library_errors,
+    map_shift,
+    note_shift,
     poses_of,
     read_matrix_pose,
+    refuse_camera,
+    required_file,
+    required_files,
+    sniff_clouds,
 )
 
 MAX_POINTS = 100_000_000

@@ -13,27 +13,24 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, UInt8, UInt16
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import depth_from_counts
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.geometry.se3 import inverse
+from tofuse.engine.frames import RangeFrame, depth_from_counts
+from tofuse.engine.geometry import inverse
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import as_color, parse_image
-from tofuse.formats.files.reading import input_error
-from tofuse.formats.recordings.camera_file import ColorCamera, checked_pinhole
-from tofuse.formats.recordings.reader import (
+from tofuse.formats.files import as_color, input_error, parse_image
+from tofuse.formats.recordings import (
+    ColorCamera,
+    FileSource,
     Reader,
     ReaderOptions,
     Sniff,
     begins_with,
-    file_of,
-    required_file,
-)
-from tofuse.formats.recordings.sources import (
-    FileSource,
     check_timestamps,
+    checked_pinhole,
+    file_of,
     poses_of,
     read_matrix_pose,
     read_part,
+    required_file,
     sampled_color,
 )
 

@@ -9,15 +9,20 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import first_size
-from tofuse.formats.files.reading import files_named, is_file
-from tofuse.formats.files.tables import read_numbers
-from tofuse.formats.recordings.camera_file import checked_pinhole
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, required
-from tofuse.formats.recordings.sources import DepthImageSource, poses_from_files, read_matrix_pose
+from tofuse.formats.files import files_named, first_size, is_file, read_numbers
+from tofuse.formats.recordings import (
+    DepthImageSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    checked_pinhole,
+    poses_from_files,
+    read_matrix_pose,
+    required,
+)
 
 FRAME_RATE_HZ = 30.0
 SENSOR, SIZE = "Kinect v1 (structured light)", (640, 480)

@@ -8,20 +8,21 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.files.reading import is_file, read_head, read_text
-from tofuse.formats.recordings.reader import (
+from tofuse.formats.files import is_file, read_head, read_text
+from tofuse.formats.recordings import (
+    FileSource,
     Reader,
     ReaderOptions,
     Sniff,
     files_at,
+    interpolated,
     refuse_camera,
     required,
 )
-from tofuse.formats.recordings.sources import FileSource, interpolated
 
 FRAME_RATE_HZ = 32.0
 # Modulated at 30 MHz, the factory default.

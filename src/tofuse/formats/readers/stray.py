@@ -10,21 +10,28 @@ from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import first_size
-from tofuse.formats.files.reading import files_with, is_file, is_folder
-from tofuse.formats.files.tables import read_columns, read_numbers
-from tofuse.formats.files.video import Video
-from tofuse.formats.recordings.imu import gravity_at
-from tofuse.formats.recordings.phones import IMAGE_SIZE, PhoneSource, lens
-from tofuse.formats.recordings.reader import (
+from tofuse.formats.files import (
+    Video,
+    files_with,
+    first_size,
+    is_file,
+    is_folder,
+    read_columns,
+    read_numbers,
+)
+from tofuse.formats.recordings import (
+    IMAGE_SIZE,
     PER_FRAME,
+    PhoneSource,
     Reader,
     ReaderOptions,
     Sniff,
+    gravity_at,
+    interpolated,
+    phone_lens,
     refuse_camera,
     required,
 )
-from tofuse.formats.recordings.sources import interpolated
 
 FRAME_RATE_HZ = 60.0
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -159,7 +166,7 @@ class StraySource(PhoneSource):
             K = read_numbers(path)
             if K.shape != (3, 3):
                 raise InputError("is not a 3x3 matrix", where=path, remedy="copy it again")
-            common = lens(K, image, size, path)
+            common = phone_lens(K, image, size, path)
             self.cameras = [common] * len(row)
         elif not all(name in columns for name in _LENS):
             raise InputError(
@@ -174,7 +181,9 @@ class StraySource(PhoneSource):
                 fx, fy, cx, cy = (columns[name][row[k]] for name in _LENS)
                 K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
                 try:
-                    self.cameras[k] = lens(K, image, size, f"{folder / 'odometry.csv'}, frame {k}")
+                    self.cameras[k] = phone_lens(
+                        K, image, size, f"{folder / 'odometry.csv'}, frame {k}"
+                    )
                 except InputError as error:
                     self.cameras[k] = error
 

@@ -8,13 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import depth_from_numbers
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame, depth_from_numbers
 from tofuse.engine.parts import part
-from tofuse.formats.files.reading import files_with, is_folder
-from tofuse.formats.files.tiff import read_tiff
-from tofuse.formats.recordings.reader import UNCERTAIN, Reader, ReaderOptions, Sniff, required
-from tofuse.formats.recordings.sources import FileSource, finite_float32
+from tofuse.formats.files import files_with, is_folder, read_tiff
+from tofuse.formats.recordings import (
+    UNCERTAIN,
+    FileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    finite_float32,
+    required,
+)
 
 _SUFFIXES = (".tif", ".tiff")
 _RANGE = ".range"

@@ -8,13 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import BrownConrady
+from tofuse.engine.cameras import BrownConrady
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files.reading import is_file, is_folder, read_text
-from tofuse.formats.files.trajectory import associate
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff
-from tofuse.formats.recordings.sources import DepthImageSource, check_timestamps, tum_poses
+from tofuse.formats.files import associate, is_file, is_folder, read_text
+from tofuse.formats.recordings import (
+    DepthImageSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    check_timestamps,
+    tum_poses,
+)
 
 DEPTH_UNIT_M = 1 / 5000
 COLOR_LIMIT_S = 0.1

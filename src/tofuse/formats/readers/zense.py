@@ -7,13 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.parts import part
-from tofuse.formats.files.images import first_size
-from tofuse.formats.files.reading import files_with, is_file, is_folder, parse_toml, read_text
-from tofuse.formats.recordings.camera_file import checked_lens, image_size, number_in
-from tofuse.formats.recordings.reader import Reader, ReaderOptions, Sniff, required
-from tofuse.formats.recordings.sources import DepthImageSource
+from tofuse.formats.files import files_with, first_size, is_file, is_folder, parse_toml, read_text
+from tofuse.formats.recordings import (
+    DepthImageSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    checked_lens,
+    image_size,
+    number_in,
+    required,
+)
 
 FRAME_RATE_HZ = 30.0
 _LENS = {"fx": "camera_fx", "fy": "camera_fy", "cx": "camera_cx", "cy": "camera_cy"}

@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, Pinhole
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import depth_from_counts
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame, depth_from_counts
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.formats.files.images import as_color, parse_image
-from tofuse.formats.files.reading import (
+from tofuse.formats.files import (
+    as_color,
     files_with,
     is_file,
     is_folder,
     list_folder,
+    parse_image,
     read_head,
     required_package,
 )

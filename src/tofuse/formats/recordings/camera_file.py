@@ -13,18 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import (
-    DISTORTION_ORDER,
-    MODELS,
-    Camera,
-    Pinhole,
-    RayTable,
-    lens_values,
-)
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable, lens_values
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import AmplitudeKind, DepthKind
-from tofuse.engine.geometry.se3 import check_pose
-from tofuse.formats.files.reading import input_error, is_file, read_text
+from tofuse.engine.frames import AmplitudeKind, DepthKind
+from tofuse.engine.geometry import check_pose
+from tofuse.formats.files import input_error, is_file, read_text
 
 # Limits for any camera: a frame per month to a million per second; ambiguity ranges of modulation
 # at 15 GHz to 1.5 kHz.

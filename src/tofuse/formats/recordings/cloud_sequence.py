@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import CloudFrame, Frame
-from tofuse.engine.geometry.quaternion import length, to_pose
-from tofuse.formats.files.reading import is_file, is_folder
-from tofuse.formats.files.tables import read_numbers
+from tofuse.engine.frames import CloudFrame, Frame
+from tofuse.engine.geometry import length, to_pose
+from tofuse.formats.files import is_file, is_folder, read_numbers
 from tofuse.formats.recordings.organised import SAMPLES, Deprojection, find_deprojection
 from tofuse.formats.recordings.reader import CERTAIN, Sniff, files_at
 from tofuse.formats.recordings.sources import FileSource

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float32
-from tofuse.engine.cameras.cameras import Camera, range_from_z, z_from_range
+from tofuse.engine.cameras import Camera, range_from_z, z_from_range
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import DepthKind
-from tofuse.engine.sensor.depth_correction import DepthCorrection
-from tofuse.formats.files.atomic import replacing
-from tofuse.formats.files.npz import read_npz
+from tofuse.engine.frames import DepthKind
+from tofuse.engine.sensor import DepthCorrection
+from tofuse.formats.files import read_npz, replacing
 
 _MAX_BYTES = 1 << 30
 

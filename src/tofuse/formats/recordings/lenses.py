@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, MODELS, BrownConrady, Pinhole, RayTable
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, BrownConrady, Pinhole, RayTable
 from tofuse.engine.errors import InputError
 from tofuse.formats.recordings.camera_file import checked_lens
 

@@ -12,23 +12,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Float32, UInt16
-from tofuse.engine.cameras.cameras import Camera, Pinhole, RayTable
+from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, OutputError
-from tofuse.engine.frames.depth_counts import INVALID_DEPTH, MAX_COUNTS
-from tofuse.engine.frames.frames import (
+from tofuse.engine.frames import (
+    INVALID_DEPTH,
+    MAX_COUNTS,
     SATURATED_AMPLITUDE,
     CloudFrame,
     DepthKind,
     Frame,
     RangeFrame,
 )
-from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.engine.sensor.depth_correction import DepthCorrection
-from tofuse.formats.files.atomic import make_folder, replacing, write_text
-from tofuse.formats.files.images import write_png
-from tofuse.formats.files.ply import write_ply
-from tofuse.formats.files.tables import exact, write_columns
-from tofuse.formats.files.trajectory import write_tum
+from tofuse.engine.fusion import GeometryRecord
+from tofuse.engine.sensor import DepthCorrection
+from tofuse.formats.files import (
+    exact,
+    make_folder,
+    replacing,
+    write_columns,
+    write_ply,
+    write_png,
+    write_text,
+    write_tum,
+)
 from tofuse.formats.recordings.camera_file import SCHEMA, camera_fields
 from tofuse.formats.recordings.correction_file import write_correction
 

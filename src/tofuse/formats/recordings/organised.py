@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
-from tofuse.engine.cameras.cameras import Camera, RayTable
+from tofuse.engine.cameras import Camera, RayTable
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.geometry.kdtree import KdTree
-from tofuse.engine.geometry.se3 import MAX_COORDINATE_M
+from tofuse.engine.frames import CloudFrame, RangeFrame
+from tofuse.engine.geometry import MAX_COORDINATE_M, KdTree
 
 SAMPLES = 8
 # Largest distance of a point from its pixel's ray: errors of rounding to 0.1 mm and float32.

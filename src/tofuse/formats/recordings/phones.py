@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.cameras.cameras import Pinhole, scaled
+from tofuse.engine.cameras import Pinhole, scaled
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import depth_from_counts
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import POSES_BY
-from tofuse.formats.files.images import read_color, read_image
+from tofuse.engine.frames import POSES_BY, RangeFrame, depth_from_counts
+from tofuse.formats.files import read_color, read_image
 from tofuse.formats.recordings.camera_file import checked_pinhole
 from tofuse.formats.recordings.sources import FileSource, read_matrix_pose
 
@@ -30,7 +28,7 @@ def arkit_pose(table: Float64, where: str) -> Float64:
     return read_matrix_pose(table, where) @ ARKIT_AXES
 
 
-def lens(
+def phone_lens(
     K: Float64, image_size: tuple[int, int], size: tuple[int, int], where: str | Path
 ) -> Pinhole:
     """Return the camera of depth images of `size` from K (3, 3) of larger colour images."""

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import ClassVar, Protocol, TypeVar
 
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import Source
-from tofuse.formats.files.reading import files_with, is_file, is_folder, read_head
+from tofuse.engine.frames import Source
+from tofuse.formats.files import files_with, is_file, is_folder, read_head
 
 CERTAIN = 0.9
 UNCERTAIN = 0.5

@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.cameras.cameras import ray_lengths
+from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.geometry.se3 import check_pose
-from tofuse.formats.files.atomic import write_text
-from tofuse.formats.files.reading import if_file
+from tofuse.engine.frames import Frame, RangeFrame, Recording
+from tofuse.engine.geometry import check_pose
+from tofuse.formats.files import if_file, write_text
 from tofuse.formats.recordings.camera_file import number_in, numbers_in, read_json
 
 SCHEMA = 1

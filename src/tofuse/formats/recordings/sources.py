@@ -13,17 +13,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
-from tofuse.engine.cameras.cameras import Camera, Pinhole
+from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames.depth_counts import depth_from_counts
-from tofuse.engine.frames.frames import AmplitudeKind, CloudFrame, DepthKind, Frame, RangeFrame
-from tofuse.engine.frames.recording import Source
-from tofuse.engine.geometry.se3 import MAX_COORDINATE_M, check_pose, orthonormalise
-from tofuse.formats.files.images import check_first_size, read_color, read_image
-from tofuse.formats.files.ply import read_ply
-from tofuse.formats.files.reading import input_error, is_file
-from tofuse.formats.files.tables import read_numbers
-from tofuse.formats.files.trajectory import associated_poses, read_tum
+from tofuse.engine.frames import (
+    AmplitudeKind,
+    CloudFrame,
+    DepthKind,
+    Frame,
+    RangeFrame,
+    Source,
+    depth_from_counts,
+)
+from tofuse.engine.geometry import MAX_COORDINATE_M, check_pose, orthonormalise
+from tofuse.formats.files import (
+    associated_poses,
+    check_first_size,
+    input_error,
+    is_file,
+    read_color,
+    read_image,
+    read_numbers,
+    read_ply,
+    read_tum,
+)
 from tofuse.formats.recordings.camera_file import CameraFile, ColorCamera, check_size, load_camera
 from tofuse.formats.recordings.reader import ReaderOptions
 

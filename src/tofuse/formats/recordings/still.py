@@ -16,11 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
-from tofuse.engine.cameras.cameras import Camera, RayTable
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
-from tofuse.engine.frames.recording import Recording
-from tofuse.engine.noise.choice import noise_model_for
-from tofuse.engine.noise.model import NoiseModel
+from tofuse.engine.cameras import Camera, RayTable
+from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame, Recording
+from tofuse.engine.noise import NoiseModel, noise_model_for
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 
 # Below these fractions of a pixel's noise, and of the blocks, nothing has moved.

@@ -11,18 +11,14 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.loops.loops import PriorLoop
-from tofuse.engine.mapping.config import Config, changed, from_method
-from tofuse.engine.mapping.progress import Progress
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.loops import PriorLoop
+from tofuse.engine.mapping import Config, Progress, changed, from_method, reconstruct
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.measures import BoxFit, PathScore
 from tofuse.lab.experiments.recorded import RecordedScene, record_scene
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.scene import SCENES
+from tofuse.lab.simulation import SCENES, Effects
 from tofuse.lab.simulation.scenes import box
 
 METHODS = ("thesis", "default")

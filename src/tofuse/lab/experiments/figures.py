@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tofuse.apps.report import plots
-from tofuse.apps.report.plots import (
+from tofuse.apps.report import (
     AFTER,
     BAD,
     BEFORE,
@@ -17,6 +16,7 @@ from tofuse.apps.report.plots import (
     MUTED,
     REFERENCE,
     make_figure,
+    plots,
     svg,
 )
 from tofuse.engine.arrays import Float64

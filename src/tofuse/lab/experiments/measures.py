@@ -13,7 +13,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.engine.quality import evaluate_trajectory
 
 _MAX_FIT_POINTS = 20_000  # max points of a wall fit
 

@@ -16,10 +16,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse._version import __version__
-from tofuse.apps.results.folder import Contract, OutputFolder, read_json_object
-from tofuse.apps.results.run_json import plain
+from tofuse.apps.results import Contract, OutputFolder, plain, read_json_object
 from tofuse.engine.errors import InputError
-from tofuse.engine.mapping.progress import Progress, Silent
+from tofuse.engine.mapping import Progress, Silent
 from tofuse.lab.experiments import sections
 from tofuse.lab.experiments.cases import CASES, DRAWS, METHODS, CaseResult, Run, run_case
 from tofuse.lab.experiments.peaks import AXES, SIGMAS_M, PeaksSweep, sweep_peaks

@@ -8,25 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
-from tofuse.engine.clouds.icp import algorithm_1
-from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.clouds import CoarseToFine, algorithm_1
+from tofuse.engine.frames import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.build import Measured, build_graph
-from tofuse.engine.graph.castellani import Castellani
-from tofuse.engine.graph.graph import Optimiser, PoseGraph
-from tofuse.engine.mapping.methods import default
-from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.refinement.plane_refinement import Planes
-from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.engine.tracking.sequential import Sequential
+from tofuse.engine.graph import Castellani, Measured, Optimiser, PoseGraph, build_graph
+from tofuse.engine.mapping import default, reconstruct
+from tofuse.engine.refinement import Planes
+from tofuse.engine.stored_views import Spacing, ViewStore
+from tofuse.engine.tracking import Sequential
 from tofuse.lab.experiments.bound import (
     joint_covariance,
     mean_distance,
     mean_distances,
     pose_covariances,
 )
-from tofuse.lab.simulation.peaks import (
+from tofuse.lab.simulation import (
     peaks_cameras,
     peaks_normals,
     peaks_points,

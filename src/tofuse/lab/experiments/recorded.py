@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.filters.base import apply_filters
-from tofuse.engine.frames.frames import Frame, RangeFrame
-from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.filters import apply_filters
+from tofuse.engine.frames import ArraySource, Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import Config
-from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.record import RecordingPlan, plan
+from tofuse.engine.mapping import Config
+from tofuse.formats.recordings import corrected_depth
+from tofuse.lab.simulation import Effects, RecordingPlan, plan
 
 # About 1 cm apart in a room, so that distances are accurate to half of that.
 _SURFACE_POINTS = 500_000

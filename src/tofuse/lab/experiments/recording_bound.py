@@ -15,10 +15,7 @@ from scipy import sparse
 
 from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation import optics
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.models import CameraModel
-from tofuse.lab.simulation.record import RecordingPlan
+from tofuse.lab.simulation import CameraModel, Effects, RecordingPlan, optics
 
 # Unknowns of a view: its pose, and the logarithm of its exposure.
 _UNKNOWNS = 7

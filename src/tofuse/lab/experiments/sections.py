@@ -14,7 +14,7 @@ from tofuse.engine.geometry import se3
 from tofuse.lab.experiments import figures
 from tofuse.lab.experiments.cases import GUESSES, METHODS, CaseResult, Model, Run
 from tofuse.lab.experiments.peaks import PeaksSweep
-from tofuse.lab.simulation.peaks import peaks_views
+from tofuse.lab.simulation import peaks_views
 from tofuse.lab.simulation.scenes import box, room
 
 _EXAMPLE_SIGMA = 0.09

@@ -17,7 +17,7 @@ from tofuse.engine.geometry import se3
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.cases import CaseResult, Run
 from tofuse.lab.experiments.peaks import PeaksRun, PeaksSweep
-from tofuse.lab.simulation.peaks import RADIUS_M
+from tofuse.lab.simulation import RADIUS_M
 from tofuse.lab.simulation.scenes import box, rail, room, torso
 
 Outcome = Literal["agrees", "partly", "disagrees"]

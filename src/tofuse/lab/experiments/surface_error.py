@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.geometry import KdTree
 
 _SAMPLES = 400_000  # points on a mesh
 _CANDIDATES = 4  # nearest samples of a mesh whose triangles are tested

@@ -13,9 +13,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.engine.graph.descent import Descent, Problem
-from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.graph.sparse import PairSystem, first_of_parts
+from tofuse.engine.graph import Descent, PairSystem, PoseGraph, Problem, first_of_parts
 
 
 class Chart(Protocol):

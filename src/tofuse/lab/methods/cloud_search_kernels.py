@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 
 
 @kernel

@@ -9,8 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.interfaces import Alignment, Matches, Rejector
+from tofuse.engine.clouds import Alignment, Matches, Rejector, transform_points
 from tofuse.engine.parts import part
 
 

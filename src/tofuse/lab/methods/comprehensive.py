@@ -8,12 +8,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.interfaces import Alignment, Matcher, Matches, Points, Search
-from tofuse.engine.clouds.metrics import PointToPoint
-from tofuse.engine.clouds.selectors import All, Random
-from tofuse.engine.clouds.stopping import SmallStep
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.clouds import (
+    Alignment,
+    All,
+    Icp,
+    Matcher,
+    Matches,
+    Points,
+    PointToPoint,
+    Random,
+    Search,
+    SmallStep,
+)
+from tofuse.engine.geometry import KdTree
 from tofuse.engine.parts import part
 from tofuse.lab.methods.variants import Variant
 

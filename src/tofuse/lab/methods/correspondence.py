@@ -9,11 +9,10 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.interfaces import Alignment, Matcher, Matches, Points, Search
+from tofuse.engine.clouds import Alignment, Matcher, Matches, Points, Search, transform_points
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.frames import RangeFrame
+from tofuse.engine.geometry import KdTree
 from tofuse.engine.parts import part
 from tofuse.lab.methods.cloud_search_kernels import grid_search
 from tofuse.lab.methods.featured_tree import FeaturedKdTree

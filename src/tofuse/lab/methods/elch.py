@@ -14,9 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import Optimisation, Optimiser, PoseGraph
-from tofuse.engine.graph.levenberg import check_graph
-from tofuse.engine.graph.sparse import parts_of
+from tofuse.engine.graph import Optimisation, Optimiser, PoseGraph, check_graph, parts_of
 from tofuse.engine.parts import part
 
 _MIN_RELATIVE_LENGTH = 1e-12  # min edge length relative to the largest

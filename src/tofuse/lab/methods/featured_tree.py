@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.geometry.kdtree import KdTree, checked_points
+from tofuse.engine.geometry import KdTree, checked_points
 
 
 class FeaturedKdTree(KdTree):

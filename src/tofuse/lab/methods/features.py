@@ -9,16 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.robust_motion import Pairs, consensus
+from tofuse.engine.clouds import Pairs, consensus
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
-from tofuse.engine.search.pair_agreement import agreement
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.search import agreement
+from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 from tofuse.lab.methods.keypoints import Channel, Detector, Keypoints, keypoints
 from tofuse.lab.methods.sample_consensus import SampleOptions, registration_of
 

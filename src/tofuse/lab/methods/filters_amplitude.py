@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from tofuse.engine.arrays import Bool
-from tofuse.engine.filters.base import Filter, Interval
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.engine.filters import Filter, Interval
+from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.engine.parts import part
 
 

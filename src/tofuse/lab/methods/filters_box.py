@@ -10,8 +10,8 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.filters.base import Filter
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.filters import Filter
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
 
 

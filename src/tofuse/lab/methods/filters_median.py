@@ -10,9 +10,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.filters.base import Filter
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.compute import run_chunks
+from tofuse.engine.filters import Filter
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
 from tofuse.lab.methods.window_median_kernels import window_median
 

@@ -10,9 +10,8 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.filters.base import Filter
-from tofuse.engine.filters.neighbours import MAX_NEIGHBOURS, mean_neighbour_distance
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.filters import MAX_NEIGHBOURS, Filter, mean_neighbour_distance
+from tofuse.engine.frames import Frame
 from tofuse.engine.parts import part
 
 

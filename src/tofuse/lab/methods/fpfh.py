@@ -7,12 +7,11 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
-from tofuse.engine.clouds.fpfh import NEIGHBOURS, POINTS, REACH, candidates
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.clouds import FPFH_NEIGHBOURS, POINTS, REACH, CoarseToFine, candidates
+from tofuse.engine.frames import Frame
 from tofuse.engine.parts import part
 from tofuse.lab.methods.sample_consensus import Method, SampleOptions, registration_of
 
@@ -45,7 +44,7 @@ class Fpfh(Bounded, Registrar):
 
     points: Annotated[int, Bounds(20, 20_000)] = POINTS
     reach: Annotated[float, Bounds(1, 100)] = REACH
-    neighbours: Annotated[int, Bounds(4, 1000)] = NEIGHBOURS
+    neighbours: Annotated[int, Bounds(4, 1000)] = FPFH_NEIGHBOURS
     signed: bool = False
     method: Method = "compatible"
     inliers: int = 6

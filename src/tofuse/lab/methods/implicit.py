@@ -9,10 +9,16 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.cloud_sum_kernels import plane_sums
-from tofuse.engine.clouds.interfaces import Alignment, Matches
-from tofuse.engine.clouds.pairs import SurfacePairs, solve, surface_pairs
-from tofuse.engine.clouds.surface_metrics import PointToPlane, SurfaceMetric
+from tofuse.engine.clouds import (
+    Alignment,
+    Matches,
+    PointToPlane,
+    SurfaceMetric,
+    SurfacePairs,
+    plane_sums,
+    solve,
+    surface_pairs,
+)
 from tofuse.engine.parts import part
 from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
 

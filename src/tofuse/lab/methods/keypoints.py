@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int64, UInt8
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.views import PreparedView
 
 Detector = Literal["sift", "orb", "fast"]
 Channel = Literal["auto", "albedo", "color"]

@@ -8,20 +8,17 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registration
+from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.interfaces import Alignment, Matches, Points
-from tofuse.engine.clouds.metrics import PointToPoint
+from tofuse.engine.clouds import Alignment, Matches, Points, PointToPoint, transform_points
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import CloudFrame, Frame
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.frames import CloudFrame, Frame
+from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.parts import part
-from tofuse.engine.search.search import SearchOptions
-from tofuse.engine.tracking.base import Odometry, Step, Tracker
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.search import SearchOptions
+from tofuse.engine.tracking import Odometry, Step, Tracker
+from tofuse.engine.views import PreparedView
 
 # Relative to the range: voxel size of the map, initial sigma of the threshold and the smallest
 # deviation that updates it (the paper: 1 m, 2 m and 0.1 m of 100 m).

@@ -7,13 +7,12 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.interfaces import Points
-from tofuse.engine.clouds.selectors import All, at_most
+from tofuse.engine.clouds import All, Points, at_most
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.lab.methods.neighbourhoods import neighbourhood

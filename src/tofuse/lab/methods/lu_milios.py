@@ -20,9 +20,14 @@ from scipy.spatial.transform import Rotation
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import ROUNDING, Optimisation, Optimiser, PoseGraph
-from tofuse.engine.graph.levenberg import check_graph
-from tofuse.engine.graph.sparse import PairSystem
+from tofuse.engine.graph import (
+    ROUNDING,
+    Optimisation,
+    Optimiser,
+    PairSystem,
+    PoseGraph,
+    check_graph,
+)
 from tofuse.engine.parts import part
 
 # Heading, pitch, roll of a camera (y down): singular only where it looks straight up or down.

@@ -15,16 +15,19 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.shape import shape_at
-from tofuse.engine.frames.frames import CloudFrame, Frame
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.kdtree import KdTree
-from tofuse.engine.graph.external_sensors import SensorPriors
-from tofuse.engine.refinement.plane_refinement import SampledPoints
-from tofuse.engine.refinement.refinement import Refinement, RefinementMethod, Refiner, accepted_with
-from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.engine.views.prepared_view import PreparedView
+from tofuse.engine.clouds import shape_at, transform_points
+from tofuse.engine.frames import CloudFrame, Frame
+from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.graph import SensorPriors
+from tofuse.engine.refinement import (
+    Refinement,
+    RefinementMethod,
+    Refiner,
+    SampledPoints,
+    accepted_with,
+)
+from tofuse.engine.stored_views import Spacing, ViewStore
+from tofuse.engine.views import PreparedView
 
 # Min fraction and number of points with a partner in an overlapping view.
 _MIN_OVERLAP, _MIN_POINTS = 0.1, 30

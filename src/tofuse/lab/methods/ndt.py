@@ -8,16 +8,13 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.interfaces import Points
-from tofuse.engine.clouds.selectors import at_most
+from tofuse.engine.clouds import Points, at_most, transform_points
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import Frame
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.frames import Frame
+from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.parts import part
 
 # Min points of a cell, and its min variance relative to the largest.

@@ -9,8 +9,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.clouds.interfaces import Alignment, Matches, Points
-from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.clouds import Alignment, Matches, Points
+from tofuse.engine.geometry import KdTree
 
 # A quadric through a point has five parameters; the point itself is its first neighbour.
 _MIN_NEIGHBOURS = 6

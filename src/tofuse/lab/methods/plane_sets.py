@@ -9,17 +9,15 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.engine.search.pair_agreement import agreement
-from tofuse.engine.search.plane_detection import Plane, detect_planes
-from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.search import Plane, agreement, detect_planes
+from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Min sine of the angle between two normals that determine a rotation, and min volume spanned by
 # three that determine a translation.

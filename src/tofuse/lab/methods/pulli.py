@@ -9,12 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.selectors import All
-from tofuse.engine.clouds.stopping import SmallStep
-from tofuse.engine.clouds.surface_metrics import PointToPlane
+from tofuse.engine.clouds import All, Icp, MaxDistance, PointToPlane, SmallStep, transform_points
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part

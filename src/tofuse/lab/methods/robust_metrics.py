@@ -10,11 +10,15 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.interfaces import Alignment, Matches, Metric
-from tofuse.engine.clouds.metrics import PointToPoint
-from tofuse.engine.clouds.pairs import in_scales
-from tofuse.engine.clouds.surface_metrics import TangentPlanes
+from tofuse.engine.clouds import (
+    Alignment,
+    Matches,
+    Metric,
+    PointToPoint,
+    TangentPlanes,
+    in_scales,
+    transform_points,
+)
 from tofuse.engine.parts import part
 
 # Factor of mu per round (Yang et al. 2020, remark 5).

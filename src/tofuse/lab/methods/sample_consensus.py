@@ -14,11 +14,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registration
-from tofuse.engine.alignment.projective import UNITS
+from tofuse.engine.alignment import UNITS, Registration
 from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.clouds.robust_motion import (
+from tofuse.engine.clouds import (
     MIN_PAIRS,
     Consensus,
     ConsensusOptions,

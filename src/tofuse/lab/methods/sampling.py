@@ -9,11 +9,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.interfaces import Selector
-from tofuse.engine.clouds.selectors import Random
-from tofuse.engine.clouds.shape import NEIGHBOURS, normals_at
+from tofuse.engine.clouds import NEIGHBOURS, Random, Selector, normals_at
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds.icp_kernels import transform_points
+from tofuse.engine.clouds import transform_points
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.lab.methods.multiview import Cloud, Pairs, RelaxationMethod, optimal_rotation

@@ -8,10 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds.cloud_sum_kernels import matrix_sums
-from tofuse.engine.clouds.interfaces import Alignment, Matches
-from tofuse.engine.clouds.pairs import SurfacePairs, solve, surface_pairs
-from tofuse.engine.clouds.surface_metrics import PointToPlane, SurfaceMetric
+from tofuse.engine.clouds import (
+    Alignment,
+    Matches,
+    PointToPlane,
+    SurfaceMetric,
+    SurfacePairs,
+    matrix_sums,
+    solve,
+    surface_pairs,
+)
 from tofuse.engine.parts import part
 from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
 

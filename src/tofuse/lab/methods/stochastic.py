@@ -10,9 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.castellani import free_vertices
-from tofuse.engine.graph.graph import Optimisation, Optimiser, PoseGraph
-from tofuse.engine.graph.levenberg import check_graph
+from tofuse.engine.graph import Optimisation, Optimiser, PoseGraph, check_graph, free_vertices
 from tofuse.engine.parts import part
 
 

@@ -8,17 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds.cloud_sum_kernels import plane_sums
-from tofuse.engine.clouds.interfaces import Alignment, Matches
-from tofuse.engine.clouds.pairs import (
+from tofuse.engine.clouds import (
+    Alignment,
     Loss,
+    Matches,
+    SurfaceMetric,
     SurfacePairs,
     loss_weights,
+    plane_sums,
     solve,
     surface_pairs,
     variance_of,
 )
-from tofuse.engine.clouds.surface_metrics import SurfaceMetric
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.lab.methods.symmetric_kernels import symmetric_sums

@@ -8,17 +8,22 @@ from typing import Annotated, Protocol
 
 import numpy as np
 
-from tofuse.engine.alignment.base import Registrar, Registration
+from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.interfaces import Metric
-from tofuse.engine.clouds.metrics import PointToPoint
-from tofuse.engine.clouds.rejectors import MaxDistance, Unique
-from tofuse.engine.clouds.selectors import All, at_most
-from tofuse.engine.clouds.stopping import SmallStep
-from tofuse.engine.clouds.surface_metrics import PlaneToPlane, PointToPlane
-from tofuse.engine.frames.frames import Frame
+from tofuse.engine.clouds import (
+    All,
+    Icp,
+    MaxDistance,
+    Metric,
+    PlaneToPlane,
+    PointToPlane,
+    PointToPoint,
+    SmallStep,
+    Unique,
+    at_most,
+)
+from tofuse.engine.frames import Frame
 from tofuse.engine.parts import part
 from tofuse.lab.methods.compatibility import Trimmed
 from tofuse.lab.methods.correspondence import ClosestCompatible, ClosestInvariant, Invariant

@@ -6,7 +6,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph import PoseGraph
 
 
 def drifting_laps(count: int, per_lap: int, degrees: float) -> tuple[PoseGraph, Float64]:

@@ -15,10 +15,10 @@ from typing import Literal
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, Rational
+from tofuse.engine.cameras import BrownConrady, Pinhole, Rational
 from tofuse.engine.errors import InputError
-from tofuse.engine.noise.model import AmplitudeLaw, NoiseModel, RangeLaw
-from tofuse.engine.sensor.frequencies import SPEED_OF_LIGHT
+from tofuse.engine.noise import AmplitudeLaw, NoiseModel, RangeLaw
+from tofuse.engine.sensor import SPEED_OF_LIGHT
 
 # Typical ambient light indoors, as a fraction of that on a white wall in a bright office.
 _TYPICAL_AMBIENT = 0.15

@@ -9,9 +9,9 @@ import numpy as np
 from scipy import ndimage
 
 from tofuse.engine.arrays import Bool, Float64, Int32
-from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.compute.thread_pool import run_chunks
-from tofuse.engine.sensor.frequencies import SPEED_OF_LIGHT
+from tofuse.engine.cameras import Pinhole
+from tofuse.engine.compute import run_chunks
+from tofuse.engine.sensor import SPEED_OF_LIGHT
 from tofuse.lab.simulation import phasor_kernels as phasor
 from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.simulation.scene import Scene

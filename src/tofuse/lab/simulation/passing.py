@@ -21,7 +21,7 @@ from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.mesh import Mesh
 from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.simulation.scene import Body, Scene, Sequence
-from tofuse.lab.simulation.scenes.torso import HAIR, SHIRT, SKIN, TROUSERS
+from tofuse.lab.simulation.scenes import HAIR, SHIRT, SKIN, TROUSERS
 from tofuse.lab.simulation.texture import Material
 
 Kind = Literal["person", "box"]

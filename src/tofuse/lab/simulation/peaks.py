@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.frames import CloudFrame
 from tofuse.engine.geometry import se3
 
 CAMERAS = 20

@@ -10,16 +10,12 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.frames import ArraySource, RangeFrame, Recording
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.engine.sensor.depth_correction import DepthCorrection
-from tofuse.formats.files.atomic import make_folder
-from tofuse.formats.files.images import write_png
-from tofuse.formats.files.ply import write_ply
-from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.engine.sensor import DepthCorrection
+from tofuse.formats.files import make_folder, write_ply, write_png
+from tofuse.formats.recordings import RecordingWriter, corrected_depth
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.accelerometer import accelerations

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Complex128, Float32, Float64, UInt16
-from tofuse.engine.cameras.cameras import ray_lengths
-from tofuse.engine.frames.depth_counts import INVALID_DEPTH, depth_from_counts
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.cameras import ray_lengths
+from tofuse.engine.frames import INVALID_DEPTH, RangeFrame, depth_from_counts
 from tofuse.lab.simulation import optics, sensor
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.models import CameraModel

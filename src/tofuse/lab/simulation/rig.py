@@ -8,11 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import ray_lengths
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.cameras import ray_lengths
+from tofuse.engine.frames import ArraySource, RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.formats.recordings.correction_file import corrected_depth
+from tofuse.formats.recordings import corrected_depth
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float32, Float64, Int32, Int64
-from tofuse.engine.compute.thread_pool import run_chunks
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.lab.simulation import bvh_kernels as bvh

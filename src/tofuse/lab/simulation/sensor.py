@@ -16,9 +16,8 @@ from functools import cache
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Complex128, Float32, Float64, UInt8
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE
-from tofuse.engine.sensor.depth_correction import DepthCorrection
-from tofuse.engine.sensor.frequencies import SPEED_OF_LIGHT
+from tofuse.engine.frames import SATURATED_AMPLITUDE
+from tofuse.engine.sensor import SPEED_OF_LIGHT, DepthCorrection
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel
 

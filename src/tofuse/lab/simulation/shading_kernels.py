@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, Int32
-from tofuse.engine.compute.jit import kernel
+from tofuse.engine.compute import kernel
 
 PLAIN, NOISE, WOOD, TILES, PRINT, SPECKLE = 0, 1, 2, 3, 4, 5
 

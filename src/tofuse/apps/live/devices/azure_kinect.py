@@ -7,17 +7,9 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from tofuse.apps.live.device import (
-    TIMEOUT_S,
-    DeviceError,
-    Settings,
-    Stream,
-    no_frame,
-    not_started,
-    vendor,
-)
-from tofuse.engine.cameras.cameras import Rational
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.apps.live import TIMEOUT_S, DeviceError, Settings, Stream, no_frame, not_started, vendor
+from tofuse.engine.cameras import Rational
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 
 Mode = Literal["NFOV_2X2BINNED", "NFOV_UNBINNED", "WFOV_2X2BINNED", "WFOV_UNBINNED"]

@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.apps.live.device import TIMEOUT_S, Settings, Stream, no_frame, not_started, vendor
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.apps.live import TIMEOUT_S, Settings, Stream, no_frame, not_started, vendor
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.readers.ifm_o3r import head_camera, head_frame, read_info
+from tofuse.formats.readers import head_camera, head_frame, read_info
 
 
 @part("device", "ifm-o3r")

@@ -8,20 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from tofuse.apps.live.device import (
-    TIMEOUT_S,
-    DeviceError,
-    Settings,
-    Stream,
-    no_frame,
-    not_started,
-    vendor,
-)
+from tofuse.apps.live import TIMEOUT_S, DeviceError, Settings, Stream, no_frame, not_started, vendor
 from tofuse.engine.arrays import Float32
-from tofuse.engine.cameras.cameras import DISTORTION_ORDER, Camera
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.cameras import DISTORTION_ORDER, Camera
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.recordings.lenses import simplest_lens
+from tofuse.formats.recordings import simplest_lens
 
 _POLL_MS = 100
 

@@ -7,19 +7,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from tofuse.apps.live.device import (
-    TIMEOUT_S,
-    DeviceError,
-    Settings,
-    Stream,
-    no_frame,
-    not_started,
-    vendor,
-)
-from tofuse.engine.cameras.cameras import BrownConrady, Camera, Pinhole
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.apps.live import TIMEOUT_S, DeviceError, Settings, Stream, no_frame, not_started, vendor
+from tofuse.engine.cameras import BrownConrady, Camera, Pinhole
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.recordings.lenses import inverse_brown
+from tofuse.formats.recordings import inverse_brown
 
 
 @part("device", "realsense")

@@ -8,10 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64
+from tofuse.lab.simulation import Material, Mesh, paths
 from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation import paths
-from tofuse.lab.simulation.mesh import Mesh
-from tofuse.lab.simulation.texture import Material
 
 
 class Assembly:
