@@ -108,7 +108,7 @@ def open_recording(
         source = JoinedSource(sources, _short_names([item.path for item in located]))
     _check_usable(source, paths[0])
     noise_file = Path(paths[0]) / "noise.json"
-    if len(paths) == 1 and is_folder(paths[0]) and is_file(noise_file):
+    if len(paths) == 1 and is_folder(noise_file.parent) and is_file(noise_file):
         source.metadata[NOISE_MODEL] = read_noise(noise_file)
     if min_depth is not None or max_depth is not None:
         source = LimitedSource(
