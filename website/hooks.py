@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import reference
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -27,11 +28,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Point links to the root's documents at their pages; set equations as MathML.
+    """Fill in the tables; point links to the root's documents at their pages; set equations.
 
     MathML needs no script, so the site shows its equations offline.
     """
-    pieces = _CODE.split(markdown)  # code at the odd places is left alone
+    pieces = _CODE.split(reference.filled(markdown))  # code at the odd places is left alone
     return "".join(piece if k % 2 else _text(piece) for k, piece in enumerate(pieces))
 
 
