@@ -93,9 +93,13 @@ def rows(head: str, lines: Iterator[tuple[str, ...]]) -> str:
 
 
 def cell(text: str) -> str:
-    """Return text on one line, with the bars outside of code escaped."""
+    """Return text on one line, with what Markdown takes for markup escaped outside of code."""
     pieces = re.split(r"(``.*?``|`[^`]*`)", " ".join(text.split()))
-    return "".join(p if k % 2 else p.replace("|", r"\|") for k, p in enumerate(pieces))
+    return "".join(piece if k % 2 else _escaped(piece) for k, piece in enumerate(pieces))
+
+
+def _escaped(text: str) -> str:
+    return re.sub(r"([|*])", r"\\\1", text).replace("<", "&lt;")
 
 
 # Docstrings.

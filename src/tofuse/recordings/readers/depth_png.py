@@ -18,7 +18,7 @@ from tofuse.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
 @part("reader", "depth-png")
 @dataclass(frozen=True)
 class DepthPng(Reader):
-    """A 16-bit .png, with a camera.json given or in its folder."""
+    """One 16-bit .png of depth, with a camera.json given or in its folder."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -37,7 +37,7 @@ _LENS_PARAMETERS = 10
 @part("reader", "ifm-h5", label="experimental")
 @dataclass(frozen=True)
 class IfmH5(Reader):
-    """A .h5 file with streams o3r_tof_0, ...: range, noise, amplitude, intrinsics."""
+    """A .h5 or .hdf5 of ifm's Vision Assistant: range, noise, amplitude, lens (extra `hdf5`)."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -28,7 +28,7 @@ _MAX_BYTES = 2 << 30
 @part("reader", "ifm-o3r", label="validated")
 @dataclass(frozen=True)
 class IfmO3r(Reader):
-    """A .data or .pcic file of the O3R's frames: range, noise, amplitude, intrinsics."""
+    """A .data, .pcic or .bin file of ifm O3R's frames: range, noise, amplitude, intrinsics."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

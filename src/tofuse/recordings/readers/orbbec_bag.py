@@ -29,7 +29,7 @@ _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 @part("reader", "orbbec-bag")
 @dataclass(frozen=True)
 class OrbbecBag(Reader):
-    """A .bag of Orbbec's viewer or SDK: depth, pixel-aligned infrared, and colour."""
+    """A .bag of Orbbec's viewer or SDK: depth, aligned infrared, and colour (extra `ros`)."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

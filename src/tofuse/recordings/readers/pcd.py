@@ -20,7 +20,7 @@ from tofuse.recordings.sources import cloud_frame, to_float32
 @part("reader", "pcd", label="validated")
 @dataclass(frozen=True)
 class PcdClouds(Reader):
-    """A .pcd file, or a folder of them; metres."""
+    """A .pcd file, or a folder of them; images if organised; metres."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -25,7 +25,7 @@ from tofuse.recordings.ros_messages import Info, camera_info
 @part("reader", "realsense-bag")
 @dataclass(frozen=True)
 class RealSenseBag(Reader):
-    """A .bag (or .db3) of RealSense's viewer or SDK: depth, colour, and infrared of the L515."""
+    """A .bag or .db3 of RealSense's SDK: depth, colour, infrared of the L515 (extra `ros`)."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

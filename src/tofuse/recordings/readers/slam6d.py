@@ -25,7 +25,7 @@ CENTIMETRE = 0.01
 @part("reader", "slam6d", label="validated")
 @dataclass(frozen=True)
 class Slam6d(Reader):
-    """A folder of scanNNN.3d with scanNNN.pose."""
+    """3DTK, slam6D: a folder of scanNNN.3d with scanNNN.pose."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -42,7 +42,7 @@ _IMU = {
 @part("reader", "stray", label="validated")
 @dataclass(frozen=True)
 class Stray(Reader):
-    """Folders with depth/, confidence/, odometry.csv, camera_matrix.csv, imu.csv and rgb.mp4."""
+    """Stray Scanner: folders with depth/, confidence/, odometry.csv, imu.csv and rgb.mp4."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
