@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help demo test slow lint docs gallery format lock audit sbom clean
+.PHONY: help demo test slow nightly lint docs gallery format lock audit sbom clean
 
 help:                       ## this list
 	@awk -F ':.*## *' '/^[a-z]+:.*##/ { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -20,10 +20,13 @@ demo: .venv/.ready          ## simulate a recording, reconstruct it, leave a mod
 # Compiled modules are kept, even where the environment says otherwise: many tests start processes.
 PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile
 test: .venv/.ready          ## run the tests of up to a second and a half each, some 4 minutes
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow and not nightly"
 
 slow: .venv/.ready          ## run the tests of whole runs, browsers, clusters and killed processes, 10 to 15 minutes
-	$(PYTEST) -m slow
+	$(PYTEST) -m "slow and not nightly"
+
+nightly: .venv/.ready       ## run the remaining tests: notebooks, examples of documents that reconstruct
+	$(PYTEST) -m nightly
 
 lint: .venv/.ready          ## formatting, style, strict types, and who may import whom
 	$(BIN)/ruff format --check .

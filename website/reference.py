@@ -108,7 +108,7 @@ def _escaped(text: str) -> str:
 def description(cls: type) -> str:
     """Return the docstring of a class up to its sections, as Markdown."""
     text = re.split(_SECTION, inspect.cleandoc(cls.__doc__ or ""), maxsplit=1)[0]
-    return text.replace("::\n", ":\n").strip()
+    return re.sub(r",? ?::\n", ":\n", text).strip()
 
 
 def summary(cls: type) -> str:
@@ -211,9 +211,10 @@ def part_entry(cls: type) -> str:
 
 
 def default_options(kind: str) -> str:
-    """Return the options of the default configuration for one kind of view."""
-    config = from_method("default", kind)  # type: ignore[arg-type]
-    return option_table(options_of(config))
+    """Return the options of the default configuration; for clouds those that images lack."""
+    found = options_of(from_method("default", kind))  # type: ignore[arg-type]
+    known = () if kind == "range" else set(options_of(from_method("default", "range")))
+    return option_table(option for option in found if option not in known)
 
 
 def configurations() -> str:
