@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import thesis
-
 from tofuse import parts
 from tofuse.bounds import Bounds, NotEmpty
 from tofuse.cli.parser import make_parser
