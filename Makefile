@@ -25,7 +25,7 @@ test: .venv/.ready          ## run the tests of up to a second and a half each, 
 slow: .venv/.ready          ## run the tests of whole runs, clusters and killed processes, 10 to 15 minutes
 	$(PYTEST) -m "slow and not nightly"
 
-nightly: .venv/.ready       ## run the tests of the pages in a browser
+nightly: .venv/.ready       ## run the remaining tests: browsers, fuzzing, notebooks, documents that reconstruct, all real data
 	$(PYTEST) -m nightly
 
 lint: .venv/.ready          ## formatting, style, strict types, and who may import whom

@@ -4,7 +4,7 @@
                                 [--journal FILE] [--minutes M]
 
 Prints how many of each kind were tried and how many passed; exits with 1 if any failed. The
-guarantees that are tested are in docs/reliability.md. All of it takes hours. With a journal, a
+guarantees that are tested are in docs/evidence.md. All of it takes hours. With a journal, a
 stopped run continues where it, or `--minutes`, ended; the table then covers all runs.
 """
 

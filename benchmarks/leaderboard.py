@@ -7,7 +7,7 @@ over. Cases are distributed over processes of this machine, or over the workers 
 
     python benchmarks/leaderboard.py [--boards pairs graphs sequences] [--seeds 4] [--workers 2]
     python benchmarks/leaderboard.py --scheduler tcp://host:8786
-    python benchmarks/leaderboard.py --page docs/leaderboard.md
+    python benchmarks/leaderboard.py --page leaderboard.md
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ from tofuse.formats.files.atomic import write_text
 
 BOARDS: dict[str, Board] = {board.name: board for board in (TwoViews(), Graphs(), Sequences())}
 KEPT = OUT / "leaderboard"
-_BEGIN, _END = "<!-- tables -->", "<!-- end of tables -->"
 
 
 def kept(board: str, method: str, case: str) -> Path:
@@ -151,7 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--scheduler")
     parser.add_argument("--fresh", action="store_true")
-    parser.add_argument("--page", type=Path, help="page whose tables are updated")
+    parser.add_argument("--page", type=Path, help="file to write the tables to")
     parser.add_argument("--data", type=Path, default=DATA)
     options = parser.parse_args(arguments)
     if options.fresh:
@@ -162,9 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.page is None:
         print(text)
         return
-    before = options.page.read_text("utf-8")
-    head, tail = before.split(_BEGIN)[0], before.split(_END)[1]
-    write_text(options.page, f"{head}{_BEGIN}\n\n{text}\n{_END}{tail}")
+    write_text(options.page, text)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+import reference
+
 ROOT = Path(__file__).resolve().parents[1]
 # Documents in the root of the project become pages of the site too.
 ROOT_PAGES = ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
@@ -27,11 +29,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Point links to the root's documents at their pages; set equations as MathML.
+    """Fill in the tables; point links to the root's documents at their pages; set equations.
 
     MathML needs no script, so the site shows its equations offline.
     """
-    pieces = _CODE.split(markdown)  # code at the odd places is left alone
+    pieces = _CODE.split(reference.filled(markdown))  # code at the odd places is left alone
     return "".join(piece if k % 2 else _text(piece) for k, piece in enumerate(pieces))
 
 

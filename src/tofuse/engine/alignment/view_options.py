@@ -17,9 +17,10 @@ class ViewOptions(Bounded):
     Attributes
     ----------
     columns
-        Images are halved until they have at most this many columns.
+        Images are halved until they have at most this many columns: fewer for speed, more for fine
+        structure.
     photometric
-        Whether the albedo is used in the alignment.
+        Whether the albedo is used in the alignment; switch it off where the light changes.
     falloff
         Exponent of the cosine to the optical axis by which amplitude falls off towards the corners;
         None to estimate it from the recording.

@@ -35,7 +35,7 @@ class NeighbourhoodAngle(Bounded, Filter):
     Attributes
     ----------
     threshold
-        Largest angle that is kept, rad.
+        Largest angle that is kept, rad; raise it to keep surfaces seen at grazing angles.
     """
 
     threshold: Annotated[float, Bounds(math.pi / 2, math.pi)] = math.radians(170)

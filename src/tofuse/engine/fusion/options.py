@@ -20,7 +20,8 @@ class Fusion(Bounded):
     min_views
         Minimum number of frames that observed a point of the model.
     island
-        Connected pieces of the surface with fewer vertices are removed.
+        Connected pieces of the surface with fewer vertices are removed: more against debris, fewer
+        to keep small objects.
     memory_mb
         Maximum memory for the voxels: beyond it, the model is fused region by region, with the
         same result. A tenth as much may be used for stored views; those that do not fit are on

@@ -91,7 +91,8 @@ class Joining(Bounded):
     searches
         Maximum number of searches, in addition to one for each component and for every 50 frames.
     bridge
-        Whether gaps may be bridged by motion alone, odometry or extrapolated.
+        Whether gaps may be bridged by motion alone, odometry or extrapolated; switch it off for a
+        camera that stops or jumps.
     tries
         Largest number of view pairs that are tried between the same two components.
     min_probability

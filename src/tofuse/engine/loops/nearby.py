@@ -35,7 +35,7 @@ class Nearby(Bounded, LoopDetector):
     Attributes
     ----------
     max_distance_m
-        Largest distance between the two cameras.
+        Largest distance between the two cameras, m: the range of the sensor.
     max_yaw_rad
         Largest rotation about the camera's y axis between them.
     min_gap

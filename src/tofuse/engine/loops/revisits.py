@@ -73,7 +73,8 @@ class Revisits(Bounded, LoopDetector):
     Attributes
     ----------
     overlap
-        Minimum overlap of a candidate, as a fraction of its pixels.
+        Minimum overlap of a candidate, as a fraction of its pixels; lower it where places are
+        revisited from other directions.
     per_view
         Maximum number of candidates of each view with the largest overlap; unless it is 0, the one
         with the largest gain is another candidate.

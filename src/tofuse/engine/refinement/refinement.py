@@ -212,7 +212,7 @@ class Joint(Bounded, RefinementMethod):
     calibrate
         Errors of the camera to estimate as well: "offset", "scale", "focal".
     neighbours
-        Maximum number of earlier views that each one is compared with.
+        Maximum number of earlier views that each one is compared with; fewer for speed.
     submap
         Largest number of views that are refined together; more are divided, see `submaps`.
     """

@@ -40,7 +40,7 @@ class Wrapped(Bounded, Filter):
     Attributes
     ----------
     min_albedo
-        Lowest possible albedo.
+        Lowest possible albedo: darker pixels are wrapped. Lower it for very dark materials.
     """
 
     min_albedo: Annotated[float, Bounds(0, 1)] = 0.02

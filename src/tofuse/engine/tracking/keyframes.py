@@ -30,7 +30,8 @@ class Keyframes(Bounded, Odometry):
     views
         How images are prepared and aligned.
     searches
-        Whether lost frames are relocalized by exhaustive search while frames arrive.
+        Whether lost frames are relocalized by exhaustive search while frames arrive; without, the
+        time of each frame is bounded.
     guess
         Where an alignment starts: "previous" (constant velocity), "identity" (the last pose),
         "odometry" (the motion between the poses of an odometry file).

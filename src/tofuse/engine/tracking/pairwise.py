@@ -46,7 +46,8 @@ class Pairwise(Bounded, Odometry):
     registration
         Registers one pair, and states whether the pose is accepted.
     references
-        Maximum number of earlier views that a view is registered to, the last one first.
+        Maximum number of earlier views that a view is registered to, the last one first; more for
+        unordered views.
     minimum_points
         Points that a view must have.
     probable

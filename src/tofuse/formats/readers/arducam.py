@@ -30,7 +30,7 @@ CONFIDENCE_MAX = 255.0
 
 @part("reader", "arducam", label="experimental")
 class Arducam(Reader):
-    """Folders of depth_W_H_f32_*.raw (Arducam ToF), with the camera in a camera.json."""
+    """Arducam ToF: folders of depth_W_H_f32_T.raw, with the camera in a camera.json."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -110,7 +110,7 @@ def depth_camera(lens: KinectLens) -> Camera:
 
 @part("reader", "azure-kinect", label="validated")
 class AzureKinect(Reader):
-    """A .mkv file of k4arecorder: depth, infrared, and colour if it is MJPG."""
+    """A .mkv of k4arecorder (Azure Kinect, Femto): depth, infrared, and colour if it is MJPG."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -47,7 +47,7 @@ class PlyClouds(Reader):
 
 @part("reader", "pcd", label="validated")
 class PcdClouds(Reader):
-    """A .pcd file, or a folder of them; metres."""
+    """A .pcd file, or a folder of them; images if organised; metres."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -185,7 +185,7 @@ CENTIMETRE = 0.01
 
 @part("reader", "slam6d", label="validated")
 class Slam6d(Reader):
-    """A folder of scanNNN.3d with scanNNN.pose."""
+    """3DTK, slam6D: a folder of scanNNN.3d with scanNNN.pose."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

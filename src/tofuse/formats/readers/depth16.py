@@ -27,7 +27,7 @@ CONFIDENCE_MAX = 7.0
 
 @part("reader", "depth16", label="experimental")
 class Depth16(Reader):
-    """Folders of *_depth16.bin or *.depth16, with the camera in a camera.json."""
+    """Android, ARCore: folders of *_depth16.bin or *.depth16 with a camera.json."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -14,7 +14,7 @@ from tofuse.formats.recordings import CERTAIN, DepthImageSource, Reader, ReaderO
 
 @part("reader", "depth-png")
 class DepthPng(Reader):
-    """A 16-bit .png, with a camera.json given or in its folder."""
+    """One 16-bit .png of depth, with a camera.json given or in its folder."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

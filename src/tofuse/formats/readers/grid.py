@@ -45,7 +45,7 @@ _MAX_RAY_DISTANCE_PX, _MIN_ON_RAYS = 0.3, 0.8
 
 @part("reader", "grid")
 class Grid(Reader):
-    """A folder of .ply, .csv or .pcd files with one point per pixel, row-major; m or mm."""
+    """Helios, blaze, pmd: a folder of .ply, .csv or .pcd, one point per pixel; m or mm."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -46,7 +46,7 @@ _REMEDY = "copy the recording again"
 
 @part("reader", "hololens2", label="experimental")
 class HoloLens2(Reader):
-    """Folders with 'Depth Long Throw_lut.bin' and .tar, or those of 'Depth AHaT'."""
+    """HoloLens 2: folders with 'Depth Long Throw_lut.bin' and .tar, or those of 'Depth AHaT'."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

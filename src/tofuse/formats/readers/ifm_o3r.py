@@ -49,7 +49,7 @@ _MAX_BYTES = 2 << 30
 
 @part("reader", "ifm-o3r", label="validated")
 class IfmO3r(Reader):
-    """A .data or .pcic file of the O3R's frames: range, noise, amplitude, intrinsics."""
+    """A .data, .pcic or .bin file of ifm O3R's frames: range, noise, amplitude, intrinsics."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -296,7 +296,7 @@ _LENS_PARAMETERS = 10
 
 @part("reader", "ifm-h5", label="experimental")
 class IfmH5(Reader):
-    """A .h5 file with streams o3r_tof_0, ...: range, noise, amplitude, intrinsics."""
+    """A .h5 or .hdf5 of ifm's Vision Assistant: range, noise, amplitude, lens (extra `hdf5`)."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

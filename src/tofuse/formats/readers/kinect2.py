@@ -34,7 +34,7 @@ _MATRIX = re.compile(r"^cameraMatrix:.*?data:\s*\[(.*?)\]", re.DOTALL | re.MULTI
 
 @part("reader", "kinect2", label="experimental")
 class Kinect2(Reader):
-    """Folders of NNNN_depth.png and NNNN_color.jpg, with kinect2_bridge's calib_*.yaml."""
+    """Kinect v2 by iai_kinect2: folders of NNNN_depth.png, NNNN_color.jpg and calib_*.yaml."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -123,7 +123,7 @@ class MakerBagSource(BagSource):
 
 @part("reader", "realsense-bag")
 class RealSenseBag(Reader):
-    """A .bag (or .db3) of RealSense's viewer or SDK: depth, colour, and infrared of the L515."""
+    """A .bag or .db3 of RealSense's SDK: depth, colour, infrared of the L515 (extra `ros`)."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -286,7 +286,7 @@ _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 @part("reader", "orbbec-bag")
 class OrbbecBag(Reader):
-    """A .bag of Orbbec's viewer or SDK: depth, pixel-aligned infrared, and colour."""
+    """A .bag of Orbbec's viewer or SDK: depth, aligned infrared, and colour (extra `ros`)."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -47,7 +47,7 @@ _REMEDY = "correct it there"
 
 @part("reader", "nerfstudio", label="experimental")
 class Nerfstudio(Reader):
-    """A transforms.json whose frames have depth, or the folder of one."""
+    """nerfstudio, instant-ngp, NeRFCapture, `tofuse export`: a transforms.json with depth."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -36,7 +36,7 @@ _LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and
 
 @part("reader", "polycam", label="experimental")
 class Polycam(Reader):
-    """Folders with keyframes/depth, images, cameras and maybe confidence, corrected_cameras."""
+    """Polycam, "raw data": folders with keyframes/, in it depth/, images/ and cameras/."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -58,7 +58,7 @@ _REMEDY = "export the recording again"
 
 @part("reader", "record3d", label="validated")
 class Record3D(Reader):
-    """Folders with metadata.json, depth/*.exr and rgb/*.jpg; or .r3d files."""
+    """Record3D: folders with metadata.json and depth/*.exr; or .r3d files (extra `phones`)."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

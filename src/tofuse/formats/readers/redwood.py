@@ -36,7 +36,7 @@ _MICROSECONDS = re.compile(r"[0-9]+-([0-9]{12})")
 
 @part("reader", "redwood", label="validated")
 class Redwood(Reader):
-    """Folders with depth/, color/ (or image/, rgb/), maybe a camera .json and trajectory.log."""
+    """Open3D, Redwood: folders with depth/, color/ (image/, rgb/), camera .json, trajectory.log."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -51,7 +51,7 @@ _ODOMETRY = "odom"
 
 @part("reader", "ros")
 class Ros(Reader):
-    """A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag, with depth images or clouds."""
+    """ROS 1 and 2: a .bag, .db3 or .mcap, or a bag's folder; depth or clouds (extra `ros`)."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

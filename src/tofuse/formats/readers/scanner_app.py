@@ -37,7 +37,7 @@ _REMEDY = "export the recording again"
 
 @part("reader", "3dscannerapp", label="validated")
 class ScannerApp(Reader):
-    """Folders of depth_NNNNN.png, conf_NNNNN.png, frame_NNNNN.json and some .jpg."""
+    """3d Scanner App, "all data": folders of depth_NNNNN.png, frame_NNNNN.json and some .jpg."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -46,7 +46,7 @@ _COPY = "copy the file again, or export it again"
 
 @part("reader", "las")
 class LasScans(Reader):
-    """A .las or .laz file, or a folder of them; metres."""
+    """A .las or .laz file, or a folder of them; metres (extra `scan`)."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
@@ -194,7 +194,7 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
 
 @part("reader", "e57")
 class E57Scans(Reader):
-    """A .e57 file: one view per scan, in the scanner's frame; its poses as reference."""
+    """A .e57 file: one view per scan, in its frame; poses as reference (extra `scan`)."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -47,7 +47,7 @@ _RATE_HZ = 30.0
 
 @part("reader", "sens")
 class Sens(Reader):
-    """A .sens file: depth, colour, both intrinsics, and ScanNet's poses as reference."""
+    """ScanNet: a .sens file (version 4): depth, colour, both intrinsics, and poses."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

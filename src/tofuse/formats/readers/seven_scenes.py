@@ -33,7 +33,7 @@ _DEPTH = re.compile(r"frame-([0-9]{1,9})\.depth\.png", re.IGNORECASE)
 
 @part("reader", "7scenes", label="validated")
 class SevenScenes(Reader):
-    """Folders of frame-NNNNNN.depth.png, .pose.txt and .color.png or .jpg."""
+    """7-Scenes: folders of frame-NNNNNN.depth.png, .pose.txt and .color.png or .jpg."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -44,7 +44,7 @@ _TIME = re.compile(rb"%[^\n]*time stamp \[ms\][^\n]*\n\s*([0-9.eE+-]+)", re.IGNO
 
 @part("reader", "sr4000", label="validated")
 class Sr4000(Reader):
-    """Folders of .dat files with blocks of Z, x and y vectors, amplitude and confidence."""
+    """SwissRanger SR4000: folders of .dat files of MESA's ASCII export."""
 
     joinable = True
 

@@ -50,7 +50,7 @@ _IMU = {
 
 @part("reader", "stray", label="validated")
 class Stray(Reader):
-    """Folders with depth/, confidence/, odometry.csv, camera_matrix.csv, imu.csv and rgb.mp4."""
+    """Stray Scanner: folders with depth/, confidence/, odometry.csv, imu.csv and rgb.mp4."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -29,7 +29,7 @@ _NOT_DEPTH = (*_AMPLITUDE_KEYWORDS, "conf")
 
 @part("reader", "tiff")
 class Tiff(Reader):
-    """A folder of depth images as TIFF, with a camera.json given; amplitude in *intens*.tif."""
+    """Tiff3D, viewers: a folder of depth images as .tif, with `--camera`."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

@@ -41,7 +41,7 @@ CAMERAS = {
 
 @part("reader", "tum")
 class Tum(Reader):
-    """Folders with depth.txt (timestamp and file name), depth/, and maybe rgb.txt, rgb/."""
+    """TUM RGB-D: folders with depth.txt (timestamp and file name), maybe rgb.txt."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

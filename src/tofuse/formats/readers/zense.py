@@ -27,7 +27,7 @@ _LENS = {"fx": "camera_fx", "fy": "camera_fy", "cx": "camera_cx", "cy": "camera_
 
 @part("reader", "zense", label="validated")
 class Zense(Reader):
-    """Folders of depth*.png in mm and a .toml with camera_fx, _fy, _cx and _cy."""
+    """Pico Zense: folders of depth*.png in mm and a .toml with camera_fx and so on."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""

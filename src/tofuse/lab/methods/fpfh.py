@@ -35,8 +35,12 @@ class Fpfh(Bounded, Registrar):
     signed
         Whether the orientation of the normals is known. Arrays of points are assumed to be seen
         from their origin.
-    method, inliers, seeds
-        Options of the consensus, see `SampleOptions`.
+    method
+        Consensus: "samples", RANSAC; "compatible", second-order compatibility.
+    inliers
+        Minimum number of inliers.
+    seeds
+        Number of the best-connected matches that propose motions, if "compatible".
     refine
         Whether the pose is refined by generalised ICP (`CoarseToFine`, starting at the resolution
         of the averaged views); else it is that of the matches.

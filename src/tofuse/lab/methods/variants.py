@@ -128,8 +128,14 @@ class SymmetricIcp(Variant):
 
     Attributes
     ----------
-    resolution, points, reach, max_iterations
-        See `PointToPlaneIcp`.
+    resolution
+        Typical distance between neighbouring points, m.
+    points
+        Random points of the source (None: all), against all of the target.
+    reach
+        Largest distance of a pair, in resolutions.
+    max_iterations
+        Maximum number of iterations.
     """
 
     resolution: float = 0.01
@@ -151,8 +157,14 @@ class GeneralizedIcp(Variant):
 
     Attributes
     ----------
-    resolution, points, reach, max_iterations
-        See `PointToPlaneIcp`.
+    resolution
+        Typical distance between neighbouring points, m.
+    points
+        Random points of the source (None: all), against all of the target.
+    reach
+        Largest distance of a pair, in resolutions.
+    max_iterations
+        Maximum number of iterations.
     epsilon
         Variance across a surface relative to that along it.
     """
@@ -307,8 +319,12 @@ class Icpif(Variant):
         Typical distance between neighbouring points, m.
     points
         Random points of the source (None: all), against all of the target.
-    features, weight, radius
-        See `ClosestInvariant`.
+    features
+        Any of "curvature", "moments".
+    weight
+        Distance, in resolutions, equivalent to one mean absolute deviation of a feature.
+    radius
+        Radius of the ball for moments, in resolutions.
     reach
         Largest distance of a pair in the plain ICP, in resolutions.
     max_iterations
