@@ -32,7 +32,7 @@ lint: .venv/.ready          ## formatting, style, strict types, and who may impo
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/lint-imports
+	PYTHONPATH=.ci $(BIN)/lint-imports
 	$(BIN)/python requirements/check.py
 
 gallery: .venv/.ready       ## simulate, reconstruct and draw the gallery of the documentation anew, some minutes

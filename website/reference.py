@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import thesis
-from tofuse import parts
+from tofuse.engine import parts
 from tofuse.apps.cli.parser import make_parser
 from tofuse.engine.bounds import Bounds, NotEmpty
 from tofuse.engine.graph.graph import LoopRecord

@@ -103,8 +103,7 @@ def _with_camera(make: Callable[[Path], Any], inside: str, format_: str) -> Subj
 
 
 def _depth_png(path: Path) -> None:
-    from tofuse.formats.files.noise_file import read_noise
-from tofuse.formats.files.images import png_bytes
+    from tofuse.formats.files.images import png_bytes
 
     path.write_bytes(png_bytes(np.full((24, 32), 2000, np.uint16)))
 
@@ -223,6 +222,7 @@ def _possible(
 
 def _small() -> dict[str, Subject]:
     """Single files: graphs, poses, cameras, configurations, meshes, tracked frames."""
+    from tofuse.formats.files.noise_file import read_noise
     from tofuse.apps.batch.jobs import read_jobs
     from tofuse.apps.calibration.lens_files import read_lens_file
     from tofuse.apps.cli.batching import run_arguments

@@ -19,7 +19,7 @@ import pytest
 
 import tofuse
 from paths import ROOT
-from tofuse import parts
+from tofuse.engine import parts
 from tofuse.apps.cli.parser import DEMO_SCENES, make_parser
 from tofuse.apps.jobs.pair import register_files
 from tofuse.apps.results.pair import pair_json
