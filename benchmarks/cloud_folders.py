@@ -28,7 +28,7 @@ import scoring
 import tofuse
 from sequences import DATA
 from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.formats.files.ply import write_ply
+from tofuse.formats.geometry.ply import write_ply
 
 # Pose (4, 4) in a common frame and points (n, 3) of each view.
 Views = Iterator[tuple[Float64, Float32]]

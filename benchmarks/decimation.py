@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.geometry.kdtree import KdTree
-from tofuse.formats.files.ply import read_ply
+from tofuse.formats.geometry.ply import read_ply
 from tofuse.lab.experiments.surface_error import Surface, distances
 
 _POINTS = 400_000

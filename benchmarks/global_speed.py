@@ -33,8 +33,8 @@ from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.loops.revisits import Revisits
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.mapping.progress import Stopwatch
-from tofuse.engine.quality.types import Reconstruction
+from tofuse.engine.progress import Stopwatch
+from tofuse.engine.results.types import Reconstruction
 from tofuse.engine.search.search import Search
 from tofuse.engine.stored_views.view_store import SampledView, Spacing, ViewStore, overlaps
 from tofuse.engine.tracking.keyframes import Keyframes

@@ -40,9 +40,9 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.formats.export.conversion import convert
-from tofuse.formats.files.trajectory import read_tum
+from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation import mesh as meshes

@@ -36,7 +36,7 @@ from tofuse.engine.errors import TofuseError
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pose_deviation import Fit, deviation
-from tofuse.engine.quality.trajectory import align, displacement
+from tofuse.engine.quality.trajectory_errors import align, displacement
 from tofuse.formats.recordings.open import open_recording
 
 NOISE_M, NOISE_RAD = 1e-3, np.radians(0.02)

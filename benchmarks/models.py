@@ -21,8 +21,8 @@ from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.quality.trajectory import evaluate_trajectory
-from tofuse.engine.quality.types import Reconstruction
+from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
+from tofuse.engine.results.types import Reconstruction
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.cases import CHEST
 from tofuse.lab.experiments.recorded import RecordedScene

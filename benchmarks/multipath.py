@@ -38,7 +38,7 @@ from tofuse.engine.frames.recording import Recording
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.engine.sensor.multipath_correction import Multipath, MultipathCorrector
 from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.formats.recordings.open import open_recording

@@ -22,7 +22,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.noise.choice import noise_model_for
-from tofuse.formats.files.images import read_image
+from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.open import open_recording
 from tofuse.formats.recordings.still import average_still
 from tofuse.lab.simulation.effects import Effects

@@ -36,7 +36,7 @@ def ate(times: Sequence[float], poses: object, recording: object) -> str:
     import numpy as np
 
     from tofuse.engine.frames.recording import Recording
-    from tofuse.engine.quality.trajectory import evaluate_trajectory
+    from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 
     assert isinstance(recording, Recording)
     if recording.reference is None:
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not options.no_first:
             ours(source, chosen, options.threads, out)
         seconds, peak = ours(source, chosen, options.threads, out)
-        from tofuse.formats.files.trajectory import read_tum
+        from tofuse.formats.poses.trajectory import read_tum
         from tofuse.formats.recordings.open import open_recording
 
         recording = open_recording(source).select(options.start, options.end, options.every)

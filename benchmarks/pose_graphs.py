@@ -30,8 +30,8 @@ from tofuse.engine.graph.castellani import Castellani
 from tofuse.engine.graph.graph import Optimiser, PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
 from tofuse.engine.graph.robust import Settings
-from tofuse.engine.quality.trajectory import align
-from tofuse.formats.files.g2o import read_g2o, write_g2o
+from tofuse.engine.quality.trajectory_errors import align
+from tofuse.formats.poses.g2o import read_g2o, write_g2o
 from tofuse.lab.methods.charts import Cosines, Quaternion, descend
 from tofuse.lab.methods.elch import Elch
 from tofuse.lab.methods.lu_milios import LuMilios

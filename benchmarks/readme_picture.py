@@ -19,9 +19,9 @@ from tofuse.apps.results.run_json import read_run_json
 from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory import evaluate_trajectory
-from tofuse.formats.files.ply import read_ply
-from tofuse.formats.files.trajectory import read_tum
+from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
+from tofuse.formats.geometry.ply import read_ply
+from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.open import open_recording
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-from tofuse.formats.files.ply import read_ply
+from tofuse.formats.geometry.ply import read_ply
 
 SIZES = {"desktop": (1280, 900, 1.0), "phone": (390, 844, 2.0)}
 FLAGS = ["--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"]

@@ -17,7 +17,7 @@ import numpy as np
 
 from tofuse.engine.mapping.methods import default
 from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.lab.experiments.recording_bound import trajectory_bounds
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan, simulate_recording

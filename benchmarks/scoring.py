@@ -30,7 +30,7 @@ from scipy.sparse.csgraph import connected_components
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory import mean_rotation
+from tofuse.engine.quality.trajectory_errors import mean_rotation
 
 MAX_ERROR_M, MAX_ERROR_RAD = 0.05, np.radians(3.0)
 JOIN_M, JOIN_RAD = 0.20, np.radians(10.0)

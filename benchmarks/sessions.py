@@ -30,8 +30,8 @@ from tofuse.apps.jobs.running import run
 from tofuse.apps.results.session_words import probability_text
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory import align, displacement
-from tofuse.engine.quality.types import Reconstruction
+from tofuse.engine.quality.trajectory_errors import align, displacement
+from tofuse.engine.results.types import Reconstruction
 from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import RecordingPlan, plan, write

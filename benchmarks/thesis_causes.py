@@ -20,7 +20,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from tofuse.engine.mapping.progress import Silent
+from tofuse.engine.progress import Silent
 from tofuse.lab.experiments.cases import CASES, DRAWS, run_case
 from tofuse.lab.experiments.page import NAMES
 from tofuse.lab.experiments.peaks import sweep_peaks

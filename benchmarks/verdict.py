@@ -38,8 +38,8 @@ from tofuse.engine.errors import TofuseError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.quality.checks import tolerance_of
-from tofuse.engine.quality.trajectory import displacement
+from tofuse.engine.quality.trajectory_errors import displacement
+from tofuse.engine.results.checks import tolerance_of
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate

@@ -23,9 +23,9 @@ from tofuse.apps.jobs.run_options import Options
 from tofuse.apps.jobs.running import run
 from tofuse.apps.results.run_json import frames_in_main_model, read_run_json
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory import evaluate_trajectory
-from tofuse.formats.files.ply import read_ply
-from tofuse.formats.files.trajectory import read_tum
+from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
+from tofuse.formats.geometry.ply import read_ply
+from tofuse.formats.poses.trajectory import read_tum
 from tofuse.lab.demo import simulate_to
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -20,14 +20,14 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import thesis
-from tofuse.engine import parts
 from tofuse.apps.cli.parser import make_parser
+from tofuse.engine import parts
 from tofuse.engine.bounds import Bounds, NotEmpty
 from tofuse.engine.graph.graph import LoopRecord
 from tofuse.engine.mapping.config import PACKAGES, Config, from_method
-from tofuse.engine.quality.accuracy import Accuracy
-from tofuse.engine.quality.types import Component, FrameRecord
-from tofuse.engine.quality.verdict import REASONS
+from tofuse.engine.quality.pose_accuracy import Accuracy
+from tofuse.engine.results.types import Component, FrameRecord
+from tofuse.engine.results.verdicts import REASONS
 
 PART_PACKAGES = (*PACKAGES, "tofuse.formats.readers", "tofuse.apps.live.devices")
 RECORDS = {"frame": FrameRecord, "component": Component, "loop": LoopRecord, "accuracy": Accuracy}

@@ -103,7 +103,7 @@ def _with_camera(make: Callable[[Path], Any], inside: str, format_: str) -> Subj
 
 
 def _depth_png(path: Path) -> None:
-    from tofuse.formats.files.images import png_bytes
+    from tofuse.formats.images.images import png_bytes
 
     path.write_bytes(png_bytes(np.full((24, 32), 2000, np.uint16)))
 
@@ -128,9 +128,9 @@ def _recording(
 
 
 def _scans() -> dict[str, Subject]:
-    from tofuse.formats.files.e57 import write_e57
     from tofuse.engine.fusion.geometry_record import GeometryRecord
-    from tofuse.formats.files.las import write_las
+    from tofuse.formats.geometry.e57 import write_e57
+    from tofuse.formats.geometry.las import write_las
 
     points = np.random.default_rng(5).normal(size=(60, 3))
 
@@ -222,26 +222,26 @@ def _possible(
 
 def _small() -> dict[str, Subject]:
     """Single files: graphs, poses, cameras, configurations, meshes, tracked frames."""
-    from tofuse.formats.files.noise_file import read_noise
     from tofuse.apps.batch.jobs import read_jobs
     from tofuse.apps.calibration.lens_files import read_lens_file
     from tofuse.apps.cli.batching import run_arguments
-    from tofuse.formats.files.pose import read_pose
-    from tofuse.formats.files.tables import read_columns
-    from tofuse.formats.files.trajectory_formats import read_poses
-    from tofuse.engine.tracking.base import Step
     from tofuse.apps.jobs import tracked_file
     from tofuse.apps.jobs.run_options import read_changes
+    from tofuse.apps.jobs.tracked_file import TrackedFile
     from tofuse.engine.mapping.config import changed, from_method
     from tofuse.engine.mapping.frame_log import FrameLog
-    from tofuse.apps.jobs.tracked_file import TrackedFile
-    from tofuse.formats.files.g2o import read_g2o
-    from tofuse.formats.files.given_loops import read_loops
+    from tofuse.engine.noise.model import NoiseModel, RangeLaw
+    from tofuse.engine.results.types import FrameRecord
+    from tofuse.engine.tracking.base import Step
+    from tofuse.formats.files.noise_file import read_noise
+    from tofuse.formats.files.tables import read_columns
+    from tofuse.formats.poses.g2o import read_g2o
+    from tofuse.formats.poses.given_loops import read_loops
+    from tofuse.formats.poses.pose import read_pose
+    from tofuse.formats.poses.trajectory_formats import read_poses
     from tofuse.formats.recordings.camera_file import read_camera_file
     from tofuse.formats.recordings.open import read_reference
     from tofuse.formats.recordings.rig import read_rig
-    from tofuse.engine.quality.types import FrameRecord
-    from tofuse.engine.noise.model import NoiseModel, RangeLaw
 
     pose = [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     still = np.eye(4).tolist()
@@ -359,9 +359,9 @@ def _session(out: Path) -> None:
 
 
 def _load_session(out: Path) -> None:
-    from tofuse.engine.errors import InputError
-    from tofuse.engine.mapping.progress import Silent
     from tofuse.apps.jobs.sessions import read_sessions
+    from tofuse.engine.errors import InputError
+    from tofuse.engine.progress import Silent
 
     try:
         read_sessions([out], 1, Silent())

@@ -15,7 +15,7 @@ import numpy as np
 import pose_graphs
 from boards import Board, Score, default_made
 from tofuse.engine.graph.graph import PoseGraph
-from tofuse.formats.files.g2o import read_g2o, write_g2o
+from tofuse.formats.poses.g2o import read_g2o, write_g2o
 
 SCENES = ("room", "walk")
 _GTSAM = "GTSAM"

@@ -21,7 +21,7 @@ from tofuse.engine.errors import TofuseError
 from tofuse.engine.mapping.config import changed, from_method
 from tofuse.engine.mapping.reconstruction import reconstruct
 from tofuse.engine.parts import name_of
-from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 
 # Title, and which images are used: every n-th.
 SCENES = {

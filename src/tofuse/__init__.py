@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from tofuse.engine.graph.graph import LoopRecord, PoseGraph
     from tofuse.engine.mapping.config import Config
     from tofuse.engine.mapping.mapper import Mapper
-    from tofuse.engine.quality.accuracy import Accuracy
     from tofuse.engine.quality.change_detection import Change
-    from tofuse.engine.quality.types import (
+    from tofuse.engine.quality.pose_accuracy import Accuracy
+    from tofuse.engine.results.types import (
         Component,
         Diagnostics,
         FrameRecord,
@@ -50,17 +50,17 @@ if TYPE_CHECKING:
     from tofuse.formats.recordings.open import open_recording as open  # noqa: A004
 
 _HOMES = {
-    "Accuracy": "tofuse.engine.quality.accuracy",
+    "Accuracy": "tofuse.engine.quality.pose_accuracy",
     "BrownConrady": "tofuse.engine.cameras.cameras",
     "Change": "tofuse.engine.quality.change_detection",
     "Cloud": "tofuse.engine.fusion.cloud",
     "CloudFrame": "tofuse.engine.frames.frames",
-    "Component": "tofuse.engine.quality.types",
+    "Component": "tofuse.engine.results.types",
     "Config": "tofuse.engine.mapping.config",
-    "Diagnostics": "tofuse.engine.quality.types",
+    "Diagnostics": "tofuse.engine.results.types",
     "Evaluation": "tofuse.apps.jobs.evaluating",
     "Fisheye": "tofuse.engine.cameras.cameras",
-    "FrameRecord": "tofuse.engine.quality.types",
+    "FrameRecord": "tofuse.engine.results.types",
     "InputError": "tofuse.engine.errors",
     "Judgement": "tofuse.apps.jobs.judging",
     "LoopRecord": "tofuse.engine.graph.graph",
@@ -73,15 +73,15 @@ _HOMES = {
     "RangeFrame": "tofuse.engine.frames.frames",
     "Rational": "tofuse.engine.cameras.cameras",
     "RayTable": "tofuse.engine.cameras.cameras",
-    "Reason": "tofuse.engine.quality.types",
-    "Reconstruction": "tofuse.engine.quality.types",
+    "Reason": "tofuse.engine.results.types",
+    "Reconstruction": "tofuse.engine.results.types",
     "Recording": "tofuse.engine.frames.recording",
     "Registration": "tofuse.engine.alignment.base",
     "RegistrationError": "tofuse.engine.errors",
     "Result": "tofuse.apps.api.result",
-    "SessionChange": "tofuse.engine.quality.types",
-    "SessionPair": "tofuse.engine.quality.types",
-    "SessionRecord": "tofuse.engine.quality.types",
+    "SessionChange": "tofuse.engine.results.types",
+    "SessionPair": "tofuse.engine.results.types",
+    "SessionRecord": "tofuse.engine.results.types",
     "TofuseError": "tofuse.engine.errors",
     "evaluate": "tofuse.apps.jobs.evaluating",
     "from_arrays": "tofuse.engine.frames.from_arrays",

@@ -21,7 +21,7 @@ from tofuse.apps.cli.progress import (
     TerminalProgress,
     progress_for,
 )
-from tofuse.engine.quality.types import FrameRecord
+from tofuse.engine.results.types import FrameRecord
 
 
 class Clock:
@@ -119,7 +119,7 @@ def test_json_progress_reports_events(capsys) -> None:
 _SHOW = """
 import time
 from tofuse.apps.cli.progress import progress_for
-from tofuse.engine.quality.types import FrameRecord
+from tofuse.engine.results.types import FrameRecord
 with progress_for(as_json=False) as progress:
     progress.stage("tracking", 40)
     progress.note("read [this]")

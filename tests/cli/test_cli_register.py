@@ -17,10 +17,10 @@ from tofuse.apps.jobs import pair as pair_module
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.formats.files.las import write_las
-from tofuse.formats.files.ply import read_ply, write_ply
-from tofuse.formats.files.pose import read_pose
-from tofuse.formats.files.trajectory import read_tum, tum_text, write_tum
+from tofuse.formats.geometry.las import write_las
+from tofuse.formats.geometry.ply import read_ply, write_ply
+from tofuse.formats.poses.pose import read_pose
+from tofuse.formats.poses.trajectory import read_tum, tum_text, write_tum
 from tofuse.formats.recordings.open import open_recording
 
 FILES = {"registration.json", "transform.txt", "aligned.ply", "report.html"}

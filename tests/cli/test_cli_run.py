@@ -25,13 +25,13 @@ from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.reconstruction import reconstruct
 from tofuse.engine.parts import name_of
-from tofuse.engine.quality.types import Component, Reason, Reconstruction
-from tofuse.engine.quality.verdict import ADVICE, REASONS
+from tofuse.engine.results.types import Component, Reason, Reconstruction
+from tofuse.engine.results.verdicts import ADVICE, REASONS
 from tofuse.formats.export.conversion import convert
-from tofuse.formats.files.g2o import read_g2o
-from tofuse.formats.files.images import read_image, write_png
-from tofuse.formats.files.ply import read_ply
-from tofuse.formats.files.trajectory import read_tum
+from tofuse.formats.geometry.ply import read_ply
+from tofuse.formats.images.images import read_image, write_png
+from tofuse.formats.poses.g2o import read_g2o
+from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab import demo as demo_module
 from tofuse.lab.simulation.effects import Effects

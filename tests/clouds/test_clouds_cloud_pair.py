@@ -23,7 +23,7 @@ from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
 from tofuse.engine.tracking.pairwise import Pairwise
-from tofuse.formats.files.ply import write_ply
+from tofuse.formats.geometry.ply import write_ply
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.peaks import peaks_views

@@ -11,7 +11,7 @@ from searched_pair import TRUE, A, B, seen
 from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
 from tofuse.engine.clouds.fpfh import fpfh, mutually_nearest
 from tofuse.engine.geometry import se3
-from tofuse.formats.files.ply import read_ply
+from tofuse.formats.geometry.ply import read_ply
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from tofuse.engine.clouds.remapping import Remapping
 from tofuse.engine.clouds.surface_metrics import PointToPlane
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
-from tofuse.formats.files.ply import read_ply
+from tofuse.formats.geometry.ply import read_ply
 from tofuse.lab.methods.variants import Tricp
 
 

@@ -16,7 +16,7 @@ _COMPILE = """
 import numpy as np
 from pathlib import Path
 from tofuse.engine.compute import jit
-from tofuse.formats.files.lzf_kernels import lzf_decompress
+from tofuse.formats.geometry.lzf_kernels import lzf_decompress
 out = np.zeros(3, np.uint8)
 assert lzf_decompress(np.frombuffer(bytes([2]) + b"abc", np.uint8), out) == 3
 print(out.tobytes().decode())

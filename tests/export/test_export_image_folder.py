@@ -24,9 +24,9 @@ from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.formats.files.ply import read_ply, write_ply
-from tofuse.formats.files.trajectory import write_tum
-from tofuse.formats.files.trajectory_formats import read_poses
+from tofuse.formats.geometry.ply import read_ply, write_ply
+from tofuse.formats.poses.trajectory import write_tum
+from tofuse.formats.poses.trajectory_formats import read_poses
 from tofuse.formats.recordings.open import Opening
 
 PLAIN = Pinhole(*SIZE, 40.0, 41.0, 23.0, 18.0)

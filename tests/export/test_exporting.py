@@ -19,9 +19,9 @@ from tofuse.apps.results.folder import OutputFolder
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import las
-from tofuse.formats.files.ply import read_ply, write_ply
-from tofuse.formats.files.trajectory import write_tum
+from tofuse.formats.geometry import las
+from tofuse.formats.geometry.ply import read_ply, write_ply
+from tofuse.formats.poses.trajectory import write_tum
 
 TIMES, POSES = np.array([0.1, 0.2, 0.5]), se3.exp(np.random.default_rng(1).normal(size=(3, 6)))
 POSES[0] = np.eye(4)

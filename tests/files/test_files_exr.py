@@ -9,7 +9,7 @@ import pytest
 
 from made_phones import exr_bytes
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.exr import parse_exr
+from tofuse.formats.images.exr import parse_exr
 
 IMAGE = np.random.default_rng(1).uniform(0, 5, (37, 21)).astype(np.float32)
 SMOOTH = np.linspace(0, 5, 37 * 21, dtype=np.float32).reshape(37, 21)

@@ -9,7 +9,7 @@ from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.build import Measured, build_graph
 from tofuse.engine.graph.graph import PoseGraph
-from tofuse.formats.files.g2o import read_g2o, write_g2o
+from tofuse.formats.poses.g2o import read_g2o, write_g2o
 
 VERTICES = "VERTEX_SE3:QUAT 3 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 7 1 2 3 0 0 0.6 0.8\n"
 UPPER = " ".join(str(v) for v in np.eye(6)[np.triu_indices(6)])

@@ -7,12 +7,12 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.formats.files.e57 import write_e57
-from tofuse.formats.files.glb import write_glb, write_gltf
-from tofuse.formats.files.las import write_las, write_laz
-from tofuse.formats.files.obj import write_obj
-from tofuse.formats.files.pcd import write_pcd
-from tofuse.formats.files.ply import write_ply
+from tofuse.formats.geometry.e57 import write_e57
+from tofuse.formats.geometry.glb import write_glb, write_gltf
+from tofuse.formats.geometry.las import write_las, write_laz
+from tofuse.formats.geometry.obj import write_obj
+from tofuse.formats.geometry.pcd import write_pcd
+from tofuse.formats.geometry.ply import write_ply
 
 POINTS = np.zeros((3, 3), np.float32)
 FACE = np.array([[0, 1, 2]], np.int32)

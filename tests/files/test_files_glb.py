@@ -8,7 +8,7 @@ import pytest
 from parsed_glb import parse
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.formats.files.glb import write_glb
+from tofuse.formats.geometry.glb import write_glb
 
 
 def test_mesh_round_trips(tmp_path) -> None:

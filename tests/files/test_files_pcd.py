@@ -8,8 +8,8 @@ import pytest
 
 import tofuse
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.lzf_kernels import lzf_decompress
-from tofuse.formats.files.pcd import read_pcd
+from tofuse.formats.geometry.lzf_kernels import lzf_decompress
+from tofuse.formats.geometry.pcd import read_pcd
 
 
 def lzf_twin(source: bytes) -> bytes:

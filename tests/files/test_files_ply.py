@@ -8,8 +8,8 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.formats.files import ply as plys
-from tofuse.formats.files.ply import read_ply, write_ply
+from tofuse.formats.geometry import ply as plys
+from tofuse.formats.geometry.ply import read_ply, write_ply
 
 CUBE = """ply
 format ascii 1.0

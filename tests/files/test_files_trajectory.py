@@ -7,7 +7,7 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry.se3 import exp
-from tofuse.formats.files.trajectory import (
+from tofuse.formats.poses.trajectory import (
     associate,
     associated_poses,
     read_tum,

@@ -12,9 +12,9 @@ from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.geometry.quaternion import from_matrix
-from tofuse.engine.quality.trajectory import evaluate_trajectory
-from tofuse.formats.files.trajectory import write_kitti, write_log, write_tum
-from tofuse.formats.files.trajectory_formats import TimedPoses, read_poses
+from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
+from tofuse.formats.poses.trajectory import write_kitti, write_log, write_tum
+from tofuse.formats.poses.trajectory_formats import TimedPoses, read_poses
 
 RNG = np.random.default_rng(3)
 POSES = np.stack(

@@ -23,10 +23,10 @@ from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.texture import TextureView, baked, exposures, textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import texturing as paint
-from tofuse.formats.files.glb import linear, write_glb
-from tofuse.formats.files.images import png_bytes
-from tofuse.formats.files.obj import write_obj
-from tofuse.formats.files.ply import read_ply
+from tofuse.formats.geometry.glb import linear, write_glb
+from tofuse.formats.geometry.obj import write_obj
+from tofuse.formats.geometry.ply import read_ply
+from tofuse.formats.images.images import png_bytes
 
 CAMERA = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
 

@@ -14,7 +14,7 @@ from tofuse.engine.graph.castellani import Castellani
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
 from tofuse.engine.graph.robust import Settings
-from tofuse.formats.files.g2o import read_g2o, write_g2o
+from tofuse.formats.poses.g2o import read_g2o, write_g2o
 from tofuse.lab.methods.elch import Elch
 from tofuse.lab.methods.lu_milios import LuMilios
 from walked_graph import walk

@@ -11,7 +11,7 @@ from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.graph.build import Measured, build_graph
 from tofuse.engine.graph.castellani import Castellani, Problem, free_vertices, normalisation_factors
 from tofuse.engine.graph.graph import PoseGraph
-from tofuse.formats.files.g2o import read_g2o
+from tofuse.formats.poses.g2o import read_g2o
 from tofuse.lab.experiments.peaks import chain
 
 NORMALISATIONS = ("thesis", "fusiello")

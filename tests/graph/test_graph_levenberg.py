@@ -16,7 +16,7 @@ from tofuse.engine.graph.graph import Gravity, PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
 from tofuse.engine.graph.solver import Settings, solve
 from tofuse.engine.graph.sparse import Blocks, PairSystem
-from tofuse.formats.files.g2o import read_g2o
+from tofuse.formats.poses.g2o import read_g2o
 from walked_graph import SIGMA, walk
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from made_recordings import pcd_bytes
 from tofuse.engine.cameras.cameras import BrownConrady
 from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.formats.files.ply import write_ply
+from tofuse.formats.geometry.ply import write_ply
 
 CAMERA = BrownConrady(32, 24, 28.0, 28.5, 15.2, 11.8, k1=-0.2, k2=0.05, p1=0.001)
 BEHIND_M = 0.0135

@@ -8,8 +8,8 @@ import numpy as np
 
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.geometry.se3 import exp
-from tofuse.formats.files.images import write_png
-from tofuse.formats.files.trajectory import write_tum
+from tofuse.formats.images.images import write_png
+from tofuse.formats.poses.trajectory import write_tum
 
 RNG = np.random.default_rng(20)
 COUNTS = [RNG.integers(500, 4000, (480, 640), np.uint16) for _ in range(3)]

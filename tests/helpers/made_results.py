@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.fusion.cloud import empty_cloud
 from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.quality.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
+from tofuse.engine.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 
 
 def result(seed=0) -> Reconstruction:

@@ -11,8 +11,8 @@ from tofuse.engine.cameras.cameras import BrownConrady, Camera
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.formats.files.ply import write_ply
-from tofuse.formats.files.trajectory import write_tum
+from tofuse.formats.geometry.ply import write_ply
+from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import Opening
 

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from tofuse.apps.results.run_json import read_run_json, write_run_json
-from tofuse.engine.quality.types import Reconstruction
+from tofuse.engine.results.types import Reconstruction
 
 
 def run_json(result: Reconstruction) -> dict[str, Any]:

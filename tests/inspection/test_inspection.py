@@ -27,9 +27,9 @@ from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.types import SelfCalibration
-from tofuse.formats.files.images import read_image
-from tofuse.formats.files.ply import write_ply
+from tofuse.engine.results.types import SelfCalibration
+from tofuse.formats.geometry.ply import write_ply
+from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.native import RecordingWriter
 from wrapped_depth import wrapping
 

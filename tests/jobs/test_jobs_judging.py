@@ -20,12 +20,12 @@ from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import from_method
-from tofuse.engine.quality.accuracy import Accuracy
+from tofuse.engine.quality.pose_accuracy import Accuracy
 from tofuse.engine.quality.pose_deviation import deviation
-from tofuse.engine.quality.trajectory import align, displacement
+from tofuse.engine.quality.trajectory_errors import align, displacement
 from tofuse.engine.refinement.refinement import NoRefinement
 from tofuse.engine.tracking.given import GivenPoses
-from tofuse.formats.files.trajectory import write_tum
+from tofuse.formats.poses.trajectory import write_tum
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +169,7 @@ def test_poses_in_recording_of_phone_are_read(tmp_path) -> None:
 
 
 def tofuse_ply(path, points) -> None:
-    from tofuse.formats.files.ply import write_ply
+    from tofuse.formats.geometry.ply import write_ply
 
     path.parent.mkdir(exist_ok=True)
     write_ply(path, GeometryRecord(points))

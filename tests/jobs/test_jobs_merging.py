@@ -29,9 +29,9 @@ from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.texture import textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import texturing as paint
-from tofuse.engine.mapping.progress import Silent
 from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.formats.files.trajectory import read_tum
+from tofuse.engine.progress import Silent
+from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import Opening
 from written_run_json import run_json

@@ -26,7 +26,7 @@ from tofuse.engine.loops.joining import Joining
 from tofuse.engine.mapping import reconstruction as reconstruct
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.frame_log import FrameLog
-from tofuse.engine.quality.types import FrameRecord
+from tofuse.engine.results.types import FrameRecord
 from tofuse.engine.search.search import SearchOptions
 from tofuse.engine.tracking.base import Step, Tracker
 from written_run_json import run_json

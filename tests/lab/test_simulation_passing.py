@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.images import read_image
+from tofuse.formats.images.images import read_image
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.passing import Passing
 from tofuse.lab.simulation.record import plan, simulate, simulate_recording

@@ -7,9 +7,9 @@ import pytest
 
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.geometry import se3
-from tofuse.formats.files.images import read_image
-from tofuse.formats.files.ply import read_ply
-from tofuse.formats.files.trajectory import read_tum
+from tofuse.formats.geometry.ply import read_ply
+from tofuse.formats.images.images import read_image
+from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.readers.native import NativeSource
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan, simulate, simulate_recording

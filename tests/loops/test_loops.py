@@ -18,7 +18,7 @@ from tofuse.engine.graph.build import Measured, build_graph
 from tofuse.engine.loops.loops import Confirmation, LoopDetector, PriorLoop, mean_error
 from tofuse.engine.loops.nearby import Nearby, yaw
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.formats.files.given_loops import read_loops
+from tofuse.formats.poses.given_loops import read_loops
 from tofuse.lab.simulation.peaks import peaks_views
 
 

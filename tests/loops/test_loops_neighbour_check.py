@@ -14,7 +14,7 @@ from tofuse.engine.loops.loops import ClosedLoop
 from tofuse.engine.loops.neighbour_check import degraded_neighbours
 from tofuse.engine.mapping.backend import BackEnd
 from tofuse.engine.mapping.config import from_method
-from tofuse.engine.mapping.progress import Stopwatch
+from tofuse.engine.progress import Stopwatch
 from tofuse.engine.tracking.base import Step
 
 SIGMA = np.array([0.003] * 3 + [0.002] * 3)

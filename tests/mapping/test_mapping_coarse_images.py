@@ -12,7 +12,7 @@ from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.quality.trajectory import evaluate_trajectory
+from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render

@@ -20,8 +20,8 @@ from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.live_poses import DELAY, LiveLoops, LivePoses
 from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.quality.types import FrameRecord
 from tofuse.engine.refinement.refinement import NoRefinement
+from tofuse.engine.results.types import FrameRecord
 from tofuse.engine.tracking.base import Step
 
 COUNT = 24

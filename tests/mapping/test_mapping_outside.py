@@ -13,10 +13,10 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.graph.external_sensors import GravityEdges, OdometryEdges
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.reconstruction import reconstruct
-from tofuse.engine.quality.types import Reconstruction
 from tofuse.engine.refinement.refinement import Joint
+from tofuse.engine.results.types import Reconstruction
 from tofuse.formats.files.tables import write_columns
-from tofuse.formats.files.trajectory import write_tum
+from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.recordings.open import open_recording
 from written_run_json import run_json
 

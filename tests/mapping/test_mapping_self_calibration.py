@@ -14,11 +14,11 @@ from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import changed, from_method
-from tofuse.engine.mapping.progress import Silent
 from tofuse.engine.mapping.reconstruction import reconstruct
 from tofuse.engine.mapping.self_calibration import in_words, self_calibrated
-from tofuse.engine.quality.accuracy import Accuracy
-from tofuse.engine.quality.trajectory import displacement
+from tofuse.engine.progress import Silent
+from tofuse.engine.quality.pose_accuracy import Accuracy
+from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement.calibration_check import CalibrationCheck
 from tofuse.engine.refinement.refinement import Refinement
 from tofuse.engine.sensor.camera_errors import CameraErrors

@@ -19,15 +19,15 @@ import pytest
 
 import tofuse
 from paths import ROOT
-from tofuse.engine import parts
 from tofuse.apps.cli.parser import DEMO_SCENES, make_parser
 from tofuse.apps.jobs.pair import register_files
 from tofuse.apps.results.pair import pair_json
+from tofuse.engine import parts
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import Config, ViewKind, changed, from_method
-from tofuse.engine.quality.verdict import REASONS
+from tofuse.engine.results.verdicts import REASONS
 from tofuse.formats.export.conversion import convert
-from tofuse.formats.files.trajectory import read_tum
+from tofuse.formats.poses.trajectory import read_tum
 from tofuse.lab import demo
 from tofuse.lab.simulation.models import CAMERAS
 from written_run_json import run_json

@@ -15,8 +15,8 @@ from tofuse.engine.graph.build import Measured, build_graph
 from tofuse.engine.graph.covariances import GraphCovariances
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
-from tofuse.engine.quality import accuracy
-from tofuse.engine.quality.accuracy import (
+from tofuse.engine.quality import pose_accuracy as accuracy
+from tofuse.engine.quality.pose_accuracy import (
     Accuracy,
     ObservedErrors,
     accuracy_of,
@@ -24,7 +24,7 @@ from tofuse.engine.quality.accuracy import (
     degenerate_directions,
     without_degenerate,
 )
-from tofuse.engine.quality.trajectory import displacement
+from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.stored_views.view_store import PosedView
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions

@@ -9,9 +9,9 @@ import pytest
 
 from made_results import result
 from tofuse.apps.cli.program import main
-from tofuse.engine.quality.accuracy import Accuracy, WorstFrame
-from tofuse.engine.quality.accuracy_card import SEPARATOR, bound, card, length, weakest_frame
-from tofuse.engine.quality.types import Reason
+from tofuse.engine.quality.pose_accuracy import Accuracy, WorstFrame
+from tofuse.engine.results.accuracy_card import SEPARATOR, bound, card, length, weakest_frame
+from tofuse.engine.results.types import Reason
 
 KNOWN = Accuracy(0.0238, 0.004, 0.0038, True, WorstFrame(17, 0.0291, 0.006))
 

@@ -14,14 +14,14 @@ from tofuse.engine.graph.build import Measured, build_graph
 from tofuse.engine.graph.covariances import GraphCovariances
 from tofuse.engine.graph.external_sensors import SensorRecord
 from tofuse.engine.graph.graph import GraphPart, LoopRecord, Optimisation
-from tofuse.engine.quality.accuracy import Accuracy, ObservedErrors, accuracy_of
-from tofuse.engine.quality.checks import Evidence, judge, ranges_with_status
 from tofuse.engine.quality.cross_view import CrossViewConsistency, PairConsistency
-from tofuse.engine.quality.types import Component, FrameRecord, Reason
-from tofuse.engine.quality.verdict import ADVICE, REASONS, ranked, verdict_of
+from tofuse.engine.quality.pose_accuracy import Accuracy, ObservedErrors, accuracy_of
 from tofuse.engine.refinement.calibration_check import CalibrationCheck
 from tofuse.engine.refinement.loop_drift import Gap
 from tofuse.engine.refinement.refinement import Refinement
+from tofuse.engine.results.checks import Evidence, judge, ranges_with_status
+from tofuse.engine.results.types import Component, FrameRecord, Reason
+from tofuse.engine.results.verdicts import ADVICE, REASONS, ranked, verdict_of
 
 STEP = se3.exp(np.array([0.05, 0, 0, 0, 0.02, 0]))
 

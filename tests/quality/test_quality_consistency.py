@@ -29,7 +29,7 @@ from tofuse.engine.quality.consistency import (
     map_consistency,
     poses_of_frames,
 )
-from tofuse.formats.files.trajectory import write_tum
+from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.readers.native import NativeSource
 
 # A synthetic room, and poses in it -------------------------------------------------------------

@@ -14,7 +14,7 @@ from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry.quaternion import to_matrix
-from tofuse.formats.files.las import write_las
+from tofuse.formats.geometry.las import write_las
 
 
 def image(recording: tofuse.Recording, k: int) -> RangeFrame:

@@ -12,7 +12,7 @@ from tofuse.engine.cameras.cameras import BrownConrady, Camera, Pinhole, Rationa
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.formats.files.ply import write_ply
+from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.recordings.open import open_recording
 from tofuse.formats.recordings.organised import find_deprojection
 

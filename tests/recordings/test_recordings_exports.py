@@ -15,8 +15,8 @@ from made_exports import BEHIND_M, CAMERA
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.formats.files.ply import read_ply, write_ply
-from tofuse.formats.files.tiff import read_tiff
+from tofuse.formats.geometry.ply import read_ply, write_ply
+from tofuse.formats.images.tiff import read_tiff
 from tofuse.formats.recordings.open import open_recording
 
 Maker = Callable[[Path], None]

@@ -15,8 +15,8 @@ from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.formats.files.images import write_png
-from tofuse.formats.files.ply import write_ply
+from tofuse.formats.geometry.ply import write_ply
+from tofuse.formats.images.images import write_png
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording, readers
 

@@ -16,7 +16,7 @@ from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFr
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.noise.choice import noise_model_for
 from tofuse.engine.noise.model import NoiseModel, RangeLaw
-from tofuse.formats.files.images import read_image
+from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.formats.recordings.still import (

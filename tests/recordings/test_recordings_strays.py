@@ -17,12 +17,12 @@ import tofuse
 from made_recordings import make_sr4000
 from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.g2o import read_g2o
-from tofuse.formats.files.given_loops import read_loops
 from tofuse.formats.files.npz import read_npz
-from tofuse.formats.files.pose import read_pose
 from tofuse.formats.files.stamps import stamp, stamps_in
-from tofuse.formats.files.trajectory_formats import read_poses
+from tofuse.formats.poses.g2o import read_g2o
+from tofuse.formats.poses.given_loops import read_loops
+from tofuse.formats.poses.pose import read_pose
+from tofuse.formats.poses.trajectory_formats import read_poses
 from tofuse.formats.recordings.rig import read_rig
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="links and queues of other systems")

@@ -10,7 +10,7 @@ import pytest
 
 from aligned_surfaces import OPTIONS, path, surfaces
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory import displacement
+from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
     check_calibration,
@@ -209,9 +209,9 @@ def test_longest_loop_uses_consecutive_views_only():
 def test_kinect_loop_raises_alarm(shared_data):
     """Its intrinsics are wrong by 5 %, as box corners of 87 degrees confirm."""
     from tofuse.engine.mapping.config import changed, from_method
-    from tofuse.engine.mapping.progress import Silent
     from tofuse.engine.mapping.reconstruction import reconstruct
     from tofuse.engine.mapping.self_calibration import self_calibrated
+    from tofuse.engine.progress import Silent
     from tofuse.formats.recordings.open import open_recording
 
     recording = open_recording(shared_data / "kinectv2_loop" / "recording")

@@ -13,7 +13,7 @@ from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.build import build_graph
 from tofuse.engine.graph.covariances import GraphCovariances
-from tofuse.engine.quality.accuracy import ObservedErrors, accuracy_of
+from tofuse.engine.quality.pose_accuracy import ObservedErrors, accuracy_of
 from tofuse.engine.refinement.joint_alignment import Bodies, refine, spread_evenly
 from tofuse.engine.refinement.refinement import Joint, NoRefinement, propagate_poses, without_errors
 from tofuse.engine.stored_views import pair_equation_kernels as kernels

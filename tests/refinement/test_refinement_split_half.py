@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aligned_surfaces import OPTIONS, SHARP, corner, path
-from tofuse.engine.quality.trajectory import displacement
+from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement.joint_alignment import refine
 from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.refinement.split_half import split_half_errors

@@ -20,9 +20,9 @@ from tofuse.apps.results.loading import load_result
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import frames_in_main_model, plain, read_run_json
 from tofuse.engine.errors import InputError, OutputError
-from tofuse.engine.quality.types import FrameRecord
-from tofuse.formats.files.pcd import read_pcd
+from tofuse.engine.results.types import FrameRecord
 from tofuse.formats.files.staging import beside
+from tofuse.formats.geometry.pcd import read_pcd
 from wavy_surface import waves
 from written_run_json import run_json
 

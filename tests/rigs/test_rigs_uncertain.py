@@ -1,7 +1,7 @@
 """A static rig whose calibration is uncertain is marked as such, not as a badly tracked camera."""
 
 from tofuse.apps.rigs.run import _calibration_reason
-from tofuse.engine.quality.types import Reason
+from tofuse.engine.results.types import Reason
 
 
 def test_uncertain_poses_of_static_cameras_are_attributed_to_rig() -> None:

@@ -25,7 +25,7 @@ from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.rough import with_rough_planes
 from tofuse.engine.views.surface_options import SurfaceOptions
-from tofuse.formats.files.trajectory import read_tum
+from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate_recording

@@ -17,7 +17,7 @@ from tofuse.apps.jobs.running import run
 from tofuse.apps.viewer.coverage import Coverage
 from tofuse.apps.viewer.server import serve, stop
 from tofuse.engine.frames.frames import CloudFrame
-from tofuse.engine.mapping.progress import Silent
+from tofuse.engine.progress import Silent
 
 needs_viser = pytest.mark.skipif(
     importlib.util.find_spec("viser") is None, reason="viser is not installed"
@@ -59,7 +59,7 @@ class Recorder(Silent):
 def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser, monkeypatch):
     from tofuse.apps.viewer.live_view import LiveView
     from tofuse.apps.viewer.server import address
-    from tofuse.engine.mapping.progress import CombinedProgress
+    from tofuse.engine.progress import CombinedProgress
 
     same = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply")
     quick = {"end": 4, "method": "thesis"}

@@ -12,8 +12,8 @@ from typing import Any
 from tofuse.apps.jobs import Options, resolve, run
 from tofuse.apps.results import RECORDING, OutputFolder, is_result
 from tofuse.engine.errors import OutputError
-from tofuse.engine.mapping import Progress, Silent
-from tofuse.engine.quality import Reconstruction
+from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.results import Reconstruction
 from tofuse.formats.files import replacing_folder, write_text
 from tofuse.lab.simulation import Effects, Passing, simulate
 

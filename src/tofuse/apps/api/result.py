@@ -24,9 +24,10 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Foreground
 from tofuse.engine.frames import Recording
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import Config, Progress, adapted, changed, from_method, view_kind
+from tofuse.engine.mapping import Config, adapted, changed, from_method, view_kind
 from tofuse.engine.mapping import reconstruct as reconstruct_recording
-from tofuse.engine.quality import SEPARATOR, Reconstruction, card
+from tofuse.engine.progress import Progress
+from tofuse.engine.results import SEPARATOR, Reconstruction, card
 
 if TYPE_CHECKING:
     from tofuse.apps.viewer import ReportServer

@@ -124,7 +124,7 @@ def _html(
 
 
 def _row(job: Job, record: Record, folder: BatchFolder) -> Row:
-    from tofuse.engine.quality import length
+    from tofuse.engine.results import length
 
     done = record.state == "done"
     accuracy = ""

@@ -23,7 +23,7 @@ from tofuse.apps.cli.progress import (
     escaped,
     progress_for,
 )
-from tofuse.engine.quality import Reason, Reconstruction
+from tofuse.engine.results import Reason, Reconstruction
 from tofuse.formats.files import write_noise
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def _run_live(arguments: argparse.Namespace, options: Options) -> int:
     from tofuse.apps.jobs import exit_status
     from tofuse.apps.jobs import run as run_pipeline
     from tofuse.apps.viewer import LiveView, address, serve, stop
-    from tofuse.engine.mapping import CombinedProgress
+    from tofuse.engine.progress import CombinedProgress
 
     server = serve(arguments.port)
     try:
@@ -367,7 +367,7 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
         session_sentences,
     )
     from tofuse.engine.frames import in_words
-    from tofuse.engine.quality import SEPARATOR, card
+    from tofuse.engine.results import SEPARATOR, card
 
     d = result.diagnostics
     sessions = session_sentences(result)
@@ -421,7 +421,7 @@ def _print_warnings(console: Console, warnings: Iterable[str]) -> None:
 
 
 def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
-    from tofuse.engine.quality import ADVICE, REASONS, ranked
+    from tofuse.engine.results import ADVICE, REASONS, ranked
 
     for reason in ranked(reasons):
         level = REASONS[reason.code][0]
@@ -637,7 +637,7 @@ def optimize(arguments: argparse.Namespace) -> int:
     """``tofuse optimize``."""
     from tofuse.apps.calibration import check_new
     from tofuse.engine.mapping import changed, from_method
-    from tofuse.formats.files import read_g2o, write_g2o
+    from tofuse.formats.poses import read_g2o, write_g2o
 
     check_new(arguments.out, overwrite=arguments.overwrite)
     config = from_method("default", "range")

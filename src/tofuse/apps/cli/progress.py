@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Column
 
-from tofuse.engine.mapping import Silent
-from tofuse.engine.quality import FrameRecord
+from tofuse.engine.progress import Silent
+from tofuse.engine.results import FrameRecord
 
 _WINDOW = 30  # steps from whose rate the remaining time is estimated
 _GOOD_FRACTION = 0.8  # inliers

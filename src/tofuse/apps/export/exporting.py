@@ -28,16 +28,9 @@ from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion import GeometryRecord, Mesh, baked
 from tofuse.formats.export import exchange
-from tofuse.formats.files import (
-    associate,
-    jpeg_bytes,
-    make_folder,
-    read_tum,
-    replacing_folder,
-    stamp,
-    write_kitti,
-    write_log,
-)
+from tofuse.formats.files import make_folder, replacing_folder, stamp
+from tofuse.formats.images import jpeg_bytes
+from tofuse.formats.poses import associate, read_tum, write_kitti, write_log
 
 # Default number of triangles, and the maximum size of a .glb with their texture.
 FACES = 60_000

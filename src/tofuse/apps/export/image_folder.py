@@ -27,7 +27,8 @@ from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.fusion import TextureView
 from tofuse.engine.noise import noise_model_for
 from tofuse.engine.sensor import CameraErrors, Corrector
-from tofuse.formats.files import make_folder, write_png
+from tofuse.formats.files import make_folder
+from tofuse.formats.images import write_png
 from tofuse.formats.recordings import FileSource, Rectifier, pinhole_of
 
 DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # m per count

@@ -22,7 +22,9 @@ from tofuse.apps.export.image_folder import (
 from tofuse.engine.cameras import DISTORTION_ORDER, BrownConrady, Camera, Fisheye, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files import OPENGL, write_ply, write_text
+from tofuse.formats.files import write_text
+from tofuse.formats.geometry import write_ply
+from tofuse.formats.poses import OPENGL
 
 _FILES = {"file_path": IMAGES, "depth_file_path": DEPTH, "sigma_file_path": SIGMA}
 

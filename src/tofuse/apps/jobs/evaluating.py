@@ -16,14 +16,14 @@ from tofuse.engine.frames import Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality import (
     Consistency,
-    Reconstruction,
     TrajectoryError,
     evaluate_trajectory,
     map_consistency,
     poses_of_frames,
 )
+from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors, Corrector
-from tofuse.formats.files import Clock, TimedPoses, read_poses
+from tofuse.formats.poses import Clock, TimedPoses, read_poses
 from tofuse.formats.recordings import open_recording, read_reference
 
 Poses = str | Path | Float64 | Reconstruction

@@ -31,8 +31,6 @@ from tofuse.engine.frames import POSES_BY, Range, Recording, evenly_spaced, in_w
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import (
     Config,
-    Progress,
-    Silent,
     check_views,
     from_method,
     reconstruct_with_views,
@@ -40,35 +38,38 @@ from tofuse.engine.mapping import (
     with_odometry,
 )
 from tofuse.engine.parts import check_number
+from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import (
     Accuracy,
     Consistency,
     CrossViewConsistency,
     Deviation,
-    Reason,
-    Reconstruction,
-    Verdict,
     WorstFrame,
-    accuracy_reasons,
-    bound,
     compare_views,
-    cross_view_reasons,
     displacement,
     distances_between,
     fitted,
-    length,
     map_consistency,
     measured_pairs,
     prepare_for_comparison,
+)
+from tofuse.engine.quality import deviation as deviation_of
+from tofuse.engine.results import (
+    Reason,
+    Reconstruction,
+    Verdict,
+    accuracy_reasons,
+    bound,
+    cross_view_reasons,
+    length,
     ranked,
     tolerance_of,
     verdict_of,
 )
-from tofuse.engine.quality import deviation as deviation_of
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import FrameTime, GivenPoses, find_jumps
 from tofuse.engine.views import PreparedView
-from tofuse.formats.files import TimedPoses, read_poses
+from tofuse.formats.poses import TimedPoses, read_poses
 from tofuse.formats.recordings import Opening, OpeningOptions, read_reference
 
 Views = Sequence[PosedView[PreparedView]]

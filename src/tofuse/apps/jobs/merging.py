@@ -28,22 +28,15 @@ from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import (
     Config,
     Mapper,
-    Progress,
-    Silent,
     from_method,
     make_texture,
     push_frames,
     with_recording_facts,
 )
 from tofuse.engine.parts import check_number
-from tofuse.engine.quality import (
-    Reason,
-    Reconstruction,
-    SessionRecord,
-    align,
-    in_main_model,
-    verdict_of,
-)
+from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.quality import align
+from tofuse.engine.results import Reason, Reconstruction, SessionRecord, in_main_model, verdict_of
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import GivenPoses, StatedPose, StatedPoses
 from tofuse.engine.views import PreparedView

@@ -17,8 +17,8 @@ from tofuse.engine.compute import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping import Progress, Silent
-from tofuse.formats.files import read_pose
+from tofuse.engine.progress import Progress, Silent
+from tofuse.formats.poses import read_pose
 from tofuse.formats.recordings import SingleView, open_view
 
 # Clouds farther from the origin are centred first: rotation errors would have long lever arms.

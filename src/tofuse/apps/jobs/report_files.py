@@ -16,8 +16,8 @@ from tofuse.engine.frames import CloudFrame, Frame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Config, changed, past_frames
 from tofuse.engine.parts import name_of
-from tofuse.engine.quality import Reconstruction
-from tofuse.formats.files import read_ply
+from tofuse.engine.results import Reconstruction
+from tofuse.formats.geometry import read_ply
 
 _DRAWN_CLOUDS = 12  # views in the report, if they are clouds
 _TRUTH_POINTS = 100_000

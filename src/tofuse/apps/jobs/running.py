@@ -25,20 +25,12 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.engine.fusion import Textured
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import (
-    Config,
-    Progress,
-    Silent,
-    Stopwatch,
-    adapted,
-    make_texture,
-    reconstruct,
-    view_kind,
-    with_prior,
-)
-from tofuse.engine.quality import Reason, Reconstruction, in_main_model, ranked, verdict_of
+from tofuse.engine.mapping import Config, adapted, make_texture, reconstruct, view_kind, with_prior
+from tofuse.engine.progress import Progress, Silent, Stopwatch
+from tofuse.engine.results import Reason, Reconstruction, in_main_model, ranked, verdict_of
 from tofuse.engine.sensor import Unwrap
-from tofuse.formats.files import read_loops, stamps_of
+from tofuse.formats.files import stamps_of
+from tofuse.formats.poses import read_loops
 from tofuse.formats.recordings import Opening
 
 

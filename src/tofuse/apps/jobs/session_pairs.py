@@ -11,15 +11,8 @@ import numpy as np
 from tofuse.apps.results import MAX_STATED_PROBABILITY
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import evenly_spaced
-from tofuse.engine.quality import (
-    CrossViewConsistency,
-    Reconstruction,
-    SessionChange,
-    SessionPair,
-    SessionRecord,
-    changes,
-    compare_views,
-)
+from tofuse.engine.quality import CrossViewConsistency, changes, compare_views
+from tofuse.engine.results import Reconstruction, SessionChange, SessionPair, SessionRecord
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.views import PreparedView
 

@@ -25,7 +25,8 @@ from tofuse.apps.results import (
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
-from tofuse.engine.mapping import Config, Progress, adapted, changed, from_method, kind_of
+from tofuse.engine.mapping import Config, adapted, changed, from_method, kind_of
+from tofuse.engine.progress import Progress
 from tofuse.engine.tracking import GivenPoses, Keyframes, StatedPose, Status
 from tofuse.formats.files import path_of
 from tofuse.formats.recordings import Opening

@@ -11,7 +11,7 @@ from typing import Any
 from tofuse._version import __version__
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.policy import secured
-from tofuse.engine.quality import Reconstruction
+from tofuse.engine.results import Reconstruction
 from tofuse.formats.files import write_text
 
 # Files of the pages' script; each uses functions of the previous ones.

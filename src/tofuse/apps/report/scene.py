@@ -13,7 +13,7 @@ from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
 from tofuse.engine.fusion import Cloud, Mesh, display_colors
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality import Reconstruction
+from tofuse.engine.results import Reconstruction
 
 MAX_POINTS = 150_000
 MAX_FACES = 300_000

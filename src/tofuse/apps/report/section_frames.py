@@ -12,7 +12,7 @@ from tofuse.apps.report.section_parts import component_color
 from tofuse.apps.report.subject import ROWS, Subject, Values
 from tofuse.engine.compute import trim_memory
 from tofuse.engine.frames import Frame, RangeFrame
-from tofuse.engine.quality import Component, FrameRecord, in_main_model
+from tofuse.engine.results import Component, FrameRecord, in_main_model
 
 _STRIP = 600  # cells in the strip of frames
 _THUMBNAIL, _FILTER = (220, 165), (320, 240)  # px

@@ -11,7 +11,7 @@ from tofuse.apps.results import CHANGE_COLORS, component_name, probability_text
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import numbers
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality import Component, SessionChange, SessionPair
+from tofuse.engine.results import Component, SessionChange, SessionPair
 from tofuse.formats.recordings import RigCamera
 
 _COLORS = 6  # of components in the style sheet; further ones reuse them

@@ -17,7 +17,7 @@ from tofuse.apps.report import (
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.subject import Subject, Values
 from tofuse.engine.compute import job_pool
-from tofuse.engine.quality import Reconstruction, bound, weakest_frame
+from tofuse.engine.results import Reconstruction, bound, weakest_frame
 
 Section = Callable[[Subject], Values | None]
 

@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.scene import Scene, finite_poses, make_scene
 from tofuse.engine.arrays import Float64
-from tofuse.engine.quality import Reconstruction
+from tofuse.engine.results import Reconstruction
 
 Values = dict[str, Any]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.frames import Range, in_words, size
-from tofuse.engine.quality import ADVICE, REASONS, Reason, Reconstruction, ranked
+from tofuse.engine.results import ADVICE, REASONS, Reason, Reconstruction, ranked
 
 STATUSES = ("tracked", "predicted", "lost", "skipped")
 

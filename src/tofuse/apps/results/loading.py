@@ -18,8 +18,8 @@ from tofuse.apps.results.run_json import (
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh, mesh_of
 from tofuse.engine.graph import GraphPart, LoopRecord, SensorRecord
-from tofuse.engine.quality import (
-    Accuracy,
+from tofuse.engine.quality import Accuracy, WorstFrame
+from tofuse.engine.results import (
     Component,
     Diagnostics,
     FrameRecord,
@@ -28,9 +28,10 @@ from tofuse.engine.quality import (
     SelfCalibration,
     SessionPair,
     SessionRecord,
-    WorstFrame,
 )
-from tofuse.formats.files import path_of, read_g2o, read_ply
+from tofuse.formats.files import path_of
+from tofuse.formats.geometry import read_ply
+from tofuse.formats.poses import read_g2o
 from tofuse.formats.readers import read_las
 
 

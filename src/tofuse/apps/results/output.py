@@ -13,8 +13,10 @@ from tofuse.apps.results.folder import OutputFolder, component_name
 from tofuse.apps.results.run_json import write_run_json
 from tofuse.engine.compute import job_pool
 from tofuse.engine.fusion import GeometryRecord, Mesh, Textured, display_colors
-from tofuse.engine.quality import Reconstruction
-from tofuse.formats.files import png_bytes, write_g2o, write_glb, write_obj, write_ply, write_tum
+from tofuse.engine.results import Reconstruction
+from tofuse.formats.geometry import write_glb, write_obj, write_ply
+from tofuse.formats.images import png_bytes
+from tofuse.formats.poses import write_g2o, write_tum
 
 # Colours of surfaces that changed between sessions, distinguishable by colour-blind people.
 CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}

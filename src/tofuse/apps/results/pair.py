@@ -20,7 +20,9 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import pose_text, write_ply, write_text
+from tofuse.formats.files import write_text
+from tofuse.formats.geometry import write_ply
+from tofuse.formats.poses import pose_text
 from tofuse.formats.recordings import MAP_COORDINATES_M, SingleView
 
 MARKER = "registration.json"

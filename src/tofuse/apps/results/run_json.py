@@ -16,9 +16,11 @@ from tofuse.apps.results.folder import is_result
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality import Accuracy, FrameRecord, Reason, Reconstruction, SelfCalibration
+from tofuse.engine.quality import Accuracy
 from tofuse.engine.refinement import CalibrationCheck, Refinement
-from tofuse.formats.files import damage_reported, parsed, read_text, read_tum
+from tofuse.engine.results import FrameRecord, Reason, Reconstruction, SelfCalibration
+from tofuse.formats.files import damage_reported, parsed, read_text
+from tofuse.formats.poses import read_tum
 
 
 def write_run_json(path: Path, result: Reconstruction) -> None:

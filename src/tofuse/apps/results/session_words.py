@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tofuse.engine.quality import Reconstruction, SessionPair
+from tofuse.engine.results import Reconstruction, SessionPair
 
 # Higher probabilities can't be justified by any model.
 MAX_STATED_PROBABILITY = 0.999

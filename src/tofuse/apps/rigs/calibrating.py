@@ -16,7 +16,7 @@ from tofuse.apps.rigs.moving_rig import MovingRig, calibrate_moving
 from tofuse.apps.rigs.static_rig import StaticRig, calibrate_static, is_static
 from tofuse.engine.compute import threads as using_threads
 from tofuse.engine.errors import InputError
-from tofuse.engine.mapping import Progress, Silent
+from tofuse.engine.progress import Progress, Silent
 from tofuse.formats.recordings import Disagreement, Rig, RigCamera
 
 Motion = Literal["auto", "still", "moving"]

@@ -18,9 +18,10 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping import Progress, Silent, reconstruct
-from tofuse.engine.quality import Reconstruction
+from tofuse.engine.mapping import reconstruct
+from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import Priors, propagate_poses, refine, refined_by_halves
+from tofuse.engine.results import Reconstruction
 from tofuse.engine.stored_views import RefineOptions, SampledView
 
 # Number of views of each camera that are refined jointly, and of their points.

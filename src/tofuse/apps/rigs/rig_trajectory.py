@@ -19,8 +19,8 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured
-from tofuse.engine.mapping import Progress, Silent, reconstruct
-from tofuse.engine.quality import Reconstruction
+from tofuse.engine.mapping import reconstruct
+from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import (
     Bodies,
     pairwise_measurements,
@@ -28,6 +28,7 @@ from tofuse.engine.refinement import (
     refine,
     support_fell,
 )
+from tofuse.engine.results import Reconstruction
 from tofuse.engine.stored_views import RefineOptions, SampledView, Spacing
 from tofuse.formats.recordings import RigCamera, RigSource
 

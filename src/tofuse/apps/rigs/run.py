@@ -23,18 +23,14 @@ from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured
 from tofuse.engine.loops import Nearby
-from tofuse.engine.mapping import Config, Progress, Silent, reconstruct, with_odometry
-from tofuse.engine.quality import (
-    UNOBSERVED_ERROR_FACTOR,
-    Reason,
-    Reconstruction,
-    ranked,
-    verdict_of,
-)
+from tofuse.engine.mapping import Config, reconstruct, with_odometry
+from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.quality import UNOBSERVED_ERROR_FACTOR
 from tofuse.engine.refinement import AlreadyRefined, NoRefinement
+from tofuse.engine.results import Reason, Reconstruction, ranked, verdict_of
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.tracking import GivenPoses
-from tofuse.formats.files import write_tum
+from tofuse.formats.poses import write_tum
 from tofuse.formats.recordings import Disagreement, Rig, RigSource, read_rig, recordings_of
 
 # No loops are searched: poses of the rig are final.

@@ -27,9 +27,9 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.filters import BackgroundSurface, background_surface
 from tofuse.engine.frames import RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping import Progress
 from tofuse.engine.noise import noise_model_for
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
+from tofuse.engine.progress import Progress
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.views import PreparedView
 from tofuse.formats.recordings import average_of, change_between

@@ -15,7 +15,7 @@ from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import from_matrix, se3
 from tofuse.engine.normal import OF_95_PERCENT
-from tofuse.engine.quality import FrameRecord
+from tofuse.engine.results import FrameRecord
 
 if TYPE_CHECKING:
     from viser import ViserServer

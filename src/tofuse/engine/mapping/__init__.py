@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from tofuse.engine.mapping.mapper import Mapper
     from tofuse.engine.mapping.methods import default
     from tofuse.engine.mapping.priors import Prior, with_odometry, with_prior
-    from tofuse.engine.mapping.progress import CombinedProgress, Progress, Silent, Stopwatch
     from tofuse.engine.mapping.reconstruction import (
         past_frames,
         push_frames,

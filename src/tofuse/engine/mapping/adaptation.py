@@ -14,10 +14,10 @@ from tofuse.engine.filters import Confidence, Filter
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.mapping.config import Config, check_views, kind_of
 from tofuse.engine.mapping.falloff import RANGE, estimate_falloff
-from tofuse.engine.mapping.progress import Progress, Silent
 from tofuse.engine.mapping.trial import Prepare, trial
 from tofuse.engine.noise import NOISE, NoiseModel, noise_model_for
 from tofuse.engine.parts import name_of
+from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.sensor import Correction, Noise
 from tofuse.engine.tracking import GivenPoses, Keyframes
 from tofuse.engine.views import RAW_RANGE_FALLOFF

@@ -14,8 +14,8 @@ from tofuse.engine.mapping.backend import BackEnd
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog, poses_in_world
 from tofuse.engine.mapping.observations import Observations
-from tofuse.engine.mapping.progress import Progress, Stopwatch
-from tofuse.engine.quality import Component, Reconstruction
+from tofuse.engine.progress import Progress, Stopwatch
+from tofuse.engine.results import Component, Reconstruction
 
 # An unconnected component gets its own model if it has more frames than this.
 _MAX_WITHOUT_MODEL = 5

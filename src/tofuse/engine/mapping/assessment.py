@@ -28,21 +28,15 @@ from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.parts import name_of
 from tofuse.engine.quality import (
     Accuracy,
-    Component,
     CrossViewConsistency,
-    Evidence,
-    FrameRecord,
     ObservedErrors,
-    Reason,
-    Verdict,
     accuracy_of,
     covariances_of,
     cross_view_consistency,
     displacement,
-    judge,
-    ranked,
 )
 from tofuse.engine.refinement import CalibrationCheck, Refinement
+from tofuse.engine.results import Component, Evidence, FrameRecord, Reason, Verdict, judge, ranked
 from tofuse.engine.sensor import CameraErrors
 from tofuse.engine.tracking import GivenPoses
 

@@ -26,10 +26,10 @@ from tofuse.engine.mapping.assessment import Assessment
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.observations import Observations
-from tofuse.engine.mapping.progress import Progress, Stopwatch
 from tofuse.engine.mapping.stage_results import Optimised, Refined, VisualEvidence
 from tofuse.engine.mapping.tracked_graph import TrackedGraph
-from tofuse.engine.quality import Component, Diagnostics, Reconstruction
+from tofuse.engine.progress import Progress, Stopwatch
+from tofuse.engine.results import Component, Diagnostics, Reconstruction
 
 # Maximum number of repeated loop searches along a long trajectory.
 _MAX_SEARCHES = 2

@@ -15,7 +15,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.graph import SensorData
 from tofuse.engine.loops import TrackedComponent
 from tofuse.engine.mapping.config import ViewKind, kind_of
-from tofuse.engine.quality import FrameRecord
+from tofuse.engine.results import FrameRecord
 from tofuse.engine.stored_views import ViewStore
 from tofuse.engine.tracking import Step
 from tofuse.engine.views import PreparedView

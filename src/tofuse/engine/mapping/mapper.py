@@ -17,9 +17,9 @@ from tofuse.engine.mapping.frame_log import FrameLog, FrameSequence, record_of
 from tofuse.engine.mapping.live_poses import LivePoses
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.preparation import FilteredFrame, Preparation, Prepared
-from tofuse.engine.mapping.progress import Progress, Silent, Stopwatch
 from tofuse.engine.parts import check_number
-from tofuse.engine.quality import FrameRecord, Reconstruction
+from tofuse.engine.progress import Progress, Silent, Stopwatch
+from tofuse.engine.results import FrameRecord, Reconstruction
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import FrameTime, Step, Tracker
 from tofuse.engine.views import PreparedView

@@ -19,9 +19,9 @@ from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config, ViewKind, from_method, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.mapping.progress import Progress, Silent
 from tofuse.engine.mapping.self_calibration import self_calibrated
-from tofuse.engine.quality import Reconstruction
+from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.results import Reconstruction
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import Tracker
 from tofuse.engine.views import PreparedView

@@ -17,8 +17,10 @@ from dataclasses import replace
 import numpy as np
 
 from tofuse.engine.mapping.config import Config
-from tofuse.engine.mapping.progress import Progress
-from tofuse.engine.quality import (
+from tofuse.engine.progress import Progress
+from tofuse.engine.refinement import CalibrationCheck
+from tofuse.engine.refinement import in_words as errors_in_words
+from tofuse.engine.results import (
     Diagnostics,
     Reason,
     Reconstruction,
@@ -26,8 +28,6 @@ from tofuse.engine.quality import (
     length,
     ranked,
 )
-from tofuse.engine.refinement import CalibrationCheck
-from tofuse.engine.refinement import in_words as errors_in_words
 from tofuse.engine.sensor import FIELDS, CameraErrors
 
 # The first estimate uses poses that the error has distorted, the second one does not.

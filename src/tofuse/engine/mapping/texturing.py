@@ -10,8 +10,8 @@ from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.fusion import Textured, TextureView, textured
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.progress import Progress, Silent
-from tofuse.engine.quality import Reconstruction
+from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors
 
 # Maximum number of views and of textured triangles: more improve little, and unwrap slowly.

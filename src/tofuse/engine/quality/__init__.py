@@ -6,25 +6,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.quality import samples
-    from tofuse.engine.quality.accuracy import (
-        UNOBSERVED_ERROR_FACTOR,
-        Accuracy,
-        ObservedErrors,
-        WorstFrame,
-        accuracy_of,
-        covariances_of,
-        degenerate_directions,
-        without_degenerate,
-    )
-    from tofuse.engine.quality.accuracy_card import SEPARATOR, bound, card, length, weakest_frame
-    from tofuse.engine.quality.change_detection import changes
-    from tofuse.engine.quality.checks import (
-        Evidence,
-        accuracy_reasons,
-        cross_view_reasons,
-        judge,
-        tolerance_of,
-    )
+    from tofuse.engine.quality.change_detection import Change, changes
     from tofuse.engine.quality.consistency import Consistency, map_consistency, poses_of_frames
     from tofuse.engine.quality.cross_view import (
         CrossViewConsistency,
@@ -34,9 +16,19 @@ if TYPE_CHECKING:
         restore_thinned,
     )
     from tofuse.engine.quality.pair_measurements import measured_pairs
+    from tofuse.engine.quality.pose_accuracy import (
+        UNOBSERVED_ERROR_FACTOR,
+        Accuracy,
+        ObservedErrors,
+        WorstFrame,
+        accuracy_of,
+        covariances_of,
+        degenerate_directions,
+        without_degenerate,
+    )
     from tofuse.engine.quality.pose_deviation import Deviation, deviation, fitted
     from tofuse.engine.quality.samples import FrameSample, FrameSamples
-    from tofuse.engine.quality.trajectory import (
+    from tofuse.engine.quality.trajectory_errors import (
         MAX_GAP_S,
         TrajectoryError,
         align,
@@ -44,19 +36,5 @@ if TYPE_CHECKING:
         distances_between,
         evaluate_trajectory,
     )
-    from tofuse.engine.quality.types import (
-        Component,
-        Diagnostics,
-        FrameRecord,
-        Reason,
-        Reconstruction,
-        SelfCalibration,
-        SessionChange,
-        SessionPair,
-        SessionRecord,
-        Verdict,
-        in_main_model,
-    )
-    from tofuse.engine.quality.verdict import ADVICE, REASONS, ranked, verdict_of
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -33,7 +33,7 @@ from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory import finite_or_none
+from tofuse.engine.quality.trajectory_errors import finite_or_none
 from tofuse.engine.quality.view_agreement_kernels import (
     agreement_sums,
     project_by_lens,

@@ -11,7 +11,7 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured, PoseGraph, build_graph
-from tofuse.engine.quality.accuracy import without_degenerate
+from tofuse.engine.quality.pose_accuracy import without_degenerate
 from tofuse.engine.refinement import spread_evenly
 from tofuse.engine.stored_views import PosedView, RefineOptions, SampledView, overlaps
 from tofuse.engine.views import PreparedView

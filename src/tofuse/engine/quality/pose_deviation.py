@@ -29,8 +29,8 @@ from tofuse.engine.alignment import UNITS
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import GraphCovariances, PairSystem, PoseGraph, Settings, Solution, solve
-from tofuse.engine.quality.accuracy import ObservedErrors, accuracy_of
-from tofuse.engine.quality.trajectory import align
+from tofuse.engine.quality.pose_accuracy import ObservedErrors, accuracy_of
+from tofuse.engine.quality.trajectory_errors import align
 
 _CONFIDENCE = 0.95
 # Of a chi-square variable with six degrees of freedom: its median, and Huber's threshold.

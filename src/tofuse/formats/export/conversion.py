@@ -17,14 +17,9 @@ from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import MAX_COUNTS, CloudFrame, Frame, RangeFrame, Recording
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.files import (
-    make_folder,
-    new_folder,
-    write_log,
-    write_png,
-    write_text,
-    write_tum,
-)
+from tofuse.formats.files import make_folder, new_folder, write_text
+from tofuse.formats.images import write_png
+from tofuse.formats.poses import write_log, write_tum
 from tofuse.formats.readers import NativeSource
 from tofuse.formats.recordings import (
     SCHEMA,

@@ -12,10 +12,8 @@ from tofuse._version import __version__
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord, display_colors
-from tofuse.formats.files import (
-    path_of,
-    required_package,
-    write_bytes,
+from tofuse.formats.files import path_of, required_package, write_bytes
+from tofuse.formats.geometry import (
     write_e57,
     write_glb,
     write_gltf,

@@ -11,7 +11,8 @@ import numpy as np
 from tofuse.engine.arrays import Float32, UInt8
 from tofuse.engine.frames import RangeFrame, depth_from_numbers
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_named, is_file, read_raw
+from tofuse.formats.files import files_named, is_file
+from tofuse.formats.images import read_raw
 from tofuse.formats.recordings import (
     UNCERTAIN,
     FileSource,

@@ -19,7 +19,8 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import check_pose, orthonormalise
 from tofuse.engine.parts import part
-from tofuse.formats.files import MAGIC, Block, Matroska, Track, as_color, associate, parse_image
+from tofuse.formats.images import MAGIC, Block, Matroska, Track, as_color, parse_image
+from tofuse.formats.poses import associate
 from tofuse.formats.recordings import (
     ColorCamera,
     FileSource,

@@ -11,7 +11,8 @@ from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.parts import part
-from tofuse.formats.files import Pcd, parse_numbers, read_numbers, read_pcd, read_text
+from tofuse.formats.files import parse_numbers, read_numbers, read_text
+from tofuse.formats.geometry import Pcd, read_pcd
 from tofuse.formats.recordings import (
     SAMPLES,
     CloudFileSource,

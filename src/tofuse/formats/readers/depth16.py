@@ -8,7 +8,8 @@ import numpy as np
 
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_named, if_file, is_file, read_color, read_raw
+from tofuse.formats.files import files_named, if_file, is_file
+from tofuse.formats.images import read_color, read_raw
 from tofuse.formats.recordings import (
     UNCERTAIN,
     FileSource,

@@ -8,7 +8,8 @@ import numpy as np
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_with, is_file, read_header
+from tofuse.formats.files import files_with, is_file
+from tofuse.formats.images import read_header
 from tofuse.formats.recordings import CERTAIN, DepthImageSource, Reader, ReaderOptions, Sniff
 
 

@@ -16,7 +16,8 @@ from tofuse.engine.frames import RangeFrame
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import MAX_COORDINATE_M
 from tofuse.engine.parts import part
-from tofuse.formats.files import is_file, is_folder, parse_numbers, read_pcd, read_ply, read_text
+from tofuse.formats.files import is_file, is_folder, parse_numbers, read_text
+from tofuse.formats.geometry import read_pcd, read_ply
 from tofuse.formats.recordings import (
     SAMPLES,
     CloudFileSource,

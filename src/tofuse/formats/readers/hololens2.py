@@ -15,15 +15,8 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_from_counts
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.formats.files import (
-    input_error,
-    is_file,
-    is_folder,
-    list_folder,
-    parse_pgm,
-    read_numbers,
-    read_raw,
-)
+from tofuse.formats.files import input_error, is_file, is_folder, list_folder, read_numbers
+from tofuse.formats.images import parse_pgm, read_raw
 from tofuse.formats.recordings import (
     PER_FRAME,
     FileSource,

@@ -18,15 +18,8 @@ from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.files import (
-    BEGIN,
-    Chunk,
-    chunk_image,
-    pcic_frames,
-    read_bytes,
-    read_head,
-    required_package,
-)
+from tofuse.formats.files import read_bytes, read_head, required_package
+from tofuse.formats.images import BEGIN, Chunk, chunk_image, pcic_frames
 from tofuse.formats.recordings import (
     MAX_SLOPE,
     FileSource,

@@ -17,16 +17,14 @@ from tofuse.engine.frames import Frame, depth_from_counts
 from tofuse.engine.parts import part
 from tofuse.engine.sensor import DISAGREEMENT, SPEED_OF_LIGHT, DepthCorrection, combined
 from tofuse.formats.files import (
-    check_first_size,
     files_with,
     is_file,
     is_folder,
     list_folder,
-    read_color,
     read_columns,
-    read_image,
     read_text,
 )
+from tofuse.formats.images import check_first_size, read_color, read_image
 from tofuse.formats.recordings import (
     CERTAIN,
     LENS_COLUMNS,

@@ -14,7 +14,9 @@ from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_from_counts, depth_from_numbers
 from tofuse.engine.parts import part
-from tofuse.formats.files import OPENGL, is_file, name_order, read_color, read_head, read_image
+from tofuse.formats.files import is_file, name_order, read_head
+from tofuse.formats.images import read_color, read_image
+from tofuse.formats.poses import OPENGL
 from tofuse.formats.recordings import (
     PER_FRAME,
     FileSource,

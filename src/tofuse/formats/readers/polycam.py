@@ -11,7 +11,8 @@ from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.frames import POSES_BY
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_with, first_size, if_file, is_file, is_folder
+from tofuse.formats.files import files_with, if_file, is_file, is_folder
+from tofuse.formats.images import first_size
 from tofuse.formats.recordings import (
     CONFIDENCE_MAX,
     PER_FRAME,

@@ -18,17 +18,14 @@ from tofuse.engine.frames import POSES_BY, RangeFrame, depth_from_numbers
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
 from tofuse.formats.files import (
-    as_color,
     files_named,
     input_error,
     is_file,
     is_folder,
-    lzfse_decompress,
-    parse_exr,
-    parse_image,
     read_bytes,
     required_package,
 )
+from tofuse.formats.images import as_color, lzfse_decompress, parse_exr, parse_image
 from tofuse.formats.recordings import (
     ARKIT_AXES,
     CONFIDENCE_MAX,

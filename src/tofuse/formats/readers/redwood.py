@@ -11,7 +11,9 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_with, first_size, is_file, is_folder, read_poses, read_text
+from tofuse.formats.files import files_with, is_file, is_folder, read_text
+from tofuse.formats.images import first_size
+from tofuse.formats.poses import read_poses
 from tofuse.formats.recordings import (
     UNCERTAIN,
     DepthImageSource,

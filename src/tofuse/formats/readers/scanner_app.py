@@ -13,7 +13,8 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_named, first_size, if_file, is_file
+from tofuse.formats.files import files_named, if_file, is_file
+from tofuse.formats.images import first_size
 from tofuse.formats.recordings import (
     IMAGE_SIZE,
     PER_FRAME,

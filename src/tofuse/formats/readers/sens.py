@@ -16,7 +16,8 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_from_counts
 from tofuse.engine.geometry import inverse
 from tofuse.engine.parts import part
-from tofuse.formats.files import as_color, input_error, parse_image
+from tofuse.formats.files import input_error
+from tofuse.formats.images import as_color, parse_image
 from tofuse.formats.recordings import (
     ColorCamera,
     FileSource,

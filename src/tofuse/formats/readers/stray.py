@@ -10,15 +10,8 @@ from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
-from tofuse.formats.files import (
-    Video,
-    files_with,
-    first_size,
-    is_file,
-    is_folder,
-    read_columns,
-    read_numbers,
-)
+from tofuse.formats.files import files_with, is_file, is_folder, read_columns, read_numbers
+from tofuse.formats.images import Video, first_size
 from tofuse.formats.recordings import (
     IMAGE_SIZE,
     PER_FRAME,

@@ -10,7 +10,8 @@ import numpy as np
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_from_numbers
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_with, is_folder, read_tiff
+from tofuse.formats.files import files_with, is_folder
+from tofuse.formats.images import read_tiff
 from tofuse.formats.recordings import (
     UNCERTAIN,
     FileSource,

@@ -11,7 +11,8 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import BrownConrady
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import associate, is_file, is_folder, read_text
+from tofuse.formats.files import is_file, is_folder, read_text
+from tofuse.formats.poses import associate
 from tofuse.formats.recordings import (
     DepthImageSource,
     Reader,

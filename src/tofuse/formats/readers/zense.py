@@ -9,7 +9,8 @@ import numpy as np
 
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_with, first_size, is_file, is_folder, parse_toml, read_text
+from tofuse.formats.files import files_with, is_file, is_folder, parse_toml, read_text
+from tofuse.formats.images import first_size
 from tofuse.formats.recordings import (
     DepthImageSource,
     Reader,

@@ -20,15 +20,14 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_from_counts
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.formats.files import (
-    as_color,
     files_with,
     is_file,
     is_folder,
     list_folder,
-    parse_image,
     read_head,
     required_package,
 )
+from tofuse.formats.images import as_color, parse_image
 from tofuse.formats.recordings.camera_file import check_size, checked_lens
 from tofuse.formats.recordings.reader import ReaderOptions
 from tofuse.formats.recordings.sources import (

@@ -25,16 +25,10 @@ from tofuse.engine.frames import (
 )
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.files import (
-    exact,
-    make_folder,
-    replacing,
-    write_columns,
-    write_ply,
-    write_png,
-    write_text,
-    write_tum,
-)
+from tofuse.formats.files import exact, make_folder, replacing, write_columns, write_text
+from tofuse.formats.geometry import write_ply
+from tofuse.formats.images import write_png
+from tofuse.formats.poses import write_tum
 from tofuse.formats.recordings.camera_file import SCHEMA, camera_fields
 from tofuse.formats.recordings.correction_file import write_correction
 

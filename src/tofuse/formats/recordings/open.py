@@ -15,16 +15,8 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import NOISE_MODEL, Frame, Recording, Source
 from tofuse.engine.parts import discover, name_of, registered
-from tofuse.formats.files import (
-    TimedPoses,
-    input_error,
-    is_file,
-    is_folder,
-    list_folder,
-    path_of,
-    read_noise,
-    read_poses,
-)
+from tofuse.formats.files import input_error, is_file, is_folder, list_folder, path_of, read_noise
+from tofuse.formats.poses import TimedPoses, read_poses
 from tofuse.formats.recordings.cloud_sequence import describe_shift
 from tofuse.formats.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
 from tofuse.formats.recordings.rig import RigSource, read_rig, recordings_of, rig_file_in

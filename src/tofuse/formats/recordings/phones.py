@@ -11,7 +11,7 @@ from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Pinhole, scaled
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_from_counts
-from tofuse.formats.files import read_color, read_image
+from tofuse.formats.images import read_color, read_image
 from tofuse.formats.recordings.camera_file import checked_pinhole
 from tofuse.formats.recordings.sources import FileSource, read_matrix_pose
 

@@ -25,17 +25,10 @@ from tofuse.engine.frames import (
     depth_from_counts,
 )
 from tofuse.engine.geometry import MAX_COORDINATE_M, check_pose, orthonormalise
-from tofuse.formats.files import (
-    associated_poses,
-    check_first_size,
-    input_error,
-    is_file,
-    read_color,
-    read_image,
-    read_numbers,
-    read_ply,
-    read_tum,
-)
+from tofuse.formats.files import input_error, is_file, read_numbers
+from tofuse.formats.geometry import read_ply
+from tofuse.formats.images import check_first_size, read_color, read_image
+from tofuse.formats.poses import associated_poses, read_tum
 from tofuse.formats.recordings.camera_file import CameraFile, ColorCamera, check_size, load_camera
 from tofuse.formats.recordings.reader import ReaderOptions
 

@@ -14,7 +14,8 @@ from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import Config, Progress, changed, from_method, reconstruct
+from tofuse.engine.mapping import Config, changed, from_method, reconstruct
+from tofuse.engine.progress import Progress
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.measures import BoxFit, PathScore
 from tofuse.lab.experiments.recorded import RecordedScene, record_scene

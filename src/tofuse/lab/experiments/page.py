@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from tofuse._version import __version__
 from tofuse.apps.results import Contract, OutputFolder, plain, read_json_object
 from tofuse.engine.errors import InputError
-from tofuse.engine.mapping import Progress, Silent
+from tofuse.engine.progress import Progress, Silent
 from tofuse.lab.experiments import sections
 from tofuse.lab.experiments.cases import CASES, DRAWS, METHODS, CaseResult, Run, run_case
 from tofuse.lab.experiments.peaks import AXES, SIGMAS_M, PeaksSweep, sweep_peaks

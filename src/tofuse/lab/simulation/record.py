@@ -14,7 +14,9 @@ from tofuse.engine.frames import ArraySource, RangeFrame, Recording
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.files import make_folder, write_ply, write_png
+from tofuse.formats.files import make_folder
+from tofuse.formats.geometry import write_ply
+from tofuse.formats.images import write_png
 from tofuse.formats.recordings import RecordingWriter, corrected_depth
 from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation import sensor

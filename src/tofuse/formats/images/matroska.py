@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import input_error
+from tofuse.formats.files import input_error
 
 MAGIC = b"\x1a\x45\xdf\xa3"
 

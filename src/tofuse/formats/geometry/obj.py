@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files.atomic import write_bytes, write_text
+from tofuse.formats.files import write_bytes, write_text
 
 
 def write_obj(path: str | Path, mesh: GeometryRecord) -> None:

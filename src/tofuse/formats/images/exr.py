@@ -20,7 +20,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float32, UInt8
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.images import check_pixels
+from tofuse.formats.images.images import check_pixels
 
 MAGIC = b"\x76\x2f\x31\x01"
 _SINGLE_SCAN_LINES = 2  # the version, with none of the flags for tiles, parts or deep data

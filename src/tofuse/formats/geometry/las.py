@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files.atomic import replacing, write_bytes
+from tofuse.formats.files import replacing, write_bytes
 
 _HEADER_BYTES, _FIELD_BYTES = 375, 192
 _SCALE_M = 1e-4  # rounds by half of that; 31 bits of it span 200 km

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.atomic import write_bytes
-from tofuse.formats.files.reading import read_bytes, read_head
+from tofuse.formats.files import read_bytes, read_head, write_bytes
 
 MAX_PIXELS = 1 << 26  # 8192 x 8192: far beyond any depth camera, and 400 MB of colour
 MAX_IMAGE_BYTES = 1 << 29

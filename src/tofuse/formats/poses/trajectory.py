@@ -11,9 +11,7 @@ from numpy.typing import ArrayLike
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import MAX_COORDINATE_M, from_matrix, length, to_pose
-from tofuse.formats.files.atomic import write_text
-from tofuse.formats.files.reading import read_text
-from tofuse.formats.files.tables import exact
+from tofuse.formats.files import exact, read_text, write_text
 
 ASSOCIATION_LIMIT_S = 0.02
 

@@ -19,8 +19,8 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.formats.files.reading import input_error, is_file, is_folder, read_text
-from tofuse.formats.files.trajectory import associated_poses, poses_of_rows, read_tum, rows_of
+from tofuse.formats.files import input_error, is_file, is_folder, read_text
+from tofuse.formats.poses.trajectory import associated_poses, poses_of_rows, read_tum, rows_of
 
 # Files with the poses in a folder; the first that exists is used.
 NAMES = ("trajectory.txt", "groundtruth.txt", "images.txt", "transforms.json", "trajectory.log")

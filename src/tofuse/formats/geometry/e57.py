@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files.atomic import replacing
-from tofuse.formats.files.reading import required_package
+from tofuse.formats.files import replacing, required_package
 
 _NORMALS = "http://www.libe57.org/E57_EXT_surface_normals.txt"
 _TOFUSE = "https://tofuse.org/e57"

@@ -9,8 +9,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.images import MAX_IMAGE_BYTES, check_camera_size, check_pixels, decoded
-from tofuse.formats.files.reading import read_bytes
+from tofuse.formats.files import read_bytes
+from tofuse.formats.images.images import MAX_IMAGE_BYTES, check_camera_size, check_pixels, decoded
 
 # Tags of the TIFF 6.0 specification.
 _WIDTH, _HEIGHT, _SAMPLES = 256, 257, 277

@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.loops import PriorLoop
-from tofuse.formats.files.reading import read_text
+from tofuse.formats.files import read_text
 
 _UNIT = 1e-2  # tolerance of a quaternion's length, for files with few digits
 

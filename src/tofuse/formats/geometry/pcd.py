@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord, stacked
-from tofuse.formats.files.atomic import write_bytes
-from tofuse.formats.files.reading import read_bytes
+from tofuse.formats.files import read_bytes, write_bytes
 
 MAX_POINTS = 1 << 28
 _NORMALS = ("normal_x", "normal_y", "normal_z")
@@ -179,7 +178,7 @@ def _binary(body: memoryview, header: _Header, path: str | Path) -> list[NDArray
 
 
 def _compressed(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[Any]]:
-    from tofuse.formats.files.lzf_kernels import lzf_decompress
+    from tofuse.formats.geometry.lzf_kernels import lzf_decompress
 
     if len(body) < 8:
         raise _truncated(header, path)

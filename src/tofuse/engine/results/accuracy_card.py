@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from tofuse.engine.frames import in_words, runs_of
-from tofuse.engine.quality.accuracy import Accuracy
-from tofuse.engine.quality.types import Reason, Reconstruction
-from tofuse.engine.quality.verdict import ADVICE, ranked
+from tofuse.engine.quality import Accuracy
+from tofuse.engine.results.types import Reason, Reconstruction
+from tofuse.engine.results.verdicts import ADVICE, ranked
 
 SEPARATOR = " · "
 

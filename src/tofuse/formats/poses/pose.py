@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import check_pose, length, to_pose
-from tofuse.formats.files.reading import read_text
-from tofuse.formats.files.tables import exact
+from tofuse.formats.files import exact, read_text
 
 FIELD = "T_target_source"
 _REMEDY = (

@@ -13,12 +13,11 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Range, in_words, is_single, runs, runs_of, size, union
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import LoopRecord, Optimisation, SensorRecord, loop_errors
-from tofuse.engine.quality.accuracy import Accuracy
-from tofuse.engine.quality.accuracy_card import length
-from tofuse.engine.quality.cross_view import CrossViewConsistency
-from tofuse.engine.quality.types import Component, FrameRecord, Reason, Verdict, in_main_model
-from tofuse.engine.quality.verdict import ranked, verdict_of
+from tofuse.engine.quality import Accuracy, CrossViewConsistency
 from tofuse.engine.refinement import Refinement, proposal
+from tofuse.engine.results.accuracy_card import length
+from tofuse.engine.results.types import Component, FrameRecord, Reason, Verdict, in_main_model
+from tofuse.engine.results.verdicts import ranked, verdict_of
 from tofuse.engine.tracking import FrameTime, find_jumps
 
 # Inlier fraction below which a registration is weak.

@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import UInt8, UInt16
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.images import check_pixels
+from tofuse.formats.images.images import check_pixels
 
 _SPACE = rb"(?:\s+(?:#[^\n]*\n)?)+"
 _HEADER = re.compile(rb"P5" + (_SPACE + rb"(\d{1,5})") * 3 + rb"\s")

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float32, Int32, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord, stacked
-from tofuse.formats.files.atomic import replacing
-from tofuse.formats.files.reading import read_bytes
+from tofuse.formats.files import read_bytes, replacing
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",

@@ -16,8 +16,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.graph import PoseGraph
-from tofuse.formats.files.atomic import replacing
-from tofuse.formats.files.reading import read_text
+from tofuse.formats.files import read_text, replacing
 
 VERTEX = "VERTEX_SE3:QUAT"
 EDGE = "EDGE_SE3:QUAT"

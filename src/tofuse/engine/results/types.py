@@ -14,9 +14,7 @@ from tofuse.engine.frames import Range
 from tofuse.engine.fusion import Cloud, Mesh, T_up_world
 from tofuse.engine.graph import GraphPart, LoopRecord, PoseGraph, SensorRecord
 from tofuse.engine.loops import Join
-from tofuse.engine.quality.accuracy import Accuracy
-from tofuse.engine.quality.change_detection import Change
-from tofuse.engine.quality.samples import FrameSample
+from tofuse.engine.quality import Accuracy, Change, FrameSample
 from tofuse.engine.refinement import Refinement
 from tofuse.engine.tracking import Status
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import UInt8, UInt16
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files.atomic import write_bytes, write_text
+from tofuse.formats.files import write_bytes, write_text
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963

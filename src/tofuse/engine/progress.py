@@ -10,7 +10,7 @@ from typing import Protocol
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame
-from tofuse.engine.quality import FrameRecord
+from tofuse.engine.results import FrameRecord
 
 
 class Progress(Protocol):

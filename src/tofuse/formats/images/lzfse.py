@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import required_package
+from tofuse.formats.files import required_package
 
 # Each block begins with these letters. It has at most 40,000 literals and 10,000 copies of up to
 # 2359 bytes, and the encoder fills it with at least a few kilobytes.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from tofuse.engine.frames import size, union
-from tofuse.engine.quality.types import Reason, Verdict
+from tofuse.engine.results.types import Reason, Verdict
 
 # The closed list of reason codes. "failed" and "degraded" name the verdict each one forces;
 # "note" adds information without changing the verdict.
