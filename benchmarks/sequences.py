@@ -23,7 +23,7 @@ from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import with_recording_defaults
 from tofuse.engine.mapping.methods import default
-from tofuse.engine.quality.consistency import poses_of_frames
+from tofuse.engine.quality.map_agreement import poses_of_frames
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.record import simulate

@@ -38,7 +38,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.methods import default
-from tofuse.engine.quality.consistency import map_consistency
+from tofuse.engine.quality.map_agreement import map_consistency
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.formats.files.atomic import write_text

@@ -19,7 +19,7 @@ from registration_scenes import (
     turn,
     view,
 )
-from tofuse.engine.clouds import shape
+from tofuse.engine.clouds import surface_shape as shape
 from tofuse.engine.clouds.icp import Icp
 from tofuse.engine.clouds.icp_kernels import transform_points
 from tofuse.engine.clouds.interfaces import Alignment, History, Matches, Points

@@ -12,7 +12,7 @@ from tofuse.engine.clouds.icp import Icp
 from tofuse.engine.clouds.icp_kernels import transform_points
 from tofuse.engine.clouds.interfaces import Alignment, Matches, Points
 from tofuse.engine.clouds.metrics import PointToPoint
-from tofuse.engine.clouds.pairs import cross_information, loss_weights, surface_pairs
+from tofuse.engine.clouds.point_pairs import cross_information, loss_weights, surface_pairs
 from tofuse.engine.clouds.rejectors import MaxDistance
 from tofuse.engine.clouds.selectors import All, Random
 from tofuse.engine.clouds.stopping import SmallStep

@@ -8,10 +8,10 @@ import pytest
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.chordal import chordal_poses
-from tofuse.engine.graph.descent import Problem
 from tofuse.engine.graph.gnc import GraduatedNonConvexity
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
+from tofuse.engine.graph.minimisation import Problem
 from tofuse.engine.graph.robust import Settings
 from tofuse.lab.simulation.laps import drifting_laps
 from walked_graph import SIGMA, walk

@@ -10,16 +10,16 @@ import pytest
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import branches
 from tofuse.engine.graph.branches import Branches
-from tofuse.engine.graph.build import Measured, build_graph
-from tofuse.engine.graph.covariances import (
+from tofuse.engine.graph.graph import Optimisation, PoseGraph
+from tofuse.engine.graph.graph_covariances import (
     MIN_WEIGHT,
     GraphCovariances,
     accepted_only,
     loop_errors,
     relative_covariance,
 )
-from tofuse.engine.graph.graph import Optimisation, PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
+from tofuse.engine.graph.measured_graph import Measured, build_graph
 from walks import round_walk, step_of, true_poses
 
 N = 12

@@ -10,8 +10,6 @@ import pytest
 
 from corner_views import SHARP, corner
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.build import Measured, build_graph
-from tofuse.engine.graph.covariances import GraphCovariances
 from tofuse.engine.graph.external_sensors import (
     GravityEdges,
     OdometryEdges,
@@ -21,7 +19,9 @@ from tofuse.engine.graph.external_sensors import (
     with_sensors,
 )
 from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph.graph_covariances import GraphCovariances
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
+from tofuse.engine.graph.measured_graph import Measured, build_graph
 from tofuse.engine.refinement.joint_alignment import refine
 from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.stored_views import pair_equation_kernels as kernels

@@ -11,8 +11,8 @@ from threadpoolctl import ThreadpoolController
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import sparse
-from tofuse.engine.graph.covariances import GraphCovariances, loop_errors
 from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph.graph_covariances import GraphCovariances, loop_errors
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
 from tofuse.engine.graph.sparse import factor_size, parts_of, sparsify
 

@@ -13,7 +13,7 @@ from tofuse.engine.fusion.cloud import Cloud, CloudBuilder
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import LoopRecord, PoseGraph
-from tofuse.engine.quality.samples import FrameSample
+from tofuse.engine.quality.frame_samples import FrameSample
 from tofuse.engine.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
 
 # A room of 6.0 x 2.5 x 3.2 m around the first camera, and two blocks in it.

@@ -22,7 +22,7 @@ from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording, evenly_spaced
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.engine.quality.consistency import (
+from tofuse.engine.quality.map_agreement import (
     Consistency,
     SurfaceImage,
     consistency_of_images,

@@ -9,7 +9,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.cross_view import (
+from tofuse.engine.quality.cross_view_agreement import (
     CrossViewConsistency,
     PairConsistency,
     cross_view_consistency,

@@ -10,7 +10,7 @@ import pytest
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.consistency import SurfaceImage
+from tofuse.engine.quality.map_agreement import SurfaceImage
 from tofuse.engine.quality.view_agreement_kernels import agreement_sums, transform_points
 
 SIZE = (64, 48, 50.0, 51.0, 31.0, 24.0)

@@ -15,7 +15,7 @@ from phone_checks import check_frames, check_lens
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.quality.consistency import map_consistency
+from tofuse.engine.quality.map_agreement import map_consistency
 from tofuse.formats.recordings.open import open_recording
 
 

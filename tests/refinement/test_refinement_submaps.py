@@ -22,7 +22,7 @@ from tofuse.engine.stored_views.view_store import (
     candidate_pairs,
     overlaps,
 )
-from tofuse.engine.views.descriptor import (
+from tofuse.engine.views.view_descriptors import (
     mutual_dissimilarity,
     pairwise_dissimilarity,
     similar_views,

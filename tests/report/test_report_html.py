@@ -39,7 +39,7 @@ from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.pose_errors import UNKNOWN_M
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import LoopRecord
-from tofuse.engine.quality.samples import FrameSample, FrameSamples
+from tofuse.engine.quality.frame_samples import FrameSample, FrameSamples
 from tofuse.engine.results.types import Component, FrameRecord, Reason
 from unpacked import unpack
 

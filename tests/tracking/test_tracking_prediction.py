@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.engine.tracking.prediction import Prediction, degenerate_runs
+from tofuse.engine.tracking.motion_prediction import Prediction, degenerate_runs
 
 NONE, SOME = np.zeros((0, 6)), np.eye(6)[:1]
 

@@ -24,10 +24,10 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Foreground
 from tofuse.engine.frames import Recording
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import Config, adapted, changed, from_method, view_kind
+from tofuse.engine.mapping import Config, adaptation, changed, from_method, view_kind
 from tofuse.engine.mapping import reconstruct as reconstruct_recording
 from tofuse.engine.progress import Progress
-from tofuse.engine.results import SEPARATOR, Reconstruction, card
+from tofuse.engine.results import Reconstruction, accuracy_card
 
 if TYPE_CHECKING:
     from tofuse.apps.viewer import ReportServer
@@ -75,7 +75,7 @@ class Result(Reconstruction):
     @property
     def accuracy(self) -> str:
         """The accuracy card, in one line."""
-        return SEPARATOR.join(card(self))
+        return accuracy_card.SEPARATOR.join(accuracy_card.card(self))
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the files of ``tofuse run``, and return the folder.
@@ -103,7 +103,9 @@ class Result(Reconstruction):
         from tofuse.apps.report import ReportExtras, write_report
 
         if self.source is not None:
-            config = self.fitted or adapted(_configuration(self.config, self.source), self.source)
+            config = self.fitted or adaptation.adapted(
+                _configuration(self.config, self.source), self.source
+            )
             write_report_files(self.source, config, result, folder)
             return
         title = Path(str(result.recording["path"])).name
@@ -276,7 +278,7 @@ def reconstruct(
             remedy="pass tofuse.open(path), or tofuse.from_arrays(depth, K)",
         )
     with _with_terminal(progress) as display:
-        fitted = adapted(_configuration(config, recording), recording, threads, display)
+        fitted = adaptation.adapted(_configuration(config, recording), recording, threads, display)
         turning = any(isinstance(part, Foreground) for part in fitted.filters)
         findings = quick_findings(recording, fitted, turning=turning)
         reconstruction = reconstruct_recording(

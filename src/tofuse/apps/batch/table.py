@@ -124,12 +124,12 @@ def _html(
 
 
 def _row(job: Job, record: Record, folder: BatchFolder) -> Row:
-    from tofuse.engine.results import length
+    from tofuse.engine.results import accuracy_card
 
     done = record.state == "done"
     accuracy = ""
     if record.position_m is not None:
-        accuracy = f"±{length(record.position_m)}"
+        accuracy = f"±{accuracy_card.length(record.position_m)}"
         accuracy += "" if record.relative is None else f" ({100 * record.relative:.2g} %)"
     elif done:
         accuracy = "not bounded"

@@ -366,8 +366,8 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
         reasons_json,
         session_sentences,
     )
-    from tofuse.engine.frames import in_words
-    from tofuse.engine.results import SEPARATOR, card
+    from tofuse.engine.frames import frame_ranges
+    from tofuse.engine.results import accuracy_card
 
     d = result.diagnostics
     sessions = session_sentences(result)
@@ -394,7 +394,7 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     _print_reasons(console, d.reasons)
     for line in sessions:
         console.print(line, markup=False)
-    console.print(SEPARATOR.join(card(result)), markup=False)
+    console.print(accuracy_card.SEPARATOR.join(accuracy_card.card(result)), markup=False)
     parts = [f"{counts['tracked']} of {len(d.frames)} frames tracked"]
     parts += [f"{counts[s]} {s}" for s in ("predicted", "lost") if counts[s]]
     parts += [f"{skipped} unreadable"] if skipped else []
@@ -406,7 +406,9 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     for number, component in enumerate(result.components):
         if component.result is not None and not component.connected:
             path = _page_of(out / component_name(number))
-            console.print(f"and {path}, for {in_words(component.frames)}", markup=False)
+            console.print(
+                f"and {path}, for {frame_ranges.in_words(component.frames)}", markup=False
+            )
 
 
 def _page_of(folder: Path) -> Path:
@@ -421,13 +423,13 @@ def _print_warnings(console: Console, warnings: Iterable[str]) -> None:
 
 
 def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
-    from tofuse.engine.results import ADVICE, REASONS, ranked
+    from tofuse.engine.results import verdicts
 
-    for reason in ranked(reasons):
-        level = REASONS[reason.code][0]
+    for reason in verdicts.ranked(reasons):
+        level = verdicts.REASONS[reason.code][0]
         console.print(f"  [{VERDICT_COLORS[level]}]{level}:[/] {escaped(reason.text)}")
-        if reason.code in ADVICE:
-            console.print(f"    {ADVICE[reason.code]}", markup=False, style="dim")
+        if reason.code in verdicts.ADVICE:
+            console.print(f"    {verdicts.ADVICE[reason.code]}", markup=False, style="dim")
 
 
 def inspect(arguments: argparse.Namespace) -> int:
@@ -593,7 +595,7 @@ def noise(arguments: argparse.Namespace) -> int:
 def evaluate(arguments: argparse.Namespace) -> int:
     """``tofuse evaluate``."""
     from tofuse.apps.jobs import evaluate as evaluate_poses
-    from tofuse.engine.quality import MAX_GAP_S
+    from tofuse.engine.quality import trajectory_errors
 
     evaluation = evaluate_poses(
         arguments.estimate,
@@ -605,7 +607,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
     if error.mostly_unmatched:
         print(
             f"note: only {error.associated} of {error.estimated} estimated poses have a reference "
-            f"pose within {1000 * MAX_GAP_S:.0f} ms: check that both files have the same clock",
+            f"pose within {1000 * trajectory_errors.MAX_GAP_S:.0f} ms: check that both files have the same clock",
             file=sys.stderr,
         )
     if arguments.json:

@@ -26,7 +26,7 @@ from tofuse.apps.results import (
 )
 from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError, OutputError
-from tofuse.engine.fusion import GeometryRecord, Mesh, baked
+from tofuse.engine.fusion import GeometryRecord, Mesh, texture
 from tofuse.formats.export import exchange
 from tofuse.formats.files import make_folder, replacing_folder, stamp
 from tofuse.formats.images import jpeg_bytes
@@ -88,7 +88,7 @@ class _Result:
             return self.mesh.decimated(max_faces).record()
         if min(max_faces, len(self.mesh.faces)) > _MAX_TEXTURED_FACES:
             return self.mesh.decimated(max_faces).record()
-        baked_mesh = baked(self.mesh, max_faces, _TEXTURE_SIZE)
+        baked_mesh = texture.baked(self.mesh, max_faces, _TEXTURE_SIZE)
         vertex_rows = baked_mesh.atlas.vertices
         return GeometryRecord(
             baked_mesh.mesh.vertices[vertex_rows],

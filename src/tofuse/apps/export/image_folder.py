@@ -24,7 +24,7 @@ from tofuse.engine.arrays import Float32, Float64, UInt8, UInt16
 from tofuse.engine.cameras import Camera, Pinhole, ray_lengths, scaled
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording
-from tofuse.engine.fusion import TextureView
+from tofuse.engine.fusion import texture
 from tofuse.engine.noise import noise_model_for
 from tofuse.engine.sensor import CameraErrors, Corrector
 from tofuse.formats.files import make_folder
@@ -204,7 +204,7 @@ class _ImageRenderer:
         """(H, W, 3) RGB of a frame, black where unknown; None without colour and amplitude."""
         if frame.color_image is not None and frame.color_registered:
             return frame.color_image
-        view = TextureView.of(replace(frame, color_image=None))
+        view = texture.TextureView.of(replace(frame, color_image=None))
         if view is None:
             return None
         intensity = view.intensity[..., 0]

@@ -10,19 +10,23 @@ import numpy as np
 from scipy import ndimage
 
 from tofuse.apps.inspection.planar import Distortion, Region, fit_distortion, regions_of
-from tofuse.engine.alignment import Aligned, Level, ProjectiveOptions, Target, align
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames import Frame, RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.search import landing_pixels
+from tofuse.engine.search import view_points
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Faults affect the full image; a higher resolution would only take longer.
 VIEW_COLUMNS = 128
 # Views are small, so nearly all pixels are used at all levels.
-_OPTIONS = ProjectiveOptions(
-    levels=(Level(2, 8, 0.03, 0.1), Level(2, 3, 0.005, 0.02), Level(1, 2, 0.0, 0.0))
+_OPTIONS = projective.ProjectiveOptions(
+    levels=(
+        projective.Level(2, 8, 0.03, 0.1),
+        projective.Level(2, 3, 0.005, 0.02),
+        projective.Level(1, 2, 0.0, 0.0),
+    )
 )
 # An alignment with this score needs no other initial pose.
 _SUFFICIENT_SCORE = 0.7
@@ -178,7 +182,7 @@ class Pair:
     j: int
     first: PreparedView
     second: PreparedView
-    alignment: Aligned
+    alignment: projective.Aligned
 
     @property
     def T_first_second(self) -> Float64:
@@ -235,17 +239,19 @@ def aligned_pair(first: PreparedView, second: PreparedView, i: int, j: int) -> P
     return Pair(i, j, first, second, best)
 
 
-def aligned(source: PreparedView, target: PreparedView, T_target_source: Float64) -> Aligned:
+def aligned(
+    source: PreparedView, target: PreparedView, T_target_source: Float64
+) -> projective.Aligned:
     """Align two small views from an initial pose; without photometric terms if that fails."""
-    targets = [Target(target, np.eye(4))]
+    targets = [projective.Target(target, np.eye(4))]
     for options in (_OPTIONS, replace(_OPTIONS, photometric=False)):
         try:
-            return align(source, targets, T_target_source, options)
+            return projective.align(source, targets, T_target_source, options)
         except np.linalg.LinAlgError:
             continue
     # The views do not overlap.
     zeros = np.zeros((6, 6))
-    return Aligned(
+    return projective.Aligned(
         T_world_source=T_target_source, converged=False, iterations=0, information=zeros,
         cross=zeros, unobservable=np.eye(6), points=0, projected=0, compared=0, inliers=0,
         in_front=0, rms_m=np.inf, scale=1.0, photo_scale=0.0, score=-1.0,
@@ -261,7 +267,7 @@ def _in_front(source: PreparedView, target: PreparedView, T_target_source: Float
     is_valid = source.z > 0
     points = np.concatenate([source.rays, np.ones_like(source.rays[..., :1])], -1)
     points = se3.transform(T_target_source, (points * source.z[..., None])[is_valid].astype(float))
-    pixels = landing_pixels(target, points)
+    pixels = view_points.landing_pixels(target, points)
     inside = (
         (points[:, 2] > 0.05)
         & (pixels >= 0).all(-1)

@@ -14,13 +14,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality import (
-    Consistency,
-    TrajectoryError,
-    evaluate_trajectory,
-    map_consistency,
-    poses_of_frames,
-)
+from tofuse.engine.quality import map_agreement, trajectory_errors
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors, Corrector
 from tofuse.formats.poses import Clock, TimedPoses, read_poses
@@ -45,9 +39,9 @@ class Evaluation:
         Map consistency of the recording's images at these poses; None without a recording.
     """
 
-    error: TrajectoryError
+    error: trajectory_errors.TrajectoryError
     ate_interval_m: tuple[float, float] | None = None
-    consistency: Consistency | None = None
+    consistency: map_agreement.Consistency | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as plain data, angles in degrees."""
@@ -121,14 +115,16 @@ def evaluate(
     reference_times, reference_poses = _timed(timed_reference, reference, clock, names[1])
     frame_times = None if recording is None else recording.timestamps
     try:
-        error = evaluate_trajectory(times, poses, reference_times, reference_poses, frame_times)
+        error = trajectory_errors.evaluate_trajectory(
+            times, poses, reference_times, reference_poses, frame_times
+        )
     except InputError as cause:
         raise InputError(cause.problem, where=", ".join(names), remedy=cause.remedy) from cause
     interval = None if reference_error_m is None else error.ate_within(reference_error_m)
     consistency = None
     if recording is not None:
-        frame_poses = poses_of_frames(recording.timestamps, times, poses)
-        consistency = map_consistency(
+        frame_poses = map_agreement.poses_of_frames(recording.timestamps, times, poses)
+        consistency = map_agreement.map_consistency(
             recording, frame_poses, correctors=_correctors(estimate, config)
         )
     return Evaluation(error, interval, consistency)

@@ -27,47 +27,29 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import POSES_BY, Range, Recording, evenly_spaced, in_words, runs_of
+from tofuse.engine.frames import POSES_BY, Recording, evenly_spaced, frame_ranges
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import (
     Config,
     check_views,
     from_method,
+    priors,
     reconstruct_with_views,
     view_kind,
-    with_odometry,
 )
 from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import (
-    Accuracy,
-    Consistency,
-    CrossViewConsistency,
-    Deviation,
-    WorstFrame,
-    compare_views,
-    displacement,
-    distances_between,
-    fitted,
-    map_consistency,
+    cross_view_agreement,
+    map_agreement,
     measured_pairs,
-    prepare_for_comparison,
+    pose_accuracy,
+    pose_deviation,
+    trajectory_errors,
 )
-from tofuse.engine.quality import deviation as deviation_of
-from tofuse.engine.results import (
-    Reason,
-    Reconstruction,
-    Verdict,
-    accuracy_reasons,
-    bound,
-    cross_view_reasons,
-    length,
-    ranked,
-    tolerance_of,
-    verdict_of,
-)
+from tofuse.engine.results import Reason, Reconstruction, Verdict, accuracy_card, checks, verdicts
 from tofuse.engine.stored_views import PosedView
-from tofuse.engine.tracking import FrameTime, GivenPoses, find_jumps
+from tofuse.engine.tracking import FrameTime, find_jumps, given
 from tofuse.engine.views import PreparedView
 from tofuse.formats.poses import TimedPoses, read_poses
 from tofuse.formats.recordings import Opening, OpeningOptions, read_reference
@@ -109,12 +91,12 @@ class Judgement:
     """
 
     poses: Float64
-    accuracy: Accuracy
+    accuracy: pose_accuracy.Accuracy
     verdict: Verdict
     reasons: tuple[Reason, ...]
-    consistency: Consistency | None
-    refined_consistency: Consistency | None
-    deviation: Deviation | None
+    consistency: map_agreement.Consistency | None
+    refined_consistency: map_agreement.Consistency | None
+    deviation: pose_deviation.Deviation | None
     displacement_m: Float64
     refined: Reconstruction
     started: bool = True
@@ -180,7 +162,7 @@ def judge(
     config = replace(
         from_method("default", kind), tolerance_m=tolerance_m, priors=(), self_calibration=False
     )
-    given_config = replace(config, odometry=GivenPoses())
+    given_config = replace(config, odometry=given.GivenPoses())
     check_views(given_config, kind)
     compared_images = _Images(recording)
 
@@ -194,7 +176,9 @@ def judge(
 
     progress.stage("comparing images")
     initial_support = compared_images.support_at(poses)
-    refined, views, refined_support = reconstructed(with_odometry(recording, poses), given_config)
+    refined, views, refined_support = reconstructed(
+        priors.with_odometry(recording, poses), given_config
+    )
     from_poses = True
     if not refined_support.is_supported:
         independent, independent_views, independent_support = reconstructed(recording, config)
@@ -210,7 +194,7 @@ def judge(
         deviation = _deviation(poses, refined, views)
     distances = _distances(poses, refined.trajectory)
     accuracy = _accuracy(distances, poses, refined)
-    reasons = ranked(
+    reasons = verdicts.ranked(
         [
             *_reasons(
                 poses, accuracy, deviation, initial_support, refined_support, refined, tolerance_m
@@ -220,7 +204,7 @@ def judge(
     return Judgement(
         poses,
         accuracy,
-        verdict_of(reasons),
+        verdicts.verdict_of(reasons),
         reasons,
         _consistency(recording, poses),
         _consistency(recording, refined.trajectory),
@@ -235,7 +219,7 @@ def judge(
 class ViewSupport:
     """Cross-view consistency of overlapping images under given poses."""
 
-    cross_view: CrossViewConsistency
+    cross_view: cross_view_agreement.CrossViewConsistency
 
     @property
     def overlapping(self) -> float:
@@ -266,13 +250,17 @@ class _Images:
         rows = evenly_spaced(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
         views = [(k, view) for k in rows if (view := self._view(k)) is not None]
         used_rows = [k for k, _ in views]
-        return ViewSupport(compare_views([view for _, view in views], poses[used_rows]))
+        return ViewSupport(
+            cross_view_agreement.compare_views([view for _, view in views], poses[used_rows])
+        )
 
     def _view(self, k: int) -> PreparedView | None:
         """Return the k-th frame as a prepared view; None if it can't be read."""
         if k not in self._views:
             frame = self._recording.image(k)
-            self._views[k] = None if frame is None else prepare_for_comparison(frame)
+            self._views[k] = (
+                None if frame is None else cross_view_agreement.prepare_for_comparison(frame)
+            )
         return self._views[k]
 
 
@@ -342,8 +330,8 @@ def _write(
 def sentence(judgement: Judgement, name: str) -> str:
     """Summarise the judgement: "poses.txt: ±31 mm ...; refined: ±9 mm ..."."""
     diagonal = judgement.refined.cloud.diagonal_m
-    given_bound = bound(judgement.accuracy, diagonal)
-    refined_bound = bound(judgement.refined.diagnostics.accuracy, diagonal)
+    given_bound = accuracy_card.bound(judgement.accuracy, diagonal)
+    refined_bound = accuracy_card.bound(judgement.refined.diagnostics.accuracy, diagonal)
     label = "refined" if judgement.started else "tracked again"
     readable = [f.status != "skipped" for f in judgement.refined.diagnostics.frames]
     posed = np.isfinite(judgement.poses[readable, 0, 0])
@@ -353,18 +341,20 @@ def sentence(judgement: Judgement, name: str) -> str:
     )
 
 
-def _agreement(deviation: Deviation | None) -> str:
+def _agreement(deviation: pose_deviation.Deviation | None) -> str:
     """State whether the depth contradicts the poses."""
     if deviation is None:
         return ""
     if not deviation.consistent:
         return (
             " Inconsistent with the depth: surfaces displaced by about "
-            f"{length(deviation.estimate_m)}, at least {length(deviation.at_least_m)} (95 %)."
+            f"{accuracy_card.length(deviation.estimate_m)}, at least {accuracy_card.length(deviation.at_least_m)} (95 %)."
         )
     if not np.isfinite(deviation.at_most_m):
         return " Consistent with the depth, as far as that constrains them."
-    return f" Consistent with the depth to within {length(deviation.at_most_m)} (95 %)."
+    return (
+        f" Consistent with the depth to within {accuracy_card.length(deviation.at_most_m)} (95 %)."
+    )
 
 
 def device_sentence(recording: Recording, result: Reconstruction) -> str:
@@ -381,8 +371,8 @@ def device_sentence(recording: Recording, result: Reconstruction) -> str:
         return ""
     rms, bound_m = float(np.sqrt((distances**2).mean())), result.diagnostics.accuracy.position_m
     if not np.isfinite(bound_m):
-        return f"{by}'s poses differ from these by {length(rms)} rms."
-    return f"{by}'s poses: ±{length(rms + bound_m)} (95 %); these: ±{length(bound_m)}."
+        return f"{by}'s poses differ from these by {accuracy_card.length(rms)} rms."
+    return f"{by}'s poses: ±{accuracy_card.length(rms + bound_m)} (95 %); these: ±{accuracy_card.length(bound_m)}."
 
 
 def _read(path: Path) -> TimedPoses:
@@ -428,21 +418,23 @@ def _distances(poses: Float64, refined: Float64) -> Float64:
     common = np.isfinite(poses[:, 0, 0]) & np.isfinite(refined[:, 0, 0])
     out = np.full(len(poses), np.nan)
     if common.any():
-        out[common] = distances_between(poses[common], refined[common])
+        out[common] = trajectory_errors.distances_between(poses[common], refined[common])
     return out
 
 
-def _accuracy(distances: Float64, poses: Float64, refined: Reconstruction) -> Accuracy:
+def _accuracy(
+    distances: Float64, poses: Float64, refined: Reconstruction
+) -> pose_accuracy.Accuracy:
     """Return the bound of the given poses: distance from the refined ones plus their bound."""
     refined_accuracy = refined.diagnostics.accuracy
     common = np.flatnonzero(np.isfinite(distances))
     if not refined_accuracy.assessed or not len(common):
         return refined_accuracy
-    moved, turned = displacement(refined.trajectory[common], poses[common])
+    moved, turned = trajectory_errors.displacement(refined.trajectory[common], poses[common])
     # In the worst case both have the same direction.
     position, rotation = moved + refined_accuracy.position_m, turned + refined_accuracy.rotation_rad
     worst = int(common[np.argmax(distances[common])])
-    at_worst = WorstFrame(
+    at_worst = pose_accuracy.WorstFrame(
         int(refined.diagnostics.frames[worst].index),
         float(distances[worst]) + refined_accuracy.position_m,
         rotation,
@@ -451,10 +443,14 @@ def _accuracy(distances: Float64, poses: Float64, refined: Reconstruction) -> Ac
         at_worst = refined_accuracy.worst
     diagonal = refined.cloud.diagonal_m
     relative = position / diagonal if diagonal > 0 else np.inf
-    return Accuracy(position, rotation, relative, True, at_worst, refined_accuracy.unbounded)
+    return pose_accuracy.Accuracy(
+        position, rotation, relative, True, at_worst, refined_accuracy.unbounded
+    )
 
 
-def _deviation(poses: Float64, refined: Reconstruction, views: Views) -> Deviation | None:
+def _deviation(
+    poses: Float64, refined: Reconstruction, views: Views
+) -> pose_deviation.Deviation | None:
     """Compare the poses with registered pairs of views that have a given and a refined pose."""
     row_of = {f.index: k for k, f in enumerate(refined.diagnostics.frames)}
     common = np.flatnonzero(np.isfinite(poses[:, 0, 0]) & np.isfinite(refined.trajectory[:, 0, 0]))
@@ -464,14 +460,14 @@ def _deviation(poses: Float64, refined: Reconstruction, views: Views) -> Deviati
         return None
     rows = [row_of[view.index] for view in posed]
     depth_m = float(np.median([view.depth for view in posed]))
-    fit = fitted(measured_pairs(posed, refined.trajectory[rows]), depth_m)
-    return deviation_of(fit, poses[rows]) if fit.dof > 0 else None
+    fit = pose_deviation.fitted(measured_pairs(posed, refined.trajectory[rows]), depth_m)
+    return pose_deviation.deviation(fit, poses[rows]) if fit.dof > 0 else None
 
 
 def _reasons(
     poses: Float64,
-    accuracy: Accuracy,
-    deviation: Deviation | None,
+    accuracy: pose_accuracy.Accuracy,
+    deviation: pose_deviation.Deviation | None,
     initial_support: ViewSupport,
     refined_support: ViewSupport,
     refined: Reconstruction,
@@ -486,8 +482,8 @@ def _reasons(
             f"these poses; under the refined ones {refined_support.overlapping:.0%} do."
         )
         yield Reason("images_disagree", full_range, text)
-    yield from cross_view_reasons(initial_support.cross_view, full_range)
-    allowed_m = tolerance_of(tolerance_m, refined.cloud.diagonal_m)
+    yield from checks.cross_view_reasons(initial_support.cross_view, full_range)
+    allowed_m = checks.tolerance_of(tolerance_m, refined.cloud.diagonal_m)
     contradictions = (
         [] if deviation is None else [*_contradiction(deviation, allowed_m, full_range)]
     )
@@ -495,7 +491,7 @@ def _reasons(
     # Uncertain poses are no further reason if they are known to be wrong.
     yield from (
         r
-        for r in accuracy_reasons(accuracy, allowed_m, indices)
+        for r in checks.accuracy_reasons(accuracy, allowed_m, indices)
         if not contradictions or r.code != "uncertain_poses"
     )
     # The camera itself may have moved abruptly; then the refined poses jump as well.
@@ -506,24 +502,26 @@ def _reasons(
     }
     if jumped:
         first = next(iter(jumped))
-        ranges = runs_of(indices, [indices[k] for k in jumped])
+        ranges = frame_ranges.runs_of(indices, [indices[k] for k in jumped])
         text = (
-            f"The poses of {in_words(ranges)} jump, and the refined ones don't; that of frame "
+            f"The poses of {frame_ranges.in_words(ranges)} jump, and the refined ones don't; that of frame "
             f"{indices[first]} is {jumped[first]}."
         )
         yield Reason("jumped", ranges, text)
 
 
 def _contradiction(
-    deviation: Deviation, allowed_m: float, full_range: tuple[Range, ...]
+    deviation: pose_deviation.Deviation,
+    allowed_m: float,
+    full_range: tuple[frame_ranges.Range, ...],
 ) -> Iterator[Reason]:
     """Yield a reason if poses contradict the depth by more than the tolerance."""
     if deviation.at_least_m <= allowed_m:
         return
     text = (
         f"Registrations contradict the poses: surfaces are displaced by about "
-        f"{length(deviation.estimate_m)} rms, at least {length(deviation.at_least_m)} (95 %); the "
-        f"tolerance is {length(allowed_m)}."
+        f"{accuracy_card.length(deviation.estimate_m)} rms, at least {accuracy_card.length(deviation.at_least_m)} (95 %); the "
+        f"tolerance is {accuracy_card.length(allowed_m)}."
     )
     steps = tuple((int(a), int(b)) for a, b in deviation.ids[deviation.steps])
     if steps:
@@ -538,6 +536,6 @@ def _or_none(poses: Float64) -> list[Float64 | None]:
     return [T if np.isfinite(T).all() else None for T in poses]
 
 
-def _consistency(recording: Recording, poses: Float64) -> Consistency | None:
-    consistency = map_consistency(recording, poses)
+def _consistency(recording: Recording, poses: Float64) -> map_agreement.Consistency | None:
+    consistency = map_agreement.map_consistency(recording, poses)
     return consistency if consistency.pairs else None

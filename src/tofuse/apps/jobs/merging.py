@@ -29,16 +29,16 @@ from tofuse.engine.mapping import (
     Config,
     Mapper,
     from_method,
-    make_texture,
     push_frames,
+    texturing,
     with_recording_facts,
 )
 from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
-from tofuse.engine.quality import align
-from tofuse.engine.results import Reason, Reconstruction, SessionRecord, in_main_model, verdict_of
+from tofuse.engine.quality import trajectory_errors
+from tofuse.engine.results import Reason, Reconstruction, SessionRecord, in_main_model, verdicts
 from tofuse.engine.stored_views import PosedView
-from tofuse.engine.tracking import GivenPoses, StatedPose, StatedPoses
+from tofuse.engine.tracking import given
 from tofuse.engine.views import PreparedView
 from tofuse.formats.recordings import JoinedSource
 
@@ -195,9 +195,9 @@ def _earlier_links(sessions: Sequence[Session], offsets: Sequence[int]) -> list[
 def _config_of(session: Session, offset: int) -> Config:
     """Return the configuration of a session, with its stated poses as odometry."""
     odometry = session.config.odometry
-    assert isinstance(odometry, GivenPoses)
+    assert isinstance(odometry, given.GivenPoses)
     stated = {k + offset: pose for k, pose in session.stated.items()}
-    return replace(session.config, odometry=StatedPoses(stated, odometry))
+    return replace(session.config, odometry=given.StatedPoses(stated, odometry))
 
 
 def _with_sessions(
@@ -236,12 +236,16 @@ def _with_sessions(
         changes=session_changes(result, records, views),
     )
     reasons = tuple(_reasons(result))
-    diagnostics = replace(result.diagnostics, reasons=reasons, verdict=verdict_of(reasons))
+    diagnostics = replace(result.diagnostics, reasons=reasons, verdict=verdicts.verdict_of(reasons))
     return replace(result, diagnostics=diagnostics)
 
 
 def _T_main_session(
-    posed: dict[int, StatedPose], offset: int, merged_poses: dict[int, Float64], *, fixed: bool
+    posed: dict[int, given.StatedPose],
+    offset: int,
+    merged_poses: dict[int, Float64],
+    *,
+    fixed: bool,
 ) -> Float64 | None:
     """Return (4, 4) T_main_session between the world frames; None if the session is not joined.
 
@@ -256,7 +260,7 @@ def _T_main_session(
     merged = np.array([merged_poses[k + offset] for k in common])
     if fixed:
         return np.asarray(merged[0] @ se3.inverse(stated[0]), np.float64)
-    return align(stated, merged)
+    return trajectory_errors.align(stated, merged)
 
 
 def _reasons(result: Reconstruction) -> Iterator[Reason]:
@@ -321,7 +325,9 @@ def _merge_into(
     texture = None
     if config.fusion.texture:
         recording, _ = joined_recording(sessions)
-        texture = make_texture(recording, result, config.fusion.texture, options.threads, progress)
+        texture = texturing.make_texture(
+            recording, result, config.fusion.texture, options.threads, progress
+        )
     progress.stage("writing")
     with threadpool_limits(1):
         write_result(result, folder, _report, texture)

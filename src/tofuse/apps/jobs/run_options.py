@@ -11,12 +11,12 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.engine.mapping import (
     MIN_MEMORY_MB,
-    TEXTURE,
     Config,
-    Prior,
     ViewKind,
     changed,
     from_method,
+    priors,
+    texturing,
 )
 from tofuse.engine.sensor import range_and_amplitude
 from tofuse.formats.files import parse_toml, read_text
@@ -51,7 +51,7 @@ class ModelOptions:
     def applied(self, config: Config) -> Config:
         """Return the configuration with these options."""
         if self.texture and not config.fusion.texture:
-            config = changed(config, {"fusion": {"texture": TEXTURE}}, where="--texture")
+            config = changed(config, {"fusion": {"texture": texturing.TEXTURE}}, where="--texture")
         if self.faces is not None:
             config = changed(config, {"fusion": {"faces": self.faces}}, where="--faces")
         if self.voxel is not None:
@@ -73,7 +73,7 @@ class Options(OpeningOptions, ModelOptions):
     min_depth: float | None = None
     max_depth: float | None = None
     guess: Literal["identity", "previous", "odometry"] | None = None
-    prior: Prior = "auto"
+    prior: priors.Prior = "auto"
     loops: Path | None = None
     object: bool = False
     unwrap: bool = False

@@ -23,11 +23,11 @@ from tofuse.apps.results import TRACKED, OutputFolder, check_output, plain, writ
 from tofuse.engine.compute import trim_memory
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
-from tofuse.engine.fusion import Textured
+from tofuse.engine.fusion import texture
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import Config, adapted, make_texture, reconstruct, view_kind, with_prior
+from tofuse.engine.mapping import Config, adaptation, priors, reconstruct, texturing, view_kind
 from tofuse.engine.progress import Progress, Silent, Stopwatch
-from tofuse.engine.results import Reason, Reconstruction, in_main_model, ranked, verdict_of
+from tofuse.engine.results import Reason, Reconstruction, in_main_model, verdicts
 from tofuse.engine.sensor import Unwrap
 from tofuse.formats.files import stamps_of
 from tofuse.formats.poses import read_loops
@@ -114,11 +114,11 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
     _preview(recording, progress)
     config = resolve(options, view_kind(recording))
     if not options.object:  # no sensor measures the motion relative to a moving object
-        recording, config = with_prior(recording, config, options.prior)
+        recording, config = priors.with_prior(recording, config, options.prior)
     check_guess(options, recording)
     if options.unwrap:
         check_unwrap(recording)
-    config = adapted(config, recording, options.threads, progress)
+    config = adaptation.adapted(config, recording, options.threads, progress)
     indices = frozenset(recording.indices.tolist())
     loops = tuple(read_loops(options.loops, indices)) if options.loops else ()
     # At the start, so that problems of the recording are reported before hours of work.
@@ -130,13 +130,13 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
 
 def _texture(
     job: _Job, result: Reconstruction, options: Options, progress: Progress, watch: Stopwatch
-) -> Textured | None:
+) -> texture.Textured | None:
     """Make the texture if one is configured; with a note if that is impossible."""
     size = job.config.fusion.texture
     if not size:
         return None
     with watch.timing("texture"):
-        texture = make_texture(job.recording, result, size, options.threads, progress)
+        texture = texturing.make_texture(job.recording, result, size, options.threads, progress)
     if texture is None:
         progress.note("no texture: there is no surface, or neither colour nor amplitude")
     return texture
@@ -225,8 +225,8 @@ def with_findings(
         for f in findings
         if f.severity == "severe" and f.code not in harmless
     ]
-    reasons = ranked((*result.diagnostics.reasons, *severe))
-    verdict = verdict_of(reasons)
+    reasons = verdicts.ranked((*result.diagnostics.reasons, *severe))
+    verdict = verdicts.verdict_of(reasons)
     recording = {
         **result.recording,
         "warnings": [*result.recording["warnings"], *(str(f) for f in findings)],

@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.apps.results import MAX_STATED_PROBABILITY
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import evenly_spaced
-from tofuse.engine.quality import CrossViewConsistency, changes, compare_views
+from tofuse.engine.quality import changes, cross_view_agreement
 from tofuse.engine.results import Reconstruction, SessionChange, SessionPair, SessionRecord
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.views import PreparedView
@@ -68,11 +68,15 @@ class SessionModel:
         ]
         return min(max(probabilities), MAX_STATED_PROBABILITY) if probabilities else None
 
-    def cross_view(self, first: Sequence[View], second: Sequence[View]) -> CrossViewConsistency:
+    def cross_view(
+        self, first: Sequence[View], second: Sequence[View]
+    ) -> cross_view_agreement.CrossViewConsistency:
         """Return the cross-view consistency between views of two sessions."""
         views = [*first, *second]
         poses = np.array([self.poses[v.index] for v in views]).reshape(-1, 4, 4)
-        return compare_views([v.view for v in views], poses, [0] * len(first) + [1] * len(second))
+        return cross_view_agreement.compare_views(
+            [v.view for v in views], poses, [0] * len(first) + [1] * len(second)
+        )
 
 
 def session_pairs(

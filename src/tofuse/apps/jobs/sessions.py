@@ -25,9 +25,9 @@ from tofuse.apps.results import (
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
-from tofuse.engine.mapping import Config, adapted, changed, from_method, kind_of
+from tofuse.engine.mapping import Config, adaptation, changed, from_method, kind_of
 from tofuse.engine.progress import Progress
-from tofuse.engine.tracking import GivenPoses, Keyframes, StatedPose, Status
+from tofuse.engine.tracking import Keyframes, Status, given
 from tofuse.formats.files import path_of
 from tofuse.formats.recordings import Opening
 
@@ -63,11 +63,11 @@ class Session:
     opening: Opening
     recording: Recording
     config: Config
-    stated: Mapping[int, StatedPose]
+    stated: Mapping[int, given.StatedPose]
     links: tuple[tuple[int, int], ...] = ()
 
     @property
-    def posed(self) -> dict[int, StatedPose]:
+    def posed(self) -> dict[int, given.StatedPose]:
         """The stated frames with a pose."""
         return {k: s for k, s in self.stated.items() if s.T_component_camera is not None}
 
@@ -125,7 +125,7 @@ def sessions_of(
 
 def _read_parts(
     folder: Path, components: int
-) -> tuple[list[tuple[StoredRecording, dict[int, StatedPose]]], tuple[tuple[int, int], ...]]:
+) -> tuple[list[tuple[StoredRecording, dict[int, given.StatedPose]]], tuple[tuple[int, int], ...]]:
     """Read the recordings of a result and the poses of their frames, by index in the recording.
 
     Also the loop closures between them, see `Session`. Its components are numbered from
@@ -153,7 +153,7 @@ def _links(run: Mapping[str, Any], parts: Sequence[StoredRecording]) -> tuple[tu
 
 def _session(
     part: StoredRecording,
-    stated: dict[int, StatedPose],
+    stated: dict[int, given.StatedPose],
     folder: Path,
     threads: int | None,
     progress: Progress,
@@ -172,7 +172,7 @@ def _session(
     return Session(part.name, folder, opening, recording, config, stated)
 
 
-def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, StatedPose]:
+def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, given.StatedPose]:
     """Return the pose and status that a result states for each frame, by index."""
     poses = _poses(folder, dict(run))
     main = {k: (T, components) for k, T in poses.items()}
@@ -189,10 +189,10 @@ def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, 
         if index in main:
             T, component = main[index]
             C = frame_covariance(frame) if component == components else None
-            stated[index] = StatedPose(status, str(frame["reason"]), T, component, C)
+            stated[index] = given.StatedPose(status, str(frame["reason"]), T, component, C)
         else:
             reason = str(frame["reason"]) if status in ("lost", "skipped") else "was in no model"
-            stated[index] = StatedPose("lost", reason)
+            stated[index] = given.StatedPose("lost", reason)
     return stated
 
 
@@ -213,14 +213,14 @@ def _config(
     """Return the stored configuration of a result, with `GivenPoses` as odometry."""
     where = f"{folder / 'run.json'}: config"
     config = changed(from_method("default"), stored, where=where)
-    given_poses = GivenPoses()
-    if isinstance(config.odometry, Keyframes | GivenPoses):
+    given_poses = given.GivenPoses()
+    if isinstance(config.odometry, Keyframes | given.GivenPoses):
         odometry = config.odometry
-        given_poses = GivenPoses(
+        given_poses = given.GivenPoses(
             odometry.views, odometry.keyframe_angle, odometry.keyframe_distance
         )
     config = replace(config, odometry=given_poses)
-    return adapted(config, recording, threads, progress)
+    return adaptation.adapted(config, recording, threads, progress)
 
 
 def _check_different(first: Session, second: Session) -> None:

@@ -24,7 +24,7 @@ from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.mapping import FrameLog
-from tofuse.engine.tracking import FrameTime, Step, Tracker, at_size, without_pixels
+from tofuse.engine.tracking import FrameTime, Step, Tracker, moving_objects
 from tofuse.engine.views import PreparedView
 from tofuse.formats.files import Arrays, read_npz, replacing
 
@@ -215,7 +215,11 @@ class ReplayingTracker(Tracker):
         if bits is None or view is None or not isinstance(frame, RangeFrame):
             return replace(step, surface=view)
         mask = _unpacked_mask(bits, view.z.shape)
-        return replace(step, surface=without_pixels(view, mask), moving=at_size(mask, frame))
+        return replace(
+            step,
+            surface=moving_objects.without_pixels(view, mask),
+            moving=moving_objects.at_size(mask, frame),
+        )
 
     def prepare(self, frame: Frame) -> PreparedView | None:
         """See `Tracker.prepare`."""

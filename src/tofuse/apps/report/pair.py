@@ -14,7 +14,7 @@ from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.apps.report.scene import Scene, extreme_points, random_subset, render, spacing_of
 from tofuse.apps.results import LocalView, PairResult
 from tofuse.engine.arrays import Float64, Intp, UInt8
-from tofuse.engine.clouds import normals_at
+from tofuse.engine.clouds import surface_shape
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
 
@@ -158,7 +158,7 @@ class PairScene:
             distance[name] = distances(own, others, chosen)
             directions = None
             if len(frame) > _NEIGHBOURS:
-                directions = normals_at(frame, chosen.astype(np.int64))
+                directions = surface_shape.normals_at(frame, chosen.astype(np.int64))
             for key, pose in poses.items():
                 points[key] = se3.transform(axes @ pose, frame.points[chosen].astype(float))
                 R = (axes @ pose)[:3, :3]

@@ -18,7 +18,8 @@ from tofuse.apps.report.thumbnails import (
     viridis,
 )
 from tofuse.engine.compute import run_all
-from tofuse.engine.quality import FrameSample, samples
+from tofuse.engine.quality import frame_samples
+from tofuse.engine.quality import frame_samples as samples
 
 # Kinds of images, in the order in which they are shown, and their titles.
 KINDS = {"color": "Colour", "range": "Range", "amplitude": "Amplitude", "fate": "Use of pixels"}
@@ -45,7 +46,7 @@ class Pictures:
         return f"data:image/{name};base64,{base64.b64encode(data).decode()}" if data else "data:,"
 
 
-def depth_range(frames: Sequence[FrameSample]) -> tuple[float, float]:
+def depth_range(frames: Sequence[frame_samples.FrameSample]) -> tuple[float, float]:
     """Return the depths in m at the ends of the colour map, the same for all frames."""
     subsampled = [f.depth[::3, ::3] for f in frames]
     values = (
@@ -54,14 +55,14 @@ def depth_range(frames: Sequence[FrameSample]) -> tuple[float, float]:
     return percentile_range(values, min_width=1e-3)
 
 
-def draw(frames: Sequence[FrameSample]) -> tuple[Pictures, ...]:
+def draw(frames: Sequence[frame_samples.FrameSample]) -> tuple[Pictures, ...]:
     """Render the samples of frames."""
     low, high = depth_range(frames)
     fate_colors = np.zeros((4, 3), np.uint8)
     for fate, (color, _) in FATES.items():
         fate_colors[fate] = color
 
-    def render(frame: FrameSample) -> Pictures:
+    def render(frame: frame_samples.FrameSample) -> Pictures:
         depth = frame.depth.astype(float)
         picture = viridis((depth - low) / (high - low))
         picture[depth == 0] = NO_MEASUREMENT

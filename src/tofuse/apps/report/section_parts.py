@@ -9,7 +9,7 @@ from tofuse.apps.report.subject import ROWS, Subject, Values
 from tofuse.apps.report.thumbnails import css
 from tofuse.apps.results import CHANGE_COLORS, component_name, probability_text
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames import numbers
+from tofuse.engine.frames import frame_ranges
 from tofuse.engine.geometry import se3
 from tofuse.engine.results import Component, SessionChange, SessionPair
 from tofuse.formats.recordings import RigCamera
@@ -115,7 +115,7 @@ def _component(number: int, component: Component, count: int) -> Values:
     return {
         "name": f"{number} (main)" if number == 0 else str(number),
         "color": component_color(number),
-        "frames": numbers(component.frames).replace("-", "–"),
+        "frames": frame_ranges.numbers(component.frames).replace("-", "–"),
         "count": f"{count:,}",
         "joined": _JOINED.get(component.joined or "", "–" if number == 0 else "not connected"),
         "link": link,

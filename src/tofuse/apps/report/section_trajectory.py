@@ -8,7 +8,7 @@ from tofuse.apps.report import plots, words
 from tofuse.apps.report.subject import Subject, Values
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.refinement import Refinement, proposal
+from tofuse.engine.refinement import Refinement, calibration_check
 
 _AXES = ("x (right)", "y (down)", "z (forward)", "rotation")
 
@@ -213,7 +213,7 @@ def _camera_check(refinement: Refinement) -> str:
             verdict = "Check the calibration."
         elif check.unconfirmed:
             verdict = "The stated accuracy includes its effect."
-        correction = proposal(check.errors, check.best)
+        correction = calibration_check.proposal(check.errors, check.best)
         sentences += [f"Overlapping views would be more consistent with {correction}.", verdict]
     elif not refinement.errors:
         sentences.append("No evidence of errors of the intrinsics or of the range.")

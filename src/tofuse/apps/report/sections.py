@@ -17,7 +17,7 @@ from tofuse.apps.report import (
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.subject import Subject, Values
 from tofuse.engine.compute import job_pool
-from tofuse.engine.results import Reconstruction, bound, weakest_frame
+from tofuse.engine.results import Reconstruction, accuracy_card
 
 Section = Callable[[Subject], Values | None]
 
@@ -90,10 +90,10 @@ def _card(result: Reconstruction) -> list[tuple[str, str, str]]:
     closures = sum(p.accepted for p in d.loops)
     covered = f"{int(result.has_pose.sum()):,} of {words.count(readable, 'frame')}"
     lines = [
-        ("Accuracy", bound(a, result.cloud.diagonal_m).removeprefix("accuracy "), ""),
+        ("Accuracy", accuracy_card.bound(a, result.cloud.diagonal_m).removeprefix("accuracy "), ""),
         ("Coverage", f"{covered}, {words.count(closures, 'loop closure')}", ""),
     ]
-    if weakest := weakest_frame(a):
+    if weakest := accuracy_card.weakest_frame(a):
         frames = [a.unbounded[0], a.unbounded[-1]] if a.unbounded else []
         if a.worst is not None and not frames:
             frames = [a.worst.frame, a.worst.frame]

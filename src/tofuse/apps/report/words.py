@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.engine.frames import Range, in_words, size
-from tofuse.engine.results import ADVICE, REASONS, Reason, Reconstruction, ranked
+from tofuse.engine.frames import frame_ranges
+from tofuse.engine.results import Reason, Reconstruction, verdicts
 
 STATUSES = ("tracked", "predicted", "lost", "skipped")
 
@@ -104,7 +104,7 @@ class Finding:
 
     level: str
     text: str
-    ranges: tuple[Range, ...]
+    ranges: tuple[frame_ranges.Range, ...]
     advice: str
 
     where: str = ""
@@ -121,12 +121,14 @@ def findings(reasons: Sequence[Reason], total: int) -> list[Finding]:
         Number of frames: reasons that concern the majority don't list them.
     """
     listed = []
-    for reason in ranked(reasons):
-        level, meaning = REASONS[reason.code]
+    for reason in verdicts.ranked(reasons):
+        level, meaning = verdicts.REASONS[reason.code]
         text = _with_frames(reason, total) if reason.text.strip() else meaning
-        is_subset = 0 < size(reason.ranges) < total
-        where = in_words(reason.ranges).replace("-", "–") if is_subset else ""
-        listed.append(Finding(level, text, reason.ranges, ADVICE.get(reason.code, ""), where))
+        is_subset = 0 < frame_ranges.size(reason.ranges) < total
+        where = frame_ranges.in_words(reason.ranges).replace("-", "–") if is_subset else ""
+        listed.append(
+            Finding(level, text, reason.ranges, verdicts.ADVICE.get(reason.code, ""), where)
+        )
     return listed
 
 
@@ -135,9 +137,13 @@ def _with_frames(reason: Reason, total: int) -> str:
     text = sentence(reason.text)
     first, last = reason.frames
     named = {str(first), str(last)} <= set(re.findall(r"\d+", text))
-    if named or in_words(reason.ranges) in text or 2 * size(reason.ranges) > total:
+    if (
+        named
+        or frame_ranges.in_words(reason.ranges) in text
+        or 2 * frame_ranges.size(reason.ranges) > total
+    ):
         return text
-    return f"{text.rstrip('.')} ({in_words(reason.ranges)})."
+    return f"{text.rstrip('.')} ({frame_ranges.in_words(reason.ranges)})."
 
 
 def sentence(text: str) -> str:

@@ -17,8 +17,8 @@ from tofuse.apps.results.run_json import (
 )
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh, mesh_of
-from tofuse.engine.graph import GraphPart, LoopRecord, SensorRecord
-from tofuse.engine.quality import Accuracy, WorstFrame
+from tofuse.engine.graph import GraphPart, LoopRecord, external_sensors
+from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.results import (
     Component,
     Diagnostics,
@@ -76,7 +76,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         {name: each["removed"] for name, each in run["filters"].items()},
         run["seconds"],
         parts=tuple(_part(each) for each in run["optimiser"]),
-        priors=tuple(SensorRecord(**s) for s in run["priors"]),
+        priors=tuple(external_sensors.SensorRecord(**s) for s in run["priors"]),
         accuracy=_accuracy(run["accuracy"]),
         calibrated=_calibration(run.get("self_calibration")),
     )
@@ -120,18 +120,20 @@ def _part(data: dict[str, Any]) -> GraphPart:
     return GraphPart(**{name: data[name] for name in names})
 
 
-def _accuracy(data: dict[str, Any]) -> Accuracy:
+def _accuracy(data: dict[str, Any]) -> pose_accuracy.Accuracy:
     def bound(value: float | None) -> float:
         return np.inf if value is None else float(value)
 
     worst = data["worst"]
-    return Accuracy(
+    return pose_accuracy.Accuracy(
         bound(data["position_m"]),
         bound(data["rotation_rad"]),
         bound(data["relative"]),
         data["assessed"],
         worst
-        and WorstFrame(worst["frame"], bound(worst["position_m"]), bound(worst["rotation_rad"])),
+        and pose_accuracy.WorstFrame(
+            worst["frame"], bound(worst["position_m"]), bound(worst["rotation_rad"])
+        ),
         tuple(data["unbounded"]),
         tuple(data["by_odometry"]),
     )

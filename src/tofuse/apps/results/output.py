@@ -12,7 +12,7 @@ from tofuse._version import __version__
 from tofuse.apps.results.folder import OutputFolder, component_name
 from tofuse.apps.results.run_json import write_run_json
 from tofuse.engine.compute import job_pool
-from tofuse.engine.fusion import GeometryRecord, Mesh, Textured, display_colors
+from tofuse.engine.fusion import GeometryRecord, Mesh, display_colors, texture
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.geometry import write_glb, write_obj, write_ply
 from tofuse.formats.images import png_bytes
@@ -31,7 +31,7 @@ def write_result(
     result: Reconstruction,
     folder: OutputFolder,
     report: Callable[[Reconstruction, Path], None] | None = None,
-    texture: Textured | None = None,
+    texture: texture.Textured | None = None,
 ) -> None:
     """Write all files of a result.
 
@@ -67,7 +67,7 @@ def _write_files(
     result: Reconstruction,
     folder: Path,
     report: Callable[[Reconstruction, Path], None] | None,
-    texture: Textured | None,
+    texture: texture.Textured | None,
 ) -> None:
     # Both release the interpreter lock for much of their time.
     with job_pool(1, "tofuse-writer") as background:
@@ -81,7 +81,7 @@ def _write_files(
         write_run_json(folder / "run.json", result)
 
 
-def _write_model(result: Reconstruction, folder: Path, texture: Textured | None) -> None:
+def _write_model(result: Reconstruction, folder: Path, texture: texture.Textured | None) -> None:
     """Write cloud and surface."""
     if len(result.cloud) > MAX_PLY_POINTS:
         result.cloud.save(folder / "cloud.laz")
@@ -108,7 +108,9 @@ def _write_changes(result: Reconstruction, path: Path) -> None:
     )
 
 
-def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textured | None) -> None:
+def _write_mesh(
+    mesh: Mesh, result: Reconstruction, folder: Path, texture: texture.Textured | None
+) -> None:
     """Write `mesh.ply`, in the world frame, and `mesh.glb`, whose node makes it upright.
 
     `mesh.glb` is an overview of at most `OVERVIEW_BYTES`, or has a texture.

@@ -16,8 +16,8 @@ from tofuse.apps.results.folder import is_result
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality import Accuracy
-from tofuse.engine.refinement import CalibrationCheck, Refinement
+from tofuse.engine.quality import pose_accuracy
+from tofuse.engine.refinement import Refinement, calibration_check
 from tofuse.engine.results import FrameRecord, Reason, Reconstruction, SelfCalibration
 from tofuse.formats.files import damage_reported, parsed, read_text
 from tofuse.formats.poses import read_tum
@@ -138,7 +138,7 @@ def frame_clock(folder: Path) -> tuple[Float64, Intp] | None:
         return times, np.array([frame["index"] for frame in frames], np.intp)
 
 
-def accuracy_json(a: Accuracy) -> dict[str, Any]:
+def accuracy_json(a: pose_accuracy.Accuracy) -> dict[str, Any]:
     """Return the accuracy as in `run.json`, except that infinite bounds are not yet null."""
     return asdict(a)
 
@@ -173,7 +173,7 @@ def _calibration(calibration: SelfCalibration | None) -> dict[str, Any] | None:
     }
 
 
-def _suspicion(check: CalibrationCheck | None) -> dict[str, Any] | None:
+def _suspicion(check: calibration_check.CalibrationCheck | None) -> dict[str, Any] | None:
     """The check of the camera's calibration; None where it was not made."""
     if check is None:
         return None

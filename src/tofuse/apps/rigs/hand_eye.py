@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from tofuse.apps.rigs.clocks import Lag, lag_between
-from tofuse.engine.alignment import UNITS
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.errors import RegistrationError
@@ -217,19 +217,19 @@ class _Fit:
             g = _weighted_product(J, w / sigma**2, e[..., None])[:, 0]
             H += np.diag(1e-9 * H.diagonal() + 1e-6)
             step = -np.linalg.solve(H, g)
-            X = se3.orthonormalise(X @ se3.exp(step[:6] * UNITS))
+            X = se3.orthonormalise(X @ se3.exp(step[:6] * projective.UNITS))
             if not self.common_world:
-                Y = se3.orthonormalise(Y @ se3.exp(step[6:12] * UNITS))
+                Y = se3.orthonormalise(Y @ se3.exp(step[6:12] * projective.UNITS))
             offset += float(np.clip(step[-1] * _TIME_UNIT, -self.half_step, self.half_step))
             if np.abs(step).max() < _CONVERGENCE:
                 break
         J, e, times = self.linearised(X, Y, offset)
         sigma = _sigma(e)
         C = _covariance(J, e, times, sigma)
-        units = np.outer(UNITS, UNITS)
+        units = np.outer(projective.UNITS, projective.UNITS)
         return HandEye(
             X, C[:6, :6] * units, Y, offset, float(np.sqrt(C[-1, -1])) * _TIME_UNIT, len(e),
-            sigma * UNITS,
+            sigma * projective.UNITS,
         )  # fmt: skip
 
     def linearised(self, X: Float64, Y: Float64, offset: float) -> tuple[Float64, Float64, Float64]:
@@ -239,17 +239,17 @@ class _Fit:
         right = se3.jacobian_inverse(e)
         left = se3.jacobian_inverse(-e)
         by_x = -left
-        columns = [by_x * UNITS]
+        columns = [by_x * projective.UNITS]
         if not self.common_world:
-            columns.append(right @ se3.adjoint(se3.inverse(T_b)) * UNITS)
+            columns.append(right @ se3.adjoint(se3.inverse(T_b)) * projective.UNITS)
         # The velocity of b: a larger offset selects an earlier pose.
         T_after, valid_after = self.b.at(times - offset + self.half_step)
         T_before, valid_before = self.b.at(times - offset - self.half_step)
         velocity = se3.log(se3.inverse(T_before) @ T_after) / (2 * self.half_step)
         velocity = np.where((valid_after & valid_before)[:, None], velocity, 0.0)
         columns.append((-(right @ velocity[..., None])) * _TIME_UNIT)
-        J = np.concatenate(columns, axis=2) / UNITS[:, None]
-        return np.asarray(J, np.float64), np.asarray(e / UNITS, np.float64), times
+        J = np.concatenate(columns, axis=2) / projective.UNITS[:, None]
+        return np.asarray(J, np.float64), np.asarray(e / projective.UNITS, np.float64), times
 
 
 def _sigma(e: Float64) -> Float64:

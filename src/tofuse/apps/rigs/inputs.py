@@ -10,7 +10,7 @@ from pathlib import Path
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters import apply_filters
 from tofuse.engine.frames import RangeFrame, Recording
-from tofuse.engine.mapping import Config, from_method, with_recording_defaults
+from tofuse.engine.mapping import Config, adaptation, from_method
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 from tofuse.formats.recordings import open_recording
 
@@ -30,7 +30,7 @@ class Camera:
 
         Corrections that need a trial are omitted: it compares consecutive views of a moving camera.
         """
-        config = with_recording_defaults(from_method("default", "range"), self.recording)
+        config = adaptation.with_recording_defaults(from_method("default", "range"), self.recording)
         corrections = tuple(c for c in config.corrections if not c.needs_trial)
         return replace(config, corrections=corrections)
 

@@ -17,16 +17,16 @@ import numpy as np
 
 from tofuse.apps.rigs import rig_residual_kernels as kernels
 from tofuse.apps.rigs.joint_covariance import by_region, correlated, inverse_slope
-from tofuse.engine.alignment import UNITS
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
-from tofuse.engine.stored_views import Round, SampledView, shared_error
+from tofuse.engine.stored_views import SampledView, pair_equations, shared_error
 
 # Unknowns of a camera: its pose, in units of 1 cm and 1 degree, and its depth offset, in cm.
 _SIZE = 7
-_UNITS = np.append(UNITS, 0.01)
+_UNITS = np.append(projective.UNITS, 0.01)
 _PAIRS_PER_CHUNK = 8
 # Median of chi-square with one degree of freedom; limits of the noise scale of a pair of cameras.
 _MEDIAN_OF_SQUARES = 0.455
@@ -64,7 +64,11 @@ class JointOptions:
         Iterations stop when no unknown changes by more than this, in units of 1 cm and 1 degree.
     """
 
-    rounds: tuple[Round, ...] = (Round(6, 0.03, 0.0), Round(6, 0.01, 0.0), Round(12, 0.0, 0.0))
+    rounds: tuple[pair_equations.Round, ...] = (
+        pair_equations.Round(6, 0.03, 0.0),
+        pair_equations.Round(6, 0.01, 0.0),
+        pair_equations.Round(12, 0.0, 0.0),
+    )
     robust: float = 3.5
     max_angle: float = 0.7
     overlap: float = 0.04

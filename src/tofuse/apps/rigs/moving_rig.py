@@ -20,9 +20,9 @@ from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import reconstruct
 from tofuse.engine.progress import Progress, Silent
-from tofuse.engine.refinement import Priors, propagate_poses, refine, refined_by_halves
+from tofuse.engine.refinement import Priors, joint_alignment, propagate_poses, refined_by_halves
 from tofuse.engine.results import Reconstruction
-from tofuse.engine.stored_views import RefineOptions, SampledView
+from tofuse.engine.stored_views import SampledView, pair_equations
 
 # Number of views of each camera that are refined jointly, and of their points.
 _VIEWS, _POINTS = 70, 1500
@@ -30,7 +30,7 @@ _VIEWS, _POINTS = 70, 1500
 _MAX_CLOCK_DIFFERENCE_S = 0.5
 # Maximum sigma of a placed camera: fraction of the depth, and rad.
 _MAX_SIGMA_FRACTION, _MAX_SIGMA_RAD = 0.05, float(np.radians(4.0))
-_OPTIONS = RefineOptions(neighbours=16)
+_OPTIONS = pair_equations.RefineOptions(neighbours=16)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +221,7 @@ class _JointViews:
         views = [v for k in order for v in self._views[k].views]
         poses = np.concatenate([self.tracks[k].poses[self._views[k].rows] for k in order])
         first = poses[0]
-        refinement = refine(views, np.asarray(se3.inverse(first) @ poses), _OPTIONS)
+        refinement = joint_alignment.refine(views, np.asarray(se3.inverse(first) @ poses), _OPTIONS)
         count = len(views)
         before, after = refinement.before.of_views(count), refinement.after.of_views(count)
         camera = np.repeat(order, [len(self._views[k].views) for k in order])

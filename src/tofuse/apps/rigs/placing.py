@@ -25,16 +25,14 @@ from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import (
-    ACCEPTED,
     DISTINCT_M,
-    AgreementOptions,
-    Comparison,
-    PoseEvidence,
     Search,
     SearchOptions,
     are_distinct_poses,
-    comparable,
+    pair_agreement,
+    pose_probability,
     register_pair,
+    verification,
 )
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.views import PreparedView
@@ -115,9 +113,9 @@ class _Placer:
         }
         depth = min(1.0, float(np.median(list(self._depth.values()))) if self._depth else 1.0)
         self._distinct_m = min(DISTINCT_M, _DISTINCT * depth)
-        default = AgreementOptions()
+        default = pair_agreement.AgreementOptions()
         self._agreement = replace(default, floor_m=default.floor_m * depth)
-        self._comparisons: dict[tuple[int, int], list[Comparison]] = {}
+        self._comparisons: dict[tuple[int, int], list[pair_agreement.Comparison]] = {}
         self._proposals: dict[tuple[int, int], Float64] = {}
         self._refinement_views = self._views_to_refine()
         for a, b in itertools.combinations(sorted(self._depth), 2):
@@ -139,10 +137,12 @@ class _Placer:
         pairs = [
             (first, second)
             for first, second in zip(self._views[a], self._views[b], strict=True)
-            if first is not None and second is not None and comparable(first.depth, second.depth)
+            if first is not None
+            and second is not None
+            and verification.comparable(first.depth, second.depth)
         ]
         self._comparisons[a, b] = [
-            Comparison.of(s, t, self._agreement) for t, s in _evenly(pairs, _SCORED)
+            pair_agreement.Comparison.of(s, t, self._agreement) for t, s in _evenly(pairs, _SCORED)
         ]
         proposals = [self._propose(t, s) for t, s in _evenly(pairs, _SEARCHED)]
         poses = np.concatenate([np.zeros((0, 4, 4)), *proposals])
@@ -328,12 +328,12 @@ class _Placer:
         rival_scores = self._rivals({**others, camera: pose}, camera, candidates)
         rival = next(rival_scores, 0.0)
         overlap = max(sum(s.overlap for s in agreements), 1e-9)
-        evidence = PoseEvidence(
+        evidence = pose_probability.PoseEvidence(
             support=min(sum(s.support for s in agreements), 1.0),
             contradiction=sum(s.contradiction for s in agreements) / overlap,
             margin=score - rival,
         )
-        if evidence.probability >= ACCEPTED:
+        if evidence.probability >= pose_probability.ACCEPTED:
             return evidence.probability, ""
         # Only now the other rivals: each costs a joint refinement.
         scores = [rival, *itertools.islice(rival_scores, _RIVALS)]

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras import MIN_DEPTH, nearest_pixel
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
-from tofuse.engine.views import DISTANCE, NORMAL, PLANE, POINT, SIGMA, VARIANCE, TargetImage
+from tofuse.engine.views import residual_kernels
 
 # Columns of a row: signed distance from the target's plane in m and its variance (0: no
 # correspondence), the target's normal in the source's frame, the source's own normal, the corrected
@@ -29,7 +29,7 @@ ROW = 13
 @kernel
 def residuals(
     points: Float32,
-    target: TargetImage,
+    target: residual_kernels.TargetImage,
     T: Float64,
     source_offset: float,
     target_offset: float,
@@ -49,9 +49,9 @@ def residuals(
     rows, columns = image.shape[0], image.shape[1]
     for k in range(points.shape[0]):
         out[k, :] = 0.0
-        x = np.float64(points[k, POINT])
-        y = np.float64(points[k, POINT + 1])
-        z = np.float64(points[k, POINT + 2])
+        x = np.float64(points[k, residual_kernels.POINT])
+        y = np.float64(points[k, residual_kernels.POINT + 1])
+        z = np.float64(points[k, residual_kernels.POINT + 2])
         length = np.sqrt(x * x + y * y + z * z)
         relative_offset = source_offset / length
         b0, b1, b2 = x / length, y / length, z / length
@@ -61,32 +61,36 @@ def residuals(
         q0 = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
         q1 = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
         q2 = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-        if q2 <= MIN_DEPTH:
+        if q2 <= projection_kernels.MIN_DEPTH:
             continue
-        i, j = nearest_pixel(q0 / q2, q1 / q2, lookup, lookup_frame, rows, columns)
+        i, j = projection_kernels.nearest_pixel(
+            q0 / q2, q1 / q2, lookup, lookup_frame, rows, columns
+        )
         if i < 0:
             continue
         pixel = image[i, j]
-        distance = np.float64(pixel[DISTANCE])
+        distance = np.float64(pixel[residual_kernels.DISTANCE])
         if distance == 0:
             continue
-        n0 = np.float64(pixel[PLANE])
-        n1 = np.float64(pixel[PLANE + 1])
-        n2 = np.float64(pixel[PLANE + 2])
+        n0 = np.float64(pixel[residual_kernels.PLANE])
+        n1 = np.float64(pixel[residual_kernels.PLANE + 1])
+        n2 = np.float64(pixel[residual_kernels.PLANE + 2])
         m0 = T[0, 0] * n0 + T[1, 0] * n1 + T[2, 0] * n2
         m1 = T[0, 1] * n0 + T[1, 1] * n1 + T[2, 1] * n2
         m2 = T[0, 2] * n0 + T[1, 2] * n1 + T[2, 2] * n2
-        s0 = np.float64(points[k, NORMAL])
-        s1 = np.float64(points[k, NORMAL + 1])
-        s2 = np.float64(points[k, NORMAL + 2])
+        s0 = np.float64(points[k, residual_kernels.NORMAL])
+        s1 = np.float64(points[k, residual_kernels.NORMAL + 1])
+        s2 = np.float64(points[k, residual_kernels.NORMAL + 2])
         if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
             continue
         # The target's offset moves its plane along the ray of the pixel.
         target_derivative = (n0 * q0 + n1 * q1 + n2 * q2) / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2)
-        source_sigma = (m0 * x + m1 * y + m2 * z) * np.float64(points[k, SIGMA])
+        source_sigma = (m0 * x + m1 * y + m2 * z) * np.float64(points[k, residual_kernels.SIGMA])
         row = out[k]
         row[RESIDUAL] = n0 * q0 + n1 * q1 + n2 * q2 - distance - target_offset * target_derivative
-        row[RESIDUAL_VARIANCE] = source_sigma * source_sigma + np.float64(pixel[VARIANCE])
+        row[RESIDUAL_VARIANCE] = source_sigma * source_sigma + np.float64(
+            pixel[residual_kernels.VARIANCE]
+        )
         row[TARGET_NORMAL] = m0
         row[TARGET_NORMAL + 1] = m1
         row[TARGET_NORMAL + 2] = m2

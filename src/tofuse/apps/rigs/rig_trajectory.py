@@ -18,18 +18,17 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Measured
+from tofuse.engine.graph import measured_graph
 from tofuse.engine.mapping import reconstruct
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import (
-    Bodies,
+    joint_alignment,
     pairwise_measurements,
     propagate_poses,
-    refine,
     support_fell,
 )
 from tofuse.engine.results import Reconstruction
-from tofuse.engine.stored_views import RefineOptions, SampledView, Spacing
+from tofuse.engine.stored_views import SampledView, Spacing, pair_equations
 from tofuse.formats.recordings import RigCamera, RigSource
 
 # Median distance between the surfaces of two cameras, m, and number of pixels, by pair a < b.
@@ -42,7 +41,7 @@ _POINTS = 1500
 # to each pose, as even the first pose of a track has an error.
 _DEFAULT_VARIANCES, _MIN_FRACTION = np.array([0.1**2] * 6), 1e-4
 # More neighbours than for one camera, as each camera observes the same places as the others.
-_OPTIONS = RefineOptions(neighbours=16)
+_OPTIONS = pair_equations.RefineOptions(neighbours=16)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +66,8 @@ class RigTrajectory:
     poses: Float64
     T_rig_frame: Float64
     disagreement: SurfaceDistances
-    measured: tuple[Measured, ...]
-    tracked: tuple[Measured, ...] = ()
+    measured: tuple[measured_graph.Measured, ...]
+    tracked: tuple[measured_graph.Measured, ...] = ()
 
 
 def track_rig(cameras: Sequence[Camera], recording: Recording, progress: Progress) -> RigTrajectory:
@@ -118,7 +117,7 @@ def _tracking_edges(
     poses: Float64,
     instant: Intp,
     used: set[int],
-) -> list[Measured]:
+) -> list[measured_graph.Measured]:
     """Return edges from the first pose to instants that were not refined.
 
     Their information is the sum of that of the cameras' own trajectories.
@@ -135,7 +134,7 @@ def _tracking_edges(
             continue
         T = se3.inverse(poses[instant[posed[0]]]) @ poses[row]
         ends = int(recording.indices[posed[0]]), int(recording.indices[k])
-        edges.append(Measured(*ends, T, np.asarray(information, np.float64)[k]))
+        edges.append(measured_graph.Measured(*ends, T, np.asarray(information, np.float64)[k]))
     return edges
 
 
@@ -241,9 +240,9 @@ def refined(
     used, body = np.unique(instant[frames], return_inverse=True)
     if len(used) < 2:
         return RigTrajectory(poses, T_rig_frame, {}, ())
-    bodies = Bodies(body, T_rig_frame[frames])
+    bodies = joint_alignment.Bodies(body, T_rig_frame[frames])
     initial = bodies.view_poses(poses[used])
-    refinement = refine(
+    refinement = joint_alignment.refine(
         views, np.asarray(se3.inverse(initial[0]) @ initial), _OPTIONS, bodies=bodies
     )
     count = len(views)

@@ -21,15 +21,15 @@ from tofuse.engine.compute import threads as using_threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Measured
+from tofuse.engine.graph import measured_graph
 from tofuse.engine.loops import Nearby
-from tofuse.engine.mapping import Config, reconstruct, with_odometry
+from tofuse.engine.mapping import Config, priors, reconstruct
 from tofuse.engine.progress import Progress, Silent
-from tofuse.engine.quality import UNOBSERVED_ERROR_FACTOR
+from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import AlreadyRefined, NoRefinement
-from tofuse.engine.results import Reason, Reconstruction, ranked, verdict_of
+from tofuse.engine.results import Reason, Reconstruction, verdicts
 from tofuse.engine.stored_views import SampledView
-from tofuse.engine.tracking import GivenPoses
+from tofuse.engine.tracking import given
 from tofuse.formats.poses import write_tum
 from tofuse.formats.recordings import Disagreement, Rig, RigSource, read_rig, recordings_of
 
@@ -144,8 +144,8 @@ def reconstruct_rig(
     poses = np.tile(np.eye(4), (len(instants), 1, 1))
     T_rig_frame = source.T_rig_camera[recording.indices]
     displaced: list[CameraMotion] = []
-    measured: tuple[Measured, ...] = ()
-    tracked: tuple[Measured, ...] = ()
+    measured: tuple[measured_graph.Measured, ...] = ()
+    tracked: tuple[measured_graph.Measured, ...] = ()
     if moves(cameras, motion):
         trajectory = track_rig(cameras, recording, progress)
         poses, T_rig_frame, distances = (
@@ -160,7 +160,7 @@ def reconstruct_rig(
     frame_poses = poses[instant] @ T_rig_frame
     fusion_config = replace(
         config,
-        odometry=GivenPoses(),
+        odometry=given.GivenPoses(),
         loops=_NO_LOOPS,
         refinement=NoRefinement(),
         priors=(),
@@ -174,7 +174,7 @@ def reconstruct_rig(
         fusion_config, refinement=AlreadyRefined(measured, (*tracked, *calibration_edges))
     )
     result = reconstruct(
-        with_odometry(recording, frame_poses), refined_config, seed=seed, progress=progress
+        priors.with_odometry(recording, frame_poses), refined_config, seed=seed, progress=progress
     )
     names = [camera.name for camera in rig.cameras]
     rig_fields = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}
@@ -200,7 +200,7 @@ def _calibration_edges(
     T_world_frame: Float64,
     *,
     follow: bool,
-) -> list[Measured]:
+) -> list[measured_graph.Measured]:
     """Return edges from the first camera's frame of each instant to the others, with information.
 
     Calibration errors are the same at all instants: if the rig is static (`follow`), later frames
@@ -208,12 +208,13 @@ def _calibration_edges(
     """
     # The bound on the errors is enlarged for systematic ones, which these covariances include.
     covariances = [
-        c.covariance / UNOBSERVED_ERROR_FACTOR**2 + np.diag(_MIN_VARIANCES) for c in rig.cameras
+        c.covariance / pose_accuracy.UNOBSERVED_ERROR_FACTOR**2 + np.diag(_MIN_VARIANCES)
+        for c in rig.cameras
     ]
     covariances[0] = np.diag(_MIN_VARIANCES)
     posed = np.flatnonzero(np.isfinite(T_world_frame[:, 0, 0]))
     cameras = source.camera[recording.indices]
-    edges: list[Measured] = []
+    edges: list[measured_graph.Measured] = []
     reference: dict[int, int] = {}
     first_of_camera: dict[int, int] = {}
     for k in posed:
@@ -226,7 +227,9 @@ def _calibration_edges(
         if i != k:
             T = se3.inverse(T_world_frame[i]) @ T_world_frame[k]
             ends = int(recording.indices[i]), int(recording.indices[k])
-            edges.append(Measured(*ends, T, np.asarray(np.linalg.inv(C), np.float64)))
+            edges.append(
+                measured_graph.Measured(*ends, T, np.asarray(np.linalg.inv(C), np.float64))
+            )
     return edges
 
 
@@ -238,12 +241,14 @@ def _without_tracking_diagnostics(
     `cameras` (F,) are the cameras of all frames, as indices into `names`.
     """
     d = result.diagnostics
-    reasons = ranked([r for r in d.reasons if r.code not in _TRACKING_REASONS])
+    reasons = verdicts.ranked([r for r in d.reasons if r.code not in _TRACKING_REASONS])
     worst = d.accuracy.worst
     if not moves and worst is not None:
         name = names[cameras[worst.frame]]
-        reasons = ranked([_calibration_reason(r, worst.frame, name) for r in reasons])
-    d = replace(d, reasons=reasons, verdict=verdict_of(reasons), refinement=None, cloud_before=None)
+        reasons = verdicts.ranked([_calibration_reason(r, worst.frame, name) for r in reasons])
+    d = replace(
+        d, reasons=reasons, verdict=verdicts.verdict_of(reasons), refinement=None, cloud_before=None
+    )
     return replace(result, diagnostics=d)
 
 
@@ -299,8 +304,8 @@ def _with_rig_reason(result: Reconstruction, displaced: Sequence[CameraMotion]) 
     )
     text = f"Camera poses differ from those of the rig: {changes}."
     all_frames = ((d.frames[0].index, d.frames[-1].index),)
-    reasons = ranked((*d.reasons, Reason("rig_changed", all_frames, text)))
-    verdict = verdict_of(reasons)
+    reasons = verdicts.ranked((*d.reasons, Reason("rig_changed", all_frames, text)))
+    verdict = verdicts.verdict_of(reasons)
     return replace(result, diagnostics=replace(d, reasons=reasons, verdict=verdict))
 
 

@@ -13,7 +13,7 @@ from tofuse.apps.report import data_uri, depth_image, depth_limits, length, subs
 from tofuse.apps.viewer.coverage import Coverage
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.frames import Frame, RangeFrame
-from tofuse.engine.geometry import from_matrix, se3
+from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.results import FrameRecord
 
@@ -211,7 +211,7 @@ class LiveView:
             thickness=2.5,
             thickness_units="screen",
             color=_CURRENT,
-            wxyz=np.roll(from_matrix(T[:3, :3]), 1),
+            wxyz=np.roll(quaternion.from_matrix(T[:3, :3]), 1),
             position=T[:3, 3],
         )
         path = np.stack(self._path[:: -(-len(self._path) // 2000)])

@@ -5,19 +5,8 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.alignment import step_kernels
-    from tofuse.engine.alignment.base import PROBABLE, Link, Registrar, Registration
-    from tofuse.engine.alignment.projective import (
-        UNITS,
-        Aligned,
-        Level,
-        ProjectiveOptions,
-        Target,
-        align,
-        points_of,
-        registration_of,
-        span,
-    )
+    from tofuse.engine.alignment import projective, step_kernels
+    from tofuse.engine.alignment.base import Link, PROBABLE, Registrar, Registration
     from tofuse.engine.alignment.uncertainty import UncertaintyOptions, bounded_below, covariance
     from tofuse.engine.alignment.view_options import ViewOptions
 

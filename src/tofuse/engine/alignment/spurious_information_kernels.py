@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras import jacobian_row
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
-from tofuse.engine.views import NORMAL, POINT, POINT_ALBEDO, SIGMA
+from tofuse.engine.views import residual_kernels
 
 
 @kernel
@@ -51,20 +51,20 @@ def spurious_information(
     count = 0
     for k in range(0, points.shape[0], stride):
         count += 1
-        x = np.float64(points[k, POINT])
-        y = np.float64(points[k, POINT + 1])
-        z = np.float64(points[k, POINT + 2])
-        a = np.float64(points[k, NORMAL])
-        b = np.float64(points[k, NORMAL + 1])
-        c = np.float64(points[k, NORMAL + 2])
-        sigma = (x * a + y * b + z * c) * np.float64(points[k, SIGMA]) * scale
+        x = np.float64(points[k, residual_kernels.POINT])
+        y = np.float64(points[k, residual_kernels.POINT + 1])
+        z = np.float64(points[k, residual_kernels.POINT + 2])
+        a = np.float64(points[k, residual_kernels.NORMAL])
+        b = np.float64(points[k, residual_kernels.NORMAL + 1])
+        c = np.float64(points[k, residual_kernels.NORMAL + 2])
+        sigma = (x * a + y * b + z * c) * np.float64(points[k, residual_kernels.SIGMA]) * scale
         weight = tilt * tilt / max(2 * sigma * sigma + inflation * inflation, 1e-12)
         # Sum over both tangent directions: all three axes minus the normal.
         _add_outer(out, J, weight, 1.0, 0.0, 0.0, x, y, z)
         _add_outer(out, J, weight, 0.0, 1.0, 0.0, x, y, z)
         _add_outer(out, J, weight, 0.0, 0.0, 1.0, x, y, z)
         _add_outer(out, J, -weight, a, b, c, x, y, z)
-        if albedo_weight > 0 and not np.isnan(points[k, POINT_ALBEDO]):
+        if albedo_weight > 0 and not np.isnan(points[k, residual_kernels.POINT_ALBEDO]):
             _add_outer(out, J, albedo_weight, 1 / z, 0.0, -x / (z * z), x, y, z)
             _add_outer(out, J, albedo_weight, 0.0, 1 / z, -y / (z * z), x, y, z)
     return out / max(count, 1)
@@ -82,7 +82,7 @@ def _add_outer(
     y: float,
     z: float,
 ) -> None:
-    jacobian_row(J, m0, m1, m2, x, y, z)
+    projection_kernels.jacobian_row(J, m0, m1, m2, x, y, z)
     for p in range(6):
         for o in range(6):
             out[p, o] += weight * J[p] * J[o]

@@ -10,7 +10,7 @@ from tofuse.engine.alignment.spurious_information_kernels import spurious_inform
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.compute import kernel
 from tofuse.engine.geometry import compose, retract, twist_between
-from tofuse.engine.views import Residuals, TargetImage, accumulate, bin_edge, normal_equations
+from tofuse.engine.views import residual_kernels
 from tofuse.engine.views import residual_kernels as sums
 
 # Number of points from which the spurious information is estimated.
@@ -64,7 +64,7 @@ class LevelSettings(NamedTuple):
 @kernel
 def iterate_level(
     points: Float32,
-    targets: tuple[TargetImage, ...],
+    targets: tuple[residual_kernels.TargetImage, ...],
     T_targets: Float64,
     T: Float64,
     T_predicted: Float64,
@@ -100,7 +100,7 @@ def iterate_level(
     iterations = 0
     while iterations < settings.iterations and step_size >= settings.tolerance:
         total[:] = 0.0
-        residuals = Residuals(
+        residuals = residual_kernels.Residuals(
             estimates[EXPOSURE],
             estimates[SCALE_G],
             estimates[SCALE_P],
@@ -109,7 +109,9 @@ def iterate_level(
             settings.min_cosine,
         )
         for k in range(len(targets)):
-            total += accumulate(points, targets[k], compose(T_targets[k], T), residuals)
+            total += residual_kernels.accumulate(
+                points, targets[k], compose(T_targets[k], T), residuals
+            )
         if settings.remap and iterations == 0:
             spurious = total[sums.INLIERS] * spurious_information(
                 points,
@@ -165,13 +167,13 @@ def _without_exposure(A: Float64) -> Float64:
 @kernel
 def information(total: Float64) -> Float64:
     """Return the information (6, 6) of the pose, from the sums of `accumulate`."""
-    return _without_exposure(normal_equations(total)[0])
+    return _without_exposure(residual_kernels.normal_equations(total)[0])
 
 
 @kernel
 def cross_information(total: Float64) -> Float64:
     """Return the symmetrised product (6, 6) of the target's and source's pose Jacobians."""
-    return _without_exposure(normal_equations(total)[2])
+    return _without_exposure(residual_kernels.normal_equations(total)[2])
 
 
 @kernel
@@ -220,7 +222,7 @@ def solve_step(
     -------
     The updated pose (4, 4) and the step (7,), whose last element is the exposure's.
     """
-    A, g, _ = normal_equations(total)
+    A, g, _ = residual_kernels.normal_equations(total)
     deviation = twist_between(T_predicted, T)
     for p in range(6):
         deviation[p] /= units[p]
@@ -285,7 +287,7 @@ def scale_of_distances(histogram: Float64) -> float:
     for k in range(sums.BINS):
         in_bin = histogram[k]
         if in_bin > 0 and 2 * (cumulative + in_bin) >= count:
-            low, high = bin_edge(k), bin_edge(k + 1)
+            low, high = residual_kernels.bin_edge(k), residual_kernels.bin_edge(k + 1)
             return 1.48 * np.sqrt(low + (high - low) * (0.5 * count - cumulative) / in_bin)
         cumulative += in_bin
     return np.nan

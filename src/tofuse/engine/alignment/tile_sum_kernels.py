@@ -12,29 +12,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, Float64, Int64
 from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.views import (
-    DIFFERENCE,
-    INLIERS,
-    IS_INLIER,
-    JACOBIAN,
-    LANES,
-    POINT_SIZE,
-    ROWS,
-    SQRT_WEIGHT,
-    STAT,
-    WEIGHT_G,
-    WEIGHT_P,
-    WEIGHTED_RESIDUAL,
-    Residuals,
-    TargetImage,
-    ViewImages,
-    compare_albedos,
-    compare_planes,
-    load_block,
-    project_block,
-    transform_block,
-    write_point,
-)
+from tofuse.engine.views import residual_kernels
 
 # Layout of a tile's sums, over the distances of its pixels.
 RESPONSE = 0  # 7: sum of w J, the response of the gradient to an error shared by the tile
@@ -53,10 +31,10 @@ UPPER = 28
 
 @kernel
 def tile_sums(
-    source: ViewImages,
-    target: TargetImage,
+    source: residual_kernels.ViewImages,
+    target: residual_kernels.TargetImage,
     T: Float64,
-    residuals: Residuals,
+    residuals: residual_kernels.Residuals,
     stride: int,
     tiles_x: int,
     tiles_y: int,
@@ -74,15 +52,15 @@ def tile_sums(
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     rows, columns = planes.shape[0], planes.shape[1]
     tiles = np.zeros((tiles_y * tiles_x, SIZE))
-    points = np.zeros((LANES, POINT_SIZE), np.float32)
-    tile_index = np.zeros(LANES, np.int64)
-    block = np.zeros(ROWS * LANES, np.float32)
-    sums = np.zeros((KINDS * UPPER, LANES))
+    points = np.zeros((residual_kernels.LANES, residual_kernels.POINT_SIZE), np.float32)
+    tile_index = np.zeros(residual_kernels.LANES, np.int64)
+    block = np.zeros(residual_kernels.ROWS * residual_kernels.LANES, np.float32)
+    sums = np.zeros((KINDS * UPPER, residual_kernels.LANES))
     count = 0
     for row in range(stride // 2, rows, stride):
         for column in range(stride // 2, columns, stride):
             if planes[row, column, 3] > 0:
-                write_point(
+                residual_kernels.write_point(
                     points[count],
                     rays[row, column],
                     planes[row, column],
@@ -91,22 +69,24 @@ def tile_sums(
                 )
                 tile_index[count] = row * tiles_y // rows * tiles_x + column * tiles_x // columns
                 count += 1
-            if count < LANES and (row + stride < rows or column + stride < columns):
+            if count < residual_kernels.LANES and (
+                row + stride < rows or column + stride < columns
+            ):
                 continue
-            load_block(block, points[:count])
-            transform_block(block, T)
-            project_block(block, count, image, lookup, lookup_frame)
-            compare_planes(block, T, scale_g, inflation, robust, min_cosine)
+            residual_kernels.load_block(block, points[:count])
+            residual_kernels.transform_block(block, T)
+            residual_kernels.project_block(block, count, image, lookup, lookup_frame)
+            residual_kernels.compare_planes(block, T, scale_g, inflation, robust, min_cosine)
             _add_to_tiles(tiles, tile_index, block, count)
-            _add_products(sums, block, GEOMETRIC, WEIGHT_G)
+            _add_products(sums, block, GEOMETRIC, residual_kernels.WEIGHT_G)
             if scale_p > 0:
-                compare_albedos(block, T, exposure, scale_p, robust)
-                _add_products(sums, block, PHOTOMETRIC, WEIGHT_P)
+                residual_kernels.compare_albedos(block, T, exposure, scale_p, robust)
+                _add_products(sums, block, PHOTOMETRIC, residual_kernels.WEIGHT_P)
             count = 0
     upper = np.zeros((KINDS, UPPER))
     for c in range(KINDS):
         for q in range(UPPER):
-            for k in range(LANES):
+            for k in range(residual_kernels.LANES):
                 upper[c, q] += sums[c * UPPER + q, k]
     return tiles, upper
 
@@ -114,40 +94,73 @@ def tile_sums(
 @kernel
 def _add_to_tiles(tiles: Float64, tile_index: Int64, block: Float32, count: int) -> None:
     for k in range(count):
-        if block[IS_INLIER * LANES + k] > 0:
-            tile, sqrt_weight = tiles[tile_index[k]], np.float64(block[SQRT_WEIGHT * LANES + k])
+        if block[residual_kernels.IS_INLIER * residual_kernels.LANES + k] > 0:
+            tile, sqrt_weight = (
+                tiles[tile_index[k]],
+                np.float64(block[residual_kernels.SQRT_WEIGHT * residual_kernels.LANES + k]),
+            )
             for p in range(7):
-                tile[RESPONSE + p] += sqrt_weight * block[(JACOBIAN + p) * LANES + k]
+                tile[RESPONSE + p] += (
+                    sqrt_weight
+                    * block[(residual_kernels.JACOBIAN + p) * residual_kernels.LANES + k]
+                )
             tile[WEIGHT] += sqrt_weight * sqrt_weight
-            tile[RESIDUAL] += sqrt_weight * block[WEIGHTED_RESIDUAL * LANES + k]
+            tile[RESIDUAL] += (
+                sqrt_weight * block[residual_kernels.WEIGHTED_RESIDUAL * residual_kernels.LANES + k]
+            )
             tile[COUNT] += 1
 
 
 @kernel
 def _add_products(sums: Float64, block: Float32, kind: int, statistic: int) -> None:
     """Add the products of the rows of J to those of a kind, and to the weighted and cross sums."""
-    slope = np.empty(LANES, np.float32)
-    weights = block[(STAT + statistic - INLIERS) * LANES : (STAT + statistic - INLIERS + 1) * LANES]
-    for k in range(LANES):
+    slope = np.empty(residual_kernels.LANES, np.float32)
+    weights = block[
+        (residual_kernels.STAT + statistic - residual_kernels.INLIERS) * residual_kernels.LANES : (
+            residual_kernels.STAT + statistic - residual_kernels.INLIERS + 1
+        )
+        * residual_kernels.LANES
+    ]
+    for k in range(residual_kernels.LANES):
         slope[k] = tukey.relative_slope(weights[k])
     q = 0
     for p in range(7):
-        a = block[(JACOBIAN + p) * LANES : (JACOBIAN + p + 1) * LANES]
-        c = block[(DIFFERENCE + p) * LANES : (DIFFERENCE + p + 1) * LANES]
+        a = block[
+            (residual_kernels.JACOBIAN + p) * residual_kernels.LANES : (
+                residual_kernels.JACOBIAN + p + 1
+            )
+            * residual_kernels.LANES
+        ]
+        c = block[
+            (residual_kernels.DIFFERENCE + p) * residual_kernels.LANES : (
+                residual_kernels.DIFFERENCE + p + 1
+            )
+            * residual_kernels.LANES
+        ]
         for o in range(p, 7):
-            b = block[(JACOBIAN + o) * LANES : (JACOBIAN + o + 1) * LANES]
-            d = block[(DIFFERENCE + o) * LANES : (DIFFERENCE + o + 1) * LANES]
+            b = block[
+                (residual_kernels.JACOBIAN + o) * residual_kernels.LANES : (
+                    residual_kernels.JACOBIAN + o + 1
+                )
+                * residual_kernels.LANES
+            ]
+            d = block[
+                (residual_kernels.DIFFERENCE + o) * residual_kernels.LANES : (
+                    residual_kernels.DIFFERENCE + o + 1
+                )
+                * residual_kernels.LANES
+            ]
             products = sums[kind * UPPER + q]
             weighted, cross = sums[WEIGHTED * UPPER + q], sums[CROSS * UPPER + q]
-            for k in range(LANES):
+            for k in range(residual_kernels.LANES):
                 products[k] += a[k] * b[k]
             if o < 6:
-                for k in range(LANES):
+                for k in range(residual_kernels.LANES):
                     symmetrised = a[k] * b[k] - c[k] * d[k]
                     weighted[k] += symmetrised
                     cross[k] += slope[k] * symmetrised
             else:  # the exposure has the same derivative in both Jacobians
-                for k in range(LANES):
+                for k in range(residual_kernels.LANES):
                     weighted[k] += a[k] * b[k]
                     cross[k] += slope[k] * a[k] * b[k]
             q += 1

@@ -28,7 +28,7 @@ from tofuse.engine.alignment.projective import UNITS, Aligned, ProjectiveOptions
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import median
 from tofuse.engine.geometry import distance_and_angle
-from tofuse.engine.views import PreparedView, Residuals
+from tofuse.engine.views import PreparedView, residual_kernels
 
 _UPPER7 = np.triu_indices(7)
 # Everything here is in units of 1 cm and 1 degree, so that eigenvalues can be compared.
@@ -144,7 +144,7 @@ def patches(
     inverse_depths = source.planes[stride // 2 :: stride, stride // 2 :: stride, 3]
     inverse_depths = inverse_depths[inverse_depths > 0]
     depth = 1 / median(inverse_depths) if len(inverse_depths) else 1.0
-    residuals = Residuals(
+    residuals = residual_kernels.Residuals(
         aligned.exposure,
         aligned.scale,
         aligned.photo_scale if photometric else 0.0,

@@ -18,7 +18,7 @@ from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.engine.search import comparable, follow, register_pair
+from tofuse.engine.search import follow, register_pair, verification
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 MIN_POINTS = 10
@@ -106,7 +106,7 @@ def _registered_as_images(
     # Views of one recording are mostly close to each other: of ambiguous poses the one at the
     # identity is returned, unless a guess is given.
     start = T_camera_target @ (np.eye(4) if guess is None else guess) @ T_source_camera
-    if not comparable(data.depth, model.depth):
+    if not verification.comparable(data.depth, model.depth):
         if isinstance(source, RangeFrame) and isinstance(target, RangeFrame):
             raise RegistrationError(
                 f"has a median depth of {data.depth:.2g} m, and frame {target.index} of "

@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.clouds.shape import Shape, shape_at, tree_of
+from tofuse.engine.clouds.surface_shape import Shape, shape_at, tree_of
 from tofuse.engine.clouds.viewpoint import RangeSphere, Viewpoint, viewpoint_of
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
-from tofuse.engine.search import Agreement
+from tofuse.engine.search import pair_agreement
 
 # Points of each plane fit.
 NEIGHBOURS = 12
@@ -113,7 +113,9 @@ def tolerance(source: CloudMap, target: CloudMap) -> float:
     return _SIGMAS * noise + _CURVATURE_TOLERANCE * max(source.size, target.size)
 
 
-def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64) -> Agreement:
+def cloud_agreement(
+    source: CloudMap, target: CloudMap, T_target_source: Float64
+) -> pair_agreement.Agreement:
     """Return the agreement of both views at a pose (4, 4).
 
     `overlap` counts points that are near a surface or in free space. Without a known viewpoint
@@ -123,7 +125,7 @@ def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64
     directions = ((source, target, T_target_source), (target, source, se3.inverse(T_target_source)))
     statistics = [_one_direction(a, b, T, max_distance) for a, b, T in directions]
     near_fraction, on_surface, violation, squares = np.mean(statistics, axis=0)
-    return Agreement(
+    return pair_agreement.Agreement(
         overlap=float(near_fraction + violation),
         support=float(on_surface),
         violation=float(violation),

@@ -30,7 +30,7 @@ from tofuse.engine.clouds.surface_metrics import PointToPlane
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.search import CERTAIN, CLOUDS, Agreement, PoseEvidence
+from tofuse.engine.search import pair_agreement, pose_probability
 
 # Maximum number of points of each averaged view.
 _POINTS = 10_000
@@ -55,13 +55,13 @@ class _Pose:
     """A pose T_target_source (4, 4) and its agreement."""
 
     T_target_source: Float64
-    agreement: Agreement
+    agreement: pair_agreement.Agreement
     # Start of its alignment; None for proposals.
     guess: Float64 | None = None
 
 
 # Placeholder for the rival of a pose without one; it has no support.
-_NO_RIVAL = _Pose(np.eye(4), Agreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0))
+_NO_RIVAL = _Pose(np.eye(4), pair_agreement.Agreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +106,12 @@ class _CloudViews:
         aligned = self.evaluated(T)
         return aligned if aligned.agreement.score >= initial.agreement.score else initial
 
-    def evidence(self, pose: _Pose, lead: float | None = None, degenerate: int = 0) -> PoseEvidence:
-        return PoseEvidence.of(pose.agreement, lead, degenerate, CLOUDS)
+    def evidence(
+        self, pose: _Pose, lead: float | None = None, degenerate: int = 0
+    ) -> pose_probability.PoseEvidence:
+        return pose_probability.PoseEvidence.of(
+            pose.agreement, lead, degenerate, pose_probability.CLOUDS
+        )
 
     def with_information(self, registration: Registration) -> Registration:
         """Return a registration with its information matrix."""
@@ -197,9 +201,11 @@ def _registered(
     views = _CloudViews.of(source, target, rng)
     start = np.eye(4) if guess is None else guess
     local = replace(views.refined(start), guess=start)
-    if views.evidence(local).probability >= CERTAIN and not always_search:
+    if views.evidence(local).probability >= pose_probability.CERTAIN and not always_search:
         registration = _registration(views, local)
-        if (registration.probability or 0.0) >= CERTAIN and not len(registration.unobservable):
+        if (registration.probability or 0.0) >= pose_probability.CERTAIN and not len(
+            registration.unobservable
+        ):
             return views.with_information(registration)
     poses = (
         [local]
@@ -267,7 +273,7 @@ def follow_clouds(
     """Register two clouds from a guess (4, 4) without a search; see `register_clouds`."""
     views = _CloudViews.of(source, target, rng)
     local = replace(views.refined(guess), guess=guess)
-    if views.evidence(local).probability < CERTAIN:
+    if views.evidence(local).probability < pose_probability.CERTAIN:
         coarse = CoarseToFine().register(source, target, guess, rng)
         alternative = replace(views.evaluated(coarse.T_target_source), guess=guess)
         local = max(local, alternative, key=lambda pose: pose.agreement.score)

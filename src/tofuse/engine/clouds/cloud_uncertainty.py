@@ -21,7 +21,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap
-from tofuse.engine.clouds.pairs import (
+from tofuse.engine.clouds.point_pairs import (
     MIN_PAIRS,
     SurfacePairs,
     loss_weights,

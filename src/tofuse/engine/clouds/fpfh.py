@@ -19,7 +19,7 @@ from tofuse.engine.clouds.robust_motion import (
     consensus,
     motion_of,
 )
-from tofuse.engine.clouds.shape import shape_at
+from tofuse.engine.clouds.surface_shape import shape_at
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame

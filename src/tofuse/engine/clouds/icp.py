@@ -27,8 +27,8 @@ from tofuse.engine.clouds.metrics import PointToPoint
 from tofuse.engine.clouds.rejectors import MaxDistance, Unique
 from tofuse.engine.clouds.remapping import Remapping
 from tofuse.engine.clouds.selectors import Random, at_most
-from tofuse.engine.clouds.shape import NEIGHBOURS
 from tofuse.engine.clouds.stopping import TwoLoops
+from tofuse.engine.clouds.surface_shape import NEIGHBOURS
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3

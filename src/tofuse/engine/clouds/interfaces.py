@@ -15,7 +15,7 @@ from typing import ClassVar, Protocol, Self
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Int64
-from tofuse.engine.clouds.shape import NEIGHBOURS, Shape, normals_at, shape_at
+from tofuse.engine.clouds.surface_shape import NEIGHBOURS, Shape, normals_at, shape_at
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from tofuse.engine.clouds.interfaces import Alignment, Matcher, Matches, Points, Search
-from tofuse.engine.clouds.shape import tree_of
+from tofuse.engine.clouds.surface_shape import tree_of
 from tofuse.engine.geometry import KdTree
 from tofuse.engine.parts import part
 

@@ -11,7 +11,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.clouds.cloud_sum_kernels import matrix_sums, plane_sums, plane_to_plane_weights
 from tofuse.engine.clouds.interfaces import Alignment, Matches, Metric
-from tofuse.engine.clouds.pairs import (
+from tofuse.engine.clouds.point_pairs import (
     Loss,
     SurfacePairs,
     loss_weights,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32
-from tofuse.engine.geometry import MAX_COORDINATE_M
+from tofuse.engine.geometry import se3
 
 INVALID_DEPTH = 65535
 MAX_COUNTS = 65535
@@ -26,7 +26,7 @@ def depth_from_numbers(numbers: NDArray[np.generic], unit_m: float) -> Float32:
     """
     with np.errstate(all="ignore"):
         depth = numbers.astype(np.float32) * np.float32(unit_m)
-        depth[~(np.abs(depth) < MAX_COORDINATE_M)] = 0
+        depth[~(np.abs(depth) < se3.MAX_COORDINATE_M)] = 0
     if numbers.dtype.kind in "ui":
         depth[numbers == INVALID_DEPTH] = 0
     return depth

@@ -17,7 +17,7 @@ from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.cameras import Camera, points_from_z, range_from_z, unknown_rays, z_from_range
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import MAX_COORDINATE_M
+from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number
 
 DepthKind = Literal["z", "range"]
@@ -298,7 +298,7 @@ class CloudFrame:
                 remedy="pass an (N, 3) array",
             )
         largest = np.abs(self.points).max(initial=0)
-        if largest > MAX_COORDINATE_M:
+        if largest > se3.MAX_COORDINATE_M:
             raise InputError(
                 f"points have coordinates up to {largest:.0e} m",
                 where=f"frame {self.index}",

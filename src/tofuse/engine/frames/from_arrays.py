@@ -15,7 +15,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames.depth_counts import INVALID_DEPTH
 from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.geometry import check_poses
+from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number
 
 # The unit of integer depth for nearly all cameras.
@@ -208,4 +208,4 @@ def _seconds(times: NDArray[Any]) -> Float64:
 
 
 def _poses(name: str, values: ArrayLike | None, count: int) -> Float64 | None:
-    return None if values is None else check_poses(values, where=name, count=count)
+    return None if values is None else se3.check_poses(values, where=name, count=count)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
+    from tofuse.engine.fusion import texture
     from tofuse.engine.fusion.cloud import Cloud, as_cloud
     from tofuse.engine.fusion.colors import display_colors
     from tofuse.engine.fusion.geometry_record import GeometryRecord, stacked
@@ -12,7 +13,6 @@ if TYPE_CHECKING:
     from tofuse.engine.fusion.model import Model, ModelBuilder
     from tofuse.engine.fusion.options import Fusion
     from tofuse.engine.fusion.pose_errors import UNKNOWN_M, with_pose_errors
-    from tofuse.engine.fusion.texture import Textured, TextureView, baked, textured
     from tofuse.engine.fusion.upright import T_up_world
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, Int32
-from tofuse.engine.cameras import project_ray
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
 
 NO_TRIANGLE = -1
@@ -133,7 +133,7 @@ def add_view(
         d = R[2, 0] * points[n, 0] + R[2, 1] * points[n, 1] + R[2, 2] * points[n, 2] + t[2]
         if d <= 0.01:
             continue
-        u, v, i, _ = project_ray(x / d, y / d, lookup, frame)
+        u, v, i, _ = projection_kernels.project_ray(x / d, y / d, lookup, frame)
         if i < 0 or not (u >= 1 and v >= 1 and u < width - 2 and v < height - 2):
             continue
         length = np.sqrt(x * x + y * y + d * d)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int8, Int32, Int64, UInt8, UInt16
-from tofuse.engine.cameras import project_ray
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
 from tofuse.engine.fusion.block_kernels import (
     EDGE,
@@ -493,7 +493,7 @@ def _local_projection(
     """
     if z - radius < 0.5 * z or radius / z * max(lookup_frame[2], lookup_frame[3]) > nodes:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False
-    u, v, i, j = project_ray(x / z, y / z, lookup, lookup_frame)
+    u, v, i, j = projection_kernels.project_ray(x / z, y / z, lookup, lookup_frame)
     if i < 0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False
     ux = np.float64(lookup[j, i + 1, 0] - lookup[j, i, 0]) * lookup_frame[2]
@@ -820,7 +820,9 @@ def _project_by_lookup(
         z = points[2, q]
         if z < 1e-3:
             continue
-        u, v, node, _ = project_ray(points[0, q] / z, points[1, q] / z, lookup, lookup_frame)
+        u, v, node, _ = projection_kernels.project_ray(
+            points[0, q] / z, points[1, q] / z, lookup, lookup_frame
+        )
         if node < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
         pixels[q] = int(v + 0.5) * columns + int(u + 0.5)

@@ -17,9 +17,9 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.build import Measured
-from tofuse.engine.graph.descent import vertical
 from tofuse.engine.graph.graph import Gravity, PoseGraph
+from tofuse.engine.graph.measured_graph import Measured
+from tofuse.engine.graph.minimisation import vertical
 from tofuse.engine.parts import part
 
 # With fewer measured frames, a moving accelerometer can't be detected.

@@ -29,7 +29,7 @@ from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import robust
 from tofuse.engine.graph.chordal import chordal_poses
-from tofuse.engine.graph.descent import Descent, Problem
+from tofuse.engine.graph.minimisation import Descent, Problem
 from tofuse.engine.graph.robust import Settings
 
 _QUARTILE = 3.4546  # of a chi-square variable with six degrees of freedom

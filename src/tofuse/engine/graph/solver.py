@@ -17,9 +17,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.graph import robust
-from tofuse.engine.graph.descent import Descent, Problem
 from tofuse.engine.graph.gnc import truncated_least_squares
 from tofuse.engine.graph.graph import Gravity
+from tofuse.engine.graph.minimisation import Descent, Problem
 from tofuse.engine.graph.robust import Settings
 from tofuse.engine.graph.sparse import Factor, first_of_parts
 

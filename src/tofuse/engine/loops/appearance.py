@@ -9,12 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.views import (
-    dissimilarity,
-    mutual_dissimilarity,
-    pairwise_dissimilarity,
-    similar_views,
-)
+from tofuse.engine.views import view_descriptors
 
 # Pairs whose views differ by at most this many positions are similar, and at most this many of them
 # are chosen: two can confirm each other, more would displace other loops.
@@ -93,7 +88,7 @@ class Appearance:
         """Return (difference, i, j) of similar views i < j between which the camera left."""
         if len(descriptors) > _MAX_EXHAUSTIVE:
             return self._most_similar_by_index(np.stack(descriptors))
-        difference = mutual_dissimilarity(descriptors, self.shift)
+        difference = view_descriptors.mutual_dissimilarity(descriptors, self.shift)
         distinct = difference >= self.min_difference
         pairs = [
             (float(difference[i, j]), int(i), int(j))
@@ -105,8 +100,8 @@ class Appearance:
 
     def _most_similar_by_index(self, descriptors: Float32) -> list[tuple[float, int, int]]:
         """As `_most_similar`, with candidates from an index instead of all pairs."""
-        i, j = similar_views(descriptors, self.shift)
-        difference = pairwise_dissimilarity(descriptors, i, j, self.shift)
+        i, j = view_descriptors.similar_views(descriptors, self.shift)
+        difference = view_descriptors.pairwise_dissimilarity(descriptors, i, j, self.shift)
         pairs = []
         for k in np.lexsort((j, i, difference)):
             if difference[k] > self.max_difference:
@@ -114,8 +109,8 @@ class Appearance:
             a, b = int(i[k]), int(j[k])
             between = np.unique(np.linspace(a + 1, b - 1, min(b - a - 1, _MAX_BETWEEN)).round())
             sampled = descriptors[between.astype(np.intp)]
-            from_a = dissimilarity(descriptors[a], sampled, self.shift)
-            from_b = dissimilarity(descriptors[b], sampled, self.shift)
+            from_a = view_descriptors.dissimilarity(descriptors[a], sampled, self.shift)
+            from_b = view_descriptors.dissimilarity(descriptors[b], sampled, self.shift)
             if (np.minimum(from_a, from_b) >= self.min_difference).any():
                 pairs.append((float(difference[k]), a, b))
         return pairs

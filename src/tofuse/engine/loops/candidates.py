@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.compute import Spill
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import relative_covariance
+from tofuse.engine.graph import graph_covariances
 from tofuse.engine.loops.appearance import MAX_VIEW_DISTANCE, Appearance
 from tofuse.engine.loops.information_gain import InformationGain
 from tofuse.engine.stored_views import (
@@ -22,7 +22,7 @@ from tofuse.engine.stored_views import (
     overlaps,
     sampled_points,
 )
-from tofuse.engine.views import PreparedView, view_descriptor
+from tofuse.engine.views import PreparedView, view_descriptors
 
 Pair = tuple[int, int]  # frames (i, j), i < j
 LoopView = PosedView[PreparedView]
@@ -159,7 +159,9 @@ class CandidateSelector:
         """
         a, b = self._position[i], self._position[j]
         T_tracked = se3.inverse(self._poses[a]) @ self._poses[b]
-        C = relative_covariance(T_tracked, self._covariances[a], self._covariances[b])
+        C = graph_covariances.relative_covariance(
+            T_tracked, self._covariances[a], self._covariances[b]
+        )
         length, rotation = (self._path_lengths[b] - self._path_lengths[a]).tolist()
         depth = 0.5 * float(self._depth[a] + self._depth[b])
         correction = se3.inverse(T_tracked) @ T_i_j
@@ -180,7 +182,7 @@ class CandidateSelector:
         surface = posed.view.without_caches()
         coarse = CoarseView.of(surface, sampled_points(surface, _POINTS))
         return CandidateView(
-            coarse.centroid, Spilled(coarse, self._spill), view_descriptor(surface)
+            coarse.centroid, Spilled(coarse, self._spill), view_descriptors.view_descriptor(surface)
         )
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.engine.alignment import Link, ProjectiveOptions, Registration, Target, align
+from tofuse.engine.alignment import Link, Registration, projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
@@ -27,15 +27,11 @@ from tofuse.engine.loops.merged_components import (
     transformed,
 )
 from tofuse.engine.search import (
-    CONTRADICTION,
-    MAX_OVERLAP_DISTANCE,
-    PATIENT,
-    Agreement,
-    FitStatistics,
-    agreement,
     are_distinct_poses,
     follow,
-    usual_tolerances,
+    pair_agreement,
+    pose_probability,
+    verification,
 )
 
 # View pairs that verify a join, besides those of the links; and their smallest overlap.
@@ -52,7 +48,7 @@ _SMALL_MOTION = 0.3
 # Factor on the 90 % quantile of the speed, which the camera hardly exceeds. If it had no time to
 # lose sight of the place, up to this fraction of the overlap may contradict.
 _SPEED_FACTOR, _MAX_CONTRADICTION_NEAR = 2.0, 0.3
-_ALIGNMENT = ProjectiveOptions(levels=PATIENT, prior_m=3.0, prior_rad=3.0)
+_ALIGNMENT = projective.ProjectiveOptions(levels=verification.PATIENT, prior_m=3.0, prior_rad=3.0)
 
 
 class JoinChecks:
@@ -73,8 +69,8 @@ class JoinChecks:
 
     def __init__(self, merged: MergedComponents) -> None:
         self._merged = merged
-        self.fit_statistics = FitStatistics()
-        self._contradiction = CONTRADICTION
+        self.fit_statistics = verification.FitStatistics()
+        self._contradiction = pose_probability.CONTRADICTION
         tracked = list(merged.tracked.values())
         measured = np.concatenate([end_speeds(s, end=True) for s in tracked])
         # Motions during which tracking failed may have been faster than all others.
@@ -90,15 +86,19 @@ class JoinChecks:
         pairs = [
             (a, b) for s in self._merged.tracked.values() for a, b in itertools.pairwise(s.views)
         ]
-        options = ProjectiveOptions(levels=PATIENT)
+        options = projective.ProjectiveOptions(levels=verification.PATIENT)
         contradictions = []
         for k in evenly_spaced(np.arange(len(pairs)), _MAX_LEARNT_PAIRS):
             a, b = pairs[k]
             T_a_b = se3.inverse(a.T_component_camera) @ b.T_component_camera
-            aligned = align(b.view, [Target(a.view, np.eye(4))], T_a_b, options)
+            aligned = projective.align(
+                b.view, [projective.Target(a.view, np.eye(4))], T_a_b, options
+            )
             if aligned.overlap >= _OVERLAP:
                 self.fit_statistics.learn(aligned, b.depth)
-                result = agreement(b.view, a.view, T_a_b, usual_tolerances(self.fit_statistics))
+                result = pair_agreement.agreement(
+                    b.view, a.view, T_a_b, verification.usual_tolerances(self.fit_statistics)
+                )
                 contradictions.append(result.contradiction)
         if len(contradictions) > 3:
             median = float(np.median(contradictions))
@@ -108,9 +108,9 @@ class JoinChecks:
 
     def _overlapping(
         self, a: MergedComponent, b: MergedComponent, T_a_b: Float64
-    ) -> list[tuple[View, View, Float64, Agreement]]:
+    ) -> list[tuple[View, View, Float64, pair_agreement.Agreement]]:
         """View pairs of both sides that overlap most under T_a_b: T_i_j, and their agreement."""
-        compare = usual_tolerances(self.fit_statistics)
+        compare = verification.usual_tolerances(self.fit_statistics)
         views_a = [
             self._merged.views[i] for i in self._merged.views if self._merged.component_of[i] in a.T
         ]
@@ -128,12 +128,12 @@ class JoinChecks:
             distance = translation + np.asarray(se3.angle(relative))
             candidates += [
                 (float(distance[q]), p, int(q))
-                for q in np.flatnonzero(distance < MAX_OVERLAP_DISTANCE)
+                for q in np.flatnonzero(distance < verification.MAX_OVERLAP_DISTANCE)
             ]
         overlapping = []
         for _, p, q in sorted(candidates)[: 3 * VERIFY]:
             T = se3.inverse(Ta[p]) @ Tb[q]
-            result = agreement(views_b[q].view, views_a[p].view, T, compare)
+            result = pair_agreement.agreement(views_b[q].view, views_a[p].view, T, compare)
             if result.overlap >= _OVERLAP:
                 overlapping.append((views_a[p], views_b[q], T, result))
             if len(overlapping) >= VERIFY:
@@ -157,15 +157,15 @@ class JoinChecks:
                 continue
             agreed = at_implied
             if agreed.contradiction > self._contradiction:
-                target = [Target(first.view, np.eye(4))]
+                target = [projective.Target(first.view, np.eye(4))]
                 scale = self.fit_statistics.noise_scale
-                aligned = align(second.view, target, T, _ALIGNMENT, usual_scale=scale)
+                aligned = projective.align(second.view, target, T, _ALIGNMENT, usual_scale=scale)
                 if self._within_drift(T, aligned.T_world_source, first.depth, drift):
-                    realigned = agreement(
+                    realigned = pair_agreement.agreement(
                         second.view,
                         first.view,
                         aligned.T_world_source,
-                        usual_tolerances(self.fit_statistics),
+                        verification.usual_tolerances(self.fit_statistics),
                     )
                     agreed = min(agreed, realigned, key=lambda result: result.contradiction)
             overlap += agreed.overlap

@@ -23,24 +23,19 @@ from tofuse.engine.alignment import Link
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import cut_edges
+from tofuse.engine.graph import bridges
 from tofuse.engine.loops.gaps import TrackedComponent, View, extrapolated, odometry_over
 from tofuse.engine.loops.join_checks import VERIFY, JoinChecks, link_of
 from tofuse.engine.loops.merged_components import Join, JoinKind, MergedComponent, MergedComponents
 from tofuse.engine.loops.pairwise_consistency import maximum_consistent_set
 from tofuse.engine.search import (
     DISTINCT_M,
-    MAX_OVERLAP_DISTANCE,
     SearchOptions,
-    logistic,
+    pose_probability,
     register_pair,
+    verification,
 )
-from tofuse.engine.views import (
-    mutual_dissimilarity,
-    pairwise_dissimilarity,
-    similar_views,
-    view_descriptor,
-)
+from tofuse.engine.views import view_descriptors
 
 # Frames for each additional search, as long recordings have more places.
 _FRAMES_PER_SEARCH = 50
@@ -191,7 +186,7 @@ class _Joiner:
         """Whether a single link may join two merged components before all searches are done."""
         T_a_b = self._merged.T_a_b(a, b, _best(links))
         if np.isfinite(self._checks.speed).all():
-            return self._checks.is_near(a, b, T_a_b, MAX_OVERLAP_DISTANCE)
+            return self._checks.is_near(a, b, T_a_b, verification.MAX_OVERLAP_DISTANCE)
         # Unordered views are joined one by one, so that the next is compared with more of them.
         # Joins that rest on one link are reconsidered later.
         return any(link.certain for link in links) or bool(self._confirming(a, b, T_a_b, links))
@@ -212,15 +207,15 @@ class _Joiner:
         if len(self._merged.all) < 2 or len(views) < 2:
             return
         component = np.array([self._merged.component_of[v.index] for v in views])
-        descriptors = np.stack([view_descriptor(v.view) for v in views])
+        descriptors = np.stack([view_descriptors.view_descriptor(v.view) for v in views])
         if len(descriptors) <= _MAX_EXHAUSTIVE:
             i, j = np.nonzero(np.triu(component[:, None] != component))
-            difference = mutual_dissimilarity(descriptors, _MAX_SHIFT)[i, j]
+            difference = view_descriptors.mutual_dissimilarity(descriptors, _MAX_SHIFT)[i, j]
         else:  # by an index, as all pairs would be too many
-            i, j = similar_views(descriptors, _MAX_SHIFT)
+            i, j = view_descriptors.similar_views(descriptors, _MAX_SHIFT)
             separate = component[i] != component[j]
             i, j = i[separate], j[separate]
-            difference = pairwise_dissimilarity(descriptors, i, j, _MAX_SHIFT)
+            difference = view_descriptors.pairwise_dissimilarity(descriptors, i, j, _MAX_SHIFT)
         order = np.lexsort((j, i, difference))
         tried: dict[tuple[int, int], int] = {}
         for k in order.tolist():
@@ -249,7 +244,7 @@ class _Joiner:
         weak = [
             merged.joins[k]
             for merged in self._merged.all
-            for k in cut_edges([self._merged.components(join) for join in merged.joins])
+            for k in bridges.cut_edges([self._merged.components(join) for join in merged.joins])
         ]
         for join in weak:
             self._merged.cut(join)
@@ -380,7 +375,8 @@ class _Joiner:
                 [
                     1.0,
                     *(
-                        self._merged.separation(a, b, link, other) / MAX_OVERLAP_DISTANCE
+                        self._merged.separation(a, b, link, other)
+                        / verification.MAX_OVERLAP_DISTANCE
                         for other in counted
                     ),
                 ]
@@ -393,7 +389,7 @@ class _Joiner:
             (i in frames_a and j in frames_b) or (i in frames_b and j in frames_a)
             for i, j in self._tried
         )
-        return logistic(log_odds - float(np.log(max(tried, 1))))
+        return pose_probability.logistic(log_odds - float(np.log(max(tried, 1))))
 
     def _confirming(
         self, a: MergedComponent, b: MergedComponent, T_a_b: Float64, links: list[Link]

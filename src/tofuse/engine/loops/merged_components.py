@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 from tofuse.engine.alignment import Link
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import sides_without
+from tofuse.engine.graph import bridges
 from tofuse.engine.loops.gaps import TrackedComponent, View
 from tofuse.engine.search import DISTINCT_M, DISTINCT_RAD
 
@@ -211,7 +211,7 @@ class MergedComponents:
         self.all.remove(merged)
         self._paths.clear()
         edges = [self.components(other) for other in merged.joins]
-        for side in sides_without(edges, merged.joins.index(join)):
+        for side in bridges.sides_without(edges, merged.joins.index(join)):
             T = {c: merged.T[c] for c in merged.T if c in side}
             inside = [j for j in merged.joins if j is not join and self.components(j)[0] in side]
             self.all.append(MergedComponent(T, inside))

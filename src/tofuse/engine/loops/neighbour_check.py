@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.search import MIN_LEAD, Comparison
+from tofuse.engine.search import pair_agreement
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.views import PreparedView
 
@@ -36,6 +36,6 @@ def degraded_neighbours(
     for a, b, T, T_closed in zip(views[:-1], views[1:], *relative, strict=True):
         if suspects.isdisjoint(range(a.index + 1, b.index + 1)):
             continue
-        compared = Comparison.of(b.view, a.view)
-        if compared.at(T_closed).score < compared.at(T).score - MIN_LEAD:
+        compared = pair_agreement.Comparison.of(b.view, a.view)
+        if compared.at(T_closed).score < compared.at(T).score - pair_agreement.MIN_LEAD:
             yield a.index, b.index

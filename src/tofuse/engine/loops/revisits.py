@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.engine.alignment import Level, ProjectiveOptions, Registration, Target, align
+from tofuse.engine.alignment import Registration, projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import run_all
@@ -28,15 +28,19 @@ from tofuse.engine.loops.loops import (
     in_order,
 )
 from tofuse.engine.parts import part
-from tofuse.engine.search import DISTINCT_M, FitStatistics, SearchOptions, follow, register_pair
+from tofuse.engine.search import DISTINCT_M, SearchOptions, follow, register_pair, verification
 from tofuse.engine.stored_views import Spacing, ViewStore
 from tofuse.engine.views import PreparedView
 
 # The trajectory has drifted when a loop closes. Neighbouring pixels share their noise, so that all
 # of them have hardly more information than every second one.
-_LEVELS = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0))
+_LEVELS = (
+    projective.Level(4, 15, 0.03, 0.1),
+    projective.Level(2, 8, 0.005, 0.02),
+    projective.Level(2, 8, 0.0, 0.0),
+)
 # Nearly without a prior.
-_WEAK_PRIOR = ProjectiveOptions(
+_WEAK_PRIOR = projective.ProjectiveOptions(
     levels=_LEVELS, prior_m=3.0, prior_rad=3.0, constrained=1e6, common_tilt=0.0, common_slope=0.0
 )
 _REJECTED = "fits worse than is typical of this camera, or alignments from both ends disagree"
@@ -137,7 +141,7 @@ class _RevisitLoops(Loops):
         self._poses: dict[int, Float64] = {}
         self._prior_loops = prior
         self._decisions: dict[Pair, ClosedLoop] = {}
-        self._fit_statistics = FitStatistics()
+        self._fit_statistics = verification.FitStatistics()
         self._learnt: set[Pair] = set()
         # Accepted by an earlier `finish`, at other poses.
         self._closed: dict[Pair, ClosedLoop] = {}
@@ -247,9 +251,11 @@ class _RevisitLoops(Loops):
                 continue
             self._learnt.add(pair)
             guess = se3.inverse(a.T_component_camera) @ b.T_component_camera
-            target = [Target(a.view.without_caches(), np.eye(4))]
+            target = [projective.Target(a.view.without_caches(), np.eye(4))]
             scale = self._fit_statistics.noise_scale
-            aligned = align(b.view.without_caches(), target, guess, _WEAK_PRIOR, usual_scale=scale)
+            aligned = projective.align(
+                b.view.without_caches(), target, guess, _WEAK_PRIOR, usual_scale=scale
+            )
             if aligned.overlap >= _MIN_OVERLAP:
                 self._fit_statistics.learn(aligned, b.view.depth)
 
@@ -364,7 +370,10 @@ class _RevisitLoops(Loops):
 
 
 def register_near(
-    source: PreparedView, target: PreparedView, guess: Float64, fit_statistics: FitStatistics
+    source: PreparedView,
+    target: PreparedView,
+    guess: Float64,
+    fit_statistics: verification.FitStatistics,
 ) -> Registration | None:
     """Register two views from the guess (4, 4) T_target_source of the trajectory."""
     return follow(source, target, guess, fit_statistics=fit_statistics)
@@ -373,7 +382,7 @@ def register_near(
 def register_anywhere(
     source: PreparedView,
     target: PreparedView,
-    fit_statistics: FitStatistics,
+    fit_statistics: verification.FitStatistics,
     options: SearchOptions,
 ) -> Registration | None:
     """Register two views by exhaustive search, without a guess."""

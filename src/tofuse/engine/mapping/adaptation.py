@@ -19,7 +19,7 @@ from tofuse.engine.noise import NOISE, NoiseModel, noise_model_for
 from tofuse.engine.parts import name_of
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.sensor import Correction, Noise
-from tofuse.engine.tracking import GivenPoses, Keyframes
+from tofuse.engine.tracking import Keyframes, given
 from tofuse.engine.views import RAW_RANGE_FALLOFF
 
 # Number of evenly spaced frames: enough for the background behind an object that turns once.
@@ -72,7 +72,7 @@ def adapted(
             config = replace(config, filters=filters, model_filters=model_filters)
             config = _fitted(config, recording)
         odometry = config.odometry
-        if isinstance(odometry, Keyframes | GivenPoses):
+        if isinstance(odometry, Keyframes | given.GivenPoses):
             views = _with_falloffs(odometry.views, recording, _preparation(config))
             config = replace(config, odometry=replace(odometry, views=views))
     return config

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import threads
-from tofuse.engine.frames import runs
+from tofuse.engine.frames import frame_ranges
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import Group, Join, JoinKind, PriorLoop
 from tofuse.engine.mapping.backend import BackEnd
@@ -81,7 +81,7 @@ class Assembly:
         components = []
         for k, part in enumerate(parts):
             is_member = [e.has_pose and e.record.component == k for e in numbered.entries]
-            ranges = runs([e.record.index for e in log.entries], is_member)
+            ranges = frame_ranges.runs([e.record.index for e in log.entries], is_member)
             result = None
             if part.T_main_component is None and part.group.frames > _MAX_WITHOUT_MODEL:
                 frames = [e.record.index for e in numbered.posed if e.record.component == k]

@@ -10,14 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.fusion import Model, with_pose_errors
-from tofuse.engine.graph import (
-    GraphCovariances,
-    LoopRecord,
-    PoseGraph,
-    SensorPriors,
-    cut_edges,
-    with_sensors,
-)
+from tofuse.engine.graph import LoopRecord, PoseGraph, bridges, external_sensors, graph_covariances
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
@@ -26,19 +19,11 @@ from tofuse.engine.mapping.stage_results import Optimised, Refined
 from tofuse.engine.mapping.tracked_graph import TrackedGraph
 from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.parts import name_of
-from tofuse.engine.quality import (
-    Accuracy,
-    CrossViewConsistency,
-    ObservedErrors,
-    accuracy_of,
-    covariances_of,
-    cross_view_consistency,
-    displacement,
-)
-from tofuse.engine.refinement import CalibrationCheck, Refinement
-from tofuse.engine.results import Component, Evidence, FrameRecord, Reason, Verdict, judge, ranked
+from tofuse.engine.quality import cross_view_agreement, pose_accuracy, trajectory_errors
+from tofuse.engine.refinement import Refinement, calibration_check
+from tofuse.engine.results import Component, FrameRecord, Reason, Verdict, checks, verdicts
 from tofuse.engine.sensor import CameraErrors
-from tofuse.engine.tracking import GivenPoses
+from tofuse.engine.tracking import given
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +44,7 @@ class Assessed:
 
     verdict: Verdict
     reasons: tuple[Reason, ...]
-    accuracy: Accuracy
+    accuracy: pose_accuracy.Accuracy
     records: tuple[FrameRecord, ...]
     model: Model
 
@@ -114,7 +99,7 @@ class Assessment:
             model = self._with_pose_errors(model, graph, covariances)
         records = self._records(covariances)
         posed, entries = self.tracked.posed, self.log.entries
-        evidence = Evidence(
+        evidence = checks.Evidence(
             records=records,
             registrations=tuple(None if e.step is None else e.step.registration for e in entries),
             loops=loops,
@@ -143,51 +128,63 @@ class Assessment:
             doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
             single_link_frames=single_link_frames(self.tracked, loops),
         )
-        verdict, reasons = judge(evidence)
+        verdict, reasons = checks.judge(evidence)
         more = [*self._correction_reasons(), *self._surface_reasons(model)]
-        return Assessed(verdict, ranked([*reasons, *more]), accuracy, records, model)
+        return Assessed(verdict, verdicts.ranked([*reasons, *more]), accuracy, records, model)
 
     @property
     def _is_tracked(self) -> bool:
-        return not isinstance(self.config.odometry, GivenPoses)
+        return not isinstance(self.config.odometry, given.GivenPoses)
 
     def _accuracy(
         self,
         closed: Optimised,
         refined: Refined,
         model: Model,
-        cross_view: CrossViewConsistency | None,
-    ) -> tuple[Accuracy, Float64]:
+        cross_view: cross_view_agreement.CrossViewConsistency | None,
+    ) -> tuple[pose_accuracy.Accuracy, Float64]:
         """Return the accuracy of the final poses, and their covariances (P, 6, 6).
 
         Not assessed if covariances of registrations are unrealistic.
         """
         if not self.observations.has_covariances:
-            return Accuracy(), GraphCovariances(closed.optimisation.graph).of_poses
+            return pose_accuracy.Accuracy(), graph_covariances.GraphCovariances(
+                closed.optimisation.graph
+            ).of_poses
         refinement = refined.refinement
-        full = images_only = GraphCovariances(self._measured(refined.graph, refinement))
+        full = images_only = graph_covariances.GraphCovariances(
+            self._measured(refined.graph, refinement)
+        )
         if closed.sensors:  # the accuracy uses the images alone where they suffice
             without_sensors = closed.visual.optimisation.graph
             if refinement.kept:
                 without_sensors = self.tracked.build(
                     closed.loops, refinement, confirmed=closed.confirmed
                 )
-            images_only = GraphCovariances(self._measured(without_sensors, refinement))
+            images_only = graph_covariances.GraphCovariances(
+                self._measured(without_sensors, refinement)
+            )
         refinement_shift = 0.0, 0.0
         if self._is_tracked:  # the initial error of given poses is unrelated to the final one
-            refinement_shift = displacement(closed.optimisation.graph.poses, refined.graph.poses)
+            refinement_shift = trajectory_errors.displacement(
+                closed.optimisation.graph.poses, refined.graph.poses
+            )
         excess_m = 0.0 if cross_view is None else cross_view.excess_m()
         calibration = self._calibration_error(refinement.calibration_check)
-        observed = ObservedErrors(
+        observed = pose_accuracy.ObservedErrors(
             *refinement_shift, excess_m, *calibration, refinement.split_m, refinement.split_rad
         )
-        covariances = covariances_of(full, observed)
+        covariances = pose_accuracy.covariances_of(full, observed)
         del full  # only one large factor is in memory
-        accuracy = accuracy_of(images_only, observed, model.cloud.diagonal_m)
+        accuracy = pose_accuracy.accuracy_of(images_only, observed, model.cloud.diagonal_m)
         if accuracy.unbounded and closed.sensors.verified:
             unbounded = set(accuracy.unbounded)
-            bounded = with_sensors(images_only.graph, self._steps_at_degenerate(closed.sensors))
-            accuracy = accuracy_of(GraphCovariances(bounded), observed, model.cloud.diagonal_m)
+            bounded = external_sensors.with_sensors(
+                images_only.graph, self._steps_at_degenerate(closed.sensors)
+            )
+            accuracy = pose_accuracy.accuracy_of(
+                graph_covariances.GraphCovariances(bounded), observed, model.cloud.diagonal_m
+            )
             by_odometry = tuple(sorted(unbounded.difference(accuracy.unbounded)))
             accuracy = replace(accuracy, by_odometry=by_odometry)
         return accuracy, covariances
@@ -195,7 +192,9 @@ class Assessment:
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
         return self.tracked.measured(graph, self.observations.views, refinement.non_overlap_edges)
 
-    def _calibration_error(self, check: CalibrationCheck | None) -> tuple[float, float]:
+    def _calibration_error(
+        self, check: calibration_check.CalibrationCheck | None
+    ) -> tuple[float, float]:
         """Return the 95 % bound of the pose errors (m, rad) due to the calibration.
 
         It is the change of the poses under the estimated calibration, or the gap of a loop that a
@@ -215,12 +214,14 @@ class Assessment:
         m, rad = np.linalg.norm(errors, axis=0).tolist()
         return m, rad
 
-    def _steps_at_degenerate(self, sensors: SensorPriors) -> SensorPriors:
+    def _steps_at_degenerate(
+        self, sensors: external_sensors.SensorPriors
+    ) -> external_sensors.SensorPriors:
         """Return the odometry steps from and to degenerate frames, and over gaps."""
         ends = self.tracked.unobservable.keys()
         gaps = self.tracked.gaps
         steps = [s for s in sensors.steps if s.i in ends or s.j in ends or (s.i, s.j) in gaps]
-        return SensorPriors(tuple(steps))
+        return external_sensors.SensorPriors(tuple(steps))
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
         """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""
@@ -239,10 +240,14 @@ class Assessment:
             out.append(replace(entry.record, covariance=C) if finite else entry.record)
         return tuple(out)
 
-    def _cross_view(self, graph: PoseGraph) -> CrossViewConsistency | None:
+    def _cross_view(self, graph: PoseGraph) -> cross_view_agreement.CrossViewConsistency | None:
         """Compare overlapping images at the final poses."""
         frames, rows = self._checked_images(graph)
-        return cross_view_consistency(frames, graph.poses[rows]) if len(frames) > 1 else None
+        return (
+            cross_view_agreement.cross_view_consistency(frames, graph.poses[rows])
+            if len(frames) > 1
+            else None
+        )
 
     def _checked_images(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
         """Return the images for the final comparison, and their positions in the graph."""
@@ -292,7 +297,7 @@ def single_link_frames(tracked: TrackedGraph, loops: Sequence[LoopRecord]) -> tu
     edges = [(component_of[i], component_of[j]) for i, j in pairs]
     first = component_of[tracked.posed[0].record.index]
     weak_components: set[int] = set()
-    for k, sides in cut_edges(edges).items():
+    for k, sides in bridges.cut_edges(edges).items():
         if k < len(tracked.joins) and tracked.joins[k].kind == "links":
             weak_components |= sides[1] if first in sides[0] else sides[0]
     return tuple(index for index, c in component_of.items() if c in weak_components)

@@ -11,15 +11,11 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import trim_memory
 from tofuse.engine.fusion import Cloud, Model
 from tofuse.engine.graph import (
-    MIN_WEIGHT,
-    GraphCovariances,
     LoopRecord,
     Optimisation,
     PoseGraph,
-    SensorPriors,
-    accepted_only,
-    measure_all,
-    with_sensors,
+    external_sensors,
+    graph_covariances,
 )
 from tofuse.engine.loops import ClosedLoop, Join, PriorLoop, degraded_neighbours
 from tofuse.engine.mapping.assessment import Assessment
@@ -98,22 +94,22 @@ class BackEnd:
             graph = self._tracked.build(loops)
         # Poses before loop closure, without and with external sensors.
         sequential = aided = graph.poses
-        sensors = SensorPriors()
+        sensors = external_sensors.SensorPriors()
         if self._config.priors:
             sensor_data = self._log.sensor_data(graph.ids.tolist())
             measured_graph = self._tracked.measured(tracked, self._observations.views)
-            sensors = measure_all(self._config.priors, sensor_data, measured_graph)
-        optimisation = Optimisation(with_sensors(graph, sensors), (), True)
+            sensors = external_sensors.measure_all(self._config.priors, sensor_data, measured_graph)
+        optimisation = Optimisation(external_sensors.with_sensors(graph, sensors), (), True)
         confirmed: frozenset[int] = frozenset()
         if graph.loop.any() or sensors:
             self._progress.stage("optimising")
             with self._watch.timing("optimisation"):
                 optimisation, confirmed = self._optimise(graph, loops, sensors)
                 if sensors and graph.loop.any():  # loops are compared with these poses
-                    without_loops = with_sensors(tracked, sensors)
+                    without_loops = external_sensors.with_sensors(tracked, sensors)
                     aided = self._config.optimiser.optimise(without_loops).graph.poses
             loops = _without_rejected(loops, optimisation)
-            optimisation = accepted_only(optimisation)
+            optimisation = graph_covariances.accepted_only(optimisation)
         graph = optimisation.graph
         visual = VisualEvidence(aided, optimisation)
         if sensors:
@@ -123,7 +119,7 @@ class BackEnd:
         return Optimised(loops, sequential, optimisation, sensors, visual, confirmed)
 
     def _optimise(
-        self, graph: PoseGraph, loops: Sequence[ClosedLoop], sensors: SensorPriors
+        self, graph: PoseGraph, loops: Sequence[ClosedLoop], sensors: external_sensors.SensorPriors
     ) -> tuple[Optimisation, frozenset[int]]:
         """Optimise a graph with loops; repeat if neighbouring views become inconsistent.
 
@@ -138,7 +134,9 @@ class BackEnd:
         )
         confirmed: frozenset[int] = frozenset()
         while True:
-            optimisation = self._config.optimiser.optimise(with_sensors(graph, sensors))
+            optimisation = self._config.optimiser.optimise(
+                external_sensors.with_sensors(graph, sensors)
+            )
             views = self._observations.views.of(row_of) if suspects else []
             rows = [row_of[v.index] for v in views]
             before, after = graph.poses[rows], optimisation.graph.poses[rows]
@@ -159,7 +157,7 @@ class BackEnd:
             graph = self._tracked.build(loops)
             if not graph.loop.any():
                 break
-            graph = accepted_only(self._config.optimiser.optimise(graph)).graph
+            graph = graph_covariances.accepted_only(self._config.optimiser.optimise(graph)).graph
             poses = dict(zip(graph.ids.tolist(), graph.poses, strict=True))
             if not self._observations.loops.candidates_change(poses):
                 break
@@ -176,7 +174,7 @@ class BackEnd:
             )
             if refinement.kept:
                 graph = self._tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
-                graph = with_sensors(graph, closed.sensors)
+                graph = external_sensors.with_sensors(graph, closed.sensors)
         return Refined(graph, refinement)
 
     def _fuse(self, closed: Optimised, refined: Refined) -> tuple[Model, Cloud | None]:
@@ -247,7 +245,9 @@ class BackEnd:
 
 def _covariances(graph: PoseGraph) -> dict[int, Float64]:
     """Return the (6, 6) covariance of each pose by frame index."""
-    return dict(zip(graph.ids.tolist(), GraphCovariances(graph).of_poses, strict=True))
+    return dict(
+        zip(graph.ids.tolist(), graph_covariances.GraphCovariances(graph).of_poses, strict=True)
+    )
 
 
 def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[ClosedLoop]:
@@ -271,7 +271,7 @@ def _without_rejected(loops: Sequence[ClosedLoop], optimisation: Optimisation) -
     weights = iter(optimisation.weights[optimisation.graph.loop])
     out = []
     for loop in loops:
-        if loop.T_i_j is not None and next(weights) < MIN_WEIGHT:
+        if loop.T_i_j is not None and next(weights) < graph_covariances.MIN_WEIGHT:
             reason = f"contradicts the rest of the graph ({loop.record.reason})"
             loop = ClosedLoop(replace(loop.record, accepted=False, reason=reason))
         out.append(loop)

@@ -12,7 +12,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Filter
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.fusion import Fusion
-from tofuse.engine.graph import ExternalSensor, Optimiser
+from tofuse.engine.graph import Optimiser, external_sensors
 from tofuse.engine.loops import Joining, LoopDetector
 from tofuse.engine.mapping.budget import voxels_mb
 from tofuse.engine.refinement import NoRefinement, RefinementMethod
@@ -76,7 +76,7 @@ class Config(Bounded):
     refinement: RefinementMethod = NoRefinement()  # noqa: RUF009 - immutable
     corrections: tuple[Correction, ...] = ()
     model_filters: tuple[Filter, ...] = ()
-    priors: tuple[ExternalSensor, ...] = ()
+    priors: tuple[external_sensors.ExternalSensor, ...] = ()
     search: SearchOptions = SearchOptions()  # noqa: RUF009 - immutable
     joining: Joining = Joining()  # noqa: RUF009 - immutable
     self_calibration: bool = True

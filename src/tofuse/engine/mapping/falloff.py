@@ -25,12 +25,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
-from tofuse.engine.alignment import ProjectiveOptions, Target, align, points_of
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.mapping.pooling import pooled
-from tofuse.engine.search import PATIENT, landing_pixels
-from tofuse.engine.views import POINT, POINT_ALBEDO, PreparedView, SurfaceOptions, prepare_view
+from tofuse.engine.search import verification, view_points
+from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view, residual_kernels
 
 Prepare = Callable[[Frame], Frame]
 
@@ -41,7 +41,9 @@ _PAIRS, _STRIDE, _MAX_DOUBLINGS = 7, 2, 3
 # the range; and the minimum inlier fraction of an alignment.
 _DESIRED_MOTION, _MIN_MOTION, _MIN_INLIERS = 0.05, 0.02, 0.6
 # Alignment by geometry alone, with wide priors; and with amplitude.
-_GEOMETRIC = ProjectiveOptions(levels=PATIENT, photometric=False, prior_m=3.0, prior_rad=3.0)
+_GEOMETRIC = projective.ProjectiveOptions(
+    levels=verification.PATIENT, photometric=False, prior_m=3.0, prior_rad=3.0
+)
 _PHOTOMETRIC = replace(_GEOMETRIC, photometric=True)
 # Maximum number of photometric alignments, and the change of the exponent at convergence.
 _MAX_ROUNDS, _CONVERGED = 5, 0.1
@@ -206,10 +208,13 @@ def _aligned(
 
 
 def _constrained_pose(
-    source: PreparedView, target: PreparedView, guess: Float64, options: ProjectiveOptions
+    source: PreparedView,
+    target: PreparedView,
+    guess: Float64,
+    options: projective.ProjectiveOptions,
 ) -> Float64 | None:
     """Return T_target_source (4, 4), if the views fit and constrain it in all directions."""
-    aligned = align(source, [Target(target, np.eye(4))], guess, options)
+    aligned = projective.align(source, [projective.Target(target, np.eye(4))], guess, options)
     if not aligned.converged or aligned.inlier_ratio < _MIN_INLIERS or len(aligned.unobservable):
         return None
     return aligned.T_world_source
@@ -223,10 +228,10 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64, law: Law) -> 
     T
         (4, 4) T_target_source.
     """
-    packed = points_of(source, 2).astype(np.float64)
-    p = packed[:, POINT : POINT + 3]
+    packed = projective.points_of(source, 2).astype(np.float64)
+    p = packed[:, residual_kernels.POINT : residual_kernels.POINT + 3]
     q = p @ T[:3, :3].T + T[:3, 3]
-    u, v = landing_pixels(target, q).T
+    u, v = view_points.landing_pixels(target, q).T
     rows, columns = target.z.shape
     inside = (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
     p, q, u, v = p[inside], q[inside], u[inside], v[inside]
@@ -235,7 +240,7 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64, law: Law) -> 
         np.abs(q[:, 2] - 1 / np.maximum(z, 1e-9))
         < _MAX_DISTANCE_M + _MAX_DISTANCE_FRACTION * q[:, 2]
     )
-    log_ratio = target.albedo[v, u, 0] - packed[inside, POINT_ALBEDO]
+    log_ratio = target.albedo[v, u, 0] - packed[inside, residual_kernels.POINT_ALBEDO]
     matched &= np.isfinite(log_ratio)
     if np.count_nonzero(matched) < _MIN_POINTS:
         return None

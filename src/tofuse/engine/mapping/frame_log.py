@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import SensorData
+from tofuse.engine.graph import external_sensors
 from tofuse.engine.loops import TrackedComponent
 from tofuse.engine.mapping.config import ViewKind, kind_of
 from tofuse.engine.results import FrameRecord
@@ -245,7 +245,7 @@ class FrameLog:
             )
         return components
 
-    def sensor_data(self, ids: Sequence[int]) -> SensorData:
+    def sensor_data(self, ids: Sequence[int]) -> external_sensors.SensorData:
         """Return the measurements of external sensors for frames by index."""
         by_index = {e.record.index: e for e in self.entries}
         entries = [by_index[index] for index in ids]
@@ -255,7 +255,9 @@ class FrameLog:
                 row[:] = entry.gravity
         parts = np.array([e.recording for e in entries], np.intp)
         degenerate = np.array([len(e.record.unobservable) > 0 for e in entries], bool)
-        return SensorData(np.array(ids, np.intp), _odometry(entries), gravity, parts, degenerate)
+        return external_sensors.SensorData(
+            np.array(ids, np.intp), _odometry(entries), gravity, parts, degenerate
+        )
 
 
 def _odometry(entries: Sequence[Entry]) -> Float64:

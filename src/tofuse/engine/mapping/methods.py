@@ -7,10 +7,10 @@ from dataclasses import replace
 from tofuse.engine.clouds import AnyPair, algorithm_1
 from tofuse.engine.filters import Confidence, NeighbourFraction, NeighbourhoodAngle
 from tofuse.engine.fusion import Fusion
-from tofuse.engine.graph import Castellani, GravityEdges, LevenbergMarquardt
+from tofuse.engine.graph import Castellani, external_sensors, levenberg
 from tofuse.engine.loops import Confirmation, Nearby, Revisits
 from tofuse.engine.mapping.config import Config, ViewKind
-from tofuse.engine.refinement import Joint, Planes
+from tofuse.engine.refinement import Joint, plane_refinement
 from tofuse.engine.sensor import Multipath, Noise, Wrapped
 from tofuse.engine.tracking import Keyframes, Pairwise, Sequential
 
@@ -61,7 +61,7 @@ def default(kind: ViewKind) -> Config:
                 per_frame=6,
                 confirmation=Confirmation(registrations=(AnyPair(),)),
             ),
-            refinement=Planes(),
+            refinement=plane_refinement.Planes(),
         )
     return replace(
         base,
@@ -72,8 +72,8 @@ def default(kind: ViewKind) -> Config:
         odometry=Keyframes(),
         loops=Revisits(),
         # Not for clouds: it relies on the covariance of registrations, and ICP's is too small.
-        optimiser=LevenbergMarquardt(),
+        optimiser=levenberg.LevenbergMarquardt(),
         refinement=Joint(),
         # Odometry only on request: a file next to the images may be of any quality.
-        priors=(GravityEdges(),),
+        priors=(external_sensors.GravityEdges(),),
     )

@@ -17,7 +17,7 @@ from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.budget import checked_bytes, views_bytes
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.preparation import FilteredFrame
-from tofuse.engine.quality import FrameSample, FrameSamples, restore_thinned
+from tofuse.engine.quality import cross_view_agreement, frame_samples
 from tofuse.engine.stored_views import Spacing, Spilled, ViewStore
 from tofuse.engine.tracking import Step
 from tofuse.engine.views import PreparedView
@@ -61,7 +61,7 @@ class Observations:
             Spacing(), always=loop_frames, scratch=scratch
         )
         self.loops = config.loops.start(seed, prior_loops, self.views, config.search)
-        self.samples = FrameSamples()
+        self.samples = frame_samples.FrameSamples()
         self.refiner = config.refinement.start(self.views)
         self.model = ModelBuilder(config.fusion)
         self._places = Spacing(views_per_place=_VIEWS_PER_PLACE).places()
@@ -114,7 +114,7 @@ class Observations:
         if isinstance(frame, RangeFrame):
             self.depths[frame.index] = depth
             if isinstance(clean, RangeFrame):
-                self._checks.add(lambda: restore_thinned(frame, clean))
+                self._checks.add(lambda: cross_view_agreement.restore_thinned(frame, clean))
         assert step.T_component_camera is not None
         if self._places.keeps(depth, step.T_component_camera, step.component):
             self.model.add(clean, step.surface, _MAX_POINTS)
@@ -126,7 +126,9 @@ class Observations:
             and isinstance(tracked, RangeFrame)
             and isinstance(modelled, RangeFrame)
         ):
-            self.samples.take(lost=lost, make=partial(FrameSample.of, frame, tracked, modelled))
+            self.samples.take(
+                lost=lost, make=partial(frame_samples.FrameSample.of, frame, tracked, modelled)
+            )
 
     @property
     def checks(self) -> Sequence[Spilled[RangeFrame]]:

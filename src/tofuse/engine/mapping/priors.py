@@ -14,7 +14,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, Recording, Source
-from tofuse.engine.graph import GravityEdges, OdometryEdges
+from tofuse.engine.graph import external_sensors
 from tofuse.engine.mapping.config import Config
 
 Prior = Literal["auto", "none", "device"]
@@ -41,9 +41,11 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
         raise InputError(f"is {prior!r}", where="--prior", remedy="use auto, none or device")
     if prior == "none":
         return recording, replace(config, priors=())
-    if any(isinstance(sensor, OdometryEdges) for sensor in config.priors):
+    if any(isinstance(sensor, external_sensors.OdometryEdges) for sensor in config.priors):
         return recording, config
-    uses_gravity = any(isinstance(sensor, GravityEdges) for sensor in config.priors)
+    uses_gravity = any(
+        isinstance(sensor, external_sensors.GravityEdges) for sensor in config.priors
+    )
     poses = recording.reference if POSES_BY in recording.metadata else None
     if prior == "auto" and (not uses_gravity or poses is None):
         return recording, config
@@ -55,8 +57,10 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
                 remedy="put an odometry.txt next to the images, or use --prior auto",
             )
         recording = with_odometry(recording, poses)
-    gravity = () if uses_gravity else (GravityEdges(),)
-    return recording, replace(config, priors=(*config.priors, *gravity, OdometryEdges()))
+    gravity = () if uses_gravity else (external_sensors.GravityEdges(),)
+    return recording, replace(
+        config, priors=(*config.priors, *gravity, external_sensors.OdometryEdges())
+    )
 
 
 @dataclass

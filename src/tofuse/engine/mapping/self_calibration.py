@@ -18,15 +18,14 @@ import numpy as np
 
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.progress import Progress
-from tofuse.engine.refinement import CalibrationCheck
-from tofuse.engine.refinement import in_words as errors_in_words
+from tofuse.engine.refinement import calibration_check
 from tofuse.engine.results import (
     Diagnostics,
     Reason,
     Reconstruction,
     SelfCalibration,
-    length,
-    ranked,
+    accuracy_card,
+    verdicts,
 )
 from tofuse.engine.sensor import FIELDS, CameraErrors
 
@@ -83,12 +82,14 @@ def self_calibrated(
 
 def in_words(correction: CameraErrors) -> str:
     """Describe a correction: "a focal length 4.5 % smaller"."""
-    return " and ".join(errors_in_words({name: e for name, e in correction.errors.items() if e}))
+    return " and ".join(
+        calibration_check.in_words({name: e for name, e in correction.errors.items() if e})
+    )
 
 
 def _estimated_error(
     result: Reconstruction, applied: CameraErrors
-) -> tuple[CalibrationCheck, CameraErrors] | None:
+) -> tuple[calibration_check.CalibrationCheck, CameraErrors] | None:
     """Return the calibration error that fits the views best; None without an alarm.
 
     After a correction, also the remainder of the same error, even if it is within the tolerance.
@@ -116,14 +117,14 @@ def _is_better(candidate: Reconstruction, current: Reconstruction) -> bool:
     return new < old if np.isfinite([new, old]).any() else _support(candidate) > _support(current)
 
 
-def _is_stable(candidate: Reconstruction, check: CalibrationCheck) -> bool:
+def _is_stable(candidate: Reconstruction, check: calibration_check.CalibrationCheck) -> bool:
     """Whether the views do not significantly undo the correction that a check proposed."""
     check_after = _check_of(candidate)
     remaining = 0.0 if check_after is None else check_after.large.get(check.best, 0.0)
     return remaining * check.errors[check.best] >= 0
 
 
-def _check_of(result: Reconstruction) -> CalibrationCheck | None:
+def _check_of(result: Reconstruction) -> calibration_check.CalibrationCheck | None:
     refinement = result.diagnostics.refinement
     return None if refinement is None else refinement.calibration_check
 
@@ -136,7 +137,7 @@ def _bound_change(before: float, after: float) -> str:
     """Describe the change of the bound."""
     if not np.isfinite([before, after]).all():
         return ""
-    return f" The bound of the pose error is {length(after)} (95 %) instead of {length(before)}."
+    return f" The bound of the pose error is {accuracy_card.length(after)} (95 %) instead of {accuracy_card.length(before)}."
 
 
 def _support(result: Reconstruction) -> float:
@@ -156,4 +157,4 @@ def _with_calibration(
         f"than stated.{_bound_change(*calibration.bound_m)}"
     )
     reason = Reason("self_calibrated", ((indices[0], indices[-1]),), text)
-    return replace(d, calibrated=calibration, reasons=ranked([*d.reasons, reason]))
+    return replace(d, calibrated=calibration, reasons=verdicts.ranked([*d.reasons, reason]))

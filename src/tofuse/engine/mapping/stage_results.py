@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.graph import Optimisation, PoseGraph, SensorPriors
+from tofuse.engine.graph import Optimisation, PoseGraph, external_sensors
 from tofuse.engine.loops import ClosedLoop
 from tofuse.engine.refinement import Refinement
 
@@ -31,7 +31,7 @@ class Optimised:
     loops: list[ClosedLoop]
     sequential: Float64
     optimisation: Optimisation
-    sensors: SensorPriors
+    sensors: external_sensors.SensorPriors
     visual: VisualEvidence
     confirmed: frozenset[int]
 

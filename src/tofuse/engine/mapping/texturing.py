@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_limits
 from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording
-from tofuse.engine.fusion import Textured, TextureView, textured
+from tofuse.engine.fusion import texture
 from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
@@ -27,7 +27,7 @@ def make_texture(
     size: int,
     threads: int | None = None,
     progress: Progress | None = None,
-) -> Textured | None:
+) -> texture.Textured | None:
     """Make the texture of a model's surface; None without a surface, colour and amplitude.
 
     Parameters
@@ -48,7 +48,7 @@ def make_texture(
     correctors = CameraErrors.made_with(result.config)
     progress = progress or Silent()
     progress.stage("painting", len(frame_positions))
-    views: list[TextureView] = []
+    views: list[texture.TextureView] = []
     poses = []
     for k in frame_positions:
         progress.advance()
@@ -58,7 +58,7 @@ def make_texture(
             continue
         for corrector in correctors:
             frame = corrector.apply(frame)
-        view = TextureView.of(frame) if isinstance(frame, RangeFrame) else None
+        view = texture.TextureView.of(frame) if isinstance(frame, RangeFrame) else None
         if view is not None and (not views or view.intensity.shape == views[0].intensity.shape):
             views.append(view)
             poses.append(result.trajectory[k])
@@ -66,7 +66,7 @@ def make_texture(
         return None
     # BLAS results depend on its number of threads; those of our kernels don't.
     with use_threads(threads), threadpool_limits(1):
-        return textured(mesh.decimated(_FACES), views, np.array(poses), size)
+        return texture.textured(mesh.decimated(_FACES), views, np.array(poses), size)
 
 
 def steadiest_frames(result: Reconstruction) -> list[int]:

@@ -9,13 +9,13 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.graph import Measured, PoseGraph, build_graph
+from tofuse.engine.graph import PoseGraph, measured_graph
 from tofuse.engine.loops import ClosedLoop, Join
 from tofuse.engine.mapping.frame_log import Entry
-from tofuse.engine.quality import degenerate_directions, without_degenerate
+from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import Refinement
 from tofuse.engine.stored_views import ViewStore
-from tofuse.engine.tracking import Prediction, degenerate_runs, with_prediction
+from tofuse.engine.tracking import motion_prediction
 from tofuse.engine.views import PreparedView
 
 
@@ -72,8 +72,12 @@ class TrackedGraph:
         refined_frames = {index for edge in refined_edges for index in (edge.i, edge.j)}
         position_of = {index: k for k, index in enumerate(ids)}
         unobservable = [e.record.unobservable for e in self.posed]
-        degenerate_run_of = degenerate_runs(unobservable)
-        prediction = Prediction.of(tracked, unobservable) if degenerate_run_of.any() else None
+        degenerate_run_of = motion_prediction.degenerate_runs(unobservable)
+        prediction = (
+            motion_prediction.Prediction.of(tracked, unobservable)
+            if degenerate_run_of.any()
+            else None
+        )
         if prediction is not None and conservative:
             prediction = prediction.with_max_growth()
         times = {e.record.index: e.record.timestamp for e in self.posed}
@@ -98,19 +102,25 @@ class TrackedGraph:
             if prediction is not None:
                 sigma = prediction.error(int(degenerate_run_of[position_of[index]]), n_frames)
                 predicted_sigma = (sigma[0] * time_ratio**2, sigma[1] * time_ratio**2)
-                information = with_prediction(information, r.unobservable, predicted_sigma)
-            sequential_edges.append(Measured(step.reference, index, r.T_target_source, information))
+                information = motion_prediction.with_prediction(
+                    information, r.unobservable, predicted_sigma
+                )
+            sequential_edges.append(
+                measured_graph.Measured(step.reference, index, r.T_target_source, information)
+            )
         join_edges = [
-            Measured(j.link.i, j.link.j, j.link.T_i_j, j.link.information)
+            measured_graph.Measured(j.link.i, j.link.j, j.link.T_i_j, j.link.information)
             for j in self.joins
             if j.defines_pose and not {j.link.i, j.link.j} <= refined_frames
         ]
         loop_edges = [
-            Measured(c.record.i, c.record.j, c.T_i_j, c.information)
+            measured_graph.Measured(c.record.i, c.record.j, c.T_i_j, c.information)
             for c in loops
             if c.T_i_j is not None and c.information is not None
         ]
-        return build_graph(ids, poses, [*sequential_edges, *join_edges, *refined_edges], loop_edges)
+        return measured_graph.build_graph(
+            ids, poses, [*sequential_edges, *join_edges, *refined_edges], loop_edges
+        )
 
     def measured(
         self,
@@ -135,10 +145,10 @@ class TrackedGraph:
             if e.step is not None and e.step.reference is not None
         }
         view_by_index = {v.index: v for v in views.of(self.poses)}
-        directions = degenerate_directions(
+        directions = pose_accuracy.degenerate_directions(
             graph, self.unobservable, tracked_pairs, view_by_index, frozenset(non_overlap_edges)
         )
-        return without_degenerate(graph, directions, self.gaps)
+        return pose_accuracy.without_degenerate(graph, directions, self.gaps)
 
     @property
     def gaps(self) -> set[tuple[int, int]]:

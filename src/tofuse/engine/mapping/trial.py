@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import stdtrit
 
-from tofuse.engine.alignment import Aligned, Level, ProjectiveOptions, Target, align
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
@@ -59,8 +59,12 @@ _CORRELATION_FACTOR = 10.0
 # Standard deviation of a correction, as a fraction of it.
 _RELATIVE_SIGMA = 0.2
 _ITERATIONS = 3
-_ALIGNMENT = ProjectiveOptions(
-    levels=(Level(4, 20, 0.15, 0.3), Level(4, 15, 0.03, 0.1), Level(2, 10, 0.005, 0.02)),
+_ALIGNMENT = projective.ProjectiveOptions(
+    levels=(
+        projective.Level(4, 20, 0.15, 0.3),
+        projective.Level(4, 15, 0.03, 0.1),
+        projective.Level(2, 10, 0.005, 0.02),
+    ),
     prior_m=3.0,
     prior_rad=3.0,
     common_tilt=0.0,
@@ -178,7 +182,7 @@ class _AlignedViews:
         self._recording = recording
         self._uncorrected, self._corrected = uncorrected, corrected
         self._views: dict[int, _TrialView | None] = {}
-        self._steps: dict[tuple[int, int], Aligned | None] = {}
+        self._steps: dict[tuple[int, int], projective.Aligned | None] = {}
 
     def _view(self, k: int) -> _TrialView | None:
         if k not in self._views:
@@ -194,14 +198,14 @@ class _AlignedViews:
             return None
         return _TrialView.of(uncorrected, corrected) if len(uncorrected) else None
 
-    def _step(self, i: int, j: int) -> Aligned | None:
+    def _step(self, i: int, j: int) -> projective.Aligned | None:
         """Align view j to view i; None if they do not fit."""
         if (i, j) not in self._steps:
             target, source = self._view(i), self._view(j)
             aligned = None
             if target is not None and source is not None:
-                inputs = source.surface, [Target(target.surface, np.eye(4))]
-                aligned = align(*inputs, np.eye(4), _ALIGNMENT)
+                inputs = source.surface, [projective.Target(target.surface, np.eye(4))]
+                aligned = projective.align(*inputs, np.eye(4), _ALIGNMENT)
                 fits = aligned.inlier_ratio * aligned.overlap >= _MIN_INLIERS
                 if not fits or len(aligned.unobservable) > 6 - _MIN_CONSTRAINED:
                     aligned = None
@@ -222,7 +226,7 @@ class _AlignedViews:
             stride = min(max(1, round(stride / ratio)), max_stride)
         return stride
 
-    def _relative_motion(self, k: int, step: Aligned) -> float:
+    def _relative_motion(self, k: int, step: projective.Aligned) -> float:
         """Return the motion relative to the desired one."""
         view, T = self._view(k), step.T_world_source
         depth = 1.0 if view is None else view.surface.depth

@@ -6,19 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tofuse.engine.alignment import UNITS, ProjectiveOptions, Target, align, covariance
+from tofuse.engine.alignment import covariance, projective
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Measured, PoseGraph, build_graph
+from tofuse.engine.graph import PoseGraph, measured_graph
 from tofuse.engine.quality.pose_accuracy import without_degenerate
-from tofuse.engine.refinement import spread_evenly
-from tofuse.engine.stored_views import PosedView, RefineOptions, SampledView, overlaps
+from tofuse.engine.refinement import joint_alignment
+from tofuse.engine.stored_views import PosedView, SampledView, overlaps, pair_equations
 from tofuse.engine.views import PreparedView
 
-_ALIGNMENT = ProjectiveOptions()
+_ALIGNMENT = projective.ProjectiveOptions()
 # Pairs are selected as in joint refinement.
-_PAIRS = RefineOptions()
+_PAIRS = pair_equations.RefineOptions()
 
 
 def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> PoseGraph:
@@ -45,27 +45,29 @@ def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> 
     def work(start: int, stop: int) -> list[tuple[Float64, Float64, Float64]]:
         results = []
         for (i, j), T in zip(pairs[start:stop].tolist(), T_i_j[start:stop], strict=True):
-            target = [Target(surfaces[i], np.eye(4))]
-            aligned = align(surfaces[j], target, T, _ALIGNMENT)
+            target = [projective.Target(surfaces[i], np.eye(4))]
+            aligned = projective.align(surfaces[j], target, T, _ALIGNMENT)
             C = covariance(surfaces[j], target, aligned, _ALIGNMENT)
-            results.append((aligned.T_world_source, C, aligned.unobservable * UNITS))
+            results.append((aligned.T_world_source, C, aligned.unobservable * projective.UNITS))
         return results
 
     results = [result for chunk in run_chunks(work, len(pairs), 64) for result in chunk]
     ids = [view.index for view in views]
     edges = [
-        Measured(ids[i], ids[j], T, np.asarray(np.linalg.inv(C), np.float64))
+        measured_graph.Measured(ids[i], ids[j], T, np.asarray(np.linalg.inv(C), np.float64))
         for (i, j), (T, C, _) in zip(pairs.tolist(), results, strict=True)
     ]
     return without_degenerate(
-        build_graph(ids, poses, edges), [degenerate for _, _, degenerate in results]
+        measured_graph.build_graph(ids, poses, edges), [degenerate for _, _, degenerate in results]
     )
 
 
 def _overlapping(views: Sequence[PosedView[PreparedView]], poses: Float64) -> Intp:
     """Return (M, 2) positions i < j of the views that are compared."""
     sampled = [SampledView.of(view.view, _PAIRS.points) for view in views]
-    pairs = spread_evenly(overlaps(sampled, poses, _PAIRS.overlap)[0], _PAIRS.neighbours)
+    pairs = joint_alignment.spread_evenly(
+        overlaps(sampled, poses, _PAIRS.overlap)[0], _PAIRS.neighbours
+    )
     later = np.arange(1, len(views))
     consecutive = np.stack([later - 1, later], 1)
     return np.unique(np.concatenate([pairs, consecutive]), axis=0)

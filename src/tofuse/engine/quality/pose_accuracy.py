@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import bdtrc, gammaincinv
 
-from tofuse.engine.alignment import UNITS, ProjectiveOptions, Target, align, span
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import GraphCovariances, PoseGraph
+from tofuse.engine.graph import PoseGraph, graph_covariances
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.views import PreparedView
 
@@ -47,9 +47,9 @@ _CHANCE_OF_PAIR = 0.05
 # Significance level of the number of such pairs of a view. It admits the only pair of a view.
 _SIGNIFICANCE = 0.05 + 1e-9
 # Near the final pose. A direction with no smaller sigma than the prior is not measured.
-_ALIGNMENT = ProjectiveOptions()
+_ALIGNMENT = projective.ProjectiveOptions()
 # Standard deviation, in `UNITS`, that an error along a degenerate direction causes in the others.
-_LEAK = _DISTINCT * _ALIGNMENT.prior_m / UNITS[0]
+_LEAK = _DISTINCT * _ALIGNMENT.prior_m / projective.UNITS[0]
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class _CovarianceErrors:
 
     @classmethod
     def of_graph(
-        cls, covariances: GraphCovariances, extra: Intp | None = None
+        cls, covariances: graph_covariances.GraphCovariances, extra: Intp | None = None
     ) -> _CovarianceErrors | None:
         """Evaluate evenly spaced poses and `extra`; None if the graph does not constrain all poses.
 
@@ -231,8 +231,11 @@ def degenerate_directions(
     def work(start: int, stop: int) -> None:
         for k in to_align[start:stop]:
             i, j = (views[int(graph.ids[end])].view.without_caches() for end in graph.edges[k])
-            target = [Target(i, np.eye(4))]
-            realigned = align(j, target, graph.measurements[k], _ALIGNMENT).unobservable * UNITS
+            target = [projective.Target(i, np.eye(4))]
+            realigned = (
+                projective.align(j, target, graph.measurements[k], _ALIGNMENT).unobservable
+                * projective.UNITS
+            )
             # Directions are known to a few degrees only, and the remainder would look measured: a
             # degenerate pair is taken to be degenerate in all directions of its views.
             result[k] = np.concatenate([realigned, result[k]]) if len(realigned) else _NO_DIRECTIONS
@@ -293,7 +296,7 @@ def without_degenerate(
         Pairs of frames with only extrapolated motion between them.
     """
     information = graph.information.copy()
-    unmeasured_variance = np.diag((_UNMEASURED_SIGMA / UNITS) ** 2)
+    unmeasured_variance = np.diag((_UNMEASURED_SIGMA / projective.UNITS) ** 2)
     is_degenerate = np.array([len(d) > 0 for d in directions], np.bool_)
     n_degenerate = np.bincount(graph.edges[is_degenerate].ravel(), minlength=len(graph.ids))
     for k, ((a, b), degenerate) in enumerate(zip(graph.edges, directions, strict=True)):
@@ -303,19 +306,21 @@ def without_degenerate(
             continue
         if not len(degenerate):
             continue
-        basis = span(degenerate, _DISTINCT)
-        H = information[k] * np.outer(UNITS, UNITS)
+        basis = projective.span(degenerate, _DISTINCT)
+        H = information[k] * np.outer(projective.UNITS, projective.UNITS)
         scaled = H - H @ basis @ np.linalg.pinv(basis.T @ H @ basis, hermitian=True) @ basis.T @ H
         unbounded = basis @ np.linalg.inv(basis.T @ unmeasured_variance @ basis) @ basis.T
         measured = scaled + unbounded
         leak_variance = _LEAK**2 * max(n_degenerate[a], n_degenerate[b])
         measured = np.linalg.solve(np.eye(6) + leak_variance * measured, measured)
-        information[k] = 0.5 * (measured + measured.T) / np.outer(UNITS, UNITS)
+        information[k] = (
+            0.5 * (measured + measured.T) / np.outer(projective.UNITS, projective.UNITS)
+        )
     return replace(graph, information=information)
 
 
 def accuracy_of(
-    covariances: GraphCovariances, observed: ObservedErrors, diagonal_m: float
+    covariances: graph_covariances.GraphCovariances, observed: ObservedErrors, diagonal_m: float
 ) -> Accuracy:
     """Return the bounds on the errors of the poses of a graph.
 
@@ -363,7 +368,9 @@ def accuracy_of(
     )
 
 
-def covariances_of(covariances: GraphCovariances, observed: ObservedErrors) -> Float64:
+def covariances_of(
+    covariances: graph_covariances.GraphCovariances, observed: ObservedErrors
+) -> Float64:
     """(N, 6, 6) covariances of single poses relative to the first, as right perturbations.
 
     NaN where a pose is not connected to the first. An unbounded direction has a sigma of tens of
@@ -377,7 +384,9 @@ def covariances_of(covariances: GraphCovariances, observed: ObservedErrors) -> F
     return UNOBSERVED_ERROR_FACTOR**2 * C
 
 
-def _pose_covariances(covariances: GraphCovariances, limits: Float64) -> tuple[Float64, Bool]:
+def _pose_covariances(
+    covariances: graph_covariances.GraphCovariances, limits: Float64
+) -> tuple[Float64, Bool]:
     """Covariances (N, 6, 6) of the poses, and whether position and rotation are unbounded, (N, 2).
 
     Relative to the first one, or to another if the first is one of few unbounded ones.
@@ -386,7 +395,7 @@ def _pose_covariances(covariances: GraphCovariances, limits: Float64) -> tuple[F
     unbounded = _is_unbounded(to_first, limits)
     if 2 * unbounded.any(1).sum() > len(unbounded):
         unbounded_rows = np.flatnonzero(unbounded.any(1))
-        to_other = GraphCovariances(
+        to_other = graph_covariances.GraphCovariances(
             covariances.graph, int(unbounded_rows[len(unbounded_rows) // 2])
         ).of_poses
         other_unbounded = _is_unbounded(to_other, limits)

@@ -25,10 +25,10 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import fdtri, gammaincinv  # scipy.stats takes long to import
 
-from tofuse.engine.alignment import UNITS
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import GraphCovariances, PairSystem, PoseGraph, Settings, Solution, solve
+from tofuse.engine.graph import PoseGraph, graph_covariances, robust, solver, sparse
 from tofuse.engine.quality.pose_accuracy import ObservedErrors, accuracy_of
 from tofuse.engine.quality.trajectory_errors import align
 
@@ -140,7 +140,10 @@ def fitted(graph: PoseGraph, depth_m: float) -> Fit:
     information, poses = graph.information, graph.poses
     variance_scale = max(float(np.median(_chi2(graph))) / _CHI2_MEDIAN, _MIN_SCALE)
     measured_dof = int(
-        (np.linalg.eigvalsh(information * np.outer(UNITS, UNITS)) > _MIN_INFORMATION).sum()
+        (
+            np.linalg.eigvalsh(information * np.outer(projective.UNITS, projective.UNITS))
+            > _MIN_INFORMATION
+        ).sum()
     )
     scale_dof = max(measured_dof - 6 * (n - 1), 0)
     for _ in range(_ITERATIONS):
@@ -178,7 +181,7 @@ def deviation(fit: Fit, poses: Float64) -> Deviation:
     f_quantile = float(fdtri(fit.dof, fit.scale_dof, _CONFIDENCE))
     estimate = problem.smallest_correction(x, _TYPICAL_RATIO * fit.dof)
     bound = problem.smallest_correction(x, _MAX_RATIO * f_quantile * fit.dof)
-    fit_accuracy = accuracy_of(GraphCovariances(graph), ObservedErrors(), 0.0)
+    fit_accuracy = accuracy_of(graph_covariances.GraphCovariances(graph), ObservedErrors(), 0.0)
     fit_error_m = float(np.hypot(fit_accuracy.position_m, fit.depth_m * fit_accuracy.rotation_rad))
     return Deviation(
         problem.norm(estimate),
@@ -201,7 +204,7 @@ class _Corrections:
         self._graph, self._T_i_j = graph, se3.inverse(graph.poses[i]) @ graph.poses[j]
         self._A = se3.adjoint(se3.inverse(self._T_i_j))
         self._units = np.array([1.0] * 3 + [depth_m] * 3)
-        self._system = PairSystem(n, graph.edges, np.zeros(n, np.bool_))
+        self._system = sparse.PairSystem(n, graph.edges, np.zeros(n, np.bool_))
 
     def product(self, x: Float64) -> float:
         """Return x^T S^-1 x."""
@@ -258,12 +261,12 @@ def _chi2(graph: PoseGraph) -> Float64:
     return np.asarray(np.einsum("mi,mij,mj->m", e, graph.information, e), np.float64)
 
 
-def _robust_fit(graph: PoseGraph) -> Solution:
-    return solve(
+def _robust_fit(graph: PoseGraph) -> solver.Solution:
+    return solver.solve(
         graph.poses,
         graph.edges,
         graph.measurements,
         graph.information,
         loop=np.ones(len(graph.edges), np.bool_),
-        settings=Settings(robust="huber", gate=_CHI2_99),
+        settings=robust.Settings(robust="huber", gate=_CHI2_99),
     )

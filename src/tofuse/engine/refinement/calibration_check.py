@@ -32,7 +32,7 @@ from tofuse.engine.refinement.joint_alignment import (
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap
 from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.refinement.split_half import aligned_motion
-from tofuse.engine.stored_views import RefineOptions, SampledView
+from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
@@ -166,7 +166,10 @@ def _large(name: str, error: float, limit: float, factor: float = 1.0) -> bool:
 
 
 def check_calibration(
-    views: Sequence[SampledView], refined: Refined, options: RefineOptions, priors: Priors
+    views: Sequence[SampledView],
+    refined: Refined,
+    options: pair_equations.RefineOptions,
+    priors: Priors,
 ) -> CalibrationCheck:
     """Estimate the errors of the camera from refined views.
 
@@ -246,7 +249,11 @@ class _FirstEstimates:
 
     @classmethod
     def of(
-        cls, views: Sequence[SampledView], refined: Refined, options: RefineOptions, priors: Priors
+        cls,
+        views: Sequence[SampledView],
+        refined: Refined,
+        options: pair_equations.RefineOptions,
+        priors: Priors,
     ) -> _FirstEstimates:
         """Estimate all errors. The parameters are those of `check_calibration`."""
         poses, pairs = refined.poses, refined.pairs
@@ -292,12 +299,16 @@ class _Estimator:
     views: Sequence[SampledView]
     poses: Float64
     pairs: Intp
-    options: RefineOptions
+    options: pair_equations.RefineOptions
     priors: Priors
 
     @classmethod
     def of(
-        cls, views: Sequence[SampledView], refined: Refined, options: RefineOptions, priors: Priors
+        cls,
+        views: Sequence[SampledView],
+        refined: Refined,
+        options: pair_equations.RefineOptions,
+        priors: Priors,
     ) -> _Estimator:
         """Select the pairs. The parameters are those of `check_calibration`."""
         pairs, count = refined.pairs, len(refined.pairs)
@@ -363,7 +374,7 @@ def _check_by_loop(
     refined: Refined,
     first: _FirstEstimates,
     without_error: CalibrationCheck,
-    options: RefineOptions,
+    options: pair_equations.RefineOptions,
 ) -> CalibrationCheck:
     """Estimate the errors of the camera from the drift over the longest loop alone.
 

@@ -10,14 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.pose_priors import DAMPING, Priors, weak_prior
-from tofuse.engine.stored_views import (
-    RefineOptions,
-    SampledView,
-    directed_pairs,
-    evaluate,
-    rescale,
-    without_exposure,
-)
+from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
 
@@ -86,7 +79,7 @@ def response(
     views: Sequence[SampledView],
     poses: Float64,
     pairs: Intp,
-    options: RefineOptions,
+    options: pair_equations.RefineOptions,
     *,
     priors: Priors | None = None,
 ) -> Response:
@@ -106,13 +99,15 @@ def response(
     priors = priors or Priors.none()
     zero_errors, estimate_all = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS, np.int64)
     stage = options.rounds[-1]
-    state = directed_pairs(views, pairs, options)
+    state = pair_equations.directed_pairs(views, pairs, options)
     system = priors.system(len(views), np.stack([state.target, state.source], 1))
-    evaluate(views, poses, zero_errors, np.ones_like(estimate_all), state, stage, options)
-    without_exposure(state)
-    rescale(state, stage)
-    evaluate(views, poses, zero_errors, estimate_all, state, stage, options)
-    H, g = without_exposure(state)
+    pair_equations.evaluate(
+        views, poses, zero_errors, np.ones_like(estimate_all), state, stage, options
+    )
+    pair_equations.without_exposure(state)
+    pair_equations.rescale(state, stage)
+    pair_equations.evaluate(views, poses, zero_errors, estimate_all, state, stage, options)
+    H, g = pair_equations.without_exposure(state)
     prior_count = len(priors.pairs)
     i, j = system.pairs.T
     T_i_j = se3.inverse(poses[i]) @ poses[j]

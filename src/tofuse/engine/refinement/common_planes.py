@@ -19,7 +19,7 @@ from tofuse.engine.arrays import Bool, Float64, Int64, Intp
 from tofuse.engine.clouds import extent
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.geometry import KdTree, se3
-from tofuse.engine.graph import Factor, PairSystem
+from tofuse.engine.graph import sparse
 from tofuse.engine.refinement import plane_kernels as kernels
 
 # Iterations of moving cells to the centroids of their points, which aligns them with the surface.
@@ -371,7 +371,7 @@ def _back_sides(cells: _PlaneCells, poses: Float64) -> Bool:
 
 def _system(
     points: _Points, poses: Float64, divisions: Sequence[_PlaneCells], options: PlaneOptions
-) -> tuple[Factor | None, PairSystem]:
+) -> tuple[sparse.Factor | None, sparse.PairSystem]:
     """Normal equations of all poses without the planes, averaged over several divisions."""
     n = points.count
     variances = [_variance(cells, options.min_points) for cells in divisions]
@@ -405,7 +405,7 @@ def _system(
         for parts in run_chunks(work, len(variance), _CHUNKS):
             for total, part in zip((diagonal, gradient, off_diagonal), parts, strict=True):
                 total += part / len(divisions)
-    system = PairSystem(n, pairs)
+    system = sparse.PairSystem(n, pairs)
     none, flat = np.zeros_like(off_diagonal), np.zeros((len(pairs), 6))
     matrix, rhs = system.assemble(none, off_diagonal, none, flat, flat, (diagonal, gradient))
     return system.factor(matrix, rhs, _DAMPING), system

@@ -14,25 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.engine.alignment import UNITS
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64, Int64, Intp
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Gravity, PairSystem, robust, vertical
+from tofuse.engine.graph import Gravity, minimisation, robust, sparse
 from tofuse.engine.refinement.pose_priors import DAMPING, WEAK, Priors, weak_prior
-from tofuse.engine.stored_views import (
-    DirectedPairs,
-    RefineOptions,
-    Round,
-    SampledView,
-    depends_on_patches,
-    directed_pairs,
-    discount_shared,
-    evaluate,
-    overlaps,
-    rescale,
-    without_exposure,
-)
+from tofuse.engine.stored_views import SampledView, overlaps, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
 _ERROR_UNIT = 0.01  # of the camera's errors, for their weak prior and convergence
@@ -143,7 +131,7 @@ class Bodies:
 def refine(
     views: Sequence[SampledView],
     poses: Float64,
-    options: RefineOptions,
+    options: pair_equations.RefineOptions,
     *,
     calibrate: Sequence[int] = (),
     priors: Priors | None = None,
@@ -191,12 +179,12 @@ def refine(
     count = len(state.target) // 2
     pairs = np.stack([state.target[:count], state.source[:count]], 1)
     final_round = options.rounds[-1]
-    by_patch = not calibrate and depends_on_patches(state, options)
+    by_patch = not calibrate and pair_equations.depends_on_patches(state, options)
     after = _support(
         views, poses, errors, fixed_errors, state, final_round, options, by_patch=by_patch
     )
     if by_patch:
-        discount_shared(views, poses, state, options)
+        pair_equations.discount_shared(views, poses, state, options)
     measured = _pairwise_measurements(poses, pairs, state)
     before = _support(
         views, start, np.zeros_like(errors), fixed_errors, state, final_round, options
@@ -223,7 +211,7 @@ class AlignedViews:
 
     poses: Float64
     errors: Float64
-    state: DirectedPairs
+    state: pair_equations.DirectedPairs
     fixed_errors: Int64
     moved: tuple[float, ...]
 
@@ -231,7 +219,7 @@ class AlignedViews:
 def align_views(
     views: Sequence[SampledView],
     poses: Float64,
-    options: RefineOptions,
+    options: pair_equations.RefineOptions,
     *,
     calibrate: Sequence[int] = (),
     errors: Float64 | None = None,
@@ -250,26 +238,28 @@ def align_views(
     fixed_errors[list(calibrate)] = 0
     motions: list[float] = []
     overlapping = _overlapping(views, poses, options, bodies) if pairs is None else pairs
-    state = directed_pairs(views, overlapping, options)
+    state = pair_equations.directed_pairs(views, overlapping, options)
     system = _system(state, len(views), priors, bodies)
     motion_since_overlaps = 0.0
     for stage in options.rounds:
         if motion_since_overlaps >= _MAX_MOTION:
             overlapping = _overlapping(views, poses, options, bodies)
-            state = directed_pairs(views, overlapping, options, state)
+            state = pair_equations.directed_pairs(views, overlapping, options, state)
             system = _system(state, len(views), priors, bodies)
             motion_since_overlaps = 0.0
         for _ in range(stage.iterations if len(state.target) else 0):
             is_last = stage is options.rounds[-1] and not calibrate
-            by_patch = is_last and depends_on_patches(state, options)
-            evaluate(views, poses, errors, fixed_errors, state, stage, options, by_patch=by_patch)
+            by_patch = is_last and pair_equations.depends_on_patches(state, options)
+            pair_equations.evaluate(
+                views, poses, errors, fixed_errors, state, stage, options, by_patch=by_patch
+            )
             if by_patch:
-                discount_shared(views, poses, state, options)
+                pair_equations.discount_shared(views, poses, state, options)
             step, error_step = _solve(poses, state, system, fixed_errors, priors, bodies)
             poses = _apply_step(poses, step, bodies)
             errors = errors + error_step
-            rescale(state, stage)
-            motions.append(float(np.abs(step / UNITS).max()))
+            pair_equations.rescale(state, stage)
+            motions.append(float(np.abs(step / projective.UNITS).max()))
             motion_since_overlaps += motions[-1] if pairs is None else 0.0
             error_change = float(np.abs(error_step).max()) / _ERROR_UNIT
             if max(motions[-1], error_change) < options.convergence:
@@ -278,10 +268,13 @@ def align_views(
 
 
 def support_of(
-    views: Sequence[SampledView], poses: Float64, refined: Refined, options: RefineOptions
+    views: Sequence[SampledView],
+    poses: Float64,
+    refined: Refined,
+    options: pair_equations.RefineOptions,
 ) -> Support:
     """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
-    state = directed_pairs(views, refined.pairs, options)
+    state = pair_equations.directed_pairs(views, refined.pairs, options)
     state.exposure, state.scale_g, state.scale_p = refined.scales.T.copy()
     fixed_errors = (refined.errors == 0).astype(np.int64)
     return _support(views, poses, refined.errors, fixed_errors, state, options.rounds[-1], options)
@@ -291,7 +284,7 @@ def align_pairs(
     views: Sequence[SampledView],
     pairs: Intp,
     T_i_j: Float64,
-    options: RefineOptions,
+    options: pair_equations.RefineOptions,
     errors: Float64,
 ) -> Float64:
     """(M, 4, 4) relative poses T_i_j of pairs, each aligned separately.
@@ -312,18 +305,18 @@ def align_pairs(
     ends = np.arange(2 * count).reshape(-1, 2)
     poses = np.tile(np.eye(4), (2 * count, 1, 1))
     poses[1::2] = T_i_j
-    state = directed_pairs(views, ends, options)
+    state = pair_equations.directed_pairs(views, ends, options)
     fixed_errors, stage = np.ones(len(errors), np.int64), options.rounds[-1]
     active = np.arange(count)
     for _ in range(_PAIR_ITERATIONS):
         directed = np.concatenate([active, active + count])
         subset = state.subset(directed)
-        evaluate(views, poses, errors, fixed_errors, subset, stage, options)
+        pair_equations.evaluate(views, poses, errors, fixed_errors, subset, stage, options)
         aligned, _ = _pairwise_measurements(poses, ends[active], subset)
-        rescale(subset, stage)
+        pair_equations.rescale(subset, stage)
         state.put(directed, subset)
         sources = 2 * active + 1
-        step = se3.log(se3.inverse(poses[sources]) @ aligned) / UNITS
+        step = se3.log(se3.inverse(poses[sources]) @ aligned) / projective.UNITS
         poses[sources] = se3.orthonormalise(aligned)
         active = active[np.abs(step).max(1) >= _PAIR_CONVERGED]
         if not len(active):
@@ -344,7 +337,10 @@ def spread_evenly(pairs: Intp, neighbours: int) -> Intp:
 
 
 def _overlapping(
-    views: Sequence[SampledView], poses: Float64, options: RefineOptions, bodies: Bodies | None
+    views: Sequence[SampledView],
+    poses: Float64,
+    options: pair_equations.RefineOptions,
+    bodies: Bodies | None,
 ) -> Intp:
     """Return the (M, 2) pairs of overlapping views, of different bodies if there are any."""
     pairs = overlaps(views, poses, options.overlap)[0]
@@ -366,23 +362,25 @@ def _support(
     poses: Float64,
     errors: Float64,
     fixed_errors: Int64,
-    state: DirectedPairs,
-    stage: Round,
-    options: RefineOptions,
+    state: pair_equations.DirectedPairs,
+    stage: pair_equations.Round,
+    options: pair_equations.RefineOptions,
     *,
     by_patch: bool = False,
 ) -> Support:
-    evaluate(views, poses, errors, fixed_errors, state, stage, options, by_patch=by_patch)
+    pair_equations.evaluate(
+        views, poses, errors, fixed_errors, state, stage, options, by_patch=by_patch
+    )
     score = state.rows[:, kernels.SUPPORT] - 2 * state.rows[:, kernels.IN_FRONT]
     # A copy, as a view would keep the equations of all pairs in memory.
     return Support(state.target, state.source, score, state.rows[:, kernels.TERMS].copy())
 
 
 def _pairwise_measurements(
-    poses: Float64, pairs: Intp, state: DirectedPairs
+    poses: Float64, pairs: Intp, state: pair_equations.DirectedPairs
 ) -> tuple[Float64, Float64]:
     """Measurement T_i_j of each pair alone, and its information."""
-    H, g = without_exposure(state)
+    H, g = pair_equations.without_exposure(state)
     H, g = H[:, :6, :6], g[:, :6]
     count = len(pairs)
     T_i_j = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
@@ -391,14 +389,17 @@ def _pairwise_measurements(
     At = np.swapaxes(A, 1, 2)
     H = H[:count] + At @ H[count:] @ A
     g = g[:count] + (At @ g[count:, :, None])[..., 0]
-    scaled = H * np.outer(UNITS, UNITS) + WEAK * np.eye(6)
-    step = -np.linalg.solve(scaled, (g * UNITS)[..., None])[..., 0] * UNITS
-    return T_i_j @ se3.exp(step), scaled / np.outer(UNITS, UNITS)
+    scaled = H * np.outer(projective.UNITS, projective.UNITS) + WEAK * np.eye(6)
+    step = -np.linalg.solve(scaled, (g * projective.UNITS)[..., None])[..., 0] * projective.UNITS
+    return T_i_j @ se3.exp(step), scaled / np.outer(projective.UNITS, projective.UNITS)
 
 
 def _system(
-    state: DirectedPairs, view_count: int, priors: Priors, bodies: Bodies | None = None
-) -> PairSystem:
+    state: pair_equations.DirectedPairs,
+    view_count: int,
+    priors: Priors,
+    bodies: Bodies | None = None,
+) -> sparse.PairSystem:
     """Return the sparse system of all views, or of their bodies."""
     ends = np.stack([state.target, state.source], 1)
     if bodies is None:
@@ -408,14 +409,14 @@ def _system(
 
 def _solve(
     poses: Float64,
-    state: DirectedPairs,
-    system: PairSystem,
+    state: pair_equations.DirectedPairs,
+    system: sparse.PairSystem,
     fixed_errors: Int64,
     priors: Priors,
     bodies: Bodies | None = None,
 ) -> tuple[Float64, Float64]:
     """One Gauss-Newton step: (N, 6) right perturbations of views or bodies, and of the errors."""
-    H, g = without_exposure(state)
+    H, g = pair_equations.without_exposure(state)
     if bodies is not None:
         # A perturbation of the body is one of its view, by the adjoint.
         A = np.tile(np.eye(H.shape[1]), (len(H), 1, 1))
@@ -476,13 +477,13 @@ def _add_gravity(
     gravity: Gravity,
     unary: tuple[Float64, Float64],
     shared: _SharedUnknowns,
-    system: PairSystem,
+    system: sparse.PairSystem,
 ) -> None:
     """Add gravity's equations of single poses, and of the world's vertical, which they share."""
     vertices, d = gravity.vertices, gravity.directions
     R = poses[vertices, :3, :3]
     observed = (R @ d[..., None])[..., 0]
-    down = vertical(observed, gravity)
+    down = minimisation.vertical(observed, gravity)
     down /= np.linalg.norm(down)
     tangent = np.linalg.svd(down[None])[2][1:].T  # (3, 2) tangent directions
     e = observed - down

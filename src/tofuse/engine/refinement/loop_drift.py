@@ -10,11 +10,15 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.joint_alignment import Refined, align_pairs, align_views
-from tofuse.engine.stored_views import RefineOptions, Round, SampledView
+from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
 # Iterations of an estimate of camera errors, which may be far from the initial poses.
-COARSE_TO_FINE = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(12, 0.0, 0.0))
+COARSE_TO_FINE = (
+    pair_equations.Round(2, 0.02, 0.1),
+    pair_equations.Round(2, 0.005, 0.03),
+    pair_equations.Round(12, 0.0, 0.0),
+)
 # A loop is closed if its error is below this, m and rad.
 _MAX_CLOSURE_ERROR = (0.01, np.radians(0.5))
 # Secant steps to the error that closes a loop: their maximum number; and the change at convergence,
@@ -84,7 +88,7 @@ def loop_gap(
     refined: Refined,
     poses: Float64,
     errors: Float64,
-    options: RefineOptions,
+    options: pair_equations.RefineOptions,
 ) -> Gap | None:
     """Closure errors of the longest loop, without and with errors of the camera; None without one.
 
@@ -111,11 +115,11 @@ class Loop:
     views: Sequence[SampledView]
     i: int
     j: int
-    options: RefineOptions
+    options: pair_equations.RefineOptions
 
     @classmethod
     def longest(
-        cls, views: Sequence[SampledView], refined: Refined, options: RefineOptions
+        cls, views: Sequence[SampledView], refined: Refined, options: pair_equations.RefineOptions
     ) -> Loop | None:
         """Return the longest loop of refined views; None if there is none."""
         ends = longest_loop(refined.pairs)

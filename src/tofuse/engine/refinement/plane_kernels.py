@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.cameras import jacobian_row
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.clouds import symmetric_eigen
 from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
@@ -141,7 +141,7 @@ def plane_equations(
                 continue
             w = tukey.weight(e2) / variance[s]
             R = rotations[i]
-            jacobian_row(
+            projection_kernels.jacobian_row(
                 J,
                 R[0, 0] * n0 + R[1, 0] * n1 + R[2, 0] * n2,
                 R[0, 1] * n0 + R[1, 1] * n1 + R[2, 1] * n2,

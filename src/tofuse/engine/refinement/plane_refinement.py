@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Measured, SensorPriors
+from tofuse.engine.graph import external_sensors, measured_graph
 from tofuse.engine.parts import part
 from tofuse.engine.refinement.common_planes import (
     SUPPORT_NOISE,
@@ -85,7 +85,10 @@ class _Planes(Refiner):
         self._store.push(SampledPoints.of(view, self._options.points), T_component_camera)
 
     def finish(
-        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+        self,
+        ids: Sequence[int],
+        poses: Float64,
+        measured: external_sensors.SensorPriors | None = None,
     ) -> Refinement:
         """See `Refiner.finish`."""
         row = {int(index): k for k, index in enumerate(ids)}
@@ -105,11 +108,11 @@ class _Planes(Refiner):
         return replace(accepted_with(unchanged, positions, after), edges=edges)
 
 
-def _edges(aligned: Aligned, ids: Sequence[int], lost: Bool) -> list[Measured]:
+def _edges(aligned: Aligned, ids: Sequence[int], lost: Bool) -> list[measured_graph.Measured]:
     """Joint measurements of neighbouring views; those of all pairs would count them repeatedly."""
     out = []
     for (i, j), C in zip(aligned.pairs, aligned.covariance, strict=True):
         if j == i + 1 and not (lost[i] or lost[j]):
             T = se3.inverse(aligned.poses[i]) @ aligned.poses[j]
-            out.append(Measured(ids[i], ids[j], T, np.linalg.inv(C)))
+            out.append(measured_graph.Measured(ids[i], ids[j], T, np.linalg.inv(C)))
     return out

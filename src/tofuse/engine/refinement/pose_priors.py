@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.engine.alignment import UNITS
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Gravity, PairSystem
+from tofuse.engine.graph import Gravity, sparse
 
 WEAK = 1e-3  # information of a weak prior in `UNITS`
 DAMPING = 1e-6  # fraction of the diagonal that is added to it
@@ -37,10 +37,10 @@ class Priors:
         """Return no priors."""
         return cls(np.zeros((0, 2), np.intp), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
 
-    def system(self, n: int, ends: Intp) -> PairSystem:
+    def system(self, n: int, ends: Intp) -> sparse.PairSystem:
         """Return the sparse system of n poses, pairs `ends` (m, 2) and those of the priors."""
         first = np.arange(n) == 0
-        return PairSystem(n, np.concatenate([ends, self.pairs]), fixed=first)
+        return sparse.PairSystem(n, np.concatenate([ends, self.pairs]), fixed=first)
 
     def equations(self, T_i_j: Float64) -> tuple[Float64, Float64]:
         """Return the normal equations (M, 6, 6), (M, 6) at relative poses (M, 4, 4)."""
@@ -52,4 +52,4 @@ class Priors:
 
 def weak_prior(n: int) -> tuple[Float64, Float64]:
     """Return equations (n, 6, 6), (n, 6) that just keep unconstrained poses in place."""
-    return np.tile(np.diag(WEAK / UNITS**2), (n, 1, 1)), np.zeros((n, 6))
+    return np.tile(np.diag(WEAK / projective.UNITS**2), (n, 1, 1)), np.zeros((n, 6))

@@ -14,7 +14,7 @@ from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import Spill
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Measured, SensorPriors
+from tofuse.engine.graph import external_sensors, measured_graph
 from tofuse.engine.parts import part
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
@@ -29,11 +29,11 @@ from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps, supp
 from tofuse.engine.stored_views import (
     CoarseView,
     PosedView,
-    RefineOptions,
     SampledView,
     Spilled,
     SpilledCoarseView,
     ViewStore,
+    pair_equations,
     sampled_points,
 )
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
@@ -90,7 +90,7 @@ class Refinement:
     moved_rad: float = 0.0
     support: tuple[float, float] = (0.0, 0.0)
     errors: dict[str, float] = field(default_factory=dict)
-    edges: tuple[Measured, ...] = ()
+    edges: tuple[measured_graph.Measured, ...] = ()
     calibration_check: CalibrationCheck | None = None
     non_overlap_edges: tuple[tuple[int, int], ...] = ()
     split_m: float = 0.0
@@ -113,7 +113,10 @@ class Refiner(Protocol):
         ...
 
     def finish(
-        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+        self,
+        ids: Sequence[int],
+        poses: Float64,
+        measured: external_sensors.SensorPriors | None = None,
     ) -> Refinement:
         """Refine the poses of all frames.
 
@@ -156,7 +159,10 @@ class _Idle(Refiner):
         """See `Refiner.push`: views are not needed."""
 
     def finish(
-        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+        self,
+        ids: Sequence[int],
+        poses: Float64,
+        measured: external_sensors.SensorPriors | None = None,
     ) -> Refinement:
         """See `Refiner.finish`."""
         return Refinement(poses)
@@ -172,8 +178,8 @@ class AlreadyRefined(RefinementMethod):
         By frame indices: measurements of pairs of views, and other edges.
     """
 
-    measured: tuple[Measured, ...]
-    non_overlap_edges: tuple[Measured, ...]
+    measured: tuple[measured_graph.Measured, ...]
+    non_overlap_edges: tuple[measured_graph.Measured, ...]
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `RefinementMethod.start`."""
@@ -185,7 +191,10 @@ class _AlreadyRefined(_Idle):
         self._previous = previous
 
     def finish(
-        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+        self,
+        ids: Sequence[int],
+        poses: Float64,
+        measured: external_sensors.SensorPriors | None = None,
     ) -> Refinement:
         """See `Refiner.finish`."""
         posed = set(ids)
@@ -222,9 +231,9 @@ class Joint(Bounded, RefinementMethod):
     submap: Annotated[int, Bounds(10, 100_000)] = 300
 
     @property
-    def alignment(self) -> RefineOptions:
+    def alignment(self) -> pair_equations.RefineOptions:
         """Options of the joint alignment."""
-        return RefineOptions(neighbours=self.neighbours)
+        return pair_equations.RefineOptions(neighbours=self.neighbours)
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `RefinementMethod.start`."""
@@ -242,7 +251,10 @@ class _Joint(Refiner):
         """See `Refiner.push`. The views are in the store."""
 
     def finish(
-        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+        self,
+        ids: Sequence[int],
+        poses: Float64,
+        measured: external_sensors.SensorPriors | None = None,
     ) -> Refinement:
         """See `Refiner.finish`."""
         options = self._options
@@ -254,7 +266,7 @@ class _Joint(Refiner):
         before = poses[positions]
         refine_views = _refine_jointly if len(posed) <= options.submap else _refine_in_submaps
         refined, evidence = refine_views(
-            options, posed, before, measured or SensorPriors(), self._store
+            options, posed, before, measured or external_sensors.SensorPriors(), self._store
         )
         support = refined.before.of_views(len(posed)), refined.after.of_views(len(posed))
         mean = float(support[0].mean()), float(support[1].mean())
@@ -291,7 +303,7 @@ def _refine_jointly(
     options: Joint,
     posed: Sequence[PosedView[PreparedView]],
     poses: Float64,
-    measured: SensorPriors,
+    measured: external_sensors.SensorPriors,
     _: ViewStore[PreparedView],
 ) -> tuple[Refined, _Checks]:
     """Refine all views at once."""
@@ -310,7 +322,7 @@ def _refine_in_submaps(
     options: Joint,
     posed: Sequence[PosedView[PreparedView]],
     poses: Float64,
-    measured: SensorPriors,
+    measured: external_sensors.SensorPriors,
     store: ViewStore[PreparedView],
 ) -> tuple[Refined, _Checks]:
     """Refine submap by submap."""
@@ -374,7 +386,9 @@ def _calibration_check(submap: RefinedSubmap, options: Joint) -> CalibrationChec
     return CalibrationCheck(gap=gap)
 
 
-def pairwise_measurements(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:
+def pairwise_measurements(
+    ids: Sequence[int], refined: Refined
+) -> tuple[measured_graph.Measured, ...]:
     """Return the measurements of single pairs, with reduced information.
 
     All pairs of a view share its errors, so the information is divided by their number.
@@ -390,14 +404,14 @@ def pairwise_measurements(ids: Sequence[int], refined: Refined) -> tuple[Measure
     partners = np.bincount(pairs.ravel(), minlength=len(ids))
     divisors = _CORRELATED_PIXELS * 0.5 * partners[pairs].sum(1)
     return tuple(
-        Measured(ids[i], ids[j], T, H / divisor)
+        measured_graph.Measured(ids[i], ids[j], T, H / divisor)
         for (i, j), T, H, divisor in zip(
             pairs, refined.measured, refined.information, divisors, strict=True
         )
     )
 
 
-def _priors(ids: Sequence[int], measured: SensorPriors) -> Priors:
+def _priors(ids: Sequence[int], measured: external_sensors.SensorPriors) -> Priors:
     """Measurements of external sensors as priors on the views, scaled to the pixels' noise."""
     position = {index: k for k, index in enumerate(ids)}
     steps = measured.between(ids)

@@ -23,10 +23,10 @@ from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.joint_alignment import Refined, align_views
 from tofuse.engine.refinement.pose_priors import Priors
-from tofuse.engine.stored_views import ACROSS, DOWN, RefineOptions, Round, SampledView
+from tofuse.engine.stored_views import SampledView, pair_equations, shared_error
 
 # The poses are near the solution of each half.
-_ROUNDS = (Round(5, 0.0, 0.0),)
+_ROUNDS = (pair_equations.Round(5, 0.0, 0.0),)
 # Every n-th point of a half is enough for the errors that they share.
 _POINT_STRIDE = 2
 
@@ -34,7 +34,7 @@ _POINT_STRIDE = 2
 def split_half_errors(
     views: Sequence[SampledView],
     refined: Refined,
-    options: RefineOptions,
+    options: pair_equations.RefineOptions,
     priors: Priors,
     calibrate: Sequence[int] = (),
 ) -> tuple[float, float]:
@@ -57,7 +57,7 @@ def split_half_errors(
 def refined_by_halves(
     views: Sequence[SampledView],
     refined: Refined,
-    options: RefineOptions,
+    options: pair_equations.RefineOptions,
     priors: Priors,
     calibrate: Sequence[int] = (),
 ) -> Iterator[tuple[Float64, Float64]]:
@@ -85,8 +85,8 @@ def refined_by_halves(
             pairs=refined.pairs,
         ).poses
 
-    left = [v.patches % ACROSS < ACROSS // 2 for v in views]
-    upper = [v.patches // ACROSS < DOWN // 2 for v in views]
+    left = [v.patches % shared_error.ACROSS < shared_error.ACROSS // 2 for v in views]
+    upper = [v.patches // shared_error.ACROSS < shared_error.DOWN // 2 for v in views]
     for halves in (left, upper):
         yield by_half(True, halves), by_half(False, halves)
 

@@ -15,10 +15,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from tofuse.engine.alignment import UNITS
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import LevenbergMarquardt, PoseGraph
+from tofuse.engine.graph import PoseGraph, levenberg
 from tofuse.engine.refinement.joint_alignment import (
     Refined,
     Support,
@@ -29,9 +29,9 @@ from tofuse.engine.refinement.joint_alignment import (
 from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.stored_views import (
     HasCoarseView,
-    RefineOptions,
     SampledView,
     overlaps,
+    pair_equations,
     world_centroids,
 )
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
@@ -121,7 +121,7 @@ def submaps(places: Float64, pairs: Intp, max_size: int) -> list[Submap]:
 def refine_submaps(
     coarse: Sequence[HasCoarseView],
     poses: Float64,
-    options: RefineOptions,
+    options: pair_equations.RefineOptions,
     max_size: int,
     load: Callable[[Intp], list[SampledView]],
     priors: Callable[[Intp | None], Priors],
@@ -209,7 +209,7 @@ def _refine_submap(
     views: Sequence[SampledView],
     part: Submap,
     poses: Float64,
-    options: RefineOptions,
+    options: pair_equations.RefineOptions,
     calibrate: Sequence[int],
     priors: Priors,
     evaluate: Callable[[RefinedSubmap], A],
@@ -242,7 +242,7 @@ def _optimised_poses(
     previous = np.arange(len(poses) - 1)
     steps = np.stack([previous, previous + 1], 1)
     # Parts of the path that no pair connects keep their relative pose.
-    weak = np.tile(np.diag(_WEAK_PRIOR / UNITS**2), (len(steps), 1, 1))
+    weak = np.tile(np.diag(_WEAK_PRIOR / projective.UNITS**2), (len(steps), 1, 1))
     edges = np.concatenate([pairs, priors.pairs, steps])
     graph = PoseGraph(
         ids=np.arange(len(poses)),
@@ -255,7 +255,7 @@ def _optimised_poses(
         loop=np.zeros(len(edges), bool),
         gravity=priors.gravity,
     )
-    return LevenbergMarquardt().optimise(graph).graph.poses
+    return levenberg.LevenbergMarquardt().optimise(graph).graph.poses
 
 
 def _combined_support(supports: Sequence[tuple[Submap, Support]]) -> Support:

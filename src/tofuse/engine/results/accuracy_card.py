@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tofuse.engine.frames import in_words, runs_of
-from tofuse.engine.quality import Accuracy
+from tofuse.engine.frames import frame_ranges
+from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.results.types import Reason, Reconstruction
 from tofuse.engine.results.verdicts import ADVICE, ranked
 
@@ -37,7 +37,7 @@ def _advice(reasons: Sequence[Reason]) -> str:
     return by_code.get("calibration_alarm") or next(filter(None, by_code.values()), "")
 
 
-def bound(accuracy: Accuracy, diagonal_m: float) -> str:
+def bound(accuracy: pose_accuracy.Accuracy, diagonal_m: float) -> str:
     """Return the accuracy of the poses as text: "±24 mm (95 %) over 6.2 m, 0.4 %".
 
     Parameters
@@ -62,13 +62,13 @@ def _extent(metres: float) -> str:
     return f"{metres:.0f} m" if metres >= 100 else f"{metres:.3g} m"
 
 
-def weakest_frame(accuracy: Accuracy) -> str:
+def weakest_frame(accuracy: pose_accuracy.Accuracy) -> str:
     """Return the frames with the largest pose error, and that error; empty if not assessed."""
     if accuracy.unbounded:
-        ranges = runs_of(
+        ranges = frame_ranges.runs_of(
             range(accuracy.unbounded[0], accuracy.unbounded[-1] + 1), accuracy.unbounded
         )
-        return f"{in_words(ranges)}, not bounded"
+        return f"{frame_ranges.in_words(ranges)}, not bounded"
     if accuracy.worst is None:
         return ""
     return f"frame {accuracy.worst.frame}, {length(accuracy.worst.position_m)}"

@@ -10,11 +10,11 @@ import numpy as np
 
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames import Range, in_words, is_single, runs, runs_of, size, union
+from tofuse.engine.frames import frame_ranges
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import LoopRecord, Optimisation, SensorRecord, loop_errors
-from tofuse.engine.quality import Accuracy, CrossViewConsistency
-from tofuse.engine.refinement import Refinement, proposal
+from tofuse.engine.graph import LoopRecord, Optimisation, external_sensors, graph_covariances
+from tofuse.engine.quality import cross_view_agreement, pose_accuracy
+from tofuse.engine.refinement import Refinement, calibration_check
 from tofuse.engine.results.accuracy_card import length
 from tofuse.engine.results.types import Component, FrameRecord, Reason, Verdict, in_main_model
 from tofuse.engine.results.verdicts import ranked, verdict_of
@@ -102,8 +102,8 @@ class Evidence:
     loops: tuple[LoopRecord, ...]
     sequential: Float64
     optimisation: Optimisation
-    cross_view: CrossViewConsistency | None
-    accuracy: Accuracy = Accuracy()  # noqa: RUF009 - immutable
+    cross_view: cross_view_agreement.CrossViewConsistency | None
+    accuracy: pose_accuracy.Accuracy = pose_accuracy.Accuracy()  # noqa: RUF009 - immutable
     diagonal_m: float = 0.0
     tolerance_m: float | None = None
     has_covariances: bool = False
@@ -113,19 +113,19 @@ class Evidence:
     ambiguity_m: float | None = None
     repeated: tuple[int, ...] = ()
     interruptions: tuple[int, ...] = ()
-    priors: tuple[SensorRecord, ...] = ()
+    priors: tuple[external_sensors.SensorRecord, ...] = ()
     components: tuple[Component, ...] = ()
     moving: tuple[tuple[int, float], ...] = ()
     doubtful: tuple[int, ...] = ()
     single_link_frames: tuple[int, ...] = ()
 
     @property
-    def full_range(self) -> tuple[Range, ...]:
+    def full_range(self) -> tuple[frame_ranges.Range, ...]:
         """First and last frame of the recording."""
         return ((self.records[0].index, self.records[-1].index),)
 
     @property
-    def posed_range(self) -> tuple[Range, ...]:
+    def posed_range(self) -> tuple[frame_ranges.Range, ...]:
         """First and last frame of the main model."""
         ids = self.optimisation.graph.ids
         return ((int(ids[0]), int(ids[-1])),)
@@ -140,13 +140,13 @@ class Evidence:
         """Whether each record is in the main model."""
         return [in_main_model(record, self.components) for record in self.records]
 
-    def runs(self, marked: Sequence[bool]) -> tuple[Range, ...]:
+    def runs(self, marked: Sequence[bool]) -> tuple[frame_ranges.Range, ...]:
         """Return the ranges of marked records."""
-        return runs([record.index for record in self.records], marked)
+        return frame_ranges.runs([record.index for record in self.records], marked)
 
-    def runs_of(self, frames: Collection[int]) -> tuple[Range, ...]:
+    def runs_of(self, frames: Collection[int]) -> tuple[frame_ranges.Range, ...]:
         """Return the ranges of the records with these indices."""
-        return runs_of([record.index for record in self.records], frames)
+        return frame_ranges.runs_of([record.index for record in self.records], frames)
 
 
 def tolerance_of(tolerance_m: float | None, diagonal_m: float) -> float:
@@ -188,7 +188,7 @@ def _poses(e: Evidence) -> Iterator[Reason]:
         yield Reason("few_poses", e.full_range, text)
     lost = ranges_with_status(e.records, "lost")
     if lost:
-        text = f"{_sentence(lost)} {'has' if is_single(lost) else 'have'} no pose."
+        text = f"{_sentence(lost)} {'has' if frame_ranges.is_single(lost) else 'have'} no pose."
         yield Reason("lost_frames", lost, text)
     skipped = ranges_with_status(e.records, "skipped")
     if skipped:
@@ -208,35 +208,37 @@ def _connections(e: Evidence) -> Iterator[Reason]:
         parts = sorted([connected, *(c.frames for c in disconnected)])
         yield Reason(
             "disconnected",
-            union(r for c in disconnected for r in c.frames),
+            frame_ranges.union(r for c in disconnected for r in c.frames),
             f"The recording consists of {len(parts)} disconnected parts: {_listed(parts)}; no "
             "overlap found.",
         )
     for joined_by, motion in (("motion", "extrapolated motion"), ("odometry", "recorded odometry")):
-        bridged = union(r for c in e.components if c.joined == joined_by for r in c.frames)
+        bridged = frame_ranges.union(
+            r for c in e.components if c.joined == joined_by for r in c.frames
+        )
         # If all pose errors are bounded, later measurements connect both sides.
         if bridged and (e.accuracy.unbounded or not e.accuracy.assessed):
             text = (
-                f"{_sentence(bridged)} {'is' if is_single(bridged) else 'are'} connected to the "
+                f"{_sentence(bridged)} {'is' if frame_ranges.is_single(bridged) else 'are'} connected to the "
                 f"rest by {motion} only."
             )
             yield Reason("bridged_gap", bridged, text)
     single_link = e.runs_of(e.single_link_frames)
     if single_link:
         text = (
-            f"{_sentence(single_link)} {'is' if is_single(single_link) else 'are'} connected to "
+            f"{_sentence(single_link)} {'is' if frame_ranges.is_single(single_link) else 'are'} connected to "
             "the rest by a single registration, which no other view confirms."
         )
         yield Reason("single_link", single_link, text)
 
 
-def _listed(parts: Sequence[tuple[Range, ...]]) -> str:
+def _listed(parts: Sequence[tuple[frame_ranges.Range, ...]]) -> str:
     """Name the largest of several parts, in order."""
-    largest = sorted(sorted(parts, key=size, reverse=True)[:MAX_LISTED])
+    largest = sorted(sorted(parts, key=frame_ranges.size, reverse=True)[:MAX_LISTED])
     if all(len(part) == 1 for part in largest):
-        text = in_words([part[0] for part in largest])
+        text = frame_ranges.in_words([part[0] for part in largest])
     else:
-        text = "; ".join(in_words(part) for part in largest)
+        text = "; ".join(frame_ranges.in_words(part) for part in largest)
     more = len(parts) - len(largest)
     return f"{text} and {more} smaller" if more else text
 
@@ -260,16 +262,16 @@ def _motion(e: Evidence) -> Iterator[Reason]:
         jumped = e.runs_of(frames)
         deviation = pose_jumps[0][1]
         text = (
-            f"The pose of {in_words(jumped)} jumps: {deviation}."
-            if is_single(jumped)
-            else f"The poses of {in_words(jumped)} jump; that of frame {frames[0]} is {deviation}."
+            f"The pose of {frame_ranges.in_words(jumped)} jumps: {deviation}."
+            if frame_ranges.is_single(jumped)
+            else f"The poses of {frame_ranges.in_words(jumped)} jump; that of frame {frames[0]} is {deviation}."
         )
         yield Reason("jumped", jumped, text)
     repeated = e.runs_of(e.repeated)
     if repeated:
         n = sum(record.index in e.repeated for record in e.records)
         subject = "1 image repeats" if n == 1 else f"{n} images repeat"
-        text = f"{subject} the one before ({in_words(repeated)}): nothing new was measured."
+        text = f"{subject} the one before ({frame_ranges.in_words(repeated)}): nothing new was measured."
         yield Reason("repeated_images", repeated, text)
     T = e.optimisation.graph.poses
     moved = se3.inverse(T[:1]) @ T
@@ -315,7 +317,7 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
     weak = e.runs_of({index for index, r in pairs if r.inlier_ratio < WEAK_INLIER_FRACTION})
     if weak:
         text = (
-            f"Fewer than {_percent(WEAK_INLIER_FRACTION)} of the points of {in_words(weak)} have a "
+            f"Fewer than {_percent(WEAK_INLIER_FRACTION)} of the points of {frame_ranges.in_words(weak)} have a "
             "correspondence."
         )
         yield Reason("weak_registration", weak, text)
@@ -349,7 +351,9 @@ def _loops(e: Evidence) -> Iterator[Reason]:
         more = len(rejected) - MAX_LISTED
         listed += f" and {more} more" if more > 0 else ""
         text = f"{len(rejected)} given loop closures were not used: {listed}."
-    yield Reason("loop_rejected", union((k, k) for p in rejected for k in (p.i, p.j)), text)
+    yield Reason(
+        "loop_rejected", frame_ranges.union((k, k) for p in rejected for k in (p.i, p.j)), text
+    )
 
 
 def _optimiser(e: Evidence) -> Iterator[Reason]:
@@ -380,14 +384,14 @@ def _scene(e: Evidence) -> Iterator[Reason]:
     if where:
         text = (
             f"Moving objects cover up to {_percent(max(moving.values()))} of the image in "
-            f"{in_words(where)}; they are excluded from tracking and from the model."
+            f"{frame_ranges.in_words(where)}; they are excluded from tracking and from the model."
         )
         yield Reason("moving_objects", where, text)
     doubtful = e.runs_of(e.doubtful)
     if doubtful:
         description = (
             "fitted its keyframe worse than this camera's views usually do; look at it first."
-            if is_single(doubtful)
+            if frame_ranges.is_single(doubtful)
             else "fitted their keyframes worse than this camera's views usually do; look at them "
             "first."
         )
@@ -411,18 +415,20 @@ def _uncertainty(e: Evidence) -> Iterator[Reason]:
     yield from accuracy_reasons(e.accuracy, e.tolerance, [r.index for r in e.records])
 
 
-def accuracy_reasons(a: Accuracy, tolerance_m: float, frames: Sequence[int]) -> Iterator[Reason]:
+def accuracy_reasons(
+    a: pose_accuracy.Accuracy, tolerance_m: float, frames: Sequence[int]
+) -> Iterator[Reason]:
     """Yield reasons if the accuracy of frames with these indices exceeds a tolerance, m."""
     if not a.assessed:
         return
-    unbounded = runs_of(frames, a.unbounded)
+    unbounded = frame_ranges.runs_of(frames, a.unbounded)
     if unbounded:
         text = (
             f"{_poses_of(unbounded)} not constrained in some direction (degenerate geometry): the "
             "motion is extrapolated there, and its error is not bounded."
         )
         yield Reason("unobserved_motion", unbounded, text)
-    by_odometry = runs_of(frames, a.by_odometry)
+    by_odometry = frame_ranges.runs_of(frames, a.by_odometry)
     if by_odometry:
         text = (
             f"{_poses_of(by_odometry)} not constrained by the images in some direction (degenerate "
@@ -444,7 +450,7 @@ def accuracy_reasons(a: Accuracy, tolerance_m: float, frames: Sequence[int]) -> 
 def _loop_drift(e: Evidence) -> Iterator[Reason]:
     """Drift beyond covariances: systematic errors of the camera bend the trajectory."""
     graph = e.optimisation.graph
-    errors = loop_errors(graph, e.sequential)
+    errors = graph_covariances.loop_errors(graph, e.sequential)
     finite = np.isfinite(errors)
     # The median, as single loops may be wrong.
     if not finite.any() or np.median(errors[finite]) <= MAX_LOOP_CHI2:
@@ -471,7 +477,7 @@ def _calibration_alarm(e: Evidence) -> Iterator[Reason]:
         return
     gap = check.gap
     (m, rad), (m_after, rad_after) = gap.before, gap.after
-    correction = proposal(check.errors, check.best)
+    correction = calibration_check.proposal(check.errors, check.best)
     text = (
         f"Odometry drift over loop {gap.i}-{gap.j} is {length(m)}, {_angle(rad)}. "
         f"{correction[0].upper()}{correction[1:]} would reduce it to {length(m_after)}, "
@@ -494,7 +500,7 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
         if motion != length(0.0):  # else the views give no estimate
             text += f" An error of 1% would move the poses by {motion}."
     elif check.unconfirmed:
-        correction = proposal(check.unconfirmed, check.best)
+        correction = calibration_check.proposal(check.unconfirmed, check.best)
         qualifier = (
             "but no loop closure confirms it"
             if check.large
@@ -547,7 +553,8 @@ def _images(e: Evidence) -> Iterator[Reason]:
 
 
 def cross_view_reasons(
-    cross_view: CrossViewConsistency, full_range: tuple[Range, ...]
+    cross_view: cross_view_agreement.CrossViewConsistency,
+    full_range: tuple[frame_ranges.Range, ...],
 ) -> Iterator[Reason]:
     """Yield reasons if overlapping images contradict the poses of a range of frames."""
     if not np.isfinite(cross_view.support()):
@@ -562,11 +569,11 @@ def cross_view_reasons(
         yield Reason("images_disagree", full_range, f"Only {summary}.")
         return
     texts = []
-    inconsistent = runs(
+    inconsistent = frame_ranges.runs(
         cross_view.frames, [support < MIN_SUPPORT for support in cross_view.support_of_views()]
     )
     if inconsistent:
-        verb = "is" if is_single(inconsistent) else "are"
+        verb = "is" if frame_ranges.is_single(inconsistent) else "are"
         texts.append(f"{_sentence(inconsistent)} {verb} inconsistent with most overlapping frames.")
     # Consecutive images share the errors of the sensor, but have hardly any drift. The bounds
     # include distances of surfaces, but not the fraction of inconsistent measurements.
@@ -581,19 +588,21 @@ def cross_view_reasons(
         yield Reason("images_differ", inconsistent or full_range, " ".join(texts))
 
 
-def ranges_with_status(records: Sequence[FrameRecord], status: str) -> tuple[Range, ...]:
+def ranges_with_status(
+    records: Sequence[FrameRecord], status: str
+) -> tuple[frame_ranges.Range, ...]:
     """Return (first, last) frame index of each range of consecutive frames with that status."""
-    return runs([r.index for r in records], [r.status == status for r in records])
+    return frame_ranges.runs([r.index for r in records], [r.status == status for r in records])
 
 
-def _sentence(ranges: Sequence[Range]) -> str:
+def _sentence(ranges: Sequence[frame_ranges.Range]) -> str:
     """Return ranges as the start of a sentence: "Frame 3", "Frames 3-9, 20"."""
-    return in_words(ranges).capitalize()
+    return frame_ranges.in_words(ranges).capitalize()
 
 
-def _poses_of(ranges: Sequence[Range]) -> str:
-    single = is_single(ranges)
-    return f"{'The pose' if single else 'Poses'} of {in_words(ranges)} {'is' if single else 'are'}"
+def _poses_of(ranges: Sequence[frame_ranges.Range]) -> str:
+    single = frame_ranges.is_single(ranges)
+    return f"{'The pose' if single else 'Poses'} of {frame_ranges.in_words(ranges)} {'is' if single else 'are'}"
 
 
 def _percent(fraction: float) -> str:

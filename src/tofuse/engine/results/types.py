@@ -10,11 +10,11 @@ from typing import Any, Literal
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.frames import Range
+from tofuse.engine.frames import frame_ranges
 from tofuse.engine.fusion import Cloud, Mesh, T_up_world
-from tofuse.engine.graph import GraphPart, LoopRecord, PoseGraph, SensorRecord
+from tofuse.engine.graph import GraphPart, LoopRecord, PoseGraph, external_sensors
 from tofuse.engine.loops import Join
-from tofuse.engine.quality import Accuracy, Change, FrameSample
+from tofuse.engine.quality import Change, frame_samples, pose_accuracy
 from tofuse.engine.refinement import Refinement
 from tofuse.engine.tracking import Status
 
@@ -36,11 +36,11 @@ class Reason:
     """
 
     code: str
-    ranges: tuple[Range, ...]
+    ranges: tuple[frame_ranges.Range, ...]
     text: str
 
     @property
-    def frames(self) -> Range:
+    def frames(self) -> frame_ranges.Range:
         """First and last frame index that it concerns."""
         return self.ranges[0][0], self.ranges[-1][1]
 
@@ -162,9 +162,9 @@ class Diagnostics:
     cloud_before: Cloud | None = None
     refinement: Refinement | None = None
     parts: tuple[GraphPart, ...] = ()
-    priors: tuple[SensorRecord, ...] = ()
-    samples: tuple[FrameSample, ...] = ()
-    accuracy: Accuracy = Accuracy()  # noqa: RUF009 - immutable
+    priors: tuple[external_sensors.SensorRecord, ...] = ()
+    samples: tuple[frame_samples.FrameSample, ...] = ()
+    accuracy: pose_accuracy.Accuracy = pose_accuracy.Accuracy()  # noqa: RUF009 - immutable
     calibrated: SelfCalibration | None = None
     joins: tuple[Join, ...] = ()
 
@@ -188,7 +188,7 @@ class Component:
         its frames only, in its own world frame.
     """
 
-    frames: tuple[Range, ...]
+    frames: tuple[frame_ranges.Range, ...]
     T_main_component: Float64 | None
     joined: Literal["links", "motion", "odometry"] | None
     result: Reconstruction | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from tofuse.engine.frames import size, union
+from tofuse.engine.frames import frame_ranges
 from tofuse.engine.results.types import Reason, Verdict
 
 # The closed list of reason codes. "failed" and "degraded" name the verdict each one forces;
@@ -107,12 +107,14 @@ def ranked(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
     for reason in reasons:
         by_code.setdefault(reason.code, []).append(reason)
     merged = [_merged(group) for group in by_code.values()]
-    return tuple(sorted(merged, key=lambda r: (_SEVERITY[REASONS[r.code][0]], -size(r.ranges))))
+    return tuple(
+        sorted(merged, key=lambda r: (_SEVERITY[REASONS[r.code][0]], -frame_ranges.size(r.ranges)))
+    )
 
 
 def _merged(group: Sequence[Reason]) -> Reason:
     if len(group) == 1:
         return group[0]
     texts = dict.fromkeys(reason.text for reason in group)
-    ranges = union(r for reason in group for r in reason.ranges)
+    ranges = frame_ranges.union(r for reason in group for r in reason.ranges)
     return Reason(group[0].code, ranges, " ".join(texts))

@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from tofuse.engine.alignment import Level, ProjectiveOptions, Target, align
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import run_all
@@ -36,8 +36,10 @@ Mode = Literal["auto", "both", "planar", "full"]
 
 # Many iterations, as the basin of photometric convergence is small; degenerate directions are
 # constrained by albedo alone.
-_PHOTOMETRIC = ProjectiveOptions(
-    levels=(Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02)), common_tilt=0.0, common_slope=0.0
+_PHOTOMETRIC = projective.ProjectiveOptions(
+    levels=(projective.Level(4, 15, 0.03, 0.1), projective.Level(2, 8, 0.005, 0.02)),
+    common_tilt=0.0,
+    common_slope=0.0,
 )
 # Pixels of each image that refine a candidate by ICP.
 _ICP_POINTS = 700
@@ -257,10 +259,10 @@ class Search:
         source, target = (view.with_falloff(falloff) for view in (self.source, self.target))
         count = self.options.photometric_candidates
         best, remaining = distinct[:count], distinct[count:]
-        targets = [Target(target, np.eye(4))]
+        targets = [projective.Target(target, np.eye(4))]
         alignments = run_all(
             [
-                partial(align, source, targets, candidate.T_target_source, _PHOTOMETRIC)
+                partial(projective.align, source, targets, candidate.T_target_source, _PHOTOMETRIC)
                 for candidate in best
             ]
         )

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, Int32, Int64
-from tofuse.engine.cameras import jacobian_row, nearest_pixel
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import retract
@@ -414,10 +414,10 @@ def _add_equations(
             continue
         w = tukey.weight(e2)
         if forward:
-            jacobian_row(J, m0, m1, m2, px, py, pz)
+            projection_kernels.jacobian_row(J, m0, m1, m2, px, py, pz)
         else:
             # T exp(xi) transforms a target point by exp(-xi) in the source frame.
-            jacobian_row(J, -n0, -n1, -n2, x, y, z)
+            projection_kernels.jacobian_row(J, -n0, -n1, -n2, x, y, z)
         for p in range(6):
             g[p] += w * J[p] * r
             for o in range(p, 6):
@@ -574,7 +574,7 @@ def measure_agreement(
             continue
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        i, j = nearest_pixel(x / z, y / z, lookup, lookup_frame, rows, columns)
+        i, j = projection_kernels.nearest_pixel(x / z, y / z, lookup, lookup_frame, rows, columns)
         if i < 0:
             continue
         out[PROJECTED] += 1

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from tofuse.engine.alignment import Aligned, Level
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
@@ -45,9 +45,17 @@ MAX_OVERLAP_DISTANCE = 1.2
 # For six unknowns, with noise that is correlated between neighbouring pixels.
 _MIN_INLIERS = 40
 # Registrations without a prediction need more iterations than tracking.
-PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 6, 0.0, 0.0))
+PATIENT = (
+    projective.Level(4, 15, 0.03, 0.1),
+    projective.Level(2, 8, 0.005, 0.02),
+    projective.Level(1, 6, 0.0, 0.0),
+)
 # A guess may be less accurate than a prediction in tracking: start with more noise inflation.
-COARSE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
+COARSE = (
+    projective.Level(4, 25, 0.15, 0.3),
+    projective.Level(4, 10, 0.03, 0.1),
+    projective.Level(2, 6, 0.005, 0.02),
+)
 
 
 FitKind = Literal["usual", "noisy", "conflicting"]
@@ -117,7 +125,7 @@ class FitStatistics:
         """Usual rms distance of inliers from the surface, as a fraction of the depth."""
         return float(np.median(self._rms)) if self._rms else 0.0
 
-    def learn(self, aligned: Aligned, depth: float) -> None:
+    def learn(self, aligned: projective.Aligned, depth: float) -> None:
         """Add an accepted alignment of a view with this median depth in m."""
         self._history.append(_statistics(aligned))
         if np.isfinite(aligned.rms_m) and depth > 0:
@@ -140,7 +148,7 @@ class FitStatistics:
                 sigma[k] = np.hypot(np.sqrt(weight) * spread, np.sqrt(1 - weight) * sigma[k])
         self._mean, self._sigma = mean, np.maximum(sigma, _MIN_SIGMA)
 
-    def assess(self, aligned: Aligned) -> FitQuality:
+    def assess(self, aligned: projective.Aligned) -> FitQuality:
         """Compare an alignment with the distribution."""
         if aligned.inliers < _MIN_INLIERS:
             reason = f"{aligned.inliers} inliers are too few to determine a pose"
@@ -156,7 +164,7 @@ class FitStatistics:
         return FitQuality("conflicting" if conflict else "noisy", excess, reason)
 
 
-def _statistics(aligned: Aligned) -> Float64:
+def _statistics(aligned: projective.Aligned) -> Float64:
     compared = max(aligned.compared, 1)
     fractions = np.array([1 - aligned.inliers / compared, aligned.in_front / compared])
     odds = np.log((fractions + _ODDS_FLOOR) / (1 - fractions + _ODDS_FLOOR))

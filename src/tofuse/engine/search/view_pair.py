@@ -13,17 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.engine.alignment import (
-    UNITS,
-    Aligned,
-    ProjectiveOptions,
-    Registration,
-    Target,
-    UncertaintyOptions,
-    align,
-    covariance,
-    registration_of,
-)
+from tofuse.engine.alignment import Registration, UncertaintyOptions, covariance, projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, agreement
@@ -40,7 +30,7 @@ from tofuse.engine.search.verification import (
 from tofuse.engine.views import PreparedView
 
 # Few iterations near a guess; otherwise enough for a step of a third of the view.
-_FEW_ITERATIONS = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
+_FEW_ITERATIONS = projective.ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
 _PATIENT = replace(_FEW_ITERATIONS, levels=PATIENT)
 _COARSE_START = replace(_FEW_ITERATIONS, levels=COARSE)
 # Error of a pose after the search, m and rad, at depths of a metre and more.
@@ -65,8 +55,8 @@ class _Pose:
 
     views: tuple[PreparedView, PreparedView]
     T_target_source: Float64
-    aligned: Aligned
-    options: ProjectiveOptions
+    aligned: projective.Aligned
+    options: projective.ProjectiveOptions
     agreement: Agreement
 
     @property
@@ -229,15 +219,21 @@ class _Pair:
         return self.source.with_falloff(falloff), self.target.with_falloff(falloff)
 
     def _aligned(
-        self, views: tuple[PreparedView, PreparedView], guess: Float64, options: ProjectiveOptions
-    ) -> Aligned:
+        self,
+        views: tuple[PreparedView, PreparedView],
+        guess: Float64,
+        options: projective.ProjectiveOptions,
+    ) -> projective.Aligned:
         source, target = views
-        return align(
+        return projective.align(
             source, _as_target(target), guess, options, usual_scale=self.fit_statistics.noise_scale
         )
 
     def _consistent_pose(
-        self, views: tuple[PreparedView, PreparedView], guess: Float64, options: ProjectiveOptions
+        self,
+        views: tuple[PreparedView, PreparedView],
+        guess: Float64,
+        options: projective.ProjectiveOptions,
     ) -> _Pose | None:
         """Align forwards and backwards; None if inconsistent, or if the fit is unusual."""
         forward = self._aligned(views, guess, options)
@@ -291,9 +287,11 @@ class _Pair:
         local = replace(local, agreement=pose_agreement)
         if pose_agreement.score >= best.agreement.score - _TIE:
             return local
-        difference = se3.log(se3.inverse(local.T_target_source) @ best.T_target_source) / UNITS
+        difference = (
+            se3.log(se3.inverse(local.T_target_source) @ best.T_target_source) / projective.UNITS
+        )
         weak = local.aligned.unobservable
-        across = se3.exp((difference - weak.T @ (weak @ difference)) * UNITS)
+        across = se3.exp((difference - weak.T @ (weak @ difference)) * projective.UNITS)
         is_same = not are_distinct_poses(np.eye(4), across, self.distinct_m)
         return local if local.degenerate and best.degenerate and is_same else best
 
@@ -313,7 +311,9 @@ class _Pair:
         self, pose: _Pose, evidence: PoseEvidence, rival: Candidate | None
     ) -> Registration:
         """Return a pose as a registration."""
-        registration = registration_of(pose.aligned, pose.T_target_source, self._covariance(pose))
+        registration = projective.registration_of(
+            pose.aligned, pose.T_target_source, self._covariance(pose)
+        )
         runner_up = None if rival is None else rival.T_target_source
         return evidence.applied(registration, pose.agreement, runner_up)
 
@@ -331,5 +331,5 @@ class _Pair:
         return C
 
 
-def _as_target(view: PreparedView) -> list[Target]:
-    return [Target(view, np.eye(4))]
+def _as_target(view: PreparedView) -> list[projective.Target]:
+    return [projective.Target(view, np.eye(4))]

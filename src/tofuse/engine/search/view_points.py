@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.alignment import points_of
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.search.search_kernels import ViewPoints
-from tofuse.engine.views import NORMAL, POINT, POINT_ALBEDO, SIGMA, PreparedView
+from tofuse.engine.views import PreparedView, residual_kernels
 
 
 def sampled_points(view: PreparedView, count: int) -> ViewPoints:
     """Return about `count` pixels that have a plane, evenly over the image."""
     available = view.planar_fraction * view.z.size
-    packed = points_of(view, max(1, round(float(np.sqrt(available / count)))))
-    points = np.ascontiguousarray(packed[:, POINT : POINT + 3])
+    packed = projective.points_of(view, max(1, round(float(np.sqrt(available / count)))))
+    points = np.ascontiguousarray(packed[:, residual_kernels.POINT : residual_kernels.POINT + 3])
     return ViewPoints(
         points,
-        np.ascontiguousarray(packed[:, NORMAL : NORMAL + 3]),
-        packed[:, SIGMA] * points[:, 2],
-        packed[:, POINT_ALBEDO].copy(),
+        np.ascontiguousarray(packed[:, residual_kernels.NORMAL : residual_kernels.NORMAL + 3]),
+        packed[:, residual_kernels.SIGMA] * points[:, 2],
+        packed[:, residual_kernels.POINT_ALBEDO].copy(),
     )
 
 

@@ -13,45 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int64
-from tofuse.engine.cameras import MIN_DEPTH, jacobian_row, nearest_pixel
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.views import (
-    ALBEDO,
-    ALBEDO_SLOPE,
-    BINS,
-    CHI2,
-    DISTANCE,
-    FREE_SPACE,
-    HAS_PLANE,
-    INLIERS,
-    IS_INLIER,
-    JACOBIAN,
-    LANES,
-    NORMAL,
-    PLANE,
-    POINT,
-    POINT_ALBEDO,
-    POINT_ALBEDO_SLOPE,
-    ROWS,
-    SIGMA,
-    SQRT_WEIGHT,
-    STAT,
-    VARIANCE,
-    WEIGHTED_RESIDUAL,
-    XN,
-    YN,
-    Residuals,
-    TargetImage,
-    Z,
-    add_products,
-    compare_albedos,
-    compare_planes,
-    histogram_bin,
-    load_block,
-    project_block,
-    transform_block,
-)
+from tofuse.engine.views import residual_kernels
 from tofuse.engine.views import residual_kernels as pose_sums
 
 # Camera errors, in the order of the unknowns.
@@ -76,7 +41,7 @@ SQUARES_P = WEIGHT_P + 1
 TERMS = SQUARES_P + 1  # number of residuals of both terms
 SUPPORT = TERMS + 1  # sum of (1 - robust cost) of the residuals (Tukey's biweight)
 HISTOGRAM = SUPPORT + 1  # as in `alignment`
-SIZE = HISTOGRAM + BINS
+SIZE = HISTOGRAM + residual_kernels.BINS
 
 _EPSILON = 1e-6  # m or m^2, instead of 0 in a denominator
 
@@ -182,9 +147,9 @@ def displacement(B: Float64, x: float, y: float, z: float, radial: bool) -> None
 @kernel
 def _calibration_equations(
     points: Float32,
-    target: TargetImage,
+    target: residual_kernels.TargetImage,
     T: Float64,
-    residuals: Residuals,
+    residuals: residual_kernels.Residuals,
     camera: CameraErrors,
     out: Float64,
 ) -> None:
@@ -208,16 +173,16 @@ def _calibration_equations(
     r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     for k in range(points.shape[0]):
         point = points[k]
-        px = np.float64(point[POINT])
-        py = np.float64(point[POINT + 1])
-        pz = np.float64(point[POINT + 2])
+        px = np.float64(point[residual_kernels.POINT])
+        py = np.float64(point[residual_kernels.POINT + 1])
+        pz = np.float64(point[residual_kernels.POINT + 2])
         displacement(Bp, px, py, pz, radial_source)
         for p in range(ERRORS):
             px += errors[p] * Bp[p, 0]
             py += errors[p] * Bp[p, 1]
             pz += errors[p] * Bp[p, 2]
         z = r20 * px + r21 * py + r22 * pz + t2
-        if z <= MIN_DEPTH:
+        if z <= projection_kernels.MIN_DEPTH:
             continue
         x = r00 * px + r01 * py + r02 * pz + t0
         y = r10 * px + r11 * py + r12 * pz + t1
@@ -226,46 +191,48 @@ def _calibration_equations(
         rho2 = xn * xn + yn * yn
         ray_scale = 1.0 + errors[FOCAL] + errors[DISTORTION] * rho2
         xn, yn = xn / ray_scale, yn / ray_scale
-        i, j = nearest_pixel(xn, yn, lookup, lookup_frame, rows, columns)
+        i, j = projection_kernels.nearest_pixel(xn, yn, lookup, lookup_frame, rows, columns)
         if i < 0:
             continue
         pixel = image[i, j]
-        distance = np.float64(pixel[DISTANCE])
+        distance = np.float64(pixel[residual_kernels.DISTANCE])
         if distance == 0:
             continue
         out[COMPARED] += 1
         out[TERMS] += 1
-        n0 = np.float64(pixel[PLANE])
-        n1 = np.float64(pixel[PLANE + 1])
-        n2 = np.float64(pixel[PLANE + 2])
+        n0 = np.float64(pixel[residual_kernels.PLANE])
+        n1 = np.float64(pixel[residual_kernels.PLANE + 1])
+        n2 = np.float64(pixel[residual_kernels.PLANE + 2])
         height = n0 * x + n1 * y + n2 * z
         r = height - distance
         displacement(Bq, x, y, z, radial_target)
         for p in range(ERRORS):
             r -= errors[p] * (n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2])
-        source_sigma = (height - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(point[SIGMA])
-        raw_variance = source_sigma * source_sigma + np.float64(pixel[VARIANCE])
+        source_sigma = (height - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(
+            point[residual_kernels.SIGMA]
+        )
+        raw_variance = source_sigma * source_sigma + np.float64(pixel[residual_kernels.VARIANCE])
         variance = raw_variance * scale_g * scale_g + inflation * inflation
         r2 = r * r
-        out[HISTOGRAM + histogram_bin(r2 / raw_variance)] += 1
+        out[HISTOGRAM + residual_kernels.histogram_bin(r2 / raw_variance)] += 1
         e2 = r2 / variance / limit2
         if e2 >= 1:
-            if r < 0 and e2 > FREE_SPACE:
+            if r < 0 and e2 > residual_kernels.FREE_SPACE:
                 out[IN_FRONT] += 1
             continue
         m0 = r00 * n0 + r10 * n1 + r20 * n2
         m1 = r01 * n0 + r11 * n1 + r21 * n2
         m2 = r02 * n0 + r12 * n1 + r22 * n2
-        s0 = np.float64(point[NORMAL])
-        s1 = np.float64(point[NORMAL + 1])
-        s2 = np.float64(point[NORMAL + 2])
+        s0 = np.float64(point[residual_kernels.NORMAL])
+        s1 = np.float64(point[residual_kernels.NORMAL + 1])
+        s2 = np.float64(point[residual_kernels.NORMAL + 2])
         if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
             continue
         weight = tukey.weight(e2)
         out[SUPPORT] += tukey.support(weight)
         # Mean of both views' normals, which halves the effect of either's noise.
         m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
-        jacobian_row(J, m0, m1, m2, px, py, pz)
+        projection_kernels.jacobian_row(J, m0, m1, m2, px, py, pz)
         J[EXPOSURE] = 0.0
         # The same mean for the camera errors: otherwise the difference between the normals, which
         # the pose cannot explain, would be attributed to them.
@@ -280,12 +247,18 @@ def _calibration_equations(
                 J[7 + p] = 0.0
         _add_residual(A, g, J, r, weight / variance, unknowns)
 
-        tx = np.float64(pixel[ALBEDO_SLOPE])
-        source_albedo = np.float64(point[POINT_ALBEDO])
+        tx = np.float64(pixel[residual_kernels.ALBEDO_SLOPE])
+        source_albedo = np.float64(point[residual_kernels.POINT_ALBEDO])
         if scale_p <= 0 or np.isnan(tx) or np.isnan(source_albedo):
             continue
-        ty = np.float64(pixel[ALBEDO_SLOPE + 1])
-        r = np.float64(pixel[ALBEDO]) + tx * xn + ty * yn - source_albedo - exposure
+        ty = np.float64(pixel[residual_kernels.ALBEDO_SLOPE + 1])
+        r = (
+            np.float64(pixel[residual_kernels.ALBEDO])
+            + tx * xn
+            + ty * yn
+            - source_albedo
+            - exposure
+        )
         out[TERMS] += 1
         r2 = r * r
         e2 = r2 / (scale_p * scale_p) / limit2
@@ -302,11 +275,11 @@ def _calibration_equations(
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2
         m2 = r02 * d0 + r12 * d1 + r22 * d2
-        s0 = np.float64(point[POINT_ALBEDO_SLOPE])
-        s1 = np.float64(point[POINT_ALBEDO_SLOPE + 1])
-        s2 = np.float64(point[POINT_ALBEDO_SLOPE + 2])
+        s0 = np.float64(point[residual_kernels.POINT_ALBEDO_SLOPE])
+        s1 = np.float64(point[residual_kernels.POINT_ALBEDO_SLOPE + 1])
+        s2 = np.float64(point[residual_kernels.POINT_ALBEDO_SLOPE + 2])
         m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
-        jacobian_row(J, m0, m1, m2, px, py, pz)
+        projection_kernels.jacobian_row(J, m0, m1, m2, px, py, pz)
         J[EXPOSURE] = -1.0
         for p in range(estimated):
             J[7 + p] = 0.0 if known[p] else m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]
@@ -334,7 +307,7 @@ def _calibration_equations(
 def target_equations(
     sources: SourcePoints,
     views: Int64,
-    target: TargetImage,
+    target: residual_kernels.TargetImage,
     T: Float64,
     residuals: PairResiduals,
     errors: Float64,
@@ -370,7 +343,9 @@ def target_equations(
         view = views[k]
         begin, end = sources.begin[view], sources.end[view]
         points = sources.points[begin:end]
-        pair = Residuals(exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine)
+        pair = residual_kernels.Residuals(
+            exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine
+        )
         camera = CameraErrors(errors, known, sources.measures_range[view], radial_target)
         if known.all():
             patches = sources.patches[begin:end]
@@ -383,9 +358,9 @@ def target_equations(
 def _pose_equations(
     points: Float32,
     patches: Int64,
-    target: TargetImage,
+    target: residual_kernels.TargetImage,
     T: Float64,
-    residuals: Residuals,
+    residuals: residual_kernels.Residuals,
     camera: CameraErrors,
     out: Float64,
     sums: Float64,
@@ -395,31 +370,38 @@ def _pose_equations(
     has_errors = (errors != 0).any()
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     image, lookup, lookup_frame = target
-    block = np.zeros(ROWS * LANES, np.float32)
+    block = np.zeros(residual_kernels.ROWS * residual_kernels.LANES, np.float32)
     # Products of the rows of J and r, followed by counts and sums over columns.
-    products, support = 36, 36 + pose_sums.SQUARES_G - INLIERS
-    total = np.zeros((36 + pose_sums.COUNT_P + 1 - INLIERS, LANES))
-    for first in range(0, len(points), LANES):
-        count = min(LANES, len(points) - first)
-        load_block(block, points[first : first + count])
+    products, support = 36, 36 + pose_sums.SQUARES_G - residual_kernels.INLIERS
+    total = np.zeros(
+        (36 + pose_sums.COUNT_P + 1 - residual_kernels.INLIERS, residual_kernels.LANES)
+    )
+    for first in range(0, len(points), residual_kernels.LANES):
+        count = min(residual_kernels.LANES, len(points) - first)
+        residual_kernels.load_block(block, points[first : first + count])
         if has_errors:
             _correct_points(block, errors, radial_source)
-        transform_block(block, T)
+        residual_kernels.transform_block(block, T)
         if has_errors:
             _distort_projection(block, errors, radial_target)
-        project_block(block, count, image, lookup, lookup_frame)
-        compare_planes(block, T, scale_g, inflation, robust, min_cosine)
+        residual_kernels.project_block(block, count, image, lookup, lookup_frame)
+        residual_kernels.compare_planes(block, T, scale_g, inflation, robust, min_cosine)
         for k in range(count):
-            if block[HAS_PLANE * LANES + k] > 0:
+            if block[residual_kernels.HAS_PLANE * residual_kernels.LANES + k] > 0:
                 out[COMPARED] += 1
-                out[HISTOGRAM + histogram_bin(block[CHI2 * LANES + k])] += 1
+                out[
+                    HISTOGRAM
+                    + residual_kernels.histogram_bin(
+                        block[residual_kernels.CHI2 * residual_kernels.LANES + k]
+                    )
+                ] += 1
         if len(sums) > 0:
             _add_patches(sums, block, patches[first : first + count])
-        add_products(total, block, 8)
+        residual_kernels.add_products(total, block, 8)
         _add_support(total[support], block, pose_sums.WEIGHT_G)
         if scale_p > 0:
-            compare_albedos(block, T, exposure, scale_p, robust)
-            add_products(total, block, 8)
+            residual_kernels.compare_albedos(block, T, exposure, scale_p, robust)
+            residual_kernels.add_products(total, block, 8)
             _add_support(total[support], block, pose_sums.WEIGHT_P)
         for statistic in (
             pose_sums.IN_FRONT,
@@ -427,12 +409,17 @@ def _pose_equations(
             pose_sums.SQUARES_P,
             pose_sums.COUNT_P,
         ):
-            index = statistic - INLIERS
+            index = statistic - residual_kernels.INLIERS
             column = total[products + index]
-            row = block[(STAT + index) * LANES : (STAT + index + 1) * LANES]
-            for k in range(LANES):
+            row = block[
+                (residual_kernels.STAT + index) * residual_kernels.LANES : (
+                    residual_kernels.STAT + index + 1
+                )
+                * residual_kernels.LANES
+            ]
+            for k in range(residual_kernels.LANES):
                 column[k] += row[k]
-    width = LANES
+    width = residual_kernels.LANES
     while width > 1:
         width //= 2
         for q in range(len(total)):
@@ -449,20 +436,29 @@ def _pose_equations(
                 out[GRADIENT + p] = total[q, 0]
             q += 1
         index += ERRORS  # products with the camera errors remain 0
-    out[IN_FRONT] = total[products + pose_sums.IN_FRONT - INLIERS, 0]
-    out[WEIGHT_P] = total[products + pose_sums.WEIGHT_P - INLIERS, 0]
-    out[SQUARES_P] = total[products + pose_sums.SQUARES_P - INLIERS, 0]
-    out[TERMS] = out[COMPARED] + total[products + pose_sums.COUNT_P - INLIERS, 0]
+    out[IN_FRONT] = total[products + pose_sums.IN_FRONT - residual_kernels.INLIERS, 0]
+    out[WEIGHT_P] = total[products + pose_sums.WEIGHT_P - residual_kernels.INLIERS, 0]
+    out[SQUARES_P] = total[products + pose_sums.SQUARES_P - residual_kernels.INLIERS, 0]
+    out[TERMS] = out[COMPARED] + total[products + pose_sums.COUNT_P - residual_kernels.INLIERS, 0]
     out[SUPPORT] = total[support, 0]
 
 
 @kernel
 def _correct_points(block: Float32, errors: Float64, radial: bool) -> None:
     """Displace the points of a block by camera errors, see `displacement`."""
-    x = block[POINT * LANES : (POINT + 1) * LANES]
-    y = block[(POINT + 1) * LANES : (POINT + 2) * LANES]
-    z = block[(POINT + 2) * LANES : (POINT + 3) * LANES]
-    for k in range(LANES):
+    x = block[
+        residual_kernels.POINT * residual_kernels.LANES : (residual_kernels.POINT + 1)
+        * residual_kernels.LANES
+    ]
+    y = block[
+        (residual_kernels.POINT + 1) * residual_kernels.LANES : (residual_kernels.POINT + 2)
+        * residual_kernels.LANES
+    ]
+    z = block[
+        (residual_kernels.POINT + 2) * residual_kernels.LANES : (residual_kernels.POINT + 3)
+        * residual_kernels.LANES
+    ]
+    for k in range(residual_kernels.LANES):
         lateral2 = x[k] * x[k] + y[k] * y[k]
         r2 = max(lateral2 + z[k] * z[k], _EPSILON)  # columns without a point may be 0
         ray_scale_error = errors[FOCAL] + errors[DISTORTION] * lateral2 / max(z[k] * z[k], _EPSILON)
@@ -482,11 +478,20 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
 
     To first order in the errors this is the inverse of `_correct_points`.
     """
-    xn = block[XN * LANES : (XN + 1) * LANES]
-    yn = block[YN * LANES : (YN + 1) * LANES]
-    z = block[Z * LANES : (Z + 1) * LANES]
-    for k in range(LANES):
-        if not z[k] > MIN_DEPTH:  # it is not projected
+    xn = block[
+        residual_kernels.XN * residual_kernels.LANES : (residual_kernels.XN + 1)
+        * residual_kernels.LANES
+    ]
+    yn = block[
+        residual_kernels.YN * residual_kernels.LANES : (residual_kernels.YN + 1)
+        * residual_kernels.LANES
+    ]
+    z = block[
+        residual_kernels.Z * residual_kernels.LANES : (residual_kernels.Z + 1)
+        * residual_kernels.LANES
+    ]
+    for k in range(residual_kernels.LANES):
+        if not z[k] > projection_kernels.MIN_DEPTH:  # it is not projected
             continue
         lateral2 = xn[k] * xn[k] + yn[k] * yn[k]
         r2 = lateral2 + 1
@@ -505,21 +510,28 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
 def _add_patches(sums: Float64, block: Float32, patches: Int64) -> None:
     """Add the weighted residuals and Jacobians of the distances of a block to their patches."""
     for k in range(len(patches)):
-        if block[IS_INLIER * LANES + k] > 0:
-            sqrt_weight = np.float64(block[SQRT_WEIGHT * LANES + k])
+        if block[residual_kernels.IS_INLIER * residual_kernels.LANES + k] > 0:
+            sqrt_weight = np.float64(
+                block[residual_kernels.SQRT_WEIGHT * residual_kernels.LANES + k]
+            )
             patch = sums[patches[k]]
             patch[PATCH_WEIGHT] += sqrt_weight * sqrt_weight
-            patch[PATCH_RESIDUAL] += sqrt_weight * block[WEIGHTED_RESIDUAL * LANES + k]
+            patch[PATCH_RESIDUAL] += (
+                sqrt_weight * block[residual_kernels.WEIGHTED_RESIDUAL * residual_kernels.LANES + k]
+            )
             for p in range(6):
-                patch[PATCH_RESPONSE + p] += sqrt_weight * block[(JACOBIAN + p) * LANES + k]
+                patch[PATCH_RESPONSE + p] += (
+                    sqrt_weight
+                    * block[(residual_kernels.JACOBIAN + p) * residual_kernels.LANES + k]
+                )
 
 
 @kernel
 def _add_support(total: Float64, block: Float32, statistic: int) -> None:
     """Add the support of the residuals whose robust weights are in a statistic."""
-    index = STAT + statistic - INLIERS
-    row = block[index * LANES : (index + 1) * LANES]
-    for k in range(LANES):
+    index = residual_kernels.STAT + statistic - residual_kernels.INLIERS
+    row = block[index * residual_kernels.LANES : (index + 1) * residual_kernels.LANES]
+    for k in range(residual_kernels.LANES):
         total[k] += tukey.support(row[k])
 
 
@@ -540,7 +552,7 @@ def overlaps(
     points: Float32,
     starts: Int64,
     sources: Int64,
-    target: TargetImage,
+    target: residual_kernels.TargetImage,
     T_target_world: Float64,
     T_world_source: Float64,
     tolerance: float,
@@ -583,20 +595,35 @@ def overlaps(
         for k in range(start, stop):
             if k - start - shared > max_unseen:
                 break
-            px, py, pz = points[k, POINT], points[k, POINT + 1], points[k, POINT + 2]
+            px, py, pz = (
+                points[k, residual_kernels.POINT],
+                points[k, residual_kernels.POINT + 1],
+                points[k, residual_kernels.POINT + 2],
+            )
             z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-            if z <= MIN_DEPTH:
+            if z <= projection_kernels.MIN_DEPTH:
                 continue
             x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
             y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            i, j = nearest_pixel(x / z, y / z, lookup, lookup_frame, rows, columns)
+            i, j = projection_kernels.nearest_pixel(
+                x / z, y / z, lookup, lookup_frame, rows, columns
+            )
             if i < 0:
                 continue
             pixel = image[i, j]
-            n0, n1, n2, distance = pixel[PLANE], pixel[PLANE + 1], pixel[PLANE + 2], pixel[DISTANCE]
+            n0, n1, n2, distance = (
+                pixel[residual_kernels.PLANE],
+                pixel[residual_kernels.PLANE + 1],
+                pixel[residual_kernels.PLANE + 2],
+                pixel[residual_kernels.DISTANCE],
+            )
             if distance == 0 or abs(n0 * x + n1 * y + n2 * z - distance) > tolerance * z:
                 continue
-            nx, ny, nz = points[k, NORMAL], points[k, NORMAL + 1], points[k, NORMAL + 2]
+            nx, ny, nz = (
+                points[k, residual_kernels.NORMAL],
+                points[k, residual_kernels.NORMAL + 1],
+                points[k, residual_kernels.NORMAL + 2],
+            )
             cosine = (
                 n0 * (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz)
                 + n1 * (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz)

@@ -20,7 +20,7 @@ from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
 from tofuse.engine.stored_views.shared_error_kernels import marginalise_shared_errors
 from tofuse.engine.stored_views.view_store import SampledView
-from tofuse.engine.views import POINT_SIZE
+from tofuse.engine.views import residual_kernels
 
 _PAIRS_A_CHUNK = 8
 # Approximate number of pairs from which the disagreement of patches is estimated.
@@ -163,7 +163,10 @@ def _sources(views: Sequence[SampledView], *, by_patch: bool) -> kernels.SourceP
     unique = {id(v): v for v in views}
     row = {key: k for k, key in enumerate(unique)}
     row_of_view = np.array([row[id(v)] for v in views], np.intp)
-    points = [np.zeros((0, POINT_SIZE), np.float32), *(v.points for v in unique.values())]
+    points = [
+        np.zeros((0, residual_kernels.POINT_SIZE), np.float32),
+        *(v.points for v in unique.values()),
+    ]
     patches = [v.patches for v in unique.values()] if by_patch else []
     offsets = np.cumsum([len(p) for p in points])
     return kernels.SourcePoints(

@@ -17,7 +17,7 @@ from functools import cache
 
 import numpy as np
 
-from tofuse.engine.alignment import UNITS
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float32, Float64, Int64
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.views import Projection
@@ -33,7 +33,7 @@ _MIN_WEIGHT = 0.1
 _MIN_CHANGE = 0.02
 # Prior sigma of the pose of a single pair, in units of 1 cm and 1 degree (and 1 of the exposure).
 _PRIOR_SIGMA = 1.8
-_UNITS = np.append(UNITS, 1.0)
+_UNITS = np.append(projective.UNITS, 1.0)
 _UPPER = np.triu_indices(kernels.UNKNOWNS)
 
 

@@ -11,13 +11,13 @@ from weakref import finalize
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tofuse.engine.alignment import points_of
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float32, Float64, Int64, Intp
 from tofuse.engine.compute import Scratch, Spill, run_chunks
 from tofuse.engine.geometry import PlaceCounts, se3
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
-from tofuse.engine.views import POINT, POINT_SIZE, SIGMA, PreparedView, Projection, TargetImage
+from tofuse.engine.views import PreparedView, Projection, residual_kernels
 
 # For estimates of the overlap: points of a view, and width of its image.
 _OVERLAP_POINTS = 150
@@ -61,7 +61,7 @@ class CoarseView:
     @property
     def centroid(self) -> Float64:
         """(3,) centroid of the points, in the camera's frame."""
-        p = self.points[:, POINT : POINT + 3]
+        p = self.points[:, residual_kernels.POINT : residual_kernels.POINT + 3]
         return np.asarray(p.mean(0, dtype=float) if len(p) else np.zeros(3), np.float64)
 
 
@@ -130,9 +130,11 @@ class SampledView:
         return replace(self, points=np.ascontiguousarray(self.points[which]))
 
     @property
-    def target_image(self) -> TargetImage:
+    def target_image(self) -> residual_kernels.TargetImage:
         """The target image and its projection."""
-        return TargetImage(self.target, self.projection.lookup, self.projection.frame)
+        return residual_kernels.TargetImage(
+            self.target, self.projection.lookup, self.projection.frame
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -153,12 +155,16 @@ class SampledView:
     def sigma(self) -> float:
         """Median sigma of the points' z, m."""
         p = self.points
-        return float(np.median(p[:, SIGMA] * p[:, POINT + 2])) if len(p) else 0.01
+        return (
+            float(np.median(p[:, residual_kernels.SIGMA] * p[:, residual_kernels.POINT + 2]))
+            if len(p)
+            else 0.01
+        )
 
 
 def sampled_points(surface: PreparedView, count: int) -> Float32:
     """Return approximately `count` points (N, POINT_SIZE) of a view, on a regular grid."""
-    return points_of(surface, max(1, round(np.sqrt(surface.z.size / count))))
+    return projective.points_of(surface, max(1, round(np.sqrt(surface.z.size / count))))
 
 
 @dataclass(frozen=True)
@@ -456,7 +462,11 @@ def _visible_fractions(
     used, row = np.unique(source, return_inverse=True)
     point_sets = [views[k].coarse.points for k in used]
     starts = np.concatenate([[0], np.cumsum([len(points) for points in point_sets])])
-    points = np.concatenate(point_sets) if point_sets else np.zeros((0, POINT_SIZE), np.float32)
+    points = (
+        np.concatenate(point_sets)
+        if point_sets
+        else np.zeros((0, residual_kernels.POINT_SIZE), np.float32)
+    )
     inverse, used_poses = se3.inverse(poses), np.ascontiguousarray(poses[used])
     # All sources of a target in succession, so that it stays in the cache.
     order = np.argsort(target, kind="stable")
@@ -473,7 +483,9 @@ def _visible_fractions(
                 points,
                 starts,
                 row[rows],
-                TargetImage(view.target, view.projection.lookup, view.projection.frame),
+                residual_kernels.TargetImage(
+                    view.target, view.projection.lookup, view.projection.frame
+                ),
                 inverse[targets[k]],
                 used_poses,
                 _MAX_DISTANCE,

@@ -8,14 +8,7 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from tofuse.engine.alignment import (
-    Registration,
-    Target,
-    ViewOptions,
-    align,
-    covariance,
-    registration_of,
-)
+from tofuse.engine.alignment import Registration, ViewOptions, covariance, projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import InputError
@@ -98,20 +91,20 @@ class _GivenTracker(Tracker):
             mask = at_size(moving.view, frame)
             view = moving.applied(view)
             reference = moving.applied_to_reference(keyframe.view)
-            target = Target(reference, se3.inverse(keyframe.T_component_camera))
+            target = projective.Target(reference, se3.inverse(keyframe.T_component_camera))
         registration = self._registration(view, keyframe, target, T)
         if self._keyframes.is_far(T, self._keyframes.newest):
             self._keyframes.add(Keyframe(view, T, 0))
         return Step("tracked", "", T, keyframe.view.index, registration, view, moving=mask)
 
     def _registration(
-        self, view: PreparedView, keyframe: Keyframe, target: Target, T: Float64
+        self, view: PreparedView, keyframe: Keyframe, target: projective.Target, T: Float64
     ) -> Registration:
         alignment = self._options.views.alignment
-        aligned = align(view, [target], T, alignment)
+        aligned = projective.align(view, [target], T, alignment)
         C = covariance(view, [target], aligned, alignment)
         T_keyframe_camera = se3.inverse(keyframe.T_component_camera) @ aligned.T_world_source
-        return registration_of(aligned, T_keyframe_camera, C)
+        return projective.registration_of(aligned, T_keyframe_camera, C)
 
 
 @dataclass(frozen=True, eq=False)

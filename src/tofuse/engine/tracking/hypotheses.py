@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.engine.alignment import Aligned, Level, ProjectiveOptions, Target, align
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.search import PATIENT, FitQuality, comparable
+from tofuse.engine.search import verification
 from tofuse.engine.tracking.keyframe_map import Keyframe
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.tracking.motion import FrameTime
@@ -21,7 +21,7 @@ from tofuse.engine.views import PreparedView
 # Minimum score of a rotated start relative to the unrotated one: a flat wall fits under any.
 _MIN_ROTATED_SCORE_RATIO = 1.03
 # A nearly aligned view needs a few more iterations, at the resolution of tracking.
-_CONVERGENCE_LEVELS = (Level(4, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0))
+_CONVERGENCE_LEVELS = (projective.Level(4, 8, 0.005, 0.02), projective.Level(2, 8, 0.0, 0.0))
 # Every n-th frame is segmented, and any with an indication of moving objects: an unusual fit, more
 # than this fraction of points in free space, or objects in the frame before.
 _SEGMENT_EVERY, _MAX_IN_FRONT = 4, 0.005
@@ -32,7 +32,7 @@ class Reference:
     """A keyframe, and its view without moved objects as the target of alignments."""
 
     keyframe: Keyframe
-    target: Target
+    target: projective.Target
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +51,12 @@ class Hypothesis:
         Comparison with usual alignments.
     """
 
-    aligned: Aligned
+    aligned: projective.Aligned
     view: PreparedView
     reference: Reference
     predicted: bool
     note: str
-    fit: FitQuality
+    fit: verification.FitQuality
 
     @property
     def keyframe(self) -> Keyframe:
@@ -211,12 +211,12 @@ class Hypotheses:
             keyframes.append(last)
         references = []
         for keyframe in keyframes:
-            if not comparable(self.view.depth, keyframe.depth):
+            if not verification.comparable(self.view.depth, keyframe.depth):
                 continue
             target, mask = keyframe.target, self.state.objects.reference_mask(keyframe.view)
             if mask.any():
                 view = without_pixels(keyframe.view, mask)
-                target = Target(view, se3.inverse(keyframe.T_component_camera))
+                target = projective.Target(view, se3.inverse(keyframe.T_component_camera))
             references.append(Reference(keyframe, target))
         return references
 
@@ -260,13 +260,15 @@ class Hypotheses:
     def _without_moving(self, moving: Moving, T: Float64, hypothesis: Hypothesis) -> Hypothesis:
         """Realign a hypothesis from T (4, 4), without moving objects."""
         k = hypothesis.keyframe
-        target = Target(moving.applied_to_reference(k.view), se3.inverse(k.T_component_camera))
+        target = projective.Target(
+            moving.applied_to_reference(k.view), se3.inverse(k.T_component_camera)
+        )
         view = moving.applied(self.view)
         return self.realigned(T, view, Reference(k, target), predicted=hypothesis.predicted)
 
     def _hypothesis(
         self,
-        aligned: Aligned,
+        aligned: projective.Aligned,
         view: PreparedView,
         reference: Reference,
         note: str,
@@ -276,10 +278,10 @@ class Hypotheses:
         fit = self.state.fit_statistics.assess(aligned)
         return Hypothesis(aligned, view, reference, predicted, note, fit)
 
-    def _from_best_rotation(self, reference: Reference) -> tuple[Aligned, str]:
+    def _from_best_rotation(self, reference: Reference) -> tuple[projective.Aligned, str]:
         """Align from the last pose, or its rotation that fits best; and name the start."""
         view = self.static_view
-        coarse = replace(self._options, levels=PATIENT[:1])
+        coarse = replace(self._options, levels=verification.PATIENT[:1])
         motions = _rotation_candidates(view)
         unrotated, *rotated = [
             self._align(view, reference, self.T_last @ motion, coarse) for motion in motions
@@ -292,7 +294,9 @@ class Hypotheses:
         if rotates:
             name += f" by {np.degrees(se3.angle(motions[1 + best])):.0f} degrees"
         # Without a prediction, weakly constrained directions follow the data.
-        options = replace(self._options, levels=PATIENT, common_tilt=0.0, common_slope=0.0)
+        options = replace(
+            self._options, levels=verification.PATIENT, common_tilt=0.0, common_slope=0.0
+        )
         prior = best_aligned.T_world_source if rotates else self.T_last
         start = best_aligned.T_world_source
         return self._align(view, reference, prior, options, start=start), name
@@ -302,12 +306,14 @@ class Hypotheses:
         view: PreparedView,
         reference: Reference,
         T: Float64,
-        options: ProjectiveOptions,
+        options: projective.ProjectiveOptions,
         *,
         start: Float64 | None = None,
-    ) -> Aligned:
+    ) -> projective.Aligned:
         scale = self.state.fit_statistics.noise_scale
-        return align(view, [reference.target], T, options, start=start, usual_scale=scale)
+        return projective.align(
+            view, [reference.target], T, options, start=start, usual_scale=scale
+        )
 
 
 def _rotation_candidates(view: PreparedView) -> list[Float64]:

@@ -7,19 +7,17 @@ from functools import cached_property
 
 import numpy as np
 
-from tofuse.engine.alignment import Link, Registration, Target
+from tofuse.engine.alignment import Link, Registration, projective
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import (
     DISTINCT_M,
-    MAX_OVERLAP_DISTANCE,
-    FitStatistics,
     SearchOptions,
     are_distinct_poses,
-    comparable,
     register_pair,
+    verification,
 )
-from tofuse.engine.views import PreparedView, dissimilarity, view_descriptor
+from tofuse.engine.views import PreparedView, view_descriptors
 
 # Maximum number of keyframes, so that memory is constant.
 CAPACITY = 40
@@ -47,12 +45,12 @@ class Keyframe:
     @cached_property
     def descriptor(self) -> Float32:
         """See `view_descriptor`."""
-        return view_descriptor(self.view)
+        return view_descriptors.view_descriptor(self.view)
 
     @cached_property
-    def target(self) -> Target:
+    def target(self) -> projective.Target:
         """The target of alignments with it."""
-        return Target(self.view, se3.inverse(self.T_component_camera))
+        return projective.Target(self.view, se3.inverse(self.T_component_camera))
 
 
 class KeyframeMap:
@@ -106,7 +104,7 @@ class KeyframeMap:
             se3.angle(T_camera_keyframes)
         )
         return self._keyframes[
-            -1 if distances[-1] < MAX_OVERLAP_DISTANCE else int(np.argmin(distances))
+            -1 if distances[-1] < verification.MAX_OVERLAP_DISTANCE else int(np.argmin(distances))
         ]
 
     def most_similar(self, view: PreparedView, component: int) -> Keyframe | None:
@@ -115,7 +113,9 @@ class KeyframeMap:
         if not others:
             return None
         descriptors = np.stack([k.descriptor for k in others])
-        distances = dissimilarity(view_descriptor(view), descriptors, _MAX_SHIFT)
+        distances = view_descriptors.dissimilarity(
+            view_descriptors.view_descriptor(view), descriptors, _MAX_SHIFT
+        )
         return others[int(np.flatnonzero(distances == distances.min())[-1])]
 
     def _most_redundant(self) -> int:
@@ -155,7 +155,9 @@ class Relocalizer:
         Usual fit of views of this camera.
     """
 
-    def __init__(self, search: SearchOptions | None, fit_statistics: FitStatistics) -> None:
+    def __init__(
+        self, search: SearchOptions | None, fit_statistics: verification.FitStatistics
+    ) -> None:
         self._search, self._fit_statistics = search, fit_statistics
         self._budget = float(_FREE_SEARCHES)
         # Registrations of the last view, as several hypotheses need the same pair.
@@ -221,7 +223,7 @@ class Relocalizer:
         pair = view.index, keyframe.view.index
         if pair not in self._cache:
             can_search = self._search is not None and self._budget >= 1
-            if not can_search or not comparable(view.depth, keyframe.depth):
+            if not can_search or not verification.comparable(view.depth, keyframe.depth):
                 return None
             self._budget -= 1
             # Even where an alignment seems certain: a box looks the same from its opposite side.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.alignment import Link, Registration, covariance, registration_of
+from tofuse.engine.alignment import Link, Registration, covariance, projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, RangeFrame
-from tofuse.engine.search import FitStatistics, SearchOptions
+from tofuse.engine.search import SearchOptions, verification
 from tofuse.engine.tracking.base import Status, Step, Tracker
 from tofuse.engine.tracking.hypotheses import Hypotheses, Hypothesis
 from tofuse.engine.tracking.keyframe_map import Keyframe, KeyframeMap, Relocalizer
@@ -25,7 +25,7 @@ class KeyframeTracker(Tracker):
 
     def __init__(self, options: Keyframes, search: SearchOptions) -> None:
         self._options = options
-        fit_statistics = FitStatistics()
+        fit_statistics = verification.FitStatistics()
         self._state = TrackerState(
             KeyframeMap(options.keyframe_angle, options.keyframe_distance),
             Relocalizer(search if options.searches else None, fit_statistics),
@@ -167,7 +167,9 @@ class KeyframeTracker(Tracker):
     def _registration(self, accepted: Hypothesis) -> Registration:
         aligned, targets = accepted.aligned, [accepted.reference.target]
         C = covariance(accepted.view, targets, aligned, self._options.views.alignment)
-        return registration_of(aligned, accepted.T_keyframe_camera, C * _inflation(accepted) ** 2)
+        return projective.registration_of(
+            aligned, accepted.T_keyframe_camera, C * _inflation(accepted) ** 2
+        )
 
 
 def _inflation(accepted: Hypothesis) -> float:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
-from tofuse.engine.cameras import MIN_DEPTH, in_image, project_ray
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
 
 # Outcomes of a comparison.
@@ -146,7 +146,7 @@ def transform_point(motion: Rows, x: float, y: float, depth: float) -> tuple[flo
     r00, r01, r02, t0, r10, r11, r12, t1, r20, r21, r22, t2 = motion
     px, py = x * depth, y * depth
     z = r20 * px + r21 * py + r22 * depth + t2
-    if not z > MIN_DEPTH:
+    if not z > projection_kernels.MIN_DEPTH:
         return 0.0, 0.0, 0.0
     inv_z = 1.0 / z
     u = (r00 * px + r01 * py + r02 * depth + t0) * inv_z
@@ -198,8 +198,8 @@ def residual_ratios(
             )
             if z_proj == 0:
                 continue
-            u, v, node, _ = project_ray(x, y, lookup, lookup_frame)
-            if not in_image(u, v, node, other_z.shape[0], other_z.shape[1]):
+            u, v, node, _ = projection_kernels.project_ray(x, y, lookup, lookup_frame)
+            if not projection_kernels.in_image(u, v, node, other_z.shape[0], other_z.shape[1]):
                 continue
             k, m = int(v + 0.5), int(u + 0.5)
             w_ray = other_planes[k, m, 0] * x + other_planes[k, m, 1] * y + other_planes[k, m, 2]
@@ -277,8 +277,8 @@ def compare(
             )
             if z_proj == 0:
                 continue
-            u, v, node, _ = project_ray(x, y, lookup, lookup_frame)
-            if not in_image(u, v, node, rows, columns):
+            u, v, node, _ = projection_kernels.project_ray(x, y, lookup, lookup_frame)
+            if not projection_kernels.in_image(u, v, node, rows, columns):
                 continue
             k, m = int(v + 0.5), int(u + 0.5)
             w_ray = other_planes[k, m, 0] * x + other_planes[k, m, 1] * y + other_planes[k, m, 2]
@@ -381,8 +381,8 @@ def propagate(
             )
             if z_proj == 0:
                 continue
-            u, v, node, _ = project_ray(x, y, lookup, lookup_frame)
-            if not in_image(u, v, node, prev_shape[0], prev_shape[1]):
+            u, v, node, _ = projection_kernels.project_ray(x, y, lookup, lookup_frame)
+            if not projection_kernels.in_image(u, v, node, prev_shape[0], prev_shape[1]):
                 continue
             k, m = int(v + 0.5), int(u + 0.5)
             k, m = k // prev_stride, m // prev_stride
@@ -438,8 +438,8 @@ def predict(
             )
             if z_proj == 0:
                 continue
-            u, v, node, _ = project_ray(x, y, lookup, lookup_frame)
-            if not in_image(u, v, node, prev_shape[0], prev_shape[1]):
+            u, v, node, _ = projection_kernels.project_ray(x, y, lookup, lookup_frame)
+            if not projection_kernels.in_image(u, v, node, prev_shape[0], prev_shape[1]):
                 continue
             k, m = int(v + 0.5), int(u + 0.5)
             k, m = k // prev_stride, m // prev_stride
@@ -460,8 +460,10 @@ def _cell_on_ray(
     lookup_frame: Float64,
 ) -> tuple[int, int]:
     """Return row and column of the cell that a ray projects to; -1 outside the image."""
-    u, v, node, _ = project_ray(np.float64(ray[0]), np.float64(ray[1]), lookup, lookup_frame)
-    if not in_image(u, v, node, shape[0], shape[1]):
+    u, v, node, _ = projection_kernels.project_ray(
+        np.float64(ray[0]), np.float64(ray[1]), lookup, lookup_frame
+    )
+    if not projection_kernels.in_image(u, v, node, shape[0], shape[1]):
         return -1, -1
     return int(v + 0.5) // stride, int(u + 0.5) // stride
 

@@ -16,7 +16,7 @@ from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.engine.search import CERTAIN, SearchOptions
+from tofuse.engine.search import SearchOptions, pose_probability
 from tofuse.engine.tracking.base import Odometry, Step, Tracker
 from tofuse.engine.tracking.motion import FrameTime, MotionModel
 from tofuse.engine.tracking.sequential import SEED_STAGE
@@ -211,7 +211,9 @@ class _Registered:
     @property
     def needs_no_search(self) -> bool:
         """Whether a pose is accepted and certain or degenerate, so that no search is needed."""
-        certain = self.probability >= CERTAIN or len(self.registration.unobservable) > 0
+        certain = (
+            self.probability >= pose_probability.CERTAIN or len(self.registration.unobservable) > 0
+        )
         return self.accepted and certain
 
     def agrees(self, other: _Registered, points: Float32) -> bool:

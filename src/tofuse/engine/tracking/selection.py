@@ -8,18 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from tofuse.engine.alignment import UNITS
+from tofuse.engine.alignment import projective
 from tofuse.engine.geometry import se3
-from tofuse.engine.search import (
-    DISTINCT_M,
-    DISTINCT_RAD,
-    MIN_LEAD,
-    AgreementOptions,
-    FitKind,
-    agreement,
-    fine_tolerances,
-    usual_tolerances,
-)
+from tofuse.engine.search import DISTINCT_M, DISTINCT_RAD, pair_agreement, verification
 from tofuse.engine.tracking.hypotheses import Hypotheses, Hypothesis
 from tofuse.engine.tracking.motion import is_small
 
@@ -34,7 +25,7 @@ _MAX_DISPLACED = 5
 
 _Case = Literal["accept", "verify", "rival", "reject"]
 # By the fit, and whether the motion is predicted; see `Selection`.
-_CASES: dict[tuple[FitKind, bool], _Case] = {
+_CASES: dict[tuple[verification.FitKind, bool], _Case] = {
     ("usual", True): "accept",
     ("usual", False): "verify",
     ("noisy", True): "accept",
@@ -123,7 +114,7 @@ class Selection:
         """Whether a pose explains the references about as well as the best rival, if any."""
         if np.isinf(rival_score):
             return True
-        return self._explanation_score(hypothesis) >= rival_score - MIN_LEAD
+        return self._explanation_score(hypothesis) >= rival_score - pair_agreement.MIN_LEAD
 
     def _better_constrained(self, hypothesis: Hypothesis) -> Hypothesis:
         """Return the alignment with the best score among those that are better constrained.
@@ -136,7 +127,7 @@ class Selection:
         degenerate = len(hypothesis.aligned.unobservable)
         searched = self._by_search() if degenerate > self._state.degenerate else None
         rivals = [(searched, 0.0)] if searched is not None else []
-        rivals += [(rival, MIN_LEAD) for rival in self._displaced(hypothesis)]
+        rivals += [(rival, pair_agreement.MIN_LEAD) for rival in self._displaced(hypothesis)]
         for rival, min_lead in rivals:
             if len(rival.aligned.unobservable) < degenerate:
                 score = self._explanation_score(rival)
@@ -147,7 +138,7 @@ class Selection:
     def _displaced(self, hypothesis: Hypothesis) -> Iterator[Hypothesis]:
         """Align from starts along the degenerate directions, within the gate."""
         T, view, r = hypothesis.T_component_camera, hypothesis.view, hypothesis.reference
-        for direction in hypothesis.aligned.unobservable * UNITS:
+        for direction in hypothesis.aligned.unobservable * projective.UNITS:
             lengths = np.linalg.norm(direction.reshape(2, 3), axis=1)
             step = direction / np.max(lengths / (DISTINCT_M, DISTINCT_RAD))
             for sign in (-1, 1):
@@ -180,7 +171,10 @@ class Selection:
             return False
         if len(aligned.unobservable) >= _PLANE_DEGENERACY and hypothesis.fit.kind == "conflicting":
             return False  # mostly predicted, and the prediction explains the view badly
-        return self._agreement(hypothesis, fine_tolerances(self._state.fit_statistics)) > 0
+        return (
+            self._agreement(hypothesis, verification.fine_tolerances(self._state.fit_statistics))
+            > 0
+        )
 
     def _by_search(self) -> Hypothesis | None:
         """Return a quick, unpredicted motion of which a search is certain."""
@@ -202,24 +196,33 @@ class Selection:
         A doubtful reference counts only if there is no other: its own pose may follow a moving
         object.
         """
-        T, options = hypothesis.T_component_camera, fine_tolerances(self._state.fit_statistics)
+        T, options = (
+            hypothesis.T_component_camera,
+            verification.fine_tolerances(self._state.fit_statistics),
+        )
         references = [
             hypothesis.reference if r.keyframe is hypothesis.keyframe else r
             for r in self._hypotheses.references
         ]
         reliable = [r for r in references if not r.keyframe.doubtful] or references
         scores = [
-            agreement(hypothesis.view, r.target.view, r.target.T_target_world @ T, options).score
+            pair_agreement.agreement(
+                hypothesis.view, r.target.view, r.target.T_target_world @ T, options
+            ).score
             for r in reliable
         ]
         deviation = self._motion.normalised_deviation(T, self._now)
         return float(np.mean(scores) - _MOTION_WEIGHT * np.log1p(deviation * deviation))
 
-    def _agreement(self, hypothesis: Hypothesis, options: AgreementOptions | None = None) -> float:
+    def _agreement(
+        self, hypothesis: Hypothesis, options: pair_agreement.AgreementOptions | None = None
+    ) -> float:
         """Return support minus contradiction of an alignment, over both images."""
         target = hypothesis.reference.target.view
-        options = options or usual_tolerances(self._state.fit_statistics)
-        return agreement(hypothesis.view, target, hypothesis.T_keyframe_camera, options).score
+        options = options or verification.usual_tolerances(self._state.fit_statistics)
+        return pair_agreement.agreement(
+            hypothesis.view, target, hypothesis.T_keyframe_camera, options
+        ).score
 
     def _violates_gate(self, hypothesis: Hypothesis) -> bool:
         """Whether a pose is outside of the gate; that of an inherited velocity rejects nothing."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from tofuse.engine.search import FitStatistics
+from tofuse.engine.search import verification
 from tofuse.engine.tracking.keyframe_map import Keyframe, KeyframeMap, Relocalizer
 from tofuse.engine.tracking.motion import MotionModel
 from tofuse.engine.tracking.moving_objects import MovingObjects
@@ -42,7 +42,7 @@ class TrackerState:
 
     keyframes: KeyframeMap
     relocalizer: Relocalizer
-    fit_statistics: FitStatistics
+    fit_statistics: verification.FitStatistics
     motion: MotionModel = field(default_factory=MotionModel)
     objects: MovingObjects = field(default_factory=MovingObjects)
     last: Keyframe | None = None

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras import MIN_DEPTH, nearest_pixel, project_rays
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
 
@@ -209,7 +209,7 @@ def transform_block(block: Float32, T: Float64) -> None:
         py = block[(POINT + 1) * LANES + k]
         pz = block[(POINT + 2) * LANES + k]
         z = r20 * px + r21 * py + r22 * pz + t2
-        inv_z = 1 / z if z > MIN_DEPTH else 0.0
+        inv_z = 1 / z if z > projection_kernels.MIN_DEPTH else 0.0
         block[XN * LANES + k] = (r00 * px + r01 * py + r02 * pz + t0) * inv_z
         block[YN * LANES + k] = (r10 * px + r11 * py + r12 * pz + t1) * inv_z
         block[Z * LANES + k] = z
@@ -223,12 +223,12 @@ def project_block(
     rows, columns = target.shape[0], target.shape[1]
     u, v = np.empty(LANES), np.empty(LANES)
     xn, yn = block[XN * LANES : (XN + 1) * LANES], block[YN * LANES : (YN + 1) * LANES]
-    project_rays(xn, yn, lookup, lookup_frame, u, v)
+    projection_kernels.project_rays(xn, yn, lookup, lookup_frame, u, v)
     projected = 0
     for k in range(LANES):
         block[HAS_PLANE * LANES + k] = 0
     for k in range(count):
-        if not block[Z * LANES + k] > MIN_DEPTH:
+        if not block[Z * LANES + k] > projection_kernels.MIN_DEPTH:
             continue
         if not (u[k] > -0.5 and v[k] > -0.5 and u[k] < columns - 0.5 and v[k] < rows - 0.5):
             continue
@@ -514,11 +514,13 @@ def exposure_differences(points: Float32, stride: int, target: TargetImage, T: F
     for k in range(0, points.shape[0], stride):
         px, py, pz = points[k, POINT], points[k, POINT + 1], points[k, POINT + 2]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        if z <= MIN_DEPTH:
+        if z <= projection_kernels.MIN_DEPTH:
             continue
         x = (T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) / z
         y = (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) / z
-        i, j = nearest_pixel(x, y, lookup, lookup_frame, image.shape[0], image.shape[1])
+        i, j = projection_kernels.nearest_pixel(
+            x, y, lookup, lookup_frame, image.shape[0], image.shape[1]
+        )
         if i < 0:
             continue
         pixel = image[i, j]

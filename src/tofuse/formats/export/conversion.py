@@ -15,7 +15,7 @@ import numpy as np
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames import MAX_COUNTS, CloudFrame, Frame, RangeFrame, Recording
+from tofuse.engine.frames import CloudFrame, Frame, RangeFrame, Recording, depth_counts
 from tofuse.engine.sensor import DepthCorrection
 from tofuse.formats.files import make_folder, new_folder, write_text
 from tofuse.formats.images import write_png
@@ -144,11 +144,11 @@ def _writer(
     sigmas = [float(f.sigma_image.max()) for f in images if f.sigma_image is not None]
     sigma_unit = metadata.get("sigma_unit_m")
     if sigma_unit is None and sigmas:
-        sigma_unit = max(MIN_SIGMA_UNIT_M, _round_up(max(sigmas) / MAX_COUNTS))
+        sigma_unit = max(MIN_SIGMA_UNIT_M, _round_up(max(sigmas) / depth_counts.MAX_COUNTS))
     unit = metadata.get("depth_unit_m")
     if unit is None:
         farthest = max(float(f.depth.max()) for f in images)
-        unit = max(FINEST_UNIT_M, _round_up(1.25 * farthest / MAX_COUNTS))
+        unit = max(FINEST_UNIT_M, _round_up(1.25 * farthest / depth_counts.MAX_COUNTS))
     if any(f.amplitude_image is not None for f in images):
         properties["amplitude_kind"] = first.amplitude_kind
     return RecordingWriter(
@@ -294,8 +294,8 @@ def _write_layout(recording: Recording, folder: Path, layout: Layout) -> tuple[i
                 white = float(np.percentile(positive, _WHITE_PERCENTILE))
         frame = rectifier(item)
         counts = np.rint(frame.z.astype(float) * COUNTS_PER_M[layout])
-        out_of_range += int((counts >= MAX_COUNTS).sum())
-        counts[counts >= MAX_COUNTS] = 0
+        out_of_range += int((counts >= depth_counts.MAX_COUNTS).sum())
+        counts[counts >= depth_counts.MAX_COUNTS] = 0
         name = f"{_name(len(written), item.timestamp - float(recording.timestamps[0]))}.png"
         write_png(make_folder(folder / "depth") / name, counts.astype(np.uint16))
         write_png(make_folder(folder / color_folder) / name, _color(frame, white))
@@ -303,7 +303,7 @@ def _write_layout(recording: Recording, folder: Path, layout: Layout) -> tuple[i
     if rectifier is None:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
     if out_of_range:
-        farthest = MAX_COUNTS / COUNTS_PER_M[layout]
+        farthest = depth_counts.MAX_COUNTS / COUNTS_PER_M[layout]
         warnings.append(f"{out_of_range} pixels beyond {farthest:.1f} m don't fit, and are dropped")
     finish = _finish_tum if layout == "tum" else _finish_open3d
     finish(recording, folder, rectifier.pinhole, written)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import check_pose, length, to_pose
+from tofuse.engine.geometry import quaternion, se3
 from tofuse.formats.files import exact, read_text
 
 FIELD = "T_target_source"
@@ -40,7 +40,7 @@ def read_pose(path: str | Path) -> Float64:
     else:
         matrix, where = _from_numbers(text, path), str(path)
     try:
-        return check_pose(matrix, where=where)
+        return se3.check_pose(matrix, where=where)
     except InputError as error:
         raise InputError(error.problem, where=where, remedy=_REMEDY) from error
 
@@ -89,7 +89,7 @@ def _from_numbers(text: str, path: str | Path) -> Float64:
     if len(numbers) not in (7, 8):
         raise InputError(f"contains {len(numbers)} numbers", where=path, remedy=_REMEDY)
     row = np.array(numbers[-7:])
-    norm = float(length(row[3:]))
+    norm = float(quaternion.length(row[3:]))
     if abs(norm - 1) > 0.1:
         raise InputError(f"its quaternion has length {norm:.3g}, not 1", where=path, remedy=_REMEDY)
-    return to_pose(row[3:], row[:3])
+    return quaternion.to_pose(row[3:], row[:3])

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import MAX_COORDINATE_M, from_matrix, length, to_pose
+from tofuse.engine.geometry import quaternion, se3
 from tofuse.formats.files import exact, read_text, write_text
 
 ASSOCIATION_LIMIT_S = 0.02
@@ -85,13 +85,13 @@ def poses_of_rows(q_xyzw: Float64, t: Float64, path: str | Path, numbers: Sequen
             "write NaN for the whole pose, or remove it",
         ),
         (
-            ~unknown & (np.abs(length(q_xyzw) - 1) > 0.1),
+            ~unknown & (np.abs(quaternion.length(q_xyzw) - 1) > 0.1),
             "contains a quaternion that is not of unit length",
             "normalise it",
         ),
         (
-            ~unknown & (np.abs(t) > MAX_COORDINATE_M).any(1),
-            f"contains a coordinate beyond {MAX_COORDINATE_M:.0e} m",
+            ~unknown & (np.abs(t) > se3.MAX_COORDINATE_M).any(1),
+            f"contains a coordinate beyond {se3.MAX_COORDINATE_M:.0e} m",
             "use metres, or remove the pose",
         ),
     ):
@@ -99,7 +99,7 @@ def poses_of_rows(q_xyzw: Float64, t: Float64, path: str | Path, numbers: Sequen
             line = numbers[int(np.argmax(bad))]
             raise InputError(problem, where=f"{path}, line {line}", remedy=remedy)
     poses = np.full((len(t), 4, 4), np.nan)
-    poses[~unknown] = to_pose(q_xyzw[~unknown], t[~unknown])
+    poses[~unknown] = quaternion.to_pose(q_xyzw[~unknown], t[~unknown])
     return poses
 
 
@@ -125,7 +125,7 @@ def tum_text(timestamps: ArrayLike, poses: ArrayLike) -> str:
     times, T = times[finite], T[finite]
     if not len(times):
         return ""
-    table = np.column_stack([times, T[:, :3, 3], from_matrix(T[:, :3, :3])])
+    table = np.column_stack([times, T[:, :3, 3], quaternion.from_matrix(T[:, :3, :3])])
     return "".join(" ".join(exact(v) for v in row) + "\n" for row in table)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float32, Float64, UInt16
 from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import RangeFrame, depth_from_counts, evenly_spaced
+from tofuse.engine.frames import RangeFrame, depth_counts, evenly_spaced
 from tofuse.engine.parts import part
 from tofuse.formats.files import input_error, is_file
 from tofuse.formats.recordings import FileSource, Reader, ReaderOptions, Sniff, files_at, read_part
@@ -155,7 +155,7 @@ class AdiTofSource(FileSource):
         """See `FileSource.load`."""
         images = self._images(index)
         amplitude = None if images.brightness is None else images.brightness.astype(np.float32)
-        depth = depth_from_counts(images.depth, self.unit)
+        depth = depth_counts.depth_from_counts(images.depth, self.unit)
         return self.image(index, depth, amplitude_image=amplitude)
 
     def _images(self, index: int) -> _Images:

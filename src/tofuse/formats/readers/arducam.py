@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float32, UInt8
-from tofuse.engine.frames import RangeFrame, depth_from_numbers
+from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.files import files_named, is_file
 from tofuse.formats.images import read_raw
@@ -76,7 +76,7 @@ class ArducamSource(FileSource):
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
-        depth = depth_from_numbers(self._floats(self.depth[index]), self.unit)
+        depth = depth_counts.depth_from_numbers(self._floats(self.depth[index]), self.unit)
         confidence = self._confidence(self.confidence[index])
         return self.image(index, depth, confidence_image=confidence)
 

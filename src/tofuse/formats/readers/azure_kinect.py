@@ -17,7 +17,7 @@ from tofuse.engine.arrays import Float64, UInt8, UInt16
 from tofuse.engine.cameras import Camera, Rational, RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
-from tofuse.engine.geometry import check_pose, orthonormalise
+from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.images import MAGIC, Block, Matroska, Track, as_color, parse_image
 from tofuse.formats.poses import associate
@@ -337,7 +337,7 @@ def _lens(
     )
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
-    return lens, orthonormalise(check_pose(T, where=f"{where}: Rt"))
+    return lens, se3.orthonormalise(se3.check_pose(T, where=f"{where}: Rt"))
 
 
 def _get(data: Any, *keys: str) -> Any:

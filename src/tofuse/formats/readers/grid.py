@@ -14,7 +14,7 @@ from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.engine.geometry import MAX_COORDINATE_M
+from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import is_file, is_folder, parse_numbers, read_text
 from tofuse.formats.geometry import read_pcd, read_ply
@@ -117,7 +117,7 @@ class Cells:
 def read_cells(path: Path) -> Cells:
     """Read a file, with NaN for invalid points; raise InputError if it can't be read."""
     cells = _read(path)
-    plausible = np.asarray((np.abs(cells.points) < MAX_COORDINATE_M).all(1))
+    plausible = np.asarray((np.abs(cells.points) < se3.MAX_COORDINATE_M).all(1))
     return replace(cells, points=np.where(plausible[:, None], cells.points, np.float32(np.nan)))
 
 

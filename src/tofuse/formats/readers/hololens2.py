@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import POSES_BY, RangeFrame, depth_from_counts
+from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import input_error, is_file, is_folder, list_folder, read_numbers
@@ -149,7 +149,9 @@ class HoloLens2Source(FileSource):
                     remedy=_REMEDY,
                 )
         amplitude = None if bright is None else bright.astype(np.float32)
-        return self.image(index, depth_from_counts(depth, self.unit), amplitude_image=amplitude)
+        return self.image(
+            index, depth_counts.depth_from_counts(depth, self.unit), amplitude_image=amplitude
+        )
 
     def _image(self, tick: int, *, bright: bool) -> NDArray[np.generic]:
         path, begin, size = self.images[tick, bright]

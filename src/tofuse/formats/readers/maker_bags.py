@@ -16,7 +16,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import check_pose, inverse, orthonormalise, to_pose
+from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.parts import part
 from tofuse.formats.recordings import (
     GREY,
@@ -179,7 +179,7 @@ class RealSenseSource(MakerBagSource):
         common = sorted(depth.keys() & color.keys())
         if not common:
             raise InputError("has no pose relative to depth", where=f"{self.path}: {stream}")
-        return ColorCamera(lens, color[common[0]] @ inverse(depth[common[0]]))
+        return ColorCamera(lens, color[common[0]] @ se3.inverse(depth[common[0]]))
 
     def _extrinsics(self, stream: str) -> dict[str, Float64]:
         """Return transforms (4, 4) into a stream's frame, by the number of their reference.
@@ -200,10 +200,12 @@ class RealSenseSource(MakerBagSource):
                     T[:3, 3] = _numbers(text["translation"])
                 elif message is not None:
                     q, t = message.rotation, message.translation
-                    T = to_pose([q.x, q.y, q.z, q.w], [t.x, t.y, t.z])
+                    T = quaternion.to_pose([q.x, q.y, q.z, q.w], [t.x, t.y, t.z])
             except (AttributeError, KeyError, ValueError) as error:
                 raise InputError(f"can't be read ({error})", where=where) from error
-            out[connection.topic.rsplit("/", 1)[1]] = orthonormalise(check_pose(T, where=where))
+            out[connection.topic.rsplit("/", 1)[1]] = se3.orthonormalise(
+                se3.check_pose(T, where=where)
+            )
         return out
 
     def _lens(self, stream: str) -> Camera:
@@ -357,7 +359,7 @@ class OrbbecSource(MakerBagSource):
             raise InputError("has no pose relative to colour", where=where)
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R, self.profile.translation_m
-        return ColorCamera(lens, check_pose(orthonormalise(T), where=where))
+        return ColorCamera(lens, se3.check_pose(se3.orthonormalise(T), where=where))
 
     def _profile(self, topic: str) -> _Profile:
         where = f"{self.path}: {topic}"

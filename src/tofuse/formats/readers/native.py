@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import Camera, Pinhole, range_from_z, z_from_range
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Frame, depth_from_counts
+from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.engine.sensor import DISAGREEMENT, SPEED_OF_LIGHT, DepthCorrection, combined
 from tofuse.formats.files import (
@@ -117,7 +117,9 @@ class NativeSource(FileSource):
         if self.by_frequency:
             depth = self._unwrapped_depth(index, camera)
         else:
-            depth = depth_from_counts(self._read(self.files, index, "uint16"), self.unit)
+            depth = depth_counts.depth_from_counts(
+                self._read(self.files, index, "uint16"), self.unit
+            )
         if self.correction is not None:
             depth = corrected_depth(self.correction, camera, depth, self.kind)
         images: dict[str, Any] = {"camera": camera}
@@ -240,7 +242,7 @@ class NativeSource(FileSource):
         periods = [SPEED_OF_LIGHT / (2 * hertz) for hertz in self.by_frequency]
         ranges = []
         for files in self.by_frequency.values():
-            depth = depth_from_counts(self._read(files, index, "uint16"), self.unit)
+            depth = depth_counts.depth_from_counts(self._read(files, index, "uint16"), self.unit)
             ranges.append(depth if kind == "range" else range_from_z(camera, depth))
         radial, disagreement = combined(ranges, periods)
         consistent = np.where(disagreement < DISAGREEMENT * min(periods), radial, np.float32(0))

@@ -12,7 +12,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import RangeFrame, depth_from_counts, depth_from_numbers
+from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.files import is_file, name_order, read_head
 from tofuse.formats.images import read_color, read_image
@@ -128,8 +128,8 @@ class NerfstudioSource(FileSource):
 
     def _depth(self, path: Path) -> Float32:
         if path.suffix.lower() == ".npy":
-            return depth_from_numbers(_array(path), self.unit_m)
-        return depth_from_counts(read_image(path, dtype="uint16"), self.unit_m)
+            return depth_counts.depth_from_numbers(_array(path), self.unit_m)
+        return depth_counts.depth_from_counts(read_image(path, dtype="uint16"), self.unit_m)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, RayTable, pinhole_values
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import RangeFrame, depth_from_numbers
+from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.files import read_head, read_npz
 from tofuse.formats.recordings import (
@@ -110,7 +110,9 @@ class NpzSource(FileSource):
             f"{name}_image": finite_float32(stack[index]) if name in _FLOATS else stack[index]
             for name, stack in self.images.items()
         }
-        return self.image(index, depth_from_numbers(self.depth[index], self.unit), **images)
+        return self.image(
+            index, depth_counts.depth_from_numbers(self.depth[index], self.unit), **images
+        )
 
     def _read_camera(
         self, arrays: dict[str, NDArray[Any]], options: ReaderOptions

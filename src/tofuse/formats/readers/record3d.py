@@ -14,7 +14,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import POSES_BY, RangeFrame, depth_from_numbers
+from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
 from tofuse.formats.files import (
@@ -290,4 +290,4 @@ def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float3
             where=where,
             remedy="export the recording again",
         )
-    return depth_from_numbers(depth, 1.0)
+    return depth_counts.depth_from_numbers(depth, 1.0)

@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, UInt8
 from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Frame, depth_from_numbers
+from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.recordings import (
     COLORS,
@@ -127,7 +127,7 @@ class RosSource(BagSource):
         decode = decompressed if self.connection.msgtype == COMPRESSED else image
         counts = decode(self.depth.message(index), where)
         check_size(counts, self.camera, where)
-        return depth_from_numbers(counts, self._unit(counts.dtype.kind))
+        return depth_counts.depth_from_numbers(counts, self._unit(counts.dtype.kind))
 
     def read_color(self, track: Track, index: int, where: str) -> UInt8:
         """See `BagSource.read_color`."""

@@ -14,7 +14,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
-from tofuse.engine.geometry import to_pose
+from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
 from tofuse.formats.files import read_head, required_package
 from tofuse.formats.recordings import (
@@ -266,4 +266,4 @@ class E57Source(FileSource):
         if not header.has_pose():
             return np.eye(4)
         w, x, y, z = (float(value) for value in header.rotation)
-        return to_pose([x, y, z, w], header.translation)
+        return quaternion.to_pose([x, y, z, w], header.translation)

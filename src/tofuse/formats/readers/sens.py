@@ -13,8 +13,8 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, UInt8, UInt16
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import RangeFrame, depth_from_counts
-from tofuse.engine.geometry import inverse
+from tofuse.engine.frames import RangeFrame, depth_counts
+from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import input_error
 from tofuse.formats.images import as_color, parse_image
@@ -112,7 +112,7 @@ class SensSource(FileSource):
         data = read_part(self.path, entry.start, entry.color + entry.depth)
         packed_color, packed_depth = data[: entry.color], data[entry.color :]
         counts = self._depth(packed_depth, where)
-        frame = self.image(index, depth_from_counts(counts, self.unit))
+        frame = self.image(index, depth_counts.depth_from_counts(counts, self.unit))
         if not packed_color or self.color_camera is None:
             return frame
         where = f"{where}: colour"
@@ -159,7 +159,7 @@ class SensSource(FileSource):
             return np.eye(4)
         if not np.isfinite(poses).all():
             return np.eye(4)
-        return inverse(poses[0]) @ poses[1]
+        return se3.inverse(poses[0]) @ poses[1]
 
     def _locate_frames(self, file: BinaryIO, count: int) -> Iterator[tuple[_Entry, int, Float64]]:
         """Locate frames until the end of the file; a truncated one is skipped."""

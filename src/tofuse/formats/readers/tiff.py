@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import RangeFrame, depth_from_numbers
+from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.files import files_with, is_folder
 from tofuse.formats.images import read_tiff
@@ -90,7 +90,7 @@ class TiffSource(FileSource):
         amplitude = None
         if self.amplitude:
             amplitude = finite_float32(read_tiff(self.amplitude[index], size))
-        depth = depth_from_numbers(read_tiff(self.depth[index], size), self.unit)
+        depth = depth_counts.depth_from_numbers(read_tiff(self.depth[index], size), self.unit)
         return self.image(index, depth, amplitude_image=amplitude)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Frame, depth_from_counts
+from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.formats.files import (
     files_with,
@@ -223,7 +223,7 @@ class BagSource(FileSource):
         """Return the depth (H, W) of a frame in m."""
         counts = image(self.message(self.depth, index), where, ENCODINGS)
         check_size(counts, self.camera, where)
-        return depth_from_counts(counts.astype(np.uint16), self.unit)
+        return depth_counts.depth_from_counts(counts.astype(np.uint16), self.unit)
 
     def read_color(self, track: Track, index: int, where: str) -> UInt8:
         """Return an image (H, W, 3) of a track."""

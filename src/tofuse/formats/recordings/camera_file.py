@@ -16,7 +16,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable, lens_values
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import AmplitudeKind, DepthKind
-from tofuse.engine.geometry import check_pose
+from tofuse.engine.geometry import se3
 from tofuse.formats.files import input_error, is_file, read_text
 
 # Limits for any camera: a frame per month to a million per second; ambiguity ranges of modulation
@@ -561,4 +561,4 @@ def _color(get: _Fields) -> ColorCamera | None:
         matrix = np.array(data.get("T_color_depth"), float)
     except (TypeError, ValueError, OverflowError) as error:
         raise get.error(field, "is not a 4x4 matrix", "use four rows of four numbers") from error
-    return ColorCamera(camera, check_pose(matrix, where=f"{get.where}: {field}"))
+    return ColorCamera(camera, se3.check_pose(matrix, where=f"{get.where}: {field}"))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame
-from tofuse.engine.geometry import length, to_pose
+from tofuse.engine.geometry import quaternion
 from tofuse.formats.files import is_file, is_folder, read_numbers
 from tofuse.formats.recordings.organised import SAMPLES, Deprojection, find_deprojection
 from tofuse.formats.recordings.reader import CERTAIN, Sniff, files_at
@@ -124,7 +124,7 @@ class CloudFileSource(FileSource):
                 f"{path}: not 'index x y z qw qx qy qz', ignored; use groundtruth.txt (TUM)"
             )
             return None
-        norms = length(table[:, 4:])
+        norms = quaternion.length(table[:, 4:])
         if (np.abs(norms - 1) > 0.1).any():
             raise InputError(
                 "contains quaternions that are not of unit length",
@@ -137,7 +137,7 @@ class CloudFileSource(FileSource):
             digits = re.findall(r"[0-9]+", file.stem)
             row = by_number.get(int(digits[-1])) if digits else None
             if row is not None:
-                out[k] = to_pose(row[[5, 6, 7, 4]], row[1:4])
+                out[k] = quaternion.to_pose(row[[5, 6, 7, 4]], row[1:4])
         self.warnings.append(f"{path}: read as index x y z qw qx qy qz, used only as reference")
         return out
 

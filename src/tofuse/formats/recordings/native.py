@@ -15,13 +15,12 @@ from tofuse.engine.arrays import Float32, UInt16
 from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames import (
-    INVALID_DEPTH,
-    MAX_COUNTS,
     SATURATED_AMPLITUDE,
     CloudFrame,
     DepthKind,
     Frame,
     RangeFrame,
+    depth_counts,
 )
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.sensor import DepthCorrection
@@ -185,7 +184,8 @@ class RecordingWriter:
         if self.sigma_unit_m is not None and frame.sigma_image is not None:
             counts = np.rint(frame.sigma_image.astype(float) / self.sigma_unit_m)
             write_png(
-                self._frame_path("sigma", ".png"), np.clip(counts, 0, MAX_COUNTS).astype(np.uint16)
+                self._frame_path("sigma", ".png"),
+                np.clip(counts, 0, depth_counts.MAX_COUNTS).astype(np.uint16),
             )
         if self.camera_per_frame:
             self._write_camera(frame.camera, camera)
@@ -215,7 +215,7 @@ class RecordingWriter:
 
     def _counts(self, depth: Float32) -> UInt16:
         counts = np.rint(depth.astype(float) / self.depth_unit_m)
-        overflow = counts >= INVALID_DEPTH
+        overflow = counts >= depth_counts.INVALID_DEPTH
         self.out_of_range += int(overflow.sum())
         return np.where(overflow, 0, counts).astype(np.uint16)
 

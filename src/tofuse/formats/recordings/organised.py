@@ -22,7 +22,7 @@ from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
 from tofuse.engine.cameras import Camera, RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, RangeFrame
-from tofuse.engine.geometry import MAX_COORDINATE_M, KdTree
+from tofuse.engine.geometry import KdTree, se3
 
 SAMPLES = 8
 # Largest distance of a point from its pixel's ray: errors of rounding to 0.1 mm and float32.
@@ -239,7 +239,7 @@ def _fits(points: Float32, mask: Bool, rays: Float32) -> bool:
 
 def _measured(points: Float32) -> Bool:
     """Mask of valid points; some programs write the origin instead of NaN for missing ones."""
-    return np.asarray((np.abs(points) < MAX_COORDINATE_M).all(-1) & (points[..., 2] > 0))
+    return np.asarray((np.abs(points) < se3.MAX_COORDINATE_M).all(-1) & (points[..., 2] > 0))
 
 
 # Largest number of points to fit, and limits of the columns and rows of an image.

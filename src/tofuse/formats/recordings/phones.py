@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Pinhole, scaled
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import POSES_BY, RangeFrame, depth_from_counts
+from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.formats.images import read_color, read_image
 from tofuse.formats.recordings.camera_file import checked_pinhole
 from tofuse.formats.recordings.sources import FileSource, read_matrix_pose
@@ -98,7 +98,9 @@ class PhoneSource(FileSource):
 
     def read_depth(self, index: int, size: tuple[int, int]) -> Float32:
         """Return the depth (H, W) of a frame in m."""
-        return depth_from_counts(read_image(self.files[index], size=size, dtype="uint16"), 0.001)
+        return depth_counts.depth_from_counts(
+            read_image(self.files[index], size=size, dtype="uint16"), 0.001
+        )
 
     def read_confidence(self, path: Path, size: tuple[int, int]) -> UInt8:
         """Return the confidence (H, W) of an image file, 0 to `CONFIDENCE_MAX`."""

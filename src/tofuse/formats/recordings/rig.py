@@ -14,7 +14,7 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, RangeFrame, Recording
-from tofuse.engine.geometry import check_pose
+from tofuse.engine.geometry import se3
 from tofuse.formats.files import if_file, write_text
 from tofuse.formats.recordings.camera_file import number_in, numbers_in, read_json
 
@@ -187,7 +187,7 @@ def _camera(row: object, k: int, path: str | Path) -> RigCamera:
     if not isinstance(recording, str):
         raise InputError(f"{location}.recording is not a path", where=path, remedy=_REMEDY)
     where = f"{path}: {location}"
-    T = check_pose(numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY), where=str(path))
+    T = se3.check_pose(numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY), where=str(path))
     C = _covariance(row, "covariance", where) if "covariance" in row else np.zeros((6, 6))
     random = None
     if row.get("random_covariance") is not None:

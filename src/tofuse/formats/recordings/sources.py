@@ -22,9 +22,9 @@ from tofuse.engine.frames import (
     Frame,
     RangeFrame,
     Source,
-    depth_from_counts,
+    depth_counts,
 )
-from tofuse.engine.geometry import MAX_COORDINATE_M, check_pose, orthonormalise
+from tofuse.engine.geometry import se3
 from tofuse.formats.files import input_error, is_file, read_numbers
 from tofuse.formats.geometry import read_ply
 from tofuse.formats.images import check_first_size, read_color, read_image
@@ -182,7 +182,7 @@ def read_matrix_pose(table: Float64, where: str) -> Float64:
         )
     if not np.isfinite(table).all():
         return np.full((4, 4), np.nan)
-    return orthonormalise(check_pose(table, where=where))
+    return se3.orthonormalise(se3.check_pose(table, where=where))
 
 
 def _read_timestamps(path: Path, count: int, warnings: list[str]) -> Float64:
@@ -300,11 +300,11 @@ def cloud_frame(
     `shift` (3,) is subtracted from the points, in their own precision, and from the `origin` (3,).
     """
     # False for NaN; the squares of the remaining coordinates fit into float32.
-    measured = np.asarray((np.abs(points) < MAX_COORDINATE_M).all(1))
+    measured = np.asarray((np.abs(points) < se3.MAX_COORDINATE_M).all(1))
     if shift is not None:
         with np.errstate(over="ignore", invalid="ignore"):
             points = points - shift
-        measured &= (np.abs(points) < MAX_COORDINATE_M).all(1)
+        measured &= (np.abs(points) < se3.MAX_COORDINATE_M).all(1)
         origin = None if origin is None else origin - shift
     if not measured.all():
         points = np.where(measured[:, None], points, 0)
@@ -539,5 +539,5 @@ class DepthImageSource(FileSource):
                     where=path,
                     remedy="register colour to depth, or leave it out",
                 )
-        depth = depth_from_counts(counts, self.unit)
+        depth = depth_counts.depth_from_counts(counts, self.unit)
         return self.image(index, depth, color_image=color, color_registered=self.color_registered)

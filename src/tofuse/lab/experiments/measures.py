@@ -13,7 +13,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality import evaluate_trajectory
+from tofuse.engine.quality import trajectory_errors
 
 _MAX_FIT_POINTS = 20_000  # max points of a wall fit
 
@@ -52,7 +52,7 @@ class PathScore:
 def score_path(poses: Float64, truth: Float64) -> PathScore:
     """Compare poses (N, 4, 4), NaN where lost, with true ones; both begin with the identity."""
     times = np.arange(len(poses), dtype=float)
-    error = evaluate_trajectory(times, poses, times, truth)
+    error = trajectory_errors.evaluate_trajectory(times, poses, times, truth)
     last = int(np.flatnonzero(np.isfinite(poses[:, 0, 0]))[-1])
     end = se3.inverse(truth[last]) @ poses[last]
     step_m, step_deg = np.full((2, len(poses)), np.nan)

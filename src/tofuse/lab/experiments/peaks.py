@@ -11,9 +11,9 @@ from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.clouds import CoarseToFine, algorithm_1
 from tofuse.engine.frames import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Castellani, Measured, Optimiser, PoseGraph, build_graph
+from tofuse.engine.graph import Castellani, Optimiser, PoseGraph, measured_graph
 from tofuse.engine.mapping import default, reconstruct
-from tofuse.engine.refinement import Planes
+from tofuse.engine.refinement import plane_refinement
 from tofuse.engine.stored_views import Spacing, ViewStore
 from tofuse.engine.tracking import Sequential
 from tofuse.lab.experiments.bound import (
@@ -88,7 +88,7 @@ class PeaksRun:
     truth: Float64
 
 
-def chain(relative: Float64, loops: Sequence[Measured] = ()) -> PoseGraph:
+def chain(relative: Float64, loops: Sequence[measured_graph.Measured] = ()) -> PoseGraph:
     """Build the graph of a sequence of consecutive motions, and loops.
 
     The poses are the products of the motions (eqs 2.9-3.2); ids count from 0, and the information
@@ -105,8 +105,8 @@ def chain(relative: Float64, loops: Sequence[Measured] = ()) -> PoseGraph:
     for T in relative:
         # Rounding errors would accumulate over thousands of products.
         poses.append(se3.orthonormalise(poses[-1] @ T))
-    sequence = [Measured(k, k + 1, T, np.eye(6)) for k, T in enumerate(relative)]
-    return build_graph(range(len(poses)), np.array(poses), sequence, loops)
+    sequence = [measured_graph.Measured(k, k + 1, T, np.eye(6)) for k, T in enumerate(relative)]
+    return measured_graph.build_graph(range(len(poses)), np.array(poses), sequence, loops)
 
 
 def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> PeaksRun:
@@ -122,7 +122,7 @@ def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> Pe
     steps = [tracker.push(view) for view in views]
     relative = np.array([s.registration.T_target_source for s in steps[1:] if s.registration])
     last = len(views) - 1
-    graph = chain(relative, [Measured(0, last, truth[last], np.eye(6))])
+    graph = chain(relative, [measured_graph.Measured(0, last, truth[last], np.eye(6))])
     optimisation = (optimiser or Castellani()).optimise(graph)
     return PeaksRun(
         sigma,
@@ -143,7 +143,7 @@ def refine_peaks(sigma: float, seed: int) -> tuple[PoseErrors, PoseErrors]:
     """
     views, truth = peaks_views(sigma, seed)
     tracker = Sequential(registration=CoarseToFine(), guess="previous").start(seed)
-    refiner = Planes().start(ViewStore(Spacing()))
+    refiner = plane_refinement.Planes().start(ViewStore(Spacing()))
     poses: list[Float64] = []
     for view in views:
         step = tracker.push(view)

@@ -13,7 +13,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.engine.graph import Descent, PairSystem, PoseGraph, Problem, first_of_parts
+from tofuse.engine.graph import PoseGraph, minimisation, sparse
 
 
 class Chart(Protocol):
@@ -96,18 +96,18 @@ def _retracted(poses: Float64, slide: Float64, R: Float64) -> Float64:
     return out
 
 
-class ChartProblem(Problem):
+class ChartProblem(minimisation.Problem):
     """The least squares problem of a pose graph, in the parameters of a chart.
 
     The first vertex of each connected part is fixed.
     """
 
     def __init__(self, graph: PoseGraph, chart: Chart) -> None:
-        fixed = first_of_parts(len(graph.ids), graph.edges)
+        fixed = sparse.first_of_parts(len(graph.ids), graph.edges)
         super().__init__(graph.edges, graph.measurements, graph.information, fixed, graph.gravity)
         self.chart = chart
         fixed = self.system.fixed
-        self.system = PairSystem(len(fixed), self.all_pairs, fixed, size=chart.size)
+        self.system = sparse.PairSystem(len(fixed), self.all_pairs, fixed, size=chart.size)
 
     def assembled(
         self, poses: Float64, T_i_j: Float64, H: Float64, g: Float64
@@ -133,7 +133,9 @@ class ChartProblem(Problem):
         return self.chart.retract(poses, step)
 
 
-def descend(graph: PoseGraph, chart: Chart, tolerance: float, iterations: int = 100) -> Descent:
+def descend(
+    graph: PoseGraph, chart: Chart, tolerance: float, iterations: int = 100
+) -> minimisation.Descent:
     """Minimise the squared errors of all edges and of gravity in the parameters of a chart.
 
     Parameters
@@ -146,6 +148,6 @@ def descend(graph: PoseGraph, chart: Chart, tolerance: float, iterations: int = 
         Stopping rule, see `Descent.run`.
     """
     problem = ChartProblem(graph, chart)
-    descent = Descent(problem, problem.start(graph.poses))
+    descent = minimisation.Descent(problem, problem.start(graph.poses))
     descent.run(lambda x: x, np.ones_like, tolerance, iterations)
     return descent

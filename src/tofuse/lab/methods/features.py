@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import Pairs, consensus
+from tofuse.engine.clouds import robust_motion
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
-from tofuse.engine.search import agreement
+from tofuse.engine.search import pair_agreement
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 from tofuse.lab.methods.keypoints import Channel, Detector, Keypoints, keypoints
 from tofuse.lab.methods.sample_consensus import SampleOptions, registration_of
@@ -77,10 +77,12 @@ class Features(Bounded, Registrar):
         """
         (a, s), (b, t) = self._detect(source), self._detect(target)
         pairs = self.pairs(a, b)
-        hypotheses = consensus(pairs, self.consensus, self.consensus.motions(rng))
+        hypotheses = robust_motion.consensus(pairs, self.consensus, self.consensus.motions(rng))
         scores = [c.score / len(pairs) for c in hypotheses]
         if self.verify:
-            agreements = [agreement(s, t, c.T_target_source).score for c in hypotheses]
+            agreements = [
+                pair_agreement.agreement(s, t, c.T_target_source).score for c in hypotheses
+            ]
             if max(agreements) <= 0:
                 raise RegistrationError(
                     f"{hypotheses[0].count} of {len(pairs)} pairs of points agree on a motion that "
@@ -105,10 +107,12 @@ class Features(Bounded, Registrar):
         )
         return detected, surface
 
-    def pairs(self, source: Keypoints, target: Keypoints) -> Pairs:
+    def pairs(self, source: Keypoints, target: Keypoints) -> robust_motion.Pairs:
         """Match the points of two views."""
         i, j = self._match(source.descriptors, target.descriptors)
-        return Pairs(source.points[i], target.points[j], source.variance[i] + target.variance[j])
+        return robust_motion.Pairs(
+            source.points[i], target.points[j], source.variance[i] + target.variance[j]
+        )
 
     def _match(self, a: NDArray[Any], b: NDArray[Any]) -> tuple[Int64, Int64]:
         """Index pairs of matching descriptors, in the order of a."""

@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import FPFH_NEIGHBOURS, POINTS, REACH, CoarseToFine, candidates
+from tofuse.engine.clouds import CoarseToFine, fpfh
 from tofuse.engine.frames import Frame
 from tofuse.engine.parts import part
 from tofuse.lab.methods.sample_consensus import Method, SampleOptions, registration_of
@@ -46,9 +46,9 @@ class Fpfh(Bounded, Registrar):
         of the averaged views); else it is that of the matches.
     """
 
-    points: Annotated[int, Bounds(20, 20_000)] = POINTS
-    reach: Annotated[float, Bounds(1, 100)] = REACH
-    neighbours: Annotated[int, Bounds(4, 1000)] = FPFH_NEIGHBOURS
+    points: Annotated[int, Bounds(20, 20_000)] = fpfh.POINTS
+    reach: Annotated[float, Bounds(1, 100)] = fpfh.REACH
+    neighbours: Annotated[int, Bounds(4, 1000)] = fpfh.FPFH_NEIGHBOURS
     signed: bool = False
     method: Method = "compatible"
     inliers: int = 6
@@ -76,7 +76,7 @@ class Fpfh(Bounded, Registrar):
             If too few matches agree on a motion, or, once refined, too few points correspond.
         """
         options = self._consensus()
-        found = candidates(
+        found = fpfh.candidates(
             source,
             target,
             points=self.points,

@@ -9,16 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import (
-    Alignment,
-    Matches,
-    PointToPlane,
-    SurfaceMetric,
-    SurfacePairs,
-    plane_sums,
-    solve,
-    surface_pairs,
-)
+from tofuse.engine.clouds import Alignment, Matches, cloud_sum_kernels, point_pairs, surface_metrics
 from tofuse.engine.parts import part
 from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
 
@@ -28,7 +19,7 @@ _CUTOFF = 3.0
 
 @part("metric", "imls", label="validated")
 @dataclass(frozen=True)
-class Implicit(Bounded, SurfaceMetric):
+class Implicit(Bounded, surface_metrics.SurfaceMetric):
     """Distances to the IMLS surface of the target's points (eq 1 of the paper).
 
     ``I(x) = sum W_i(x) (x - p_i) . n_i / sum W_i(x)`` with ``W_i(x) = exp(-|x - p_i|^2 / h^2)`` is
@@ -46,13 +37,13 @@ class Implicit(Bounded, SurfaceMetric):
 
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.motion`."""
-        pairs = surface_pairs(matches, alignment)
+        pairs = point_pairs.surface_pairs(matches, alignment)
         usable = with_normals(matches, alignment)
         distance = self.distance(alignment.transformed[usable.source], alignment)
         n = pairs.target_normals
         weight = np.where(np.isfinite(distance), pairs.weight, 0.0)
-        H, g, _ = plane_sums(pairs.points, n, n, np.nan_to_num(distance), weight)
-        return pairs.motion(solve(H, g, pairs.size))
+        H, g, _ = cloud_sum_kernels.plane_sums(pairs.points, n, n, np.nan_to_num(distance), weight)
+        return pairs.motion(point_pairs.solve(H, g, pairs.size))
 
     def distance(self, x: Float64, alignment: Alignment) -> Float64:
         """I(x), (m,) in m, of points (m, 3) in the target's frame; NaN without neighbours."""
@@ -67,6 +58,6 @@ class Implicit(Bounded, SurfaceMetric):
         sums = (W * np.nan_to_num(height)).sum(1)
         return np.divide(sums, total, out=np.full(len(x), np.nan), where=total > 0)
 
-    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
+    def fit(self, pairs: point_pairs.SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: that of point-to-plane."""
-        return PointToPlane().fit(pairs)
+        return surface_metrics.PointToPlane().fit(pairs)

@@ -20,14 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import (
-    ROUNDING,
-    Optimisation,
-    Optimiser,
-    PairSystem,
-    PoseGraph,
-    check_graph,
-)
+from tofuse.engine.graph import ROUNDING, Optimisation, Optimiser, PoseGraph, levenberg, sparse
 from tofuse.engine.parts import part
 
 # Heading, pitch, roll of a camera (y down): singular only where it looks straight up or down.
@@ -57,8 +50,8 @@ class LuMilios(Optimiser):
 
     def optimise(self, graph: PoseGraph) -> Optimisation:
         """See `Optimiser.optimise`. Raises InputError for non-finite or non-positive input."""
-        check_graph(graph)
-        system = PairSystem(len(graph.ids), graph.edges)
+        levenberg.check_graph(graph)
+        system = sparse.PairSystem(len(graph.ids), graph.edges)
         best, history = graph, [graph.chi2()]
         converged = bool(system.fixed.all()) or history[0] <= ROUNDING * len(graph.edges)
         current = graph
@@ -82,7 +75,7 @@ class LuMilios(Optimiser):
         return Optimisation(best, tuple(history), converged)
 
 
-def solve_linear(graph: PoseGraph, system: PairSystem) -> Float64 | None:
+def solve_linear(graph: PoseGraph, system: sparse.PairSystem) -> Float64 | None:
     """(N, 6) motions X of the poses in the world's frame that solve G X = B; None if singular."""
     j = graph.edges[:, 1]
     e = graph.residuals()

@@ -15,16 +15,16 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import shape_at, transform_points
+from tofuse.engine.clouds import surface_shape, transform_points
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
-from tofuse.engine.graph import SensorPriors
+from tofuse.engine.graph import external_sensors
 from tofuse.engine.refinement import (
     Refinement,
     RefinementMethod,
     Refiner,
-    SampledPoints,
     accepted_with,
+    plane_refinement,
 )
 from tofuse.engine.stored_views import Spacing, ViewStore
 from tofuse.engine.views import PreparedView
@@ -62,7 +62,7 @@ class Cloud:
     def of(cls, view: CloudFrame) -> Cloud:
         """Prepare the points of a view."""
         points = view.points.astype(np.float64)
-        shape = shape_at(view, np.arange(len(points)))
+        shape = surface_shape.shape_at(view, np.arange(len(points)))
         return cls(view, points, shape.normals, shape.boundary, KdTree(points))
 
 
@@ -123,16 +123,21 @@ class _Relaxation(Refiner):
 
     def __init__(self, method: RelaxationMethod) -> None:
         self._method = method
-        self._store: ViewStore[SampledPoints] = ViewStore(
+        self._store: ViewStore[plane_refinement.SampledPoints] = ViewStore(
             Spacing(max_views=method.views, max_stretch=1e6)
         )
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`."""
-        self._store.push(SampledPoints.of(view, self._method.points), T_component_camera)
+        self._store.push(
+            plane_refinement.SampledPoints.of(view, self._method.points), T_component_camera
+        )
 
     def finish(
-        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+        self,
+        ids: Sequence[int],
+        poses: Float64,
+        measured: external_sensors.SensorPriors | None = None,
     ) -> Refinement:
         """See `Refiner.finish`; rejected if the support decreases."""
         row = {int(index): k for k, index in enumerate(ids)}

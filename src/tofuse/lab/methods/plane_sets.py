@@ -16,7 +16,7 @@ from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.engine.search import Plane, agreement, detect_planes
+from tofuse.engine.search import Plane, detect_planes, pair_agreement
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Min sine of the angle between two normals that determine a rotation, and min volume spanned by
@@ -77,7 +77,7 @@ class PlaneSets(Bounded, Registrar):
         poses = _distinct(self._poses(a, b, guess, depth), depth)[:_MAX_CANDIDATES]
         if not poses:
             raise RegistrationError("no plane of one view matches one of the other")
-        agreements = [agreement(s, t, T).score for _, _, T in poses]
+        agreements = [pair_agreement.agreement(s, t, T).score for _, _, T in poses]
         scores = [
             fraction + score for (fraction, _, _), score in zip(poses, agreements, strict=True)
         ]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds import All, Icp, MaxDistance, PointToPlane, SmallStep, transform_points
+from tofuse.engine.clouds import All, Icp, MaxDistance, SmallStep, surface_metrics, transform_points
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
@@ -57,7 +57,7 @@ class Pulli(RelaxationMethod):
             source=All(),
             target=All(),
             rejectors=(MaxDistance(self.reach), Boundary()),
-            metric=PointToPlane(),
+            metric=surface_metrics.PointToPlane(),
             stopping=SmallStep(),
         )
         constraints = []

@@ -15,8 +15,8 @@ from tofuse.engine.clouds import (
     Matches,
     Metric,
     PointToPoint,
-    TangentPlanes,
-    in_scales,
+    point_pairs,
+    surface_metrics,
     transform_points,
 )
 from tofuse.engine.parts import part
@@ -87,7 +87,7 @@ class Graduated(Bounded, Metric):
 
 @part("metric", "adaptive", label="validated")
 @dataclass(frozen=True)
-class Adaptive(TangentPlanes):
+class Adaptive(surface_metrics.TangentPlanes):
     """Point-to-plane with a loss whose shape is estimated from the residuals.
 
     The general loss of Barron (2019), ::
@@ -101,7 +101,7 @@ class Adaptive(TangentPlanes):
 
     def weights(self, residual: Float64, resolution: float) -> Float64:
         """See `TangentPlanes.weights`."""
-        x = in_scales(residual, resolution)
+        x = point_pairs.in_scales(residual, resolution)
         a = estimate_shape(x)
         return np.asarray((x * x / abs(a - 2) + 1) ** (a / 2 - 1)) if a < 2 else np.ones(len(x))
 

@@ -14,18 +14,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from tofuse.engine.alignment import UNITS, Registration
+from tofuse.engine.alignment import Registration, projective
 from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.clouds import (
-    MIN_PAIRS,
-    Consensus,
-    ConsensusOptions,
-    Motions,
-    Pairs,
-    motions_of,
-    squared_residuals,
-)
+from tofuse.engine.clouds import robust_motion
 from tofuse.engine.geometry import se3
 
 Method = Literal["samples", "compatible"]
@@ -39,7 +31,7 @@ _MIN_SIDE_SIGMAS = 4.0
 
 
 @dataclass(frozen=True)
-class SampleOptions(ConsensusOptions):
+class SampleOptions(robust_motion.ConsensusOptions):
     """Options of the consensus search, with a choice of the method.
 
     Attributes
@@ -56,14 +48,14 @@ class SampleOptions(ConsensusOptions):
     confidence: Annotated[float, Bounds(0, 1, exclusive=True)] = 0.999
     most_samples: Annotated[int, Bounds(1, 1_000_000)] = 5000
 
-    def motions(self, rng: np.random.Generator) -> Motions | None:
+    def motions(self, rng: np.random.Generator) -> robust_motion.Motions | None:
         """Return the function that proposes motions, see `consensus`; it draws from `rng`."""
         return (
             partial(_sampled_motions, options=self, rng=rng) if self.method == "samples" else None
         )
 
 
-def information_of(pairs: Pairs, T_target_source: Float64) -> Float64:
+def information_of(pairs: robust_motion.Pairs, T_target_source: Float64) -> Float64:
     """Return the information ``sum J^T J / v`` (6, 6), ``J = [I, -hat(p)]``: right perturbation.
 
     The variance v is that of the pairs, scaled up to that of the residuals if these are larger.
@@ -83,12 +75,14 @@ def information_of(pairs: Pairs, T_target_source: Float64) -> Float64:
 
 def weakly_constrained_directions(information: Float64) -> Float64:
     """Return the unit directions (k, 6) whose sigma exceeds 1 cm or 1 degree."""
-    values, vectors = np.linalg.eigh(information * UNITS[:, None] * UNITS)
-    weak = vectors[:, values < 1].T * UNITS
+    values, vectors = np.linalg.eigh(information * projective.UNITS[:, None] * projective.UNITS)
+    weak = vectors[:, values < 1].T * projective.UNITS
     return np.asarray(weak / np.linalg.norm(weak, axis=1, keepdims=True), np.float64)
 
 
-def registration_of(pairs: Pairs, estimate: Consensus, margin: float) -> Registration:
+def registration_of(
+    pairs: robust_motion.Pairs, estimate: robust_motion.Consensus, margin: float
+) -> Registration:
     """Return a consensus as a registration: points are pairs, correspondences are inliers."""
     inliers = pairs.select(estimate.inliers)
     T = estimate.T_target_source
@@ -109,33 +103,39 @@ def registration_of(pairs: Pairs, estimate: Consensus, margin: float) -> Registr
     )
 
 
-def _sampled_motions(pairs: Pairs, options: SampleOptions, rng: np.random.Generator) -> Float64:
+def _sampled_motions(
+    pairs: robust_motion.Pairs, options: SampleOptions, rng: np.random.Generator
+) -> Float64:
     """Return the motions (k, 4, 4) of random triples that are congruent in both views."""
     n = len(pairs)
     required, drawn, max_inliers = float(options.most_samples), 0, 0
     motions = []
     while drawn < min(required, options.most_samples):
         drawn += _BATCH
-        triples = rng.integers(0, n, (_BATCH, MIN_PAIRS))
+        triples = rng.integers(0, n, (_BATCH, robust_motion.MIN_PAIRS))
         a, b, c = triples.T
         triples = triples[(a != b) & (b != c) & (a != c)]
         triples = triples[_are_congruent(pairs, triples, options.sigmas)]
         if not len(triples):
             continue
         p, q = pairs.source[triples], pairs.target[triples]
-        hypotheses = motions_of(p, q, 1 / pairs.variance[triples])
+        hypotheses = robust_motion.motions_of(p, q, 1 / pairs.variance[triples])
         motions.append(hypotheses)
         max_inliers = max(
             max_inliers,
-            int((squared_residuals(pairs, hypotheses) < options.sigmas**2).sum(1).max()),
+            int(
+                (robust_motion.squared_residuals(pairs, hypotheses) < options.sigmas**2)
+                .sum(1)
+                .max()
+            ),
         )
-        all_inliers = (max_inliers / n) ** MIN_PAIRS
+        all_inliers = (max_inliers / n) ** robust_motion.MIN_PAIRS
         if all_inliers > 0:
             required = math.log(1 - options.confidence) / math.log(max(1 - all_inliers, 1e-12))
     return np.concatenate(motions) if motions else np.zeros((0, 4, 4))
 
 
-def _are_congruent(pairs: Pairs, triples: Int64, sigmas: float) -> Bool:
+def _are_congruent(pairs: robust_motion.Pairs, triples: Int64, sigmas: float) -> Bool:
     """Whether triangles (k, 3) have equal sides in both views and are not degenerate, (k,)."""
     congruent = np.ones(len(triples), bool)
     for a, b in ((0, 1), (1, 2), (2, 0)):

@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import NEIGHBOURS, Random, Selector, normals_at
+from tofuse.engine.clouds import Random, Selector, surface_shape
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
@@ -75,11 +75,11 @@ class NormalSpace(Bounded, Selector):
 
     points: Annotated[int, Bounds(1)] = 1000
     buckets: Annotated[int, Bounds(1)] = 8
-    neighbours: Annotated[int, Bounds(3)] = NEIGHBOURS
+    neighbours: Annotated[int, Bounds(3)] = surface_shape.NEIGHBOURS
 
     def select(self, view: Frame, rng: np.random.Generator) -> Int64:
         """See `Selector.select`."""
-        normals = normals_at(view, np.arange(len(view)), self.neighbours)
+        normals = surface_shape.normals_at(view, np.arange(len(view)), self.neighbours)
         valid = np.flatnonzero(np.isfinite(normals).all(1))
         if len(valid) <= self.points:
             return valid

@@ -8,23 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds import (
-    Alignment,
-    Matches,
-    PointToPlane,
-    SurfaceMetric,
-    SurfacePairs,
-    matrix_sums,
-    solve,
-    surface_pairs,
-)
+from tofuse.engine.clouds import Alignment, Matches, cloud_sum_kernels, point_pairs, surface_metrics
 from tofuse.engine.parts import part
 from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
 
 
 @part("metric", "squared-distance", label="validated")
 @dataclass(frozen=True)
-class SquaredDistance(SurfaceMetric):
+class SquaredDistance(surface_metrics.SurfaceMetric):
     """The squared distance to the target's surface, to second order in the motion.
 
     At distance d from a surface with radii of curvature rho_1 and rho_2, on its side, the squared
@@ -40,20 +31,20 @@ class SquaredDistance(SurfaceMetric):
 
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.motion`."""
-        pairs = surface_pairs(matches, alignment)
+        pairs = point_pairs.surface_pairs(matches, alignment)
         usable = with_normals(matches, alignment)
         W = approximant(usable, alignment)
         R = alignment.T_target_source[:3, :3]
-        H, g, _ = matrix_sums(
+        H, g, _ = cloud_sum_kernels.matrix_sums(
             pairs.points, pairs.residual, np.einsum("ji,njk,kl->nil", R, W, R), pairs.weight
         )
-        velocity = solve(H, g, pairs.size)
+        velocity = point_pairs.solve(H, g, pairs.size)
         speed = float(np.linalg.norm(velocity[3:]))
         return pairs.motion(velocity * (math.atan(speed) / speed) if speed > 0 else velocity)
 
-    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
+    def fit(self, pairs: point_pairs.SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: at convergence the sum is that of point-to-plane."""
-        return PointToPlane().fit(pairs)
+        return surface_metrics.PointToPlane().fit(pairs)
 
 
 def approximant(matches: Matches, alignment: Alignment) -> Float64:

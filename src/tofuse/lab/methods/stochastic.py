@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Optimisation, Optimiser, PoseGraph, check_graph, free_vertices
+from tofuse.engine.graph import Optimisation, Optimiser, PoseGraph, free_vertices, levenberg
 from tofuse.engine.parts import part
 
 
@@ -38,7 +38,7 @@ class Stochastic(Bounded, Optimiser):
 
     def optimise(self, graph: PoseGraph) -> Optimisation:
         """See `Optimiser.optimise`; the best poses of all rounds. InputError as `lu-milios`."""
-        check_graph(graph)
+        levenberg.check_graph(graph)
         best, history = graph, [graph.chi2()]
         if not len(graph.edges) or not free_vertices(graph).any():
             return Optimisation(graph, tuple(history), True)

@@ -8,18 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds import (
-    Alignment,
-    Loss,
-    Matches,
-    SurfaceMetric,
-    SurfacePairs,
-    loss_weights,
-    plane_sums,
-    solve,
-    surface_pairs,
-    variance_of,
-)
+from tofuse.engine.clouds import Alignment, Matches, cloud_sum_kernels, point_pairs, surface_metrics
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.lab.methods.symmetric_kernels import symmetric_sums
@@ -27,7 +16,7 @@ from tofuse.lab.methods.symmetric_kernels import symmetric_sums
 
 @part("metric", "symmetric", label="validated")
 @dataclass(frozen=True)
-class Symmetric(SurfaceMetric):
+class Symmetric(surface_metrics.SurfaceMetric):
     """Distances along the sum of both normals (Rusinkiewicz 2019).
 
     ``sum w_i ((R p_i - R^-1 q_i + t) . (n_pi + n_qi))^2``: each view gets half of the rotation. It
@@ -40,20 +29,20 @@ class Symmetric(SurfaceMetric):
         "square" as in the paper; "huber", "cauchy" or "tukey" downweight large residuals.
     """
 
-    loss: Loss = "square"
+    loss: point_pairs.Loss = "square"
 
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.motion`; no motion along unconstrained directions."""
-        pairs = surface_pairs(matches, alignment, source=True)
+        pairs = point_pairs.surface_pairs(matches, alignment, source=True)
         n = pairs.source_normals + pairs.target_normals
         r = (pairs.residual * n).sum(1)
-        weight = pairs.weight * loss_weights(self.loss, r, pairs.resolution)
+        weight = pairs.weight * point_pairs.loss_weights(self.loss, r, pairs.resolution)
         # p and q in the source's frame, centred between both.
         p = pairs.points
         q = p - pairs.residual
         centre = (p.mean(0) + q.mean(0)) / 2
         H, g = symmetric_sums(p - centre, q - centre, n, weight)
-        x = solve(H, g, 2 * pairs.size)
+        x = point_pairs.solve(H, g, 2 * pairs.size)
         tangent = float(np.linalg.norm(x[3:]))
         angle = math.atan(tangent)
         half = np.eye(4)
@@ -66,12 +55,12 @@ class Symmetric(SurfaceMetric):
         T = pairs.T_target_source
         return T @ T_centre @ half @ translation @ half @ T_uncentre @ se3.inverse(T)
 
-    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
+    def fit(self, pairs: point_pairs.SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: along the mean normal."""
         n = pairs.source_normals + pairs.target_normals
         n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
         r = (pairs.residual * n).sum(1)
-        weight = pairs.weight * loss_weights(self.loss, r, pairs.resolution)
-        H, _, square = plane_sums(pairs.points, n, n, r, weight)
-        variance = variance_of(square, weight, pairs.resolution)
+        weight = pairs.weight * point_pairs.loss_weights(self.loss, r, pairs.resolution)
+        H, _, square = cloud_sum_kernels.plane_sums(pairs.points, n, n, r, weight)
+        variance = point_pairs.variance_of(square, weight, pairs.resolution)
         return H / variance, variance

@@ -16,12 +16,11 @@ from tofuse.engine.clouds import (
     Icp,
     MaxDistance,
     Metric,
-    PlaneToPlane,
-    PointToPlane,
     PointToPoint,
     SmallStep,
     Unique,
     at_most,
+    surface_metrics,
 )
 from tofuse.engine.frames import Frame
 from tofuse.engine.parts import part
@@ -117,7 +116,11 @@ class PointToPlaneIcp(Variant):
     def parts(self) -> Icp:
         """See `Variant.parts`."""
         return _surface_icp(
-            self.resolution, self.points, self.reach, self.max_iterations, PointToPlane()
+            self.resolution,
+            self.points,
+            self.reach,
+            self.max_iterations,
+            surface_metrics.PointToPlane(),
         )
 
 
@@ -177,7 +180,7 @@ class GeneralizedIcp(Variant):
 
     def parts(self) -> Icp:
         """See `Variant.parts`."""
-        metric = PlaneToPlane(self.epsilon)
+        metric = surface_metrics.PlaneToPlane(self.epsilon)
         return _surface_icp(self.resolution, self.points, self.reach, self.max_iterations, metric)
 
 

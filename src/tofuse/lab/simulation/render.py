@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Complex128, Float32, Float64, UInt16
 from tofuse.engine.cameras import ray_lengths
-from tofuse.engine.frames import INVALID_DEPTH, RangeFrame, depth_from_counts
+from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.lab.simulation import optics, sensor
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.models import CameraModel
@@ -294,12 +294,12 @@ def _frame(
     if effects.under_exposure:
         depth = np.where(measured.amplitude < model.minimum_amplitude, 0, depth)
     counts = np.round(depth / model.depth_unit_m)
-    counts = np.where(counts < INVALID_DEPTH, counts, 0).astype(np.uint16)
+    counts = np.where(counts < depth_counts.INVALID_DEPTH, counts, 0).astype(np.uint16)
     return RangeFrame(
         index,
         time_s,
         model.camera,
-        depth_from_counts(counts, model.depth_unit_m),
+        depth_counts.depth_from_counts(counts, model.depth_unit_m),
         model.depth_kind,
         sensor.reported_amplitude(model, measured),
         sensor.reported_confidence(model, measured),

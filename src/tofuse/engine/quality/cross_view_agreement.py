@@ -20,7 +20,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.frames import RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.search import AgreementOptions, agreement
+from tofuse.engine.search import pair_agreement
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Points per image, and the width of the images that they are compared with.
@@ -141,7 +141,7 @@ def compare_views(
     groups
         Group of each view: pairs within a group are left out. By default all pairs are compared.
     """
-    options = AgreementOptions(points=_POINTS)
+    options = pair_agreement.AgreementOptions(points=_POINTS)
     axes = poses[:, :3, 2]
     # Cameras with opposite viewing directions observe no surface from the same side.
     facing = axes @ axes.T > 0
@@ -152,7 +152,9 @@ def compare_views(
     def work(start: int, stop: int) -> list[PairConsistency]:
         overlapping = []
         for i, j in pairs[start:stop].tolist():
-            a = agreement(views[j], views[i], se3.inverse(poses[i]) @ poses[j], options)
+            a = pair_agreement.agreement(
+                views[j], views[i], se3.inverse(poses[i]) @ poses[j], options
+            )
             support, contradiction = (a.support + a.clash) * a.points, a.violation * a.points
             if support + contradiction > _MIN_OVERLAP * a.points:
                 squares = a.rms_m**2 * support if support else 0.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.engine.alignment import UNITS, span
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import se3
 
@@ -63,7 +63,7 @@ class Prediction:
         if len(poses) < 3:
             return cls((0.1, 0.1))
         motions = se3.inverse(poses[:-1]) @ poses[1:]
-        typical = np.sqrt((se3.log(motions) / UNITS).reshape(-1, 2, 3) ** 2).mean((0, 2))
+        typical = np.sqrt((se3.log(motions) / projective.UNITS).reshape(-1, 2, 3) ** 2).mean((0, 2))
         rms, enough = _errors(poses, motions, unobservable, 1)
         sigma = np.maximum(np.where(enough, rms, _MOTION_FRACTION * typical), _MIN_SIGMA)
         power = (_DEFAULT_POWER, _DEFAULT_POWER)
@@ -74,7 +74,9 @@ class Prediction:
             exponent = np.interp(ratio**2, (k**_POWERS).sum(0), _POWERS)
             exponent = np.where(enough & enough_ahead & (rms > 0), exponent, _DEFAULT_POWER)
             power = (float(exponent[0]), float(exponent[1]))
-        return cls((float(sigma[0] * UNITS[0]), float(sigma[1] * UNITS[3])), power)
+        return cls(
+            (float(sigma[0] * projective.UNITS[0]), float(sigma[1] * projective.UNITS[3])), power
+        )
 
     def with_max_growth(self) -> Prediction:
         """Return the model whose velocity error follows a random walk."""
@@ -106,13 +108,15 @@ def _errors(
     """
     last = len(poses) - ahead
     extrapolated = np.linalg.matrix_power(motions[: last - 1], ahead)
-    errors = se3.log(se3.inverse(poses[1:last] @ extrapolated) @ poses[1 + ahead :]) / UNITS
+    errors = (
+        se3.log(se3.inverse(poses[1:last] @ extrapolated) @ poses[1 + ahead :]) / projective.UNITS
+    )
     squares, dimensions = np.zeros(2), np.zeros(2)
     for i, error in enumerate(errors, 1):
         projector = np.eye(6)
         degenerate = np.concatenate([np.zeros((0, 6)), *unobservable[i : i + ahead + 1]])
         if len(degenerate):
-            basis = span(degenerate, _DISTINCT)
+            basis = projective.span(degenerate, _DISTINCT)
             projector -= basis @ basis.T
         constrained = projector @ error
         t, r = constrained[:3], constrained[3:]
@@ -145,7 +149,9 @@ def with_prediction(
     """
     if not len(unobservable):
         return information
-    basis, _ = np.linalg.qr((unobservable / UNITS).T)
-    variance = (np.repeat(sigma, 3) / UNITS) ** 2
+    basis, _ = np.linalg.qr((unobservable / projective.UNITS).T)
+    variance = (np.repeat(sigma, 3) / projective.UNITS) ** 2
     prior_information = basis @ np.linalg.inv(basis.T @ (variance[:, None] * basis)) @ basis.T
-    return np.asarray(information + prior_information / np.outer(UNITS, UNITS), np.float64)
+    return np.asarray(
+        information + prior_information / np.outer(projective.UNITS, projective.UNITS), np.float64
+    )

@@ -10,8 +10,8 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.branches import Branches
-from tofuse.engine.graph.descent import Problem
 from tofuse.engine.graph.graph import Optimisation, PoseGraph
+from tofuse.engine.graph.minimisation import Problem
 from tofuse.engine.graph.sparse import Factor, first_of_parts, parts_of, sparsify
 
 # A loop with a smaller weight is rejected.
