@@ -37,7 +37,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.preparation import Preparation
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import align
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions

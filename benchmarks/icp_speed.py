@@ -21,12 +21,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds.icp import algorithm_1
-from tofuse.engine.clouds.selectors import Random
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.filters.base import apply_filters
 from tofuse.engine.frames.frames import Frame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp import algorithm_1
+from tofuse.engine.icp.icp_parts import Random
 from tofuse.engine.mapping.methods import thesis
 
 POINTS = 1000

@@ -20,7 +20,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import Config
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.engine.results.types import Reconstruction
 from tofuse.lab.experiments import measures

@@ -37,7 +37,7 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.engine.sensor.multipath_correction import Multipath, MultipathCorrector
 from tofuse.formats.recordings.correction_file import corrected_depth

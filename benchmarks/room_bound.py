@@ -16,7 +16,7 @@ import argparse
 import numpy as np
 
 from tofuse.engine.mapping.methods import default
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.lab.experiments.recording_bound import trajectory_bounds
 from tofuse.lab.simulation.effects import Effects

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.engine.cameras.cameras import range_from_z
+from tofuse.engine.cameras.depth_conversion import range_from_z
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.sensor.unwrap_correction import Unwrap
 from tofuse.lab.simulation.effects import Effects

@@ -42,7 +42,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import IMAGES, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 
 SEED = 7
 MAX_FRAMES = 100

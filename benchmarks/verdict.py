@@ -37,7 +37,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import TofuseError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.results.checks import tolerance_of
 from tofuse.formats.recordings.open import open_recording

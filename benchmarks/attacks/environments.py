@@ -99,7 +99,7 @@ time.time_ns = lambda: int(1e9 * time.time())
 """
 STAGES = (
     ("opening", "tofuse.apps.jobs.running:adapted"),
-    ("tracking", "tofuse.engine.mapping.reconstruction:push_frames"),
+    ("tracking", "tofuse.engine.mapping.reconstructing:push_frames"),
     ("a model", "tofuse.engine.mapping.backend:BackEnd.run"),
     ("writing", "tofuse.apps.results.output:_write_files"),
     ("moving", "tofuse.formats.files.staging:replace_folder"),

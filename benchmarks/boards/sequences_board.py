@@ -19,7 +19,7 @@ from boards import Board, Score, default_made
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import TofuseError
 from tofuse.engine.mapping.config import changed, from_method
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.parts import name_of
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 

@@ -19,14 +19,12 @@ from peers import kiss_global, o3d_global
 from tofuse.engine.alignment.base import Registrar
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import ray_lengths
-from tofuse.engine.clouds.coarse_to_fine import spacing
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.selectors import All, Random
-from tofuse.engine.clouds.stopping import SmallStep
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.coarse_to_fine import spacing
+from tofuse.engine.icp.icp import Icp
+from tofuse.engine.icp.icp_parts import All, MaxDistance, Random, SmallStep
 
 # Errors of the initial guess, m and degrees.
 STARTS = ((0.02, 1.0), (0.1, 5.0), (0.2, 10.0), (0.4, 20.0), (0.8, 40.0))

@@ -11,10 +11,10 @@ import pytest
 
 import tofuse
 from tofuse.apps.cli.progress import TerminalProgress
-from tofuse.engine.clouds.icp import Icp
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp import Icp
 from tofuse.formats.export.conversion import convert
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate

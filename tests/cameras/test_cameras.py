@@ -15,11 +15,9 @@ from tofuse.engine.cameras.cameras import (
     Pinhole,
     Rational,
     RayTable,
-    points_from_z,
-    range_from_z,
     scaled,
-    z_from_range,
 )
+from tofuse.engine.cameras.depth_conversion import points_from_z, range_from_z, z_from_range
 from tofuse.engine.errors import InputError
 
 PINHOLE = Pinhole(176, 144, 230.0, 231.0, 87.0, 71.5)

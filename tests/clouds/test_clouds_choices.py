@@ -19,19 +19,23 @@ from registration_scenes import (
     turn,
     view,
 )
-from tofuse.engine.clouds import surface_shape as shape
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.interfaces import Alignment, History, Matches, Points
-from tofuse.engine.clouds.matchers import ClosestPoint
-from tofuse.engine.clouds.metrics import PointToPoint
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.selectors import All, Random, Uniform
-from tofuse.engine.clouds.stopping import SmallStep
-from tofuse.engine.clouds.surface_metrics import PointToPlane
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp import surface_shape as shape
+from tofuse.engine.icp.icp import Icp
+from tofuse.engine.icp.icp_kernels import transform_points
+from tofuse.engine.icp.icp_parts import (
+    All,
+    ClosestPoint,
+    MaxDistance,
+    PointToPoint,
+    Random,
+    SmallStep,
+    Uniform,
+)
+from tofuse.engine.icp.interfaces import Alignment, History, Matches, Points
+from tofuse.engine.icp.surface_metrics import PointToPlane
 from tofuse.lab.methods.compatibility import (
     AmplitudeCompatibility,
     Boundary,

@@ -14,13 +14,13 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.clouds import cloud_pair
 from tofuse.engine.clouds.cloud_agreement import CloudMap, cloud_agreement
 from tofuse.engine.clouds.cloud_pair import register_clouds
-from tofuse.engine.clouds.reduce import averaged
 from tofuse.engine.clouds.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.reduce import averaged
 from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
 from tofuse.engine.tracking.pairwise import Pairwise
 from tofuse.formats.geometry.ply import write_ply

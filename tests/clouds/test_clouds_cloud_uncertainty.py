@@ -9,9 +9,9 @@ from registration_scenes import bumpy_ball, view
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.clouds.cloud_agreement import CloudMap
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
-from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.coarse_to_fine import CoarseToFine
 
 SIZE = 0.05
 # 99.9 % of a chi square of six dimensions.

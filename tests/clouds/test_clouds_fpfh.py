@@ -8,9 +8,9 @@ import pytest
 import tofuse
 from registration_scenes import rng, turn
 from searched_pair import TRUE, A, B, seen
-from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
 from tofuse.engine.clouds.fpfh import fpfh, mutually_nearest
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.coarse_to_fine import CoarseToFine
 from tofuse.formats.geometry.ply import read_ply
 
 

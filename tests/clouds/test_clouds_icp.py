@@ -11,12 +11,12 @@ import pytest
 from tofuse.engine import parts
 from tofuse.engine.alignment.base import Registrar
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.clouds.icp import Icp, algorithm_1
-from tofuse.engine.clouds.interfaces import Alignment, Matcher, Matches, Points, Search, Selector
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp import Icp, algorithm_1
+from tofuse.engine.icp.interfaces import Alignment, Matcher, Matches, Points, Search, Selector
 
 
 def corner(n, seed, noise=0.0):

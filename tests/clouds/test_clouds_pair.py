@@ -17,12 +17,12 @@ from registration_scenes import (
     turn,
     view,
 )
-from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
-from tofuse.engine.clouds.reduce import averaged
-from tofuse.engine.clouds.remapping import Remapping
-from tofuse.engine.clouds.surface_metrics import PointToPlane
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.coarse_to_fine import CoarseToFine
+from tofuse.engine.icp.reduce import averaged
+from tofuse.engine.icp.remapping import Remapping
+from tofuse.engine.icp.surface_metrics import PointToPlane
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.lab.methods.variants import Tricp
 

@@ -8,21 +8,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tofuse.engine.clouds.icp_kernels import (
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp_kernels import (
     point_information,
     shortest_of_each_target,
     transform_points,
     weighted_moments,
 )
-from tofuse.engine.clouds.interfaces import Alignment, History, Matches, Points
-from tofuse.engine.clouds.matchers import ClosestPoint
-from tofuse.engine.clouds.metrics import PointToPoint
-from tofuse.engine.clouds.rejectors import MaxDistance, Unique
-from tofuse.engine.clouds.selectors import All, Random
-from tofuse.engine.clouds.stopping import TwoLoops
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import CloudFrame
-from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp_parts import (
+    All,
+    ClosestPoint,
+    MaxDistance,
+    PointToPoint,
+    Random,
+    TwoLoops,
+    Unique,
+)
+from tofuse.engine.icp.interfaces import Alignment, History, Matches, Points
 
 seeds = st.integers(0, 2**32 - 1)
 

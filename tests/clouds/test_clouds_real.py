@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.clouds.icp import algorithm_1
 from tofuse.engine.filters.neighbours import NeighbourFraction
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp import algorithm_1
 
 
 def test_neighbours_of_real_recording(shared_data):

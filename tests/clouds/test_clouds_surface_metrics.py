@@ -8,20 +8,17 @@ import numpy as np
 import pytest
 
 from registration_scenes import box_walls, error, relief, rng, stone, turn, view
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.interfaces import Alignment, Matches, Points
-from tofuse.engine.clouds.metrics import PointToPoint
-from tofuse.engine.clouds.point_pairs import cross_information, loss_weights, surface_pairs
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.selectors import All, Random
-from tofuse.engine.clouds.stopping import SmallStep
-from tofuse.engine.clouds.surface_metrics import PlaneToPlane, PointToPlane
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.icp.icp import Icp
+from tofuse.engine.icp.icp_kernels import transform_points
+from tofuse.engine.icp.icp_parts import All, MaxDistance, PointToPoint, Random, SmallStep
+from tofuse.engine.icp.interfaces import Alignment, Matches, Points
+from tofuse.engine.icp.point_pairs import cross_information, loss_weights, surface_pairs
+from tofuse.engine.icp.surface_metrics import PlaneToPlane, PointToPlane
 from tofuse.lab.methods.symmetric import Symmetric
 
 SURFACE_METRICS = [PointToPlane(), Symmetric(), PlaneToPlane()]

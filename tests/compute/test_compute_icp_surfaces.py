@@ -6,15 +6,16 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tofuse.engine.clouds.cloud_shape_kernels import local_shapes, symmetric_eigen
-from tofuse.engine.clouds.cloud_sum_kernels import (
+from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.kdtree import KdTree
+from tofuse.engine.icp.icp_kernels import (
     direction_products,
+    local_shapes,
     matrix_sums,
     plane_sums,
     plane_to_plane_weights,
+    symmetric_eigen,
 )
-from tofuse.engine.geometry import se3
-from tofuse.engine.geometry.kdtree import KdTree
 
 seeds = st.integers(0, 2**32 - 1)
 

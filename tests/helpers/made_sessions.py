@@ -15,7 +15,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.mapping.config import Config, from_method
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.search.search import SearchOptions
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import Opening

@@ -29,7 +29,7 @@ from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.texture import textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import texturing as paint
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.progress import Silent
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.native import RecordingWriter

@@ -23,7 +23,7 @@ from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.fusion.cloud import as_cloud
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.loops.joining import Joining
-from tofuse.engine.mapping import reconstruction as reconstruct
+from tofuse.engine.mapping import reconstructing as reconstruct
 from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.results.types import FrameRecord

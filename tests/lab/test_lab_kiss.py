@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from registration_scenes import box_walls, rng
-from tofuse.engine.clouds.icp_kernels import transform_points
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp_kernels import transform_points
 from tofuse.lab.methods.kiss import AdaptiveThreshold, Kiss, first_of_voxels
 
 

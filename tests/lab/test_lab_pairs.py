@@ -10,17 +10,14 @@ from scipy.spatial.distance import cdist
 
 from registration_scenes import bumpy_ball, directions, error, relief, rng, stone, turn, view
 from tofuse.engine import parts
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.interfaces import Alignment, Matches, Points
-from tofuse.engine.clouds.metrics import PointToPoint
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.selectors import All
-from tofuse.engine.clouds.stopping import SmallStep
-from tofuse.engine.clouds.surface_metrics import PointToPlane
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp import Icp
+from tofuse.engine.icp.icp_kernels import transform_points
+from tofuse.engine.icp.icp_parts import All, MaxDistance, PointToPoint, SmallStep
+from tofuse.engine.icp.interfaces import Alignment, Matches, Points
+from tofuse.engine.icp.surface_metrics import PointToPlane
 from tofuse.lab.methods.comprehensive import Cicp, Comprehensive
 from tofuse.lab.methods.implicit import Implicit
 from tofuse.lab.methods.least_squares_matching import LeastSquaresMatching

@@ -10,12 +10,10 @@ import pytest
 from registration_scenes import bumpy_ball, error, relief, rng, stone, turn, view
 from tofuse.engine import parts
 from tofuse.engine.alignment.base import Registrar
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.selectors import All, Random
-from tofuse.engine.clouds.stopping import SmallStep
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp import Icp
+from tofuse.engine.icp.icp_parts import All, MaxDistance, Random, SmallStep
 from tofuse.engine.mapping.config import PACKAGES
 from tofuse.lab.methods.compatibility import AmplitudeCompatibility
 from tofuse.lab.methods.correspondence import ClosestInvariant

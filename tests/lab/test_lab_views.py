@@ -10,8 +10,8 @@ import pytest
 
 from registration_scenes import MIDDLE, directions, relief, rng, turn, view
 from tofuse.engine import parts
-from tofuse.engine.clouds.icp_kernels import transform_points
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp_kernels import transform_points
 from tofuse.engine.refinement.refinement import RefinementMethod
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.engine.views.prepared_view import PreparedView

@@ -11,7 +11,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import from_method
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model

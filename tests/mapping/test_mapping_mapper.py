@@ -20,7 +20,7 @@ from tofuse.engine.graph.graph import Optimisation, Optimiser
 from tofuse.engine.loops.loops import PriorLoop
 from tofuse.engine.mapping.config import changed, from_method
 from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.parts import part
 from tofuse.lab.methods.filters_temporal import TemporalDeviation
 from tofuse.lab.simulation.peaks import peaks_views

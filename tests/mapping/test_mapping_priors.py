@@ -20,7 +20,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.graph.external_sensors import GravityEdges, OdometryEdges
 from tofuse.engine.mapping.config import changed, from_method
 from tofuse.engine.mapping.priors import with_prior
-from tofuse.engine.mapping.reconstruction import device_up, reconstruct
+from tofuse.engine.mapping.reconstructing import device_up, reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.results.types import FrameRecord
 from tofuse.formats.recordings.open import open_recording

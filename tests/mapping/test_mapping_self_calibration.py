@@ -14,7 +14,7 @@ from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import changed, from_method
-from tofuse.engine.mapping.reconstruction import reconstruct
+from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.mapping.self_calibration import in_words, self_calibrated
 from tofuse.engine.progress import Silent
 from tofuse.engine.quality.pose_accuracy import Accuracy

@@ -9,7 +9,8 @@ import pytest
 
 import tofuse
 from tofuse.apps.cli.program import main
-from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, RayTable, points_from_z
+from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, RayTable
+from tofuse.engine.cameras.depth_conversion import points_from_z
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording

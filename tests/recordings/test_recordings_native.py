@@ -10,15 +10,8 @@ import numpy as np
 import pytest
 
 from paths import DOCS
-from tofuse.engine.cameras.cameras import (
-    BrownConrady,
-    Camera,
-    Fisheye,
-    Pinhole,
-    Rational,
-    RayTable,
-    points_from_z,
-)
+from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
+from tofuse.engine.cameras.depth_conversion import points_from_z
 from tofuse.engine.errors import InputError, OutputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.geometry.se3 import exp

@@ -12,10 +12,10 @@ from made_rooms import BOXES, CAMERA, OTHER, at, seen, surface
 from tofuse.engine.alignment.base import PROBABLE
 from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.cameras.cameras import RayTable
-from tofuse.engine.clouds.coarse_to_fine import CoarseToFine
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.coarse_to_fine import CoarseToFine
 from tofuse.engine.search.pair_agreement import Agreement, agreement
 from tofuse.engine.search.pose_probability import ACCEPTED, PoseEvidence
 from tofuse.engine.search.verification import FitStatistics

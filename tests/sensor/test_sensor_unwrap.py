@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.engine.cameras.cameras import Pinhole, range_from_z
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras.depth_conversion import range_from_z
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame

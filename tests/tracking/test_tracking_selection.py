@@ -196,7 +196,7 @@ def test_new_component_continues_motion() -> None:
 def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
     """Steps of 26 cm: a wall fits anywhere, and the objects before it are out of reach."""
     from tofuse.engine.mapping.config import changed, from_method
-    from tofuse.engine.mapping.reconstruction import reconstruct
+    from tofuse.engine.mapping.reconstructing import reconstruct
     from tofuse.engine.quality.trajectory_errors import displacement
 
     recording = without_multipath(tmp_path, "rail", "ifm-o3r", every=20, frames=16)
@@ -213,7 +213,7 @@ def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
 def test_starts_along_corridor_correct_short_prediction(tmp_path) -> None:
     """Steps of 14, 37 and 46 cm: the walls fit anywhere, and the prediction is too short."""
     from tofuse.engine.mapping.config import changed, from_method
-    from tofuse.engine.mapping.reconstruction import reconstruct
+    from tofuse.engine.mapping.reconstructing import reconstruct
     from tofuse.engine.quality.trajectory_errors import displacement
 
     recording = without_multipath(tmp_path, "corridor", "sr4000", every=12)

@@ -10,11 +10,11 @@ import pytest
 from tofuse.engine import parts
 from tofuse.engine.alignment.base import Registrar, Registration
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.clouds.icp import algorithm_1
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp import algorithm_1
 from tofuse.engine.tracking.base import Odometry
 from tofuse.engine.tracking.sequential import SEED_STAGE, Sequential
 from tofuse.lab.simulation.peaks import peaks_views

@@ -24,8 +24,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Foreground
 from tofuse.engine.frames import Recording
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import Config, adaptation, changed, from_method, view_kind
-from tofuse.engine.mapping import reconstruct as reconstruct_recording
+from tofuse.engine.mapping import Config, adaptation, changed, from_method, reconstructing
 from tofuse.engine.progress import Progress
 from tofuse.engine.results import Reconstruction, accuracy_card
 
@@ -281,14 +280,14 @@ def reconstruct(
         fitted = adaptation.adapted(_configuration(config, recording), recording, threads, display)
         turning = any(isinstance(part, Foreground) for part in fitted.filters)
         findings = quick_findings(recording, fitted, turning=turning)
-        reconstruction = reconstruct_recording(
+        reconstruction = reconstructing.reconstruct(
             recording, fitted, seed=seed, threads=threads, loops=loops, progress=display
         )
     return Result.of(with_findings(reconstruction, findings, turning=turning), recording, fitted)
 
 
 def _configuration(config: Config | str | Mapping[str, Any], recording: Recording) -> Config:
-    kind = view_kind(recording)
+    kind = reconstructing.view_kind(recording)
     if isinstance(config, str):
         return from_method(config, kind)
     if isinstance(config, Mapping):

@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.apps.calibration.board import Board, board_image, find_corners
 from tofuse.apps.calibration.board_pose import board_pose
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.cameras import Camera, points_from_z, ray_lengths
+from tofuse.engine.cameras import Camera, depth_conversion, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
@@ -168,7 +168,7 @@ def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[Pla
 
 def _near_plane(frame: RangeFrame, plane: Float64, noise: NoiseModel) -> Bool:
     """Return the mask (H, W) of pixels near a plane, within noise and systematic errors."""
-    points = points_from_z(frame.camera, frame.z).astype(float)
+    points = depth_conversion.points_from_z(frame.camera, frame.z).astype(float)
     distance = np.abs(points @ plane - 1) / np.linalg.norm(plane)
     sigma = noise.sigma(frame)
     near = frame.valid & (distance < _MAX_ERROR_M + _MAX_SIGMAS * sigma) & (sigma < _MAX_SIGMA_M)

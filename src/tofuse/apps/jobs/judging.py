@@ -29,14 +29,7 @@ from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, Recording, evenly_spaced, frame_ranges
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping import (
-    Config,
-    check_views,
-    from_method,
-    priors,
-    reconstruct_with_views,
-    view_kind,
-)
+from tofuse.engine.mapping import Config, check_views, from_method, priors, reconstructing
 from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import (
@@ -157,7 +150,7 @@ def judge(
     if tolerance_m is not None:
         check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
     poses = poses_for(recording, trajectory)
-    kind = view_kind(recording)
+    kind = reconstructing.view_kind(recording)
     # External sensors do not measure these poses, and images are compared with the stated camera.
     config = replace(
         from_method("default", kind), tolerance_m=tolerance_m, priors=(), self_calibration=False
@@ -169,7 +162,7 @@ def judge(
     def reconstructed(
         source: Recording, config_used: Config
     ) -> tuple[Reconstruction, Views, ViewSupport]:
-        result, views = reconstruct_with_views(
+        result, views = reconstructing.reconstruct_with_views(
             source, config_used, threads=threads, progress=progress
         )
         return result, views, compared_images.support_at(result.trajectory)

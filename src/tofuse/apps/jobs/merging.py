@@ -25,14 +25,7 @@ from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.frames import Recording, Source
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import (
-    Config,
-    Mapper,
-    from_method,
-    push_frames,
-    texturing,
-    with_recording_facts,
-)
+from tofuse.engine.mapping import Config, Mapper, from_method, reconstructing, texturing
 from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import trajectory_errors
@@ -151,7 +144,7 @@ def merge_sessions(
         for session, offset in zip(sessions, offsets, strict=True):
             mapper.interrupt(_config_of(session, offset))
             session_recording = replace(recording, indices=session.recording.indices + offset)
-            push_frames(mapper, session_recording, session.config.window)
+            reconstructing.push_frames(mapper, session_recording, session.config.window)
         result = mapper.finish()
         progress.stage("comparing sessions")
         with use_threads(mapper.threads):
@@ -230,7 +223,7 @@ def _with_sessions(
     components_before = [{s.component for s in session.posed.values()} for session in sessions]
     pairs = session_pairs(result, records, components_before, views)
     result = replace(
-        with_recording_facts(result, facts),
+        reconstructing.with_recording_facts(result, facts),
         sessions=records,
         session_pairs=pairs,
         changes=session_changes(result, records, views),

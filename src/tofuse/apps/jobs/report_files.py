@@ -14,7 +14,7 @@ from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.filters import apply_filters
 from tofuse.engine.frames import CloudFrame, Frame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping import Config, changed, past_frames
+from tofuse.engine.mapping import Config, changed, reconstructing
 from tofuse.engine.parts import name_of
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.geometry import read_ply
@@ -80,7 +80,7 @@ def _filter_steps(
     index = int(recording.indices[k])
     try:
         frame = recording[k]
-        history = past_frames(recording, index, config.window - 1)
+        history = reconstructing.past_frames(recording, index, config.window - 1)
     except UnreadableFrameError:  # the recording has been moved or deleted
         return ()
     steps: list[tuple[str, Frame]] = [("raw", frame)]

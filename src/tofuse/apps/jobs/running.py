@@ -25,7 +25,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.engine.fusion import texture
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import Config, adaptation, priors, reconstruct, texturing, view_kind
+from tofuse.engine.mapping import Config, adaptation, priors, reconstructing, texturing
 from tofuse.engine.progress import Progress, Silent, Stopwatch
 from tofuse.engine.results import Reason, Reconstruction, in_main_model, verdicts
 from tofuse.engine.sensor import Unwrap
@@ -63,7 +63,7 @@ def run(
         else nullcontext(folder)
     ) as out:
         try:
-            result = reconstruct(
+            result = reconstructing.reconstruct(
                 job.recording,
                 job.config,
                 seed=job.seed,
@@ -112,7 +112,7 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
     opening = Opening.of(inputs, options)
     recording = opening.open()
     _preview(recording, progress)
-    config = resolve(options, view_kind(recording))
+    config = resolve(options, reconstructing.view_kind(recording))
     if not options.object:  # no sensor measures the motion relative to a moving object
         recording, config = priors.with_prior(recording, config, options.prior)
     check_guess(options, recording)

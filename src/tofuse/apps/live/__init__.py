@@ -5,7 +5,18 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.apps.live.device import DeviceError, Settings, Stream, TIMEOUT_S, device_named, is_installed, known_devices, no_frame, not_started, vendor
+    from tofuse.apps.live.device import (
+        TIMEOUT_S,
+        DeviceError,
+        Settings,
+        Stream,
+        device_named,
+        is_installed,
+        known_devices,
+        no_frame,
+        not_started,
+        vendor,
+    )
     from tofuse.apps.live.recorder import record
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

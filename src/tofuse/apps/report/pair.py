@@ -14,9 +14,9 @@ from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.apps.report.scene import Scene, extreme_points, random_subset, render, spacing_of
 from tofuse.apps.results import LocalView, PairResult
 from tofuse.engine.arrays import Float64, Intp, UInt8
-from tofuse.engine.clouds import surface_shape
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp import surface_shape
 
 COLORS = {"source": (240, 160, 60), "target": (90, 176, 245)}
 MODES = {"before": "Before", "after": "After", "distance": "After, by distance"}

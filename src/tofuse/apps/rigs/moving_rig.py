@@ -18,7 +18,7 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping import reconstruct
+from tofuse.engine.mapping import reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import Priors, joint_alignment, propagate_poses, refined_by_halves
 from tofuse.engine.results import Reconstruction
@@ -73,7 +73,7 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig
     results, tracks = [], []
     for camera in cameras:
         progress.stage(f"tracking {camera.name}")
-        result = reconstruct(camera.recording, progress=Silent())
+        result = reconstructing.reconstruct(camera.recording, progress=Silent())
         results.append(result)
         tracks.append(Track.of(result.timestamps, result.trajectory))
     if len(tracks[0].times) < 2:

@@ -19,14 +19,9 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import measured_graph
-from tofuse.engine.mapping import reconstruct
+from tofuse.engine.mapping import reconstructing
 from tofuse.engine.progress import Progress, Silent
-from tofuse.engine.refinement import (
-    joint_alignment,
-    pairwise_measurements,
-    propagate_poses,
-    support_fell,
-)
+from tofuse.engine.refinement import joint_alignment, pairwise_measurements, propagate_poses
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.stored_views import SampledView, Spacing, pair_equations
 from tofuse.formats.recordings import RigCamera, RigSource
@@ -192,7 +187,7 @@ def _tracks(cameras: Sequence[Camera], source: RigSource, progress: Progress) ->
     tracks = []
     for stated, camera in zip(source.rig.cameras, cameras, strict=True):
         progress.stage(f"tracking {camera.name}")
-        result = reconstruct(camera.recording, progress=Silent())
+        result = reconstructing.reconstruct(camera.recording, progress=Silent())
         tracked = _Tracked.of(result, stated)
         if len(tracked.track.times) < 2:
             progress.note(f"{camera.name} has no trajectory")
@@ -247,7 +242,7 @@ def refined(
     )
     count = len(views)
     view_camera = source.camera[recording.indices[frames]]
-    if not len(refinement.pairs) or support_fell(
+    if not len(refinement.pairs) or joint_alignment.support_fell(
         refinement.after.of_views(count) - refinement.before.of_views(count)
     ):
         disagreement = disagreements_of(views, view_camera, initial, refinement.pairs)

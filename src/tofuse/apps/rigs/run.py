@@ -23,7 +23,7 @@ from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import measured_graph
 from tofuse.engine.loops import Nearby
-from tofuse.engine.mapping import Config, priors, reconstruct
+from tofuse.engine.mapping import Config, priors, reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import AlreadyRefined, NoRefinement
@@ -173,7 +173,7 @@ def reconstruct_rig(
     refined_config = replace(
         fusion_config, refinement=AlreadyRefined(measured, (*tracked, *calibration_edges))
     )
-    result = reconstruct(
+    result = reconstructing.reconstruct(
         priors.with_odometry(recording, frame_poses), refined_config, seed=seed, progress=progress
     )
     names = [camera.name for camera in rig.cameras]

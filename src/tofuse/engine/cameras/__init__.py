@@ -5,7 +5,21 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.cameras import projection_kernels
-    from tofuse.engine.cameras.cameras import BrownConrady, Camera, DISTORTION_ORDER, Fisheye, MODELS, Pinhole, Rational, RayTable, lens_values, pinhole_values, points_from_z, range_from_z, ray_lengths, scaled, unknown_rays, z_from_range
+    from tofuse.engine.cameras import depth_conversion, projection_kernels
+    from tofuse.engine.cameras.cameras import (
+        DISTORTION_ORDER,
+        MODELS,
+        BrownConrady,
+        Camera,
+        Fisheye,
+        Pinhole,
+        Rational,
+        RayTable,
+        lens_values,
+        pinhole_values,
+        ray_lengths,
+        scaled,
+        unknown_rays,
+    )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

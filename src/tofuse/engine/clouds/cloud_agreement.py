@@ -13,10 +13,10 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.clouds.surface_shape import Shape, shape_at, tree_of
 from tofuse.engine.clouds.viewpoint import RangeSphere, Viewpoint, viewpoint_of
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.icp import surface_shape
 from tofuse.engine.search import pair_agreement
 
 # Points of each plane fit.
@@ -73,7 +73,7 @@ class CloudMap:
     @classmethod
     def of(cls, view: CloudFrame, size: float, full_view: Frame) -> CloudMap:
         """Prepare a view that was averaged from `full_view`."""
-        shape = shape_at(view, np.arange(len(view)), NEIGHBOURS)
+        shape = surface_shape.shape_at(view, np.arange(len(view)), NEIGHBOURS)
         roughness = shape.roughness[np.isfinite(shape.roughness)]
         sigma = float(np.median(roughness)) * size if len(roughness) else size
         viewpoint = viewpoint_of(full_view)
@@ -86,7 +86,7 @@ class CloudMap:
     @property
     def tree(self) -> KdTree:
         """kd-tree over the averaged points."""
-        return tree_of(self.view)
+        return surface_shape.tree_of(self.view)
 
     @cached_property
     def compared(self) -> tuple[Float64, Float64]:
@@ -96,7 +96,7 @@ class CloudMap:
         return self.view.points[valid].astype(np.float64), self.normals[valid]
 
 
-def _tested_points(view: CloudFrame, shape: Shape, viewpoint: Float64) -> Float64:
+def _tested_points(view: CloudFrame, shape: surface_shape.Shape, viewpoint: Float64) -> Float64:
     """Return points (m, 3) on surfaces, except at edges and grazing incidence."""
     points = view.points.astype(np.float64)
     rays = points - viewpoint

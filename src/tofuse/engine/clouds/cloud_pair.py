@@ -17,19 +17,20 @@ from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
-from tofuse.engine.clouds.coarse_to_fine import CoarseToFine, spacing
 from tofuse.engine.clouds.fpfh import candidates
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.reduce import extent
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.remapping import Remapping
 from tofuse.engine.clouds.robust_motion import are_distinct
-from tofuse.engine.clouds.selectors import All, Uniform
-from tofuse.engine.clouds.stopping import SmallStep
-from tofuse.engine.clouds.surface_metrics import PointToPlane
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp import (
+    CoarseToFine,
+    Icp,
+    Remapping,
+    extent,
+    icp_parts,
+    spacing,
+    surface_metrics,
+)
 from tofuse.engine.search import pair_agreement, pose_probability
 
 # Maximum number of points of each averaged view.
@@ -314,14 +315,16 @@ def _refinement_stages(size: float) -> tuple[Icp, ...]:
     """Return ICP with few iterations, first with a wide reach, then with a narrow one."""
     wide = Icp(
         size,
-        source=Uniform(800),
-        target=All(),
-        rejectors=(MaxDistance(4.0),),
-        metric=PointToPlane(loss="tukey"),
-        stopping=SmallStep(1e-2, 8),
+        source=icp_parts.Uniform(800),
+        target=icp_parts.All(),
+        rejectors=(icp_parts.MaxDistance(4.0),),
+        metric=surface_metrics.PointToPlane(loss="tukey"),
+        stopping=icp_parts.SmallStep(1e-2, 8),
         neighbours=NEIGHBOURS,
     )
-    return wide, replace(wide, rejectors=(MaxDistance(2.0),), stopping=SmallStep(1e-3, 8))
+    return wide, replace(
+        wide, rejectors=(icp_parts.MaxDistance(2.0),), stopping=icp_parts.SmallStep(1e-3, 8)
+    )
 
 
 def _rival(views: _CloudViews, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _Pose:

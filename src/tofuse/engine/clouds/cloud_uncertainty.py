@@ -21,13 +21,8 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap
-from tofuse.engine.clouds.point_pairs import (
-    MIN_PAIRS,
-    SurfacePairs,
-    loss_weights,
-    unobservable_directions,
-)
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp import point_pairs
 from tofuse.engine.normal import robust_sigma
 
 # Maximum distance of corresponding points, in resolutions, and minimum cosine between their
@@ -78,7 +73,7 @@ def cloud_unobservable(source: CloudMap, target: CloudMap, T_target_source: Floa
     pairs = _Pairs.of(source, target, T_target_source)
     if pairs is None:
         return np.eye(6)
-    surface = SurfacePairs(
+    surface = point_pairs.SurfacePairs(
         T_target_source,
         pairs.centre,
         pairs.points,
@@ -88,7 +83,7 @@ def cloud_unobservable(source: CloudMap, target: CloudMap, T_target_source: Floa
         pairs.weight,
         pairs.resolution,
     )
-    return unobservable_directions(surface, pairs.noise**2)
+    return point_pairs.unobservable_directions(surface, pairs.noise**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +127,7 @@ class _Pairs:
         q = se3.transform(se3.inverse(T), target.view.points[j].astype(np.float64))
         cosine = (a * b).sum(1)
         matched = (nearest >= 0) & (np.abs(cosine) > _MIN_NORMAL_COSINE)  # false for NaN
-        if np.count_nonzero(matched) < MIN_PAIRS:
+        if np.count_nonzero(matched) < point_pairs.MIN_PAIRS:
             return None
         p, q, a = p[matched], q[matched], a[matched]
         b = b[matched] * np.sign(cosine[matched])[:, None]
@@ -145,7 +140,7 @@ class _Pairs:
         centre = p.mean(0)
         p = p - centre
         spread = max(float(np.sqrt((p**2).sum(1).mean())), size)
-        return cls(centre, spread, p, r, n, a, b, loss_weights("tukey", r, size), size)
+        return cls(centre, spread, p, r, n, a, b, point_pairs.loss_weights("tukey", r, size), size)
 
     @property
     def noise(self) -> float:

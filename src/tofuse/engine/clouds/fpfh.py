@@ -8,8 +8,6 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.clouds import fpfh_kernels as kernels
-from tofuse.engine.clouds.coarse_to_fine import spacing
-from tofuse.engine.clouds.reduce import reduced
 from tofuse.engine.clouds.robust_motion import (
     Consensus,
     ConsensusOptions,
@@ -19,11 +17,11 @@ from tofuse.engine.clouds.robust_motion import (
     consensus,
     motion_of,
 )
-from tofuse.engine.clouds.surface_shape import shape_at
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.icp import reduced, spacing, surface_shape
 
 # Defaults of `candidates`.
 POINTS, REACH, FPFH_NEIGHBOURS = 4000, 5.0, 12
@@ -161,7 +159,7 @@ def _described(
 
     Other points have no descriptor, and corrupt those of their neighbours.
     """
-    shape = shape_at(view, np.arange(len(view)), neighbours)
+    shape = surface_shape.shape_at(view, np.arange(len(view)), neighbours)
     valid = np.isfinite(shape.normals).all(1) & (shape.roughness < _MAX_ROUGHNESS)
     points, normals = view.points[valid].astype(np.float64), shape.normals[valid]
     if len(points) < min_points:

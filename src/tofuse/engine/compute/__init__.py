@@ -13,6 +13,13 @@ if TYPE_CHECKING:
     from tofuse.engine.compute.memory import trim_memory
     from tofuse.engine.compute.partition import median
     from tofuse.engine.compute.spill import Scratch, Spill
-    from tofuse.engine.compute.thread_pool import job_pool, run_all, run_chunks, serial_chunks, thread_count, threads
+    from tofuse.engine.compute.thread_pool import (
+        job_pool,
+        run_all,
+        run_chunks,
+        serial_chunks,
+        thread_count,
+        threads,
+    )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -6,10 +6,18 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.filters.angle import NeighbourhoodAngle
-    from tofuse.engine.filters.background_model import BackgroundSurface, background_surface, moving_object
+    from tofuse.engine.filters.background_model import (
+        BackgroundSurface,
+        background_surface,
+        moving_object,
+    )
     from tofuse.engine.filters.base import Filter, Interval, Removal, apply_filters
     from tofuse.engine.filters.confidence import Confidence
     from tofuse.engine.filters.foreground import Foreground
-    from tofuse.engine.filters.neighbours import MAX_NEIGHBOURS, NeighbourFraction, mean_neighbour_distance
+    from tofuse.engine.filters.neighbours import (
+        MAX_NEIGHBOURS,
+        NeighbourFraction,
+        mean_neighbour_distance,
+    )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

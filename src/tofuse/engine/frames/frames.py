@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.cameras import Camera, points_from_z, range_from_z, unknown_rays, z_from_range
+from tofuse.engine.cameras import Camera, depth_conversion, unknown_rays
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number
@@ -203,17 +203,25 @@ class RangeFrame:
     @cached_property
     def z(self) -> Float32:
         """(H, W) z depth in m, 0 where invalid."""
-        return self.depth if self.depth_kind == "z" else z_from_range(self.camera, self.depth)
+        return (
+            self.depth
+            if self.depth_kind == "z"
+            else depth_conversion.z_from_range(self.camera, self.depth)
+        )
 
     @cached_property
     def radial_range(self) -> Float32:
         """(H, W) radial range in m, 0 where invalid."""
-        return self.depth if self.depth_kind == "range" else range_from_z(self.camera, self.depth)
+        return (
+            self.depth
+            if self.depth_kind == "range"
+            else depth_conversion.range_from_z(self.camera, self.depth)
+        )
 
     @cached_property
     def point_image(self) -> Float32:
         """(H, W, 3) points in m in the camera frame, the origin where invalid."""
-        return points_from_z(self.camera, self.z)
+        return depth_conversion.points_from_z(self.camera, self.z)
 
     @cached_property
     def points(self) -> Float32:

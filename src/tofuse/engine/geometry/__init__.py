@@ -8,6 +8,11 @@ if TYPE_CHECKING:
     from tofuse.engine.geometry import quaternion, se3
     from tofuse.engine.geometry.kdtree import KdTree, checked_points
     from tofuse.engine.geometry.places import PlaceCounts
-    from tofuse.engine.geometry.rigid_motion_kernels import compose, distance_and_angle, retract, twist_between
+    from tofuse.engine.geometry.rigid_motion_kernels import (
+        compose,
+        distance_and_angle,
+        retract,
+        twist_between,
+    )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

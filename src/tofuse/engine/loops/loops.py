@@ -11,10 +11,10 @@ import numpy as np
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.clouds import algorithm_1
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
 from tofuse.engine.graph import LoopRecord
+from tofuse.engine.icp import algorithm_1
 from tofuse.engine.search import SearchOptions
 from tofuse.engine.stored_views import ViewStore
 from tofuse.engine.views import PreparedView

@@ -96,6 +96,7 @@ class Config(Bounded):
 PACKAGES = (
     "tofuse.engine.filters",
     "tofuse.engine.sensor",
+    "tofuse.engine.icp",
     "tofuse.engine.clouds",
     "tofuse.engine.tracking",
     "tofuse.engine.graph",

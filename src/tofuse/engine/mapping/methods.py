@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from tofuse.engine.clouds import AnyPair, algorithm_1
+from tofuse.engine.clouds import AnyPair
 from tofuse.engine.filters import Confidence, NeighbourFraction, NeighbourhoodAngle
 from tofuse.engine.fusion import Fusion
-from tofuse.engine.graph import Castellani, external_sensors, levenberg
+from tofuse.engine.graph import castellani, external_sensors, levenberg
+from tofuse.engine.icp import algorithm_1
 from tofuse.engine.loops import Confirmation, Nearby, Revisits
 from tofuse.engine.mapping.config import Config, ViewKind
 from tofuse.engine.refinement import Joint, plane_refinement
@@ -35,7 +36,7 @@ def thesis(kind: ViewKind) -> Config:
             per_frame=6,
             confirmation=Confirmation(min_fraction=0.45),
         ),
-        optimiser=Castellani(normalisation="thesis"),
+        optimiser=castellani.Castellani(normalisation="thesis"),
         fusion=Fusion(),
     )
 

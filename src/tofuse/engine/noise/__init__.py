@@ -6,6 +6,13 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.noise.choice import family_of, noise_model_for
-    from tofuse.engine.noise.model import AmplitudeLaw, ConfidenceLaw, Law, NOISE, NoiseModel, RangeLaw
+    from tofuse.engine.noise.model import (
+        NOISE,
+        AmplitudeLaw,
+        ConfidenceLaw,
+        Law,
+        NoiseModel,
+        RangeLaw,
+    )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -7,8 +7,18 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.refinement import calibration_check, joint_alignment, plane_refinement
     from tofuse.engine.refinement.pose_priors import Priors
-    from tofuse.engine.refinement.refinement import AlreadyRefined, Joint, NoRefinement, Refinement, RefinementMethod, Refiner, accepted_with, pairwise_measurements, propagate_poses, without_errors
+    from tofuse.engine.refinement.refinement import (
+        AlreadyRefined,
+        Joint,
+        NoRefinement,
+        Refinement,
+        RefinementMethod,
+        Refiner,
+        accepted_with,
+        pairwise_measurements,
+        propagate_poses,
+        without_errors,
+    )
     from tofuse.engine.refinement.split_half import refined_by_halves
-    from tofuse.engine.refinement.submaps import support_fell
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -16,10 +16,10 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Int64, Intp
-from tofuse.engine.clouds import extent
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.graph import sparse
+from tofuse.engine.icp import extent
 from tofuse.engine.refinement import plane_kernels as kernels
 
 # Iterations of moving cells to the centroids of their points, which aligns them with the surface.

@@ -18,7 +18,7 @@ from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64, Int64, Intp
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Gravity, minimisation, robust, sparse
+from tofuse.engine.graph import external_sensors, minimisation, robust, sparse
 from tofuse.engine.refinement.pose_priors import DAMPING, WEAK, Priors, weak_prior
 from tofuse.engine.stored_views import SampledView, overlaps, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
@@ -474,7 +474,7 @@ class _SharedUnknowns:
 
 def _add_gravity(
     poses: Float64,
-    gravity: Gravity,
+    gravity: external_sensors.Gravity,
     unary: tuple[Float64, Float64],
     shared: _SharedUnknowns,
     system: sparse.PairSystem,
@@ -509,3 +509,9 @@ def _add_gravity(
 def _checked(step: Float64 | None) -> Float64:
     assert step is not None, "the system is finite"
     return step
+
+
+def support_fell(gain: Float64) -> bool:
+    """Whether gains (N,) of the views' support are significantly negative on average."""
+    standard_error = float(gain.std(ddof=1)) / np.sqrt(len(gain))
+    return float(gain.mean()) < -standard_error

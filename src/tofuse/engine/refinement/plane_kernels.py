@@ -14,9 +14,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.cameras import projection_kernels
-from tofuse.engine.clouds import symmetric_eigen
 from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
+from tofuse.engine.icp import icp_kernels
 
 _MIN_PIVOT = 1e-9
 
@@ -68,7 +68,7 @@ def fit_cells(
         for c in range(3):
             for d in range(3):
                 C[c, d] /= b - a - 3
-        symmetric_eigen(C, variances[s], vectors)
+        icp_kernels.symmetric_eigen(C, variances[s], vectors)
         for c in range(3):
             for d in range(3):
                 axes[s, c, d] = vectors[d, c]

@@ -9,7 +9,7 @@ import numpy as np
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Gravity, sparse
+from tofuse.engine.graph import external_sensors, sparse
 
 WEAK = 1e-3  # information of a weak prior in `UNITS`
 DAMPING = 1e-6  # fraction of the diagonal that is added to it
@@ -30,7 +30,7 @@ class Priors:
     pairs: Intp
     measured: Float64
     information: Float64
-    gravity: Gravity | None = None
+    gravity: external_sensors.Gravity | None = None
 
     @classmethod
     def none(cls) -> Priors:

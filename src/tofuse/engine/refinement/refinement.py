@@ -21,11 +21,11 @@ from tofuse.engine.refinement.calibration_check import (
     check_calibration,
     combine_checks,
 )
-from tofuse.engine.refinement.joint_alignment import Refined, refine
+from tofuse.engine.refinement.joint_alignment import Refined, refine, support_fell
 from tofuse.engine.refinement.loop_drift import loop_gap
 from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.refinement.split_half import split_half_errors
-from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps, support_fell
+from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps
 from tofuse.engine.stored_views import (
     CoarseView,
     PosedView,

@@ -24,6 +24,7 @@ from tofuse.engine.refinement.joint_alignment import (
     Support,
     refine,
     spread_evenly,
+    support_fell,
     support_of,
 )
 from tofuse.engine.refinement.pose_priors import Priors
@@ -197,12 +198,6 @@ def refine_submaps(
         np.concatenate([r.scales for _, r in refined_submaps]),
     )
     return combined, [evaluation for _, evaluation in results]
-
-
-def support_fell(gain: Float64) -> bool:
-    """Whether gains (N,) of the views' support are significantly negative on average."""
-    standard_error = float(gain.std(ddof=1)) / np.sqrt(len(gain))
-    return float(gain.mean()) < -standard_error
 
 
 def _refine_submap(

@@ -11,10 +11,11 @@ import numpy as np
 from tofuse.engine.alignment import PROBABLE, Link, Registration
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import AnyPair, extent
+from tofuse.engine.clouds import AnyPair
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp import extent
 from tofuse.engine.parts import part
 from tofuse.engine.search import SearchOptions, pose_probability
 from tofuse.engine.tracking.base import Odometry, Step, Tracker

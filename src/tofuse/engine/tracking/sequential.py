@@ -10,10 +10,10 @@ import numpy as np
 from tofuse.engine.alignment import Registrar
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import algorithm_1
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp import algorithm_1
 from tofuse.engine.parts import part
 from tofuse.engine.search import SearchOptions
 from tofuse.engine.tracking.base import Odometry, Step, Tracker

@@ -8,7 +8,14 @@ if TYPE_CHECKING:
     from tofuse.formats.poses.g2o import read_g2o, write_g2o
     from tofuse.formats.poses.given_loops import read_loops
     from tofuse.formats.poses.pose import pose_text, read_pose
-    from tofuse.formats.poses.trajectory import associate, associated_poses, read_tum, write_kitti, write_log, write_tum
-    from tofuse.formats.poses.trajectory_formats import Clock, OPENGL, TimedPoses, read_poses
+    from tofuse.formats.poses.trajectory import (
+        associate,
+        associated_poses,
+        read_tum,
+        write_kitti,
+        write_log,
+        write_tum,
+    )
+    from tofuse.formats.poses.trajectory_formats import OPENGL, Clock, TimedPoses, read_poses
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras import Camera, Pinhole, range_from_z, z_from_range
+from tofuse.engine.cameras import Camera, Pinhole, depth_conversion
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.parts import part
@@ -243,10 +243,12 @@ class NativeSource(FileSource):
         ranges = []
         for files in self.by_frequency.values():
             depth = depth_counts.depth_from_counts(self._read(files, index, "uint16"), self.unit)
-            ranges.append(depth if kind == "range" else range_from_z(camera, depth))
+            ranges.append(
+                depth if kind == "range" else depth_conversion.range_from_z(camera, depth)
+            )
         radial, disagreement = combined(ranges, periods)
         consistent = np.where(disagreement < DISAGREEMENT * min(periods), radial, np.float32(0))
-        return consistent if kind == "range" else z_from_range(camera, consistent)
+        return consistent if kind == "range" else depth_conversion.z_from_range(camera, consistent)
 
     def _read_correction(self) -> DepthCorrection | None:
         path = self.folder / "correction.npz"

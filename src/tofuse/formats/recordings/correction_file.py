@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float32
-from tofuse.engine.cameras import Camera, range_from_z, z_from_range
+from tofuse.engine.cameras import Camera, depth_conversion
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import DepthKind
 from tofuse.engine.sensor import DepthCorrection
@@ -51,4 +51,6 @@ def corrected_depth(
     """Return depth (H, W) in m of the given kind, after correction of its radial range."""
     if kind == "range":
         return correction.correct(depth)
-    return z_from_range(camera, correction.correct(range_from_z(camera, depth)))
+    return depth_conversion.z_from_range(
+        camera, correction.correct(depth_conversion.range_from_z(camera, depth))
+    )

@@ -14,7 +14,7 @@ from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import Config, changed, from_method, reconstruct
+from tofuse.engine.mapping import Config, changed, from_method, reconstructing
 from tofuse.engine.progress import Progress
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.measures import BoxFit, PathScore
@@ -294,7 +294,7 @@ def _run(
     first, last = int(recording.indices[0]), int(recording.indices[-1])
     loops = [PriorLoop(first, last)] if last > first else []
     start = perf_counter()
-    result = reconstruct(recording, config, seed=seed + draw, loops=loops)
+    result = reconstructing.reconstruct(recording, config, seed=seed + draw, loops=loops)
     seconds = perf_counter() - start
     assert recording.reference is not None
     truth = recording.reference

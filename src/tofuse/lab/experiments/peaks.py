@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.clouds import CoarseToFine, algorithm_1
 from tofuse.engine.frames import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Castellani, Optimiser, PoseGraph, measured_graph
-from tofuse.engine.mapping import default, reconstruct
+from tofuse.engine.graph import Optimiser, PoseGraph, castellani, measured_graph
+from tofuse.engine.icp import CoarseToFine, algorithm_1
+from tofuse.engine.mapping import default, reconstructing
 from tofuse.engine.refinement import plane_refinement
 from tofuse.engine.stored_views import Spacing, ViewStore
 from tofuse.engine.tracking import Sequential
@@ -123,7 +123,7 @@ def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> Pe
     relative = np.array([s.registration.T_target_source for s in steps[1:] if s.registration])
     last = len(views) - 1
     graph = chain(relative, [measured_graph.Measured(0, last, truth[last], np.eye(6))])
-    optimisation = (optimiser or Castellani()).optimise(graph)
+    optimisation = (optimiser or castellani.Castellani()).optimise(graph)
     return PeaksRun(
         sigma,
         seed,
@@ -162,7 +162,7 @@ def reconstruct_peaks(sigma: float, seed: int) -> tuple[PoseErrors, int]:
     """
     views, truth = peaks_views(sigma, seed)
     recording = Recording.of(ArraySource(views, truth), "peaks", "simulated")
-    result = reconstruct(recording, default("cloud"), seed=seed)
+    result = reconstructing.reconstruct(recording, default("cloud"), seed=seed)
     has_pose = result.has_pose
     T_world_result = truth[has_pose][0] @ se3.inverse(result.trajectory[has_pose][0])
     return PoseErrors.of(T_world_result @ result.trajectory[has_pose], truth[has_pose]), int(

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds import transform_points
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp import icp_kernels
 from tofuse.engine.parts import part
 from tofuse.lab.methods.multiview import Cloud, Pairs, RelaxationMethod
 
@@ -33,13 +33,16 @@ class Bergevin(RelaxationMethod):
         n = len(poses)
         H, g = np.zeros((n, 6, 6)), np.zeros((n, 6))
         centroids = np.array(
-            [transform_points(T, c.points).mean(0) for T, c in zip(poses, clouds, strict=True)]
+            [
+                icp_kernels.transform_points(T, c.points).mean(0)
+                for T, c in zip(poses, clouds, strict=True)
+            ]
         )
         for p in pairs:
-            x = transform_points(poses[p.i], p.p_i)
+            x = icp_kernels.transform_points(poses[p.i], p.p_i)
             normal = p.n_j @ poses[p.j][:3, :3].T
             valid = np.isfinite(normal).all(1)
-            r = ((x - transform_points(poses[p.j], p.p_j)) * normal).sum(1)[valid]
+            r = ((x - icp_kernels.transform_points(poses[p.j], p.p_j)) * normal).sum(1)[valid]
             J = np.column_stack([normal, np.cross(x - centroids[p.i], normal)])[valid]
             H[p.i] += J.T @ J
             g[p.i] += J.T @ r

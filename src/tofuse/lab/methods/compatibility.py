@@ -9,13 +9,13 @@ from typing import Annotated
 import numpy as np
 
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import Alignment, Matches, Rejector, transform_points
+from tofuse.engine.icp import icp_kernels, interfaces
 from tofuse.engine.parts import part
 
 
 @part("rejector", "normal", label="validated")
 @dataclass(frozen=True)
-class NormalCompatibility(Bounded, Rejector):
+class NormalCompatibility(Bounded, interfaces.Rejector):
     """Drops pairs whose normals differ in direction (Zhang 1994; Pulli 1999).
 
     Pairs without a normal are dropped as well.
@@ -28,18 +28,20 @@ class NormalCompatibility(Bounded, Rejector):
 
     max_angle_rad: Annotated[float, Bounds(0, math.pi, exclusive=True)] = math.pi / 4
 
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
+    def reject(
+        self, matches: interfaces.Matches, alignment: interfaces.Alignment
+    ) -> interfaces.Matches:
         """See `Rejector.reject`."""
         rotation = np.eye(4)
         rotation[:3, :3] = alignment.T_target_source[:3, :3]
-        a = transform_points(rotation, alignment.source.normals[matches.source])
+        a = icp_kernels.transform_points(rotation, alignment.source.normals[matches.source])
         b = alignment.target.normals[matches.target]
         return matches.keep((a * b).sum(1) >= math.cos(self.max_angle_rad))
 
 
 @part("rejector", "curvature", label="validated")
 @dataclass(frozen=True)
-class CurvatureCompatibility(Bounded, Rejector):
+class CurvatureCompatibility(Bounded, interfaces.Rejector):
     """Drops pairs of different curvature (section 2.9.4).
 
     Attributes
@@ -50,7 +52,9 @@ class CurvatureCompatibility(Bounded, Rejector):
 
     tolerance: Annotated[float, Bounds(0, exclusive=True)] = 0.2
 
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
+    def reject(
+        self, matches: interfaces.Matches, alignment: interfaces.Alignment
+    ) -> interfaces.Matches:
         """See `Rejector.reject`."""
         a = alignment.source.shape.curvature[matches.source]
         b = alignment.target.shape.curvature[matches.target]
@@ -59,7 +63,7 @@ class CurvatureCompatibility(Bounded, Rejector):
 
 @part("rejector", "amplitude", label="validated")
 @dataclass(frozen=True)
-class AmplitudeCompatibility(Bounded, Rejector):
+class AmplitudeCompatibility(Bounded, interfaces.Rejector):
     """Drops pairs of different amplitude (Godin et al. 1994); needs amplitude in both views.
 
     Attributes
@@ -70,7 +74,9 @@ class AmplitudeCompatibility(Bounded, Rejector):
 
     ratio: Annotated[float, Bounds(1, exclusive=True)] = 1.5
 
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
+    def reject(
+        self, matches: interfaces.Matches, alignment: interfaces.Alignment
+    ) -> interfaces.Matches:
         """See `Rejector.reject`."""
         a = alignment.source.amplitude[matches.source]
         b = alignment.target.amplitude[matches.target]
@@ -79,7 +85,7 @@ class AmplitudeCompatibility(Bounded, Rejector):
 
 @part("rejector", "color", label="validated")
 @dataclass(frozen=True)
-class ColorCompatibility(Bounded, Rejector):
+class ColorCompatibility(Bounded, interfaces.Rejector):
     """Drops pairs of different colour (Pulli 1999); needs colour in both views.
 
     Attributes
@@ -90,7 +96,9 @@ class ColorCompatibility(Bounded, Rejector):
 
     tolerance: Annotated[float, Bounds(0, exclusive=True)] = 0.2
 
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
+    def reject(
+        self, matches: interfaces.Matches, alignment: interfaces.Alignment
+    ) -> interfaces.Matches:
         """See `Rejector.reject`."""
         difference = alignment.source.color[matches.source] - alignment.target.color[matches.target]
         return matches.keep((difference * difference).sum(1) <= self.tolerance**2)
@@ -98,21 +106,23 @@ class ColorCompatibility(Bounded, Rejector):
 
 @part("rejector", "boundary", label="validated")
 @dataclass(frozen=True)
-class Boundary(Rejector):
+class Boundary(interfaces.Rejector):
     """Drops pairs whose target point is on the surface boundary (Turk and Levoy 1994).
 
     With partial overlap, all points beyond the overlap are closest to its boundary, and would bias
     the motion towards the target.
     """
 
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
+    def reject(
+        self, matches: interfaces.Matches, alignment: interfaces.Alignment
+    ) -> interfaces.Matches:
         """See `Rejector.reject`."""
         return matches.keep(~alignment.target.shape.boundary[matches.target])
 
 
 @part("rejector", "trimmed", label="validated")
 @dataclass(frozen=True)
-class Trimmed(Bounded, Rejector):
+class Trimmed(Bounded, interfaces.Rejector):
     """Keeps the shortest pairs, as many as the source has points in the overlap (TrICP).
 
     Chetverikov, Stepanov and Krsek (2005). Of equally short pairs the first are kept.
@@ -125,7 +135,9 @@ class Trimmed(Bounded, Rejector):
 
     overlap: Annotated[float, Bounds(0.01, 1)] = 0.8
 
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
+    def reject(
+        self, matches: interfaces.Matches, alignment: interfaces.Alignment
+    ) -> interfaces.Matches:
         """See `Rejector.reject`."""
         count = int(self.overlap * len(alignment.source))
         if count >= len(matches):

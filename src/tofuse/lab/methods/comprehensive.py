@@ -8,19 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from tofuse.engine.clouds import (
-    Alignment,
-    All,
-    Icp,
-    Matcher,
-    Matches,
-    Points,
-    PointToPoint,
-    Random,
-    Search,
-    SmallStep,
-)
 from tofuse.engine.geometry import KdTree
+from tofuse.engine.icp import Icp, icp_parts, interfaces
 from tofuse.engine.parts import part
 from tofuse.lab.methods.variants import Variant
 
@@ -30,7 +19,7 @@ _INITIAL_NEIGHBOURS = 8
 
 @part("matcher", "comprehensive", label="validated")
 @dataclass(frozen=True)
-class Comprehensive(Matcher):
+class Comprehensive(interfaces.Matcher):
     """The shortest pairs, each point in at most one pair.
 
     The paper writes the distances of all points into a lookup matrix, takes the smallest entry,
@@ -40,7 +29,7 @@ class Comprehensive(Matcher):
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
-    def prepare(self, target: Points) -> Search:
+    def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations."""
         return _LookupSearch(KdTree(target.points))
 
@@ -49,7 +38,7 @@ class Comprehensive(Matcher):
 class _LookupSearch:
     tree: KdTree
 
-    def match(self, alignment: Alignment, reach: float) -> Matches:
+    def match(self, alignment: interfaces.Alignment, reach: float) -> interfaces.Matches:
         points, size = alignment.transformed, len(self.tree)
         indices, distances2 = self.tree.neighbours(points, min(_INITIAL_NEIGHBOURS, size))
         candidates = dict(enumerate(zip(indices, distances2, strict=True)))
@@ -76,7 +65,7 @@ class _LookupSearch:
                 heapq.heappush(proposals, (float(candidates[source][1][rank]), source, rank))
         pairs.sort()
         i, j, d2 = np.array(pairs).reshape(-1, 3).T
-        return Matches(i.astype(np.int64), j.astype(np.int64), np.sqrt(d2))
+        return interfaces.Matches(i.astype(np.int64), j.astype(np.int64), np.sqrt(d2))
 
 
 @part("registration", "cicp", label="validated")
@@ -102,10 +91,10 @@ class Cicp(Variant):
         """See `Variant.parts`."""
         return Icp(
             self.resolution,
-            source=Random(self.points),
-            target=All(),
+            source=icp_parts.Random(self.points),
+            target=icp_parts.All(),
             matcher=Comprehensive(),
             rejectors=(),
-            metric=PointToPoint(),
-            stopping=SmallStep(max_iterations=self.max_iterations),
+            metric=icp_parts.PointToPoint(),
+            stopping=icp_parts.SmallStep(max_iterations=self.max_iterations),
         )

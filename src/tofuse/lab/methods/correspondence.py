@@ -9,10 +9,10 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.clouds import Alignment, Matcher, Matches, Points, Search, transform_points
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import KdTree
+from tofuse.engine.icp import icp_kernels, interfaces
 from tofuse.engine.parts import part
 from tofuse.lab.methods.cloud_search_kernels import grid_search
 from tofuse.lab.methods.featured_tree import FeaturedKdTree
@@ -25,7 +25,7 @@ _MIN_COSINE = 0.1
 
 @part("matcher", "normal-shooting", label="validated")
 @dataclass(frozen=True)
-class NormalShooting(Bounded, Matcher):
+class NormalShooting(Bounded, interfaces.Matcher):
     """Intersection of a source point's normal with the target's surface (Chen and Medioni 1992).
 
     The surface is sampled, so the intersection is iterated as in the paper: the line is intersected
@@ -41,7 +41,7 @@ class NormalShooting(Bounded, Matcher):
     steps: Annotated[int, Bounds(1)] = 3
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
-    def prepare(self, target: Points) -> Search:
+    def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations."""
         return _NormalSearch(KdTree(target.points), self.steps)
 
@@ -51,11 +51,11 @@ class _NormalSearch:
     tree: KdTree
     steps: int
 
-    def match(self, alignment: Alignment, reach: float) -> Matches:
+    def match(self, alignment: interfaces.Alignment, reach: float) -> interfaces.Matches:
         start, target = alignment.transformed, alignment.target
         rotation = np.eye(4)
         rotation[:3, :3] = alignment.T_target_source[:3, :3]
-        directions = transform_points(rotation, alignment.source.normals)
+        directions = icp_kernels.transform_points(rotation, alignment.source.normals)
         intersection = start
         index, _ = self.tree.nearest(intersection, reach)
         for _ in range(self.steps):
@@ -71,12 +71,12 @@ class _NormalSearch:
         index = index[source]
         difference = start[source] - target.points[index]
         distance = np.sqrt((difference * difference).sum(1))
-        return Matches(source, index, distance).keep(distance <= reach)
+        return interfaces.Matches(source, index, distance).keep(distance <= reach)
 
 
 @part("matcher", "projection", label="validated")
 @dataclass(frozen=True)
-class Projection(Matcher):
+class Projection(interfaces.Matcher):
     """The target point on the pixel to which a source point projects ("reverse calibration").
 
     Blais and Levine (1995). Needs a target with a camera, best with all of its points.
@@ -84,14 +84,14 @@ class Projection(Matcher):
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
-    def prepare(self, target: Points) -> Search:
+    def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Index the target's points by pixel."""
         return _GridSearch(*_grid(target), 0)
 
 
 @part("matcher", "projection-search", label="validated")
 @dataclass(frozen=True)
-class ProjectionSearch(Bounded, Matcher):
+class ProjectionSearch(Bounded, interfaces.Matcher):
     """The closest point around the pixel to which a source point projects (section 2.9.3).
 
     The search continues around the closest point within `radius` until none is closer. Needs a
@@ -106,12 +106,12 @@ class ProjectionSearch(Bounded, Matcher):
     radius: Annotated[int, Bounds(1)] = 2
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
-    def prepare(self, target: Points) -> Search:
+    def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Index the target's points by pixel."""
         return _GridSearch(*_grid(target), self.radius)
 
 
-def _grid(target: Points) -> tuple[RangeFrame, Int64]:
+def _grid(target: interfaces.Points) -> tuple[RangeFrame, Int64]:
     view = target.view
     if not isinstance(view, RangeFrame):
         raise RegistrationError(
@@ -131,7 +131,7 @@ class _GridSearch:
     grid: Int64
     radius: int
 
-    def match(self, alignment: Alignment, reach: float) -> Matches:
+    def match(self, alignment: interfaces.Alignment, reach: float) -> interfaces.Matches:
         transformed = alignment.transformed
         pixels = np.ascontiguousarray(self.view.camera.project(transformed))
         index = np.empty(len(transformed), np.int64)
@@ -140,12 +140,12 @@ class _GridSearch:
             self.grid, alignment.target.points, transformed, pixels, self.radius, index, distance2
         )
         source = np.flatnonzero(distance2 <= reach * reach)
-        return Matches(source, index[source], np.sqrt(distance2[source]))
+        return interfaces.Matches(source, index[source], np.sqrt(distance2[source]))
 
 
 @part("matcher", "closest-compatible", label="validated")
 @dataclass(frozen=True)
-class ClosestCompatible(Bounded, Matcher):
+class ClosestCompatible(Bounded, interfaces.Matcher):
     """The closest target point of similar amplitude (ICCP: Godin, Rioux and Baribeau 1994).
 
     Points are compatible if their amplitudes differ by less than a factor. The search skips
@@ -160,7 +160,7 @@ class ClosestCompatible(Bounded, Matcher):
     ratio: Annotated[float, Bounds(1, exclusive=True)] = 1.2
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
-    def prepare(self, target: Points) -> Search:
+    def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations."""
         return _CompatibleSearch(
             FeaturedKdTree(target.points), _log_amplitude(target), float(np.log(self.ratio))
@@ -173,17 +173,17 @@ class _CompatibleSearch:
     features: Float64
     tolerance: float
 
-    def match(self, alignment: Alignment, reach: float) -> Matches:
+    def match(self, alignment: interfaces.Alignment, reach: float) -> interfaces.Matches:
         # Amplitudes select candidates; among these only the distance in space counts.
         source_features = _log_amplitude(alignment.source)
         index, distance2 = self.tree.nearest_featured(
             alignment.transformed, self.features, source_features, self.tolerance, reach, 0.0
         )
         source = np.flatnonzero(index >= 0)
-        return Matches(source, index[source], np.sqrt(distance2[source]))
+        return interfaces.Matches(source, index[source], np.sqrt(distance2[source]))
 
 
-def _log_amplitude(points: Points) -> Float64:
+def _log_amplitude(points: interfaces.Points) -> Float64:
     """(n, 1) logarithm of the amplitude; NaN, which never matches, where missing."""
     amplitude = points.amplitude
     return np.log(np.where(amplitude > 0, amplitude, np.nan))[:, None]
@@ -191,7 +191,7 @@ def _log_amplitude(points: Points) -> Float64:
 
 @part("matcher", "closest-invariant", label="validated")
 @dataclass(frozen=True)
-class ClosestInvariant(Bounded, Matcher):
+class ClosestInvariant(Bounded, interfaces.Matcher):
     """The target point closest in space and in invariant features (ICPIF: Sharp et al. 2002).
 
     Minimises ``|p - q|^2 + sum (a_k (f_k - g_k))^2``. The features are pose-invariant: mean
@@ -214,7 +214,7 @@ class ClosestInvariant(Bounded, Matcher):
     radius: Annotated[float, Bounds(0, exclusive=True)] = 6.0
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
-    def prepare(self, target: Points) -> Search:
+    def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations."""
         return _InvariantSearch(self, FeaturedKdTree(target.points), {})
 
@@ -224,9 +224,9 @@ class _InvariantSearch:
     options: ClosestInvariant
     tree: FeaturedKdTree
     # Features of both views, cached at the first matching; the source's by its identity.
-    cache: dict[str, tuple[Points, Float64]]
+    cache: dict[str, tuple[interfaces.Points, Float64]]
 
-    def match(self, alignment: Alignment, reach: float) -> Matches:
+    def match(self, alignment: interfaces.Alignment, reach: float) -> interfaces.Matches:
         target_features = self._features("target", alignment.target, alignment.resolution)
         source_features = self._features("source", alignment.source, alignment.resolution)
         deviation = np.array([_mean_deviation(column) for column in target_features.T])
@@ -239,9 +239,9 @@ class _InvariantSearch:
             alignment.transformed, target_features * scale, source_features * scale, np.inf, reach
         )
         source = np.flatnonzero(index >= 0)
-        return Matches(source, index[source], np.sqrt(distance2[source]))
+        return interfaces.Matches(source, index[source], np.sqrt(distance2[source]))
 
-    def _features(self, role: str, points: Points, resolution: float) -> Float64:
+    def _features(self, role: str, points: interfaces.Points, resolution: float) -> Float64:
         if role in self.cache and self.cache[role][0] is points:
             return self.cache[role][1]
         columns = []

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
+from scipy import sparse as scipy_sparse
 from scipy.sparse.csgraph import dijkstra
 
 from tofuse.engine.arrays import Bool, Float64
@@ -83,7 +83,7 @@ def _fractions(graph: PoseGraph, length: Float64, included: Bool, loop: int) -> 
     low, high, value = np.minimum(i, j)[order], np.maximum(i, j)[order], length[included][order]
     first = np.ones(len(order), bool)
     first[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
-    adjacency = sparse.csr_matrix((value[first], (low[first], high[first])), shape=(n, n))
+    adjacency = scipy_sparse.csr_matrix((value[first], (low[first], high[first])), shape=(n, n))
     distance, predecessors = dijkstra(
         adjacency, directed=False, indices=start, return_predecessors=True
     )

@@ -10,8 +10,9 @@ import numpy as np
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import CoarseToFine, fpfh
+from tofuse.engine.clouds import fpfh
 from tofuse.engine.frames import Frame
+from tofuse.engine.icp import CoarseToFine
 from tofuse.engine.parts import part
 from tofuse.lab.methods.sample_consensus import Method, SampleOptions, registration_of
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import Alignment, Matches, cloud_sum_kernels, point_pairs, surface_metrics
+from tofuse.engine.icp import icp_kernels, interfaces, point_pairs, surface_metrics
 from tofuse.engine.parts import part
 from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
 
@@ -35,17 +35,17 @@ class Implicit(Bounded, surface_metrics.SurfaceMetric):
 
     width: Annotated[float, Bounds(0, exclusive=True)] = 2.0
 
-    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+    def motion(self, matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
         """See `Metric.motion`."""
         pairs = point_pairs.surface_pairs(matches, alignment)
         usable = with_normals(matches, alignment)
         distance = self.distance(alignment.transformed[usable.source], alignment)
         n = pairs.target_normals
         weight = np.where(np.isfinite(distance), pairs.weight, 0.0)
-        H, g, _ = cloud_sum_kernels.plane_sums(pairs.points, n, n, np.nan_to_num(distance), weight)
+        H, g, _ = icp_kernels.plane_sums(pairs.points, n, n, np.nan_to_num(distance), weight)
         return pairs.motion(point_pairs.solve(H, g, pairs.size))
 
-    def distance(self, x: Float64, alignment: Alignment) -> Float64:
+    def distance(self, x: Float64, alignment: interfaces.Alignment) -> Float64:
         """I(x), (m,) in m, of points (m, 3) in the target's frame; NaN without neighbours."""
         target, h = alignment.target, self.width * alignment.resolution
         tree = neighbourhood(target).tree

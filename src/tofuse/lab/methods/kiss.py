@@ -11,10 +11,10 @@ import numpy as np
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import Alignment, Matches, Points, PointToPoint, transform_points
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.icp import icp_kernels, icp_parts, interfaces
 from tofuse.engine.parts import part
 from tofuse.engine.search import SearchOptions
 from tofuse.engine.tracking import Odometry, Step, Tracker
@@ -158,7 +158,7 @@ class _KissTracker(Tracker):
         self._threshold.update(se3.inverse(predicted) @ pose)
         self._motion = se3.orthonormalise(se3.inverse(self._pose) @ pose)
         self._pose = pose
-        self._map.add(transform_points(pose, downsampled), pose[:3, 3], self._max_range)
+        self._map.add(icp_kernels.transform_points(pose, downsampled), pose[:3, 3], self._max_range)
         reference, self._reference = self._reference, frame.index
         return Step("tracked", "", pose.copy(), reference, registration)
 
@@ -169,20 +169,20 @@ class _KissTracker(Tracker):
         target = _cloud(self._map.points)
         tree = KdTree(target.points)
         source, T = _cloud(p), predicted
-        converged, metric = False, PointToPoint()
+        converged, metric = False, icp_parts.PointToPoint()
         iterations = 0
         while not converged and iterations < self._options.max_iterations:
             iterations += 1
-            x = transform_points(T, p)
+            x = icp_kernels.transform_points(T, p)
             index, distance2 = tree.nearest(x, 3 * sigma)
             matched = np.flatnonzero(index >= 0)
             scale2 = (sigma / 3) ** 2
             weight = (scale2 / (scale2 + distance2[matched])) ** 2
-            pairs = Matches(matched, index[matched], np.sqrt(distance2[matched]), weight)
-            alignment = Alignment(source, target, self._map.size, T, x)
+            pairs = interfaces.Matches(matched, index[matched], np.sqrt(distance2[matched]), weight)
+            alignment = interfaces.Alignment(source, target, self._map.size, T, x)
             motion = metric.motion(pairs, alignment)
             T = se3.orthonormalise(motion @ T)
-            displacement = transform_points(T, p) - x
+            displacement = icp_kernels.transform_points(T, p) - x
             converged = float(np.abs(displacement).max()) < _CONVERGENCE * self._map.size
         relative = se3.inverse(self._pose) @ T
         registration = Registration(
@@ -205,6 +205,6 @@ def first_of_voxels(points: Float64, size: float) -> Float64:
     return points[np.sort(first)]
 
 
-def _cloud(points: Float64) -> Points:
+def _cloud(points: Float64) -> interfaces.Points:
     view = CloudFrame(0, 0.0, points.astype(np.float32))
-    return Points(view, np.arange(len(points)), points)
+    return interfaces.Points(view, np.arange(len(points)), points)

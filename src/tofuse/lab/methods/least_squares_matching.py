@@ -10,10 +10,10 @@ import numpy as np
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import All, Points, at_most
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp import icp_parts, interfaces
 from tofuse.engine.parts import part
 from tofuse.lab.methods.neighbourhoods import neighbourhood
 
@@ -106,8 +106,8 @@ class LeastSquaresMatching(Bounded, Registrar):
         RegistrationError
             If fewer than eight points have a foot on the target's surface.
         """
-        data = Points.of(source, at_most(self.points).select(source, rng))
-        model = Points.of(target, All().select(target, rng))
+        data = interfaces.Points.of(source, icp_parts.at_most(self.points).select(source, rng))
+        model = interfaces.Points.of(target, icp_parts.All().select(target, rng))
         intensity = (data.amplitude, model.amplitude) if self.intensity else None
         centroid = data.points.mean(0)
         centred = data.points - centroid
@@ -184,7 +184,7 @@ class LeastSquaresMatching(Bounded, Registrar):
     def _foot_points(
         self,
         x: Float64,
-        model: Points,
+        model: interfaces.Points,
         intensity: tuple[Float64, Float64] | None,
     ) -> _FootPoints:
         """Foot points of x (n, 3) on the triangles around the nearest points of the target."""

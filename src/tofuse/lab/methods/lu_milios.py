@@ -20,11 +20,12 @@ from scipy.spatial.transform import Rotation
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import ROUNDING, Optimisation, Optimiser, PoseGraph, levenberg, sparse
+from tofuse.engine.graph import Optimisation, Optimiser, PoseGraph, levenberg, sparse
 from tofuse.engine.parts import part
 
 # Heading, pitch, roll of a camera (y down): singular only where it looks straight up or down.
 _EULER = "YXZ"
+_ROUNDING = 1e-12  # squared error of an edge that counts as none
 _RELATIVE_ROUNDING = 1e-6  # relative increase that counts as rounding error
 
 
@@ -53,7 +54,7 @@ class LuMilios(Optimiser):
         levenberg.check_graph(graph)
         system = sparse.PairSystem(len(graph.ids), graph.edges)
         best, history = graph, [graph.chi2()]
-        converged = bool(system.fixed.all()) or history[0] <= ROUNDING * len(graph.edges)
+        converged = bool(system.fixed.all()) or history[0] <= _ROUNDING * len(graph.edges)
         current = graph
         for _ in range(0 if converged else self.max_iterations):
             motion = solve_linear(current, system)

@@ -15,10 +15,10 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import surface_shape, transform_points
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.graph import external_sensors
+from tofuse.engine.icp import icp_kernels, surface_shape
 from tofuse.engine.refinement import (
     Refinement,
     RefinementMethod,
@@ -171,7 +171,12 @@ def relax_poses(method: RelaxationMethod, clouds: Sequence[Cloud], poses: Float6
         updated = method.relax(poses, pairs, clouds)
         updated = se3.orthonormalise(poses[0] @ se3.inverse(updated[0]) @ updated)
         displacement = max(
-            float(np.abs(transform_points(a, c.points) - transform_points(b, c.points)).max())
+            float(
+                np.abs(
+                    icp_kernels.transform_points(a, c.points)
+                    - icp_kernels.transform_points(b, c.points)
+                ).max()
+            )
             for a, b, c in zip(poses, updated, clouds, strict=True)
         )
         poses = updated
@@ -193,7 +198,9 @@ def closest_pairs(clouds: Sequence[Cloud], poses: Float64, reach: float) -> list
         for j, target in enumerate(clouds):
             if i == j:
                 continue
-            transformed = transform_points(se3.inverse(poses[j]) @ poses[i], source.points)
+            transformed = icp_kernels.transform_points(
+                se3.inverse(poses[j]) @ poses[i], source.points
+            )
             nearest, _ = target.tree.nearest(transformed, reach)
             a = np.flatnonzero((nearest >= 0) & ~target.boundary[nearest])
             if len(a) >= max(_MIN_POINTS, _MIN_OVERLAP * len(transformed)):
@@ -216,6 +223,8 @@ def _support(
     total = sum(len(c.points) for c in clouds)
     closeness = 0.0
     for p in pairs:
-        difference = transform_points(poses[p.i], p.p_i) - transform_points(poses[p.j], p.p_j)
+        difference = icp_kernels.transform_points(poses[p.i], p.p_i) - icp_kernels.transform_points(
+            poses[p.j], p.p_j
+        )
         closeness += float((1 - np.linalg.norm(difference, axis=1) / reach).sum())
     return closeness / max(total, 1)

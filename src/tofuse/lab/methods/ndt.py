@@ -11,10 +11,10 @@ import numpy as np
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import Points, at_most, transform_points
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.icp import icp_kernels, icp_parts, interfaces
 from tofuse.engine.parts import part
 
 # Min points of a cell, and its min variance relative to the largest.
@@ -90,7 +90,9 @@ class Ndt(Bounded, Registrar):
         RegistrationError
             If fewer than six points of the source lie in cells of the target.
         """
-        data = Points.of(source, at_most(self.points).select(source, rng)).points
+        data = interfaces.Points.of(
+            source, icp_parts.at_most(self.points).select(source, rng)
+        ).points
         model = target.points.astype(np.float64)
         T, size = se3.orthonormalise(guess), self.coarsest * self.resolution
         iterations = 0
@@ -174,7 +176,7 @@ def _cells(points: Float64, size: float) -> _Cells:
 
 def _associate(p: Float64, cells: _Cells, T: Float64) -> tuple[Int64, Float64, Float64, Float64]:
     """Points (n, 3) with a cell: indices, squared Mahalanobis distances, residuals, precisions."""
-    x = transform_points(T, p)
+    x = icp_kernels.transform_points(T, p)
     nearest, _ = cells.tree.nearest(x, cells.size)
     index = np.flatnonzero(nearest >= 0)
     r = x[index] - cells.mean[nearest[index]]

@@ -9,8 +9,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.clouds import Alignment, Matches, Points
 from tofuse.engine.geometry import KdTree
+from tofuse.engine.icp import interfaces
 
 # A quadric through a point has five parameters; the point itself is its first neighbour.
 _MIN_NEIGHBOURS = 6
@@ -35,7 +35,7 @@ class PrincipalCurvatures:
 class Neighbourhood:
     """The points of a target, with a tree and the local surface shape."""
 
-    def __init__(self, points: Points) -> None:
+    def __init__(self, points: interfaces.Points) -> None:
         self._points, self._normals, self._count = points.points, points.normals, points.neighbours
 
     @cached_property
@@ -94,17 +94,19 @@ class Neighbourhood:
         return np.take_along_axis(neighbours, order, axis=1)
 
 
-_cache: WeakKeyDictionary[Points, Neighbourhood] = WeakKeyDictionary()
+_cache: WeakKeyDictionary[interfaces.Points, Neighbourhood] = WeakKeyDictionary()
 
 
-def neighbourhood(points: Points) -> Neighbourhood:
+def neighbourhood(points: interfaces.Points) -> Neighbourhood:
     """Return the local geometry of a target, cached for each set of points."""
     if points not in _cache:
         _cache[points] = Neighbourhood(points)
     return _cache[points]
 
 
-def with_normals(matches: Matches, alignment: Alignment) -> Matches:
+def with_normals(
+    matches: interfaces.Matches, alignment: interfaces.Alignment
+) -> interfaces.Matches:
     """Return the matches used by `surface_pairs`: those with a normal and nonzero weight."""
     valid = np.isfinite(alignment.target.normals[matches.target]).all(1)
     return matches.keep(valid & (matches.weights() > 0))

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds import All, Icp, MaxDistance, SmallStep, surface_metrics, transform_points
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp import Icp, icp_kernels, icp_parts, surface_metrics
 from tofuse.engine.parts import part
 from tofuse.lab.methods.compatibility import Boundary
 from tofuse.lab.methods.multiview import (
@@ -54,11 +54,11 @@ class Pulli(RelaxationMethod):
         resolution = resolution_of(clouds)
         icp = Icp(
             resolution,
-            source=All(),
-            target=All(),
-            rejectors=(MaxDistance(self.reach), Boundary()),
+            source=icp_parts.All(),
+            target=icp_parts.All(),
+            rejectors=(icp_parts.MaxDistance(self.reach), Boundary()),
             metric=surface_metrics.PointToPlane(),
-            stopping=SmallStep(),
+            stopping=icp_parts.SmallStep(),
         )
         constraints = []
         for p in pairs:
@@ -72,7 +72,7 @@ class Pulli(RelaxationMethod):
             except RegistrationError:
                 continue
             sample = p.p_i[:: max(1, len(p.p_i) // _PAIRS_PER_CONSTRAINT)]
-            transformed = transform_points(registration.T_target_source, sample)
+            transformed = icp_kernels.transform_points(registration.T_target_source, sample)
             constraints.append(Pairs(p.i, p.j, sample, transformed, np.full_like(sample, np.nan)))
         return distribute_errors(poses, constraints, self.tolerance * resolution)
 
@@ -115,7 +115,10 @@ def _align_view(k: int, poses: Float64, constraints: Sequence[Pairs]) -> Float64
         return np.asarray(poses[k])
     own_points = np.concatenate([c.p_i if c.i == k else c.p_j for c in constraints])
     other_points = np.concatenate(
-        [transform_points(poses[_other(c, k)], c.p_j if c.i == k else c.p_i) for c in constraints]
+        [
+            icp_kernels.transform_points(poses[_other(c, k)], c.p_j if c.i == k else c.p_i)
+            for c in constraints
+        ]
     )
     a, b = own_points.mean(0), other_points.mean(0)
     T = np.eye(4)
@@ -128,7 +131,11 @@ def _displacement(k: int, before: Float64, after: Float64, constraints: Sequence
     own_points = [c.p_i if c.i == k else c.p_j for c in constraints]
     return max(
         (
-            float(np.abs(transform_points(before, p) - transform_points(after, p)).max())
+            float(
+                np.abs(
+                    icp_kernels.transform_points(before, p) - icp_kernels.transform_points(after, p)
+                ).max()
+            )
             for p in own_points
         ),
         default=0.0,

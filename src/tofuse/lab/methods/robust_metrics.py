@@ -10,15 +10,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import (
-    Alignment,
-    Matches,
-    Metric,
-    PointToPoint,
-    point_pairs,
-    surface_metrics,
-    transform_points,
-)
+from tofuse.engine.icp import icp_kernels, icp_parts, interfaces, point_pairs, surface_metrics
 from tofuse.engine.parts import part
 
 # Factor of mu per round (Yang et al. 2020, remark 5).
@@ -30,7 +22,7 @@ _TRUNCATION = 10.0
 
 @part("metric", "gnc", label="validated")
 @dataclass(frozen=True)
-class Graduated(Bounded, Metric):
+class Graduated(Bounded, interfaces.Metric):
     """Truncated least squares by graduated non-convexity (Yang, Antonante, Tzoumas, Carlone 2020).
 
     Pairs with a distance above c contribute c^2. As that sum has many minima, a convex surrogate is
@@ -51,25 +43,29 @@ class Graduated(Bounded, Metric):
 
     inlier: Annotated[float, Bounds(0, exclusive=True)] = 2.0
 
-    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+    def motion(self, matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
         """See `Metric.motion`."""
         return self._solve(matches, alignment)[0]
 
-    def information(self, matches: Matches, alignment: Alignment) -> Float64:
+    def information(self, matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
         """See `Metric.information`; of the inliers."""
         _, weighted = self._solve(matches, alignment)
-        return PointToPoint().information(weighted.keep(weighted.weights() > 0), alignment)
+        return icp_parts.PointToPoint().information(
+            weighted.keep(weighted.weights() > 0), alignment
+        )
 
-    def _solve(self, matches: Matches, alignment: Alignment) -> tuple[Float64, Matches]:
+    def _solve(
+        self, matches: interfaces.Matches, alignment: interfaces.Alignment
+    ) -> tuple[Float64, interfaces.Matches]:
         c2 = (self.inlier * alignment.resolution) ** 2
         p = alignment.transformed[matches.source]
         q = alignment.target.points[matches.target]
         weights = matches.weights()
         weighted = replace(matches, weight=weights)
-        motion = PointToPoint().motion(weighted, alignment)
+        motion = icp_parts.PointToPoint().motion(weighted, alignment)
         mu = 0.0
         for _ in range(_MAX_ROUNDS):
-            r2 = ((transform_points(motion, p) - q) ** 2).sum(1)
+            r2 = ((icp_kernels.transform_points(motion, p) - q) ** 2).sum(1)
             if mu == 0:
                 largest = float(r2.max())
                 if largest <= c2:
@@ -78,7 +74,7 @@ class Graduated(Bounded, Metric):
             w = np.sqrt(c2 / np.maximum(r2, 1e-300) * mu * (mu + 1)) - mu
             w = np.where(r2 >= (mu + 1) / mu * c2, 0.0, np.clip(w, 0.0, 1.0))
             weighted = replace(matches, weight=weights * w)
-            motion = PointToPoint().motion(weighted, alignment)
+            motion = icp_parts.PointToPoint().motion(weighted, alignment)
             if np.all((w == 0) | (w == 1)):
                 break
             mu *= _MU_FACTOR

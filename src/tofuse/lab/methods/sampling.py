@@ -9,15 +9,15 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds import Random, Selector, surface_shape
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.icp import icp_parts, interfaces, surface_shape
 from tofuse.engine.parts import part
 
 
 @part("selector", "random-each-iteration", label="validated")
 @dataclass(frozen=True)
-class RandomEachIteration(Random):
+class RandomEachIteration(icp_parts.Random):
     """A random subset, redrawn at each iteration (Masuda, Sakaue and Yokoya 1996).
 
     Attributes
@@ -31,7 +31,7 @@ class RandomEachIteration(Random):
 
 @part("selector", "voxel", label="validated")
 @dataclass(frozen=True)
-class Voxel(Bounded, Selector):
+class Voxel(Bounded, interfaces.Selector):
     """The point closest to the centre of each voxel: uniform density on surfaces.
 
     Attributes
@@ -56,7 +56,7 @@ class Voxel(Bounded, Selector):
 
 @part("selector", "normal-space", label="validated")
 @dataclass(frozen=True)
-class NormalSpace(Bounded, Selector):
+class NormalSpace(Bounded, interfaces.Selector):
     """Normal-space sampling (Rusinkiewicz and Levoy 2001).
 
     Points are binned by normal direction and drawn at random from the bins in turn, so that small
@@ -110,7 +110,7 @@ def _bucket(normals: Float64, side: int) -> Int64:
 
 @part("selector", "intensity-gradient", label="validated")
 @dataclass(frozen=True)
-class IntensityGradient(Bounded, Selector):
+class IntensityGradient(Bounded, interfaces.Selector):
     """The points of largest amplitude gradient (Weik 1997).
 
     The gradient of the logarithmic amplitude is taken between a pixel's neighbours, all of which

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds import transform_points
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp import icp_kernels
 from tofuse.engine.parts import part
 from tofuse.lab.methods.multiview import Cloud, Pairs, RelaxationMethod, optimal_rotation
 
@@ -107,11 +107,15 @@ class SmallAngles(RelaxationMethod):
         n = len(poses)
         H, g = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
         centroid = np.mean(
-            [transform_points(T, c.points).mean(0) for T, c in zip(poses, clouds, strict=True)], 0
+            [
+                icp_kernels.transform_points(T, c.points).mean(0)
+                for T, c in zip(poses, clouds, strict=True)
+            ],
+            0,
         )
         for p in pairs:
-            a = transform_points(poses[p.i], p.p_i) - centroid
-            b = transform_points(poses[p.j], p.p_j) - centroid
+            a = icp_kernels.transform_points(poses[p.i], p.p_i) - centroid
+            b = icp_kernels.transform_points(poses[p.j], p.p_j) - centroid
             A, B, r = se3.point_jacobian(a), se3.point_jacobian(b), a - b
             H[p.i, :, p.i] += np.einsum("nki,nkj->ij", A, A)
             H[p.j, :, p.j] += np.einsum("nki,nkj->ij", B, B)

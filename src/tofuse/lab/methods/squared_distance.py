@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds import Alignment, Matches, cloud_sum_kernels, point_pairs, surface_metrics
+from tofuse.engine.icp import icp_kernels, interfaces, point_pairs, surface_metrics
 from tofuse.engine.parts import part
 from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
 
@@ -29,13 +29,13 @@ class SquaredDistance(surface_metrics.SurfaceMetric):
     helical motion with the same axis and pitch, through the angle atan |c'| (section 3).
     """
 
-    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+    def motion(self, matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
         """See `Metric.motion`."""
         pairs = point_pairs.surface_pairs(matches, alignment)
         usable = with_normals(matches, alignment)
         W = approximant(usable, alignment)
         R = alignment.T_target_source[:3, :3]
-        H, g, _ = cloud_sum_kernels.matrix_sums(
+        H, g, _ = icp_kernels.matrix_sums(
             pairs.points, pairs.residual, np.einsum("ji,njk,kl->nil", R, W, R), pairs.weight
         )
         velocity = point_pairs.solve(H, g, pairs.size)
@@ -47,7 +47,7 @@ class SquaredDistance(surface_metrics.SurfaceMetric):
         return surface_metrics.PointToPlane().fit(pairs)
 
 
-def approximant(matches: Matches, alignment: Alignment) -> Float64:
+def approximant(matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
     """Return F_d of each pair as a matrix (m, 3, 3) in the target's frame.
 
     ``F_d(x) = (x - q)^T W (x - q)`` with q the target point and W the result.

@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Optimisation, Optimiser, PoseGraph, free_vertices, levenberg
+from tofuse.engine.graph import Optimisation, Optimiser, PoseGraph, castellani, levenberg
 from tofuse.engine.parts import part
 
 
@@ -40,7 +40,7 @@ class Stochastic(Bounded, Optimiser):
         """See `Optimiser.optimise`; the best poses of all rounds. InputError as `lu-milios`."""
         levenberg.check_graph(graph)
         best, history = graph, [graph.chi2()]
-        if not len(graph.edges) or not free_vertices(graph).any():
+        if not len(graph.edges) or not castellani.free_vertices(graph).any():
             return Optimisation(graph, tuple(history), True)
         descent = _Descent(graph)
         for t in range(1, self.rounds + 1):

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds import Alignment, Matches, cloud_sum_kernels, point_pairs, surface_metrics
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp import icp_kernels, interfaces, point_pairs, surface_metrics
 from tofuse.engine.parts import part
 from tofuse.lab.methods.symmetric_kernels import symmetric_sums
 
@@ -31,7 +31,7 @@ class Symmetric(surface_metrics.SurfaceMetric):
 
     loss: point_pairs.Loss = "square"
 
-    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+    def motion(self, matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
         """See `Metric.motion`; no motion along unconstrained directions."""
         pairs = point_pairs.surface_pairs(matches, alignment, source=True)
         n = pairs.source_normals + pairs.target_normals
@@ -61,6 +61,6 @@ class Symmetric(surface_metrics.SurfaceMetric):
         n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
         r = (pairs.residual * n).sum(1)
         weight = pairs.weight * point_pairs.loss_weights(self.loss, r, pairs.resolution)
-        H, _, square = cloud_sum_kernels.plane_sums(pairs.points, n, n, r, weight)
+        H, _, square = icp_kernels.plane_sums(pairs.points, n, n, r, weight)
         variance = point_pairs.variance_of(square, weight, pairs.resolution)
         return H / variance, variance

@@ -11,18 +11,8 @@ import numpy as np
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.clouds import (
-    All,
-    Icp,
-    MaxDistance,
-    Metric,
-    PointToPoint,
-    SmallStep,
-    Unique,
-    at_most,
-    surface_metrics,
-)
 from tofuse.engine.frames import Frame
+from tofuse.engine.icp import Icp, icp_parts, interfaces, surface_metrics
 from tofuse.engine.parts import part
 from tofuse.lab.methods.compatibility import Trimmed
 from tofuse.lab.methods.correspondence import ClosestCompatible, ClosestInvariant, Invariant
@@ -79,15 +69,19 @@ class InTurn(Bounded, Registrar):
 
 
 def _surface_icp(
-    resolution: float, points: int | None, reach: float, max_iterations: int, metric: Metric
+    resolution: float,
+    points: int | None,
+    reach: float,
+    max_iterations: int,
+    metric: interfaces.Metric,
 ) -> Icp:
     return Icp(
         resolution,
-        source=at_most(points),
-        target=All(),
-        rejectors=(MaxDistance(reach),),
+        source=icp_parts.at_most(points),
+        target=icp_parts.All(),
+        rejectors=(icp_parts.MaxDistance(reach),),
         metric=metric,
-        stopping=SmallStep(max_iterations=max_iterations),
+        stopping=icp_parts.SmallStep(max_iterations=max_iterations),
     )
 
 
@@ -228,11 +222,11 @@ class Tricp(Bounded, Registrar):
         """Return the trimmed ICP for one overlap."""
         return Icp(
             self.resolution,
-            source=at_most(self.points),
-            target=All(),
+            source=icp_parts.at_most(self.points),
+            target=icp_parts.All(),
             rejectors=(Trimmed(overlap),),
-            metric=PointToPoint(),
-            stopping=SmallStep(max_iterations=self.max_iterations),
+            metric=icp_parts.PointToPoint(),
+            stopping=icp_parts.SmallStep(max_iterations=self.max_iterations),
         )
 
     def register(
@@ -299,12 +293,12 @@ class Iccp(Variant):
         """See `Variant.parts`."""
         return Icp(
             self.resolution,
-            source=at_most(self.points),
-            target=All(),
+            source=icp_parts.at_most(self.points),
+            target=icp_parts.All(),
             matcher=ClosestCompatible(self.ratio),
-            rejectors=(MaxDistance(self.reach),),
-            metric=PointToPoint(),
-            stopping=SmallStep(max_iterations=self.max_iterations),
+            rejectors=(icp_parts.MaxDistance(self.reach),),
+            metric=icp_parts.PointToPoint(),
+            stopping=icp_parts.SmallStep(max_iterations=self.max_iterations),
         )
 
 
@@ -346,11 +340,11 @@ class Icpif(Variant):
         """See `Variant.parts`."""
         plain = Icp(
             self.resolution,
-            source=at_most(self.points),
-            target=All(),
-            rejectors=(MaxDistance(self.reach),),
-            metric=PointToPoint(),
-            stopping=SmallStep(max_iterations=self.max_iterations),
+            source=icp_parts.at_most(self.points),
+            target=icp_parts.All(),
+            rejectors=(icp_parts.MaxDistance(self.reach),),
+            metric=icp_parts.PointToPoint(),
+            stopping=icp_parts.SmallStep(max_iterations=self.max_iterations),
         )
         matcher = ClosestInvariant(self.features, self.weight, self.radius)
-        return InTurn((replace(plain, matcher=matcher, rejectors=(Unique(),)), plain))
+        return InTurn((replace(plain, matcher=matcher, rejectors=(icp_parts.Unique(),)), plain))

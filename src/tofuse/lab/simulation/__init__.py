@@ -11,7 +11,14 @@ if TYPE_CHECKING:
     from tofuse.lab.simulation.models import CameraModel
     from tofuse.lab.simulation.passing import Passing
     from tofuse.lab.simulation.paths import Path
-    from tofuse.lab.simulation.peaks import RADIUS_M, peaks_cameras, peaks_normals, peaks_points, peaks_views, peaks_visible
+    from tofuse.lab.simulation.peaks import (
+        RADIUS_M,
+        peaks_cameras,
+        peaks_normals,
+        peaks_points,
+        peaks_views,
+        peaks_visible,
+    )
     from tofuse.lab.simulation.record import RecordingPlan, plan, simulate
     from tofuse.lab.simulation.scene import SCENES, SceneOptions, ScenePlan
     from tofuse.lab.simulation.texture import Material

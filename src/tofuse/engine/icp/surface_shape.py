@@ -12,10 +12,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Int64
-from tofuse.engine.clouds.cloud_shape_kernels import local_shapes
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import KdTree
+from tofuse.engine.icp.icp_kernels import local_shapes
 
 NEIGHBOURS = 20
 # Twenty random neighbours have an angular gap this wide at one in 300 inner points; at a straight

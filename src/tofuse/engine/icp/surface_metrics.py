@@ -9,9 +9,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.cloud_sum_kernels import matrix_sums, plane_sums, plane_to_plane_weights
-from tofuse.engine.clouds.interfaces import Alignment, Matches, Metric
-from tofuse.engine.clouds.point_pairs import (
+from tofuse.engine.icp.icp_kernels import matrix_sums, plane_sums, plane_to_plane_weights
+from tofuse.engine.icp.interfaces import Alignment, Matches, Metric
+from tofuse.engine.icp.point_pairs import (
     Loss,
     SurfacePairs,
     loss_weights,

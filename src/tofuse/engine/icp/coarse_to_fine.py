@@ -10,19 +10,17 @@ import numpy as np
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.icp import Icp
-from tofuse.engine.clouds.interfaces import Metric
-from tofuse.engine.clouds.point_pairs import MIN_PAIRS
-from tofuse.engine.clouds.reduce import averaged, extent, reduced
-from tofuse.engine.clouds.rejectors import MaxDistance
-from tofuse.engine.clouds.remapping import Remapping
-from tofuse.engine.clouds.selectors import All, Uniform
-from tofuse.engine.clouds.stopping import SmallStep
-from tofuse.engine.clouds.surface_metrics import PlaneToPlane
-from tofuse.engine.clouds.surface_shape import shape_at
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.icp.icp import Icp
+from tofuse.engine.icp.icp_parts import All, MaxDistance, SmallStep, Uniform
+from tofuse.engine.icp.interfaces import Metric
+from tofuse.engine.icp.point_pairs import MIN_PAIRS
+from tofuse.engine.icp.reduce import averaged, extent, reduced
+from tofuse.engine.icp.remapping import Remapping
+from tofuse.engine.icp.surface_metrics import PlaneToPlane
+from tofuse.engine.icp.surface_shape import shape_at
 from tofuse.engine.parts import part
 
 _SPACING_SAMPLE = 5000

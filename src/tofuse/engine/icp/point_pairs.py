@@ -12,12 +12,11 @@ from typing import Literal
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.clouds.cloud_sum_kernels import direction_products, plane_sums
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.interfaces import Alignment, Matches
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp_kernels import direction_products, plane_sums, transform_points
+from tofuse.engine.icp.interfaces import Alignment, Matches
 from tofuse.engine.normal import robust_sigma
 
 Loss = Literal["square", "huber", "cauchy", "tukey"]

@@ -15,9 +15,9 @@ from typing import ClassVar, Protocol, Self
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Int64
-from tofuse.engine.clouds.surface_shape import NEIGHBOURS, Shape, normals_at, shape_at
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
+from tofuse.engine.icp.surface_shape import NEIGHBOURS, Shape, normals_at, shape_at
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,20 @@ import numpy as np
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.clouds.icp_kernels import transform_points
-from tofuse.engine.clouds.interfaces import (
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.frames import Frame
+from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp_kernels import transform_points
+from tofuse.engine.icp.icp_parts import (
+    ClosestPoint,
+    MaxDistance,
+    PointToPoint,
+    Random,
+    TwoLoops,
+    Unique,
+    at_most,
+)
+from tofuse.engine.icp.interfaces import (
     Alignment,
     History,
     Matcher,
@@ -22,16 +34,8 @@ from tofuse.engine.clouds.interfaces import (
     Selector,
     Stopping,
 )
-from tofuse.engine.clouds.matchers import ClosestPoint
-from tofuse.engine.clouds.metrics import PointToPoint
-from tofuse.engine.clouds.rejectors import MaxDistance, Unique
-from tofuse.engine.clouds.remapping import Remapping
-from tofuse.engine.clouds.selectors import Random, at_most
-from tofuse.engine.clouds.stopping import TwoLoops
-from tofuse.engine.clouds.surface_shape import NEIGHBOURS
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames import Frame
-from tofuse.engine.geometry import se3
+from tofuse.engine.icp.remapping import Remapping
+from tofuse.engine.icp.surface_shape import NEIGHBOURS
 from tofuse.engine.parts import part
 
 _MIN_POINTS = 3
