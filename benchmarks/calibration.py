@@ -22,10 +22,10 @@ from tofuse.apps.calibration.plane_views import PlaneView, board_planes, scene_p
 from tofuse.engine.cameras.cameras import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import Recording
+from tofuse.lab.scenes import checkerboard
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import simulate_recording
-from tofuse.lab.simulation.scenes import checkerboard
 from tofuse.lab.simulation.sensor import factory_correction
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)

@@ -43,7 +43,7 @@ from tofuse.engine.frames.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
 from tofuse.formats.recordings.open import open_recording
-from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.world import scene as scenes
 
 POINTS = 20_000
 RIGHT_M, RIGHT_FRACTION, RIGHT_DEG = 0.1, 0.05, 4.0

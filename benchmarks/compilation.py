@@ -27,9 +27,9 @@ ROOT = Path(__file__).resolve().parents[1]
 LIST = ROOT / "src" / "tofuse" / "kernels" / "signatures.txt"
 ALONE = (
     "import sys; from tofuse.engine.compute import ahead; ahead.usable_cores = lambda: 1; "
-    "from tofuse.apps.cli import main; sys.exit(main())"
+    "from tofuse.apps.cli.program import main; sys.exit(main())"
 )
-BOTH = "import sys; from tofuse.apps.cli import main; sys.exit(main())"
+BOTH = "import sys; from tofuse.apps.cli.program import main; sys.exit(main())"
 _NAMES = {name: short for short, name in DTYPES.items()} | {"bool": "b1"}
 
 

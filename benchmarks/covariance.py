@@ -37,7 +37,7 @@ from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
-from tofuse.lab.simulation.scene import build
+from tofuse.lab.world.scene import build
 
 KINDS = ("room", "empty-room", "wall", "corner", "corridor")
 PAIRS = ((0, 1), (1, 2), (0, 2))

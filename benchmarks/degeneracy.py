@@ -42,7 +42,7 @@ from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model, noise_of
 from tofuse.lab.simulation.render import render
-from tofuse.lab.simulation.scene import Scene, build
+from tofuse.lab.world.scene import Scene, build
 
 SUBPIXELS = 3
 AWAY = 3.0  # in units of 1 cm and 1 degree

@@ -45,12 +45,12 @@ from tofuse.formats.export.conversion import convert
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation import paths
-from tofuse.lab.simulation.scene import Scene
-from tofuse.lab.simulation.scenes import furniture, household
-from tofuse.lab.simulation.scenes.composition import Assembly, placed
-from tofuse.lab.simulation.texture import Material
+from tofuse.lab.scenes import furniture, household
+from tofuse.lab.scenes.composition import Assembly, placed
+from tofuse.lab.world import mesh as meshes
+from tofuse.lab.world import paths
+from tofuse.lab.world.scene import Scene
+from tofuse.lab.world.texture import Material
 
 OUT = Path(__file__).parent / "out"
 COLUMNS, ROWS = 128, 96

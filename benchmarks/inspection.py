@@ -30,11 +30,11 @@ from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, ray_lengths, sc
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.lab.simulation import paths
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import RecordingPlan
-from tofuse.lab.simulation.scene import SCENES, build
+from tofuse.lab.world import paths
+from tofuse.lab.world.scene import SCENES, build
 
 Frames = list[RangeFrame]
 

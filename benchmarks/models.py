@@ -26,8 +26,8 @@ from tofuse.engine.results.types import Reconstruction
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.cases import CHEST
 from tofuse.lab.experiments.recorded import RecordedScene
+from tofuse.lab.scenes import box
 from tofuse.lab.simulation.record import plan, simulate_recording
-from tofuse.lab.simulation.scenes import box
 
 CASES = {
     "rail": ("rail", {}),

@@ -28,7 +28,7 @@ from tofuse.formats.recordings.still import average_still
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CAMERAS, camera_model
 from tofuse.lab.simulation.render import render
-from tofuse.lab.simulation.scene import build
+from tofuse.lab.world.scene import build
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 ZENSE = Pinhole(640, 480, 456.636, 456.226, 342.983, 233.82)

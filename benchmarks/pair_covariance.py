@@ -44,11 +44,11 @@ from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
+from tofuse.lab.world import scene as scenes
 
 OUT = Path(__file__).resolve().parent / "out" / "pair_covariance"
 POINTS = 20_000

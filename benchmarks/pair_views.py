@@ -15,9 +15,9 @@ import numpy as np
 import unusual
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.models import CameraModel, camera_model
-from tofuse.lab.simulation.paths import Path
+from tofuse.lab.world import scene as scenes
+from tofuse.lab.world.paths import Path
 from unusual import Unusual
 
 VIEWS = 14

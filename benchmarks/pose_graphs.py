@@ -35,7 +35,7 @@ from tofuse.formats.poses.g2o import read_g2o, write_g2o
 from tofuse.lab.methods.charts import Cosines, Quaternion, descend
 from tofuse.lab.methods.elch import Elch
 from tofuse.lab.methods.lu_milios import LuMilios
-from tofuse.lab.simulation.laps import drifting_laps
+from tofuse.lab.world.laps import drifting_laps
 
 FALSE = 0.3  # fraction of false loops
 ODOMETRY = np.array([0.004] * 3 + [np.radians(0.2)] * 3)  # standard deviations, m and rad

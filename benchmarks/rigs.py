@@ -39,11 +39,11 @@ from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.formats.recordings.rig import Rig, RigCamera
-from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
-from tofuse.lab.simulation.paths import look_at, rotation
 from tofuse.lab.simulation.rig import Mount, camera_ring, relative, simulate_rig, wander
+from tofuse.lab.world import scene as scenes
+from tofuse.lab.world.paths import look_at, rotation
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "azure_kinect_rig"
 STILL = Effects(multipath=False, scatter=0.0, smear=False)

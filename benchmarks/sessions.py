@@ -32,11 +32,11 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory_errors import align, displacement
 from tofuse.engine.results.types import Reconstruction
-from tofuse.lab.simulation import paths
+from tofuse.lab.scenes import flat, furniture
+from tofuse.lab.scenes.composition import Assembly, placed
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import RecordingPlan, plan, write
-from tofuse.lab.simulation.scenes import flat, furniture
-from tofuse.lab.simulation.scenes.composition import Assembly, placed
+from tofuse.lab.world import paths
 
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "sessions"
 RUNS = Path(__file__).resolve().parent / "out" / "sessions"

@@ -21,11 +21,11 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.formats.recordings.open import open_recording
-from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CAMERAS, camera_model
 from tofuse.lab.simulation.render import render
+from tofuse.lab.world import scene as scenes
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 OUT = Path(__file__).resolve().parent / "out"

@@ -24,12 +24,12 @@ from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.formats.recordings.open import open_recording
-from tofuse.lab.simulation import paths
-from tofuse.lab.simulation import scene as simulated
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.passing import Kind, Passing
 from tofuse.lab.simulation.record import plan, write
+from tofuse.lab.world import paths
+from tofuse.lab.world import scene as simulated
 
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "robustness"
 

@@ -25,9 +25,9 @@ from tofuse.lab.experiments.cases import CASES, DRAWS, run_case
 from tofuse.lab.experiments.page import NAMES
 from tofuse.lab.experiments.peaks import sweep_peaks
 from tofuse.lab.experiments.statements import STATEMENTS, Results, judge_all
+from tofuse.lab.scenes import room
 from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.scenes import room
-from tofuse.lab.simulation.texture import Material
+from tofuse.lab.world.texture import Material
 
 _PEAKS_SEEDS = 5
 

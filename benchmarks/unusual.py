@@ -17,16 +17,17 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.formats.recordings.correction_file import corrected_depth
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation import paths, sensor
-from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.scenes.composition import Assembly, placed, shell
+from tofuse.lab.scenes.furniture import chair, plant
+from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
-from tofuse.lab.simulation.paths import Path
 from tofuse.lab.simulation.record import RecordingPlan
-from tofuse.lab.simulation.scenes.composition import Assembly, placed, shell
-from tofuse.lab.simulation.scenes.furniture import chair, plant
-from tofuse.lab.simulation.texture import Material
+from tofuse.lab.world import mesh as meshes
+from tofuse.lab.world import paths
+from tofuse.lab.world import scene as scenes
+from tofuse.lab.world.paths import Path
+from tofuse.lab.world.texture import Material
 
 WALL = Material("wall", 0.65, 0.1, "noise", (0.5, 0.5, 0.5))
 GROUND = Material("ground", 0.4, 0.2, "speckle", (0.1, 0.1, 0.1))

@@ -8,7 +8,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation import bvh_kernels as bvh
+from tofuse.lab.world import bvh_kernels as bvh
 
 SIZE = (720, 480)  # pixels
 TILT, TURN = np.radians(48.0), np.radians(62.0)

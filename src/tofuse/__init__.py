@@ -12,12 +12,12 @@ Names are imported on first use, so that ``import tofuse`` is fast.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from tofuse._version import __version__
+from tofuse._faces import face
 
 if TYPE_CHECKING:
+    from tofuse._version import __version__
     from tofuse.apps.api.result import Result, load, merge, reconstruct
     from tofuse.apps.inspection.inspect import inspect_recording as inspect
     from tofuse.apps.jobs.evaluating import Evaluation, evaluate
@@ -49,106 +49,4 @@ if TYPE_CHECKING:
     )
     from tofuse.formats.recordings.open import open_recording as open  # noqa: A004
 
-_HOMES = {
-    "Accuracy": "tofuse.engine.quality.pose_accuracy",
-    "BrownConrady": "tofuse.engine.cameras.cameras",
-    "Change": "tofuse.engine.quality.change_detection",
-    "Cloud": "tofuse.engine.fusion.cloud",
-    "CloudFrame": "tofuse.engine.frames.frames",
-    "Component": "tofuse.engine.results.types",
-    "Config": "tofuse.engine.mapping.config",
-    "Diagnostics": "tofuse.engine.results.types",
-    "Evaluation": "tofuse.apps.jobs.evaluating",
-    "Fisheye": "tofuse.engine.cameras.cameras",
-    "FrameRecord": "tofuse.engine.results.types",
-    "InputError": "tofuse.engine.errors",
-    "Judgement": "tofuse.apps.jobs.judging",
-    "LoopRecord": "tofuse.engine.graph.graph",
-    "Mapper": "tofuse.engine.mapping.mapper",
-    "Mesh": "tofuse.engine.fusion.mesh",
-    "OutputError": "tofuse.engine.errors",
-    "Pinhole": "tofuse.engine.cameras.cameras",
-    "Player": "tofuse.apps.live.player",
-    "PoseGraph": "tofuse.engine.graph.graph",
-    "RangeFrame": "tofuse.engine.frames.frames",
-    "Rational": "tofuse.engine.cameras.cameras",
-    "RayTable": "tofuse.engine.cameras.cameras",
-    "Reason": "tofuse.engine.results.types",
-    "Reconstruction": "tofuse.engine.results.types",
-    "Recording": "tofuse.engine.frames.recording",
-    "Registration": "tofuse.engine.alignment.base",
-    "RegistrationError": "tofuse.engine.errors",
-    "Result": "tofuse.apps.api.result",
-    "SessionChange": "tofuse.engine.results.types",
-    "SessionPair": "tofuse.engine.results.types",
-    "SessionRecord": "tofuse.engine.results.types",
-    "TofuseError": "tofuse.engine.errors",
-    "evaluate": "tofuse.apps.jobs.evaluating",
-    "from_arrays": "tofuse.engine.frames.from_arrays",
-    "inspect": "tofuse.apps.inspection.inspect",
-    "judge": "tofuse.apps.jobs.judging",
-    "load": "tofuse.apps.api.result",
-    "merge": "tofuse.apps.api.result",
-    "open": "tofuse.formats.recordings.open",
-    "reconstruct": "tofuse.apps.api.result",
-    "register": "tofuse.engine.clouds.pair",
-}
-
-__all__ = [
-    "Accuracy",
-    "BrownConrady",
-    "Change",
-    "Cloud",
-    "CloudFrame",
-    "Component",
-    "Config",
-    "Diagnostics",
-    "Evaluation",
-    "Fisheye",
-    "FrameRecord",
-    "InputError",
-    "Judgement",
-    "LoopRecord",
-    "Mapper",
-    "Mesh",
-    "OutputError",
-    "Pinhole",
-    "Player",
-    "PoseGraph",
-    "RangeFrame",
-    "Rational",
-    "RayTable",
-    "Reason",
-    "Reconstruction",
-    "Recording",
-    "Registration",
-    "RegistrationError",
-    "Result",
-    "SessionChange",
-    "SessionPair",
-    "SessionRecord",
-    "TofuseError",
-    "__version__",
-    "evaluate",
-    "from_arrays",
-    "inspect",
-    "judge",
-    "load",
-    "merge",
-    "open",
-    "reconstruct",
-    "register",
-]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'tofuse' has no attribute {name!r}")
-    attribute = f"{name}_recording" if name in ("inspect", "open") else name
-    value = getattr(importlib.import_module(_HOMES[name]), attribute)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -15,7 +15,7 @@ from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
-from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
+from tofuse.lab.world.scene import FRAME_RATE_HZ, build
 
 OPTIONS = ProjectiveOptions()
 MODEL = camera_model("sr4000")

@@ -21,10 +21,10 @@ from tofuse.engine.sensor.depth_correction import DepthCorrection
 from tofuse.formats.recordings.correction_file import read_correction
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
+from tofuse.lab.scenes import checkerboard
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
-from tofuse.lab.simulation.scenes import checkerboard
 from tofuse.lab.simulation.sensor import factory_correction
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)

@@ -26,7 +26,7 @@ from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.render import render
-from tofuse.lab.simulation.scene import build
+from tofuse.lab.world.scene import build
 
 CAMERA = Pinhole(80, 60, 60.0, 60.0, 39.5, 29.5)
 

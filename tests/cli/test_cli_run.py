@@ -553,7 +553,7 @@ def test_interrupted_run_changes_nothing(
 # Prints a line in the middle of tracking, and waits there.
 _SLOW = """
 import sys, time
-from tofuse.apps.cli import main
+from tofuse.apps.cli.program import main
 from tofuse.apps.cli.progress import QuietProgress
 def advance(self, record=None):
     if record is not None and record.index == 2:

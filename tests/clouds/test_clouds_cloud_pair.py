@@ -24,10 +24,10 @@ from tofuse.engine.icp.reduce import averaged
 from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
 from tofuse.engine.tracking.pairwise import Pairwise
 from tofuse.formats.geometry.ply import write_ply
-from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.lab.simulation.record import plan
+from tofuse.lab.world import scene as scenes
 
 ANYWHERE = se3.exp([1.0, -0.7, 0.4, 1.9, 0.3, -1.0])
 

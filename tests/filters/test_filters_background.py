@@ -19,9 +19,9 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.parts import to_dict
 from tofuse.engine.sensor.scattering_correction import LensScattering
 from tofuse.formats.recordings.correction_file import corrected_depth
+from tofuse.lab.scenes import box
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
-from tofuse.lab.simulation.scenes import box
 
 OF_OBJECT = {"torso": ("skin", "hair", "shirt", "trousers", "seat"), "box": ("box",)}
 

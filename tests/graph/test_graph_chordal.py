@@ -13,7 +13,7 @@ from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
 from tofuse.engine.graph.minimisation import Problem
 from tofuse.engine.graph.robust import Settings
-from tofuse.lab.simulation.laps import drifting_laps
+from tofuse.lab.world.laps import drifting_laps
 from walked_graph import SIGMA, walk
 
 SOMEWHERE = se3.exp(np.array([3.0, -1, 2, 0.5, -2, 1]))

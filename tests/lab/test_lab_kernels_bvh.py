@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.compute.thread_pool import chunk_bounds
-from tofuse.lab.simulation import bvh_kernels as bvh
+from tofuse.lab.world import bvh_kernels as bvh
 
 
 def brute_force_cast(triangles, origins, directions):

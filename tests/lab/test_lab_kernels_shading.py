@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.lab.simulation import shading_kernels as kernels
-from tofuse.lab.simulation.texture import Material, noise_tables, parameter_rows
+from tofuse.lab.world import shading_kernels as kernels
+from tofuse.lab.world.texture import Material, noise_tables, parameter_rows
 
 
 def noise_twin(table, points):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation.scene import build
-from tofuse.lab.simulation.scenes.flat import DOOR, HALF, ROOMS, T_flat_room
+from tofuse.lab.scenes.flat import DOOR, HALF, ROOMS, T_flat_room
+from tofuse.lab.world.scene import build
 
 ALL_AROUND = np.random.default_rng(30).normal(size=(40000, 3))
 ALL_AROUND /= np.linalg.norm(ALL_AROUND, axis=1, keepdims=True)

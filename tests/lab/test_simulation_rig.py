@@ -6,7 +6,7 @@ import numpy as np
 
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.rig import Mount, simulate_rig
-from tofuse.lab.simulation.scene import build
+from tofuse.lab.world.scene import build
 
 
 def test_cameras_see_same_motion_by_their_own_clocks() -> None:

@@ -8,9 +8,9 @@ import pytest
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation.scene import SCENES, Scene, build
-from tofuse.lab.simulation.scenes import furniture
-from tofuse.lab.simulation.scenes.composition import Assembly
+from tofuse.lab.scenes import furniture
+from tofuse.lab.scenes.composition import Assembly
+from tofuse.lab.world.scene import SCENES, Scene, build
 
 
 def sr4000_rays(step=4):
@@ -187,7 +187,7 @@ def test_visible_points_lie_on_truth_mesh(built, name):
 
 
 def _mesh(vertices, faces):
-    from tofuse.lab.simulation.mesh import Mesh
+    from tofuse.lab.world.mesh import Mesh
 
     return Mesh.of(vertices, faces)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation.scene import Scene
-from tofuse.lab.simulation.scenes import blends, torso
-from tofuse.lab.simulation.texture import Material
+from tofuse.lab.scenes import blends, torso
+from tofuse.lab.world import mesh as meshes
+from tofuse.lab.world.scene import Scene
+from tofuse.lab.world.texture import Material
 
 
 def directed_edges(faces):

@@ -16,7 +16,7 @@ from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.models import CAMERAS, camera_model
 from tofuse.lab.simulation.render import RenderedFrame, render
-from tofuse.lab.simulation.scene import Hits, Sequence, build
+from tofuse.lab.world.scene import Hits, Sequence, build
 
 SMALL = Pinhole(44, 36, 57.0, 57.0, 21.5, 17.5)
 # Without blur, so that sums over sub-rays are exact.

@@ -13,7 +13,7 @@ from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.readers.native import NativeSource
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan, simulate, simulate_recording
-from tofuse.lab.simulation.scene import build
+from tofuse.lab.world.scene import build
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
-from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
+from tofuse.lab.world.scene import FRAME_RATE_HZ, build
 
 WIDTH, HEIGHT = 54, 42
 

@@ -21,7 +21,7 @@ from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
-from tofuse.lab.simulation.scene import build
+from tofuse.lab.world.scene import build
 
 
 @pytest.fixture(scope="module")

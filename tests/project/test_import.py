@@ -28,14 +28,14 @@ def test_import_loads_no_heavy_packages() -> None:
     assert done.stderr == ""
     loaded = set(json.loads(done.stdout))
     assert not loaded & (HEAVY | {"numpy"})
-    assert {m for m in loaded if m.startswith("tofuse")} == {"tofuse", "tofuse._version"}
+    assert {m for m in loaded if m.startswith("tofuse")} == {"tofuse", "tofuse._faces"}
 
 
 @pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["--version"], ["run"], []])
 def test_help_loads_no_heavy_packages(words) -> None:
     done = _python(
         "import json, sys\n"
-        "from tofuse.apps.cli import main\n"
+        "from tofuse.apps.cli.program import main\n"
         "try:\n"
         f"    main({words!r})\n"
         "except SystemExit:\n"

@@ -17,7 +17,7 @@ from tofuse.formats.recordings.rig import (
     with_range_added,
     write_rig,
 )
-from tofuse.lab.simulation.paths import rotation
+from tofuse.lab.world.paths import rotation
 
 
 def made() -> Rig:

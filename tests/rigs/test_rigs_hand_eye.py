@@ -7,8 +7,8 @@ from tofuse.apps.rigs.clocks import lag_between
 from tofuse.apps.rigs.hand_eye import Track, clock_of, hand_eye
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation.paths import rotation
 from tofuse.lab.simulation.rig import wander
+from tofuse.lab.world.paths import rotation
 
 OFFSET = 0.0123
 

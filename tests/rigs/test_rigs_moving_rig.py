@@ -19,7 +19,7 @@ from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import changed, from_method
 from tofuse.formats.recordings.rig import RigSource
-from tofuse.lab.simulation.paths import look_at, rotation
+from tofuse.lab.world.paths import look_at, rotation
 
 CLOCK = 0.012
 COUNT = 18

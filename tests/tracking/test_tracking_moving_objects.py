@@ -28,7 +28,7 @@ from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
-from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
+from tofuse.lab.world.scene import FRAME_RATE_HZ, build
 
 FRAMES = 18
 NEAR = 1.3  # m

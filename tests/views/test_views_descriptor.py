@@ -17,7 +17,7 @@ from tofuse.engine.views.view_descriptors import (
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render
-from tofuse.lab.simulation.scene import build
+from tofuse.lab.world.scene import build
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,15 @@ The kernels give float32 for float32 and float64 for float64.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute.jit import kernel
 
-_ZERO, _ONE, _FOUR, _FIVE = (np.float32(x) for x in (0, 1, 4, 5))
+_CONSTANTS: Any = [np.float32(x) for x in (0, 1, 4, 5)]
+_ZERO, _ONE, _FOUR, _FIVE = _CONSTANTS
 
 
 @kernel

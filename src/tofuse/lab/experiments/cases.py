@@ -19,8 +19,9 @@ from tofuse.engine.progress import Progress
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.measures import BoxFit, PathScore
 from tofuse.lab.experiments.recorded import RecordedScene, record_scene
-from tofuse.lab.simulation import SCENES, Effects
-from tofuse.lab.simulation.scenes import box
+from tofuse.lab.scenes import box
+from tofuse.lab.simulation import Effects
+from tofuse.lab.world import SCENES
 
 METHODS = ("thesis", "default")
 GUESSES = ("identity", "previous")
@@ -380,7 +381,7 @@ def _facts(
 
 def corner_in_view(recorded: RecordedScene, stride: int) -> Bool:
     """(N,) mask of the frames of a stride with a visible corner of the room, by the true poses."""
-    from tofuse.lab.simulation.scenes import room
+    from tofuse.lab.scenes import room
 
     recording = recorded.every(stride)
     frame = recording[0]
@@ -403,7 +404,7 @@ def corner_in_view(recorded: RecordedScene, stride: int) -> Bool:
 
 def _door(recorded: RecordedScene, recording: Recording) -> dict[str, float]:
     """Points per frame on the glossy door, and on the section of that wall at -x."""
-    from tofuse.lab.simulation.scenes import room
+    from tofuse.lab.scenes import room
 
     counts = {"door": 0, "wall": 0}
     frames = list(recording)

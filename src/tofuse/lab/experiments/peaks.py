@@ -22,13 +22,7 @@ from tofuse.lab.experiments.bound import (
     mean_distances,
     pose_covariances,
 )
-from tofuse.lab.simulation import (
-    peaks_cameras,
-    peaks_normals,
-    peaks_points,
-    peaks_views,
-    peaks_visible,
-)
+from tofuse.lab.simulation import peaks
 
 SIGMAS_M = tuple(k / 100 for k in range(1, 11))
 AXES = ("x", "y", "z", "yaw", "pitch", "roll")
@@ -116,7 +110,7 @@ def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> Pe
     stops at a change of 1e-4 over 3 iterations, or after 100. The last motion, T_1_n, is the true
     one, as in the thesis.
     """
-    views, truth = peaks_views(sigma, seed)
+    views, truth = peaks.peaks_views(sigma, seed)
     icp = algorithm_1(resolution=1.0, points=None, epsilon=1e-4, k=3, max_iterations=100)
     tracker = Sequential(registration=icp, guess="previous").start(seed)
     steps = [tracker.push(view) for view in views]
@@ -141,7 +135,7 @@ def refine_peaks(sigma: float, seed: int) -> tuple[PoseErrors, PoseErrors]:
 
     The closing motion is not given.
     """
-    views, truth = peaks_views(sigma, seed)
+    views, truth = peaks.peaks_views(sigma, seed)
     tracker = Sequential(registration=CoarseToFine(), guess="previous").start(seed)
     refiner = plane_refinement.Planes().start(ViewStore(Spacing()))
     poses: list[Float64] = []
@@ -160,7 +154,7 @@ def reconstruct_peaks(sigma: float, seed: int) -> tuple[PoseErrors, int]:
 
     Relative to the first of these, whose pose is set to the true one.
     """
-    views, truth = peaks_views(sigma, seed)
+    views, truth = peaks.peaks_views(sigma, seed)
     recording = Recording.of(ArraySource(views, truth), "peaks", "simulated")
     result = reconstructing.reconstruct(recording, default("cloud"), seed=seed)
     has_pose = result.has_pose
@@ -172,20 +166,24 @@ def reconstruct_peaks(sigma: float, seed: int) -> tuple[PoseErrors, int]:
 
 def peaks_bound(sigma: float) -> float:
     """Lower bound of the mean error (m) of the 20 positions from the surface only; see `bound`."""
-    C = pose_covariances(peaks_points(), peaks_normals(), _visibility(), peaks_cameras(), sigma)
+    C = pose_covariances(
+        peaks.peaks_points(), peaks.peaks_normals(), _visibility(), peaks.peaks_cameras(), sigma
+    )
     return mean_distance(C[:, :3, :3])
 
 
 def peaks_bound_quantiles(sigma: float, quantiles: Sequence[float]) -> Float64:
     """Quantiles (m) of the mean error of a single recording, for a method at the bound."""
-    C = joint_covariance(peaks_points(), peaks_normals(), _visibility(), peaks_cameras(), sigma)
+    C = joint_covariance(
+        peaks.peaks_points(), peaks.peaks_normals(), _visibility(), peaks.peaks_cameras(), sigma
+    )
     return np.asarray(np.quantile(mean_distances(C), quantiles), np.float64)
 
 
 def _visibility() -> Bool:
     """(points, cameras) visibility mask."""
-    visible = np.zeros((len(peaks_points()), len(peaks_cameras())), bool)
-    for k, rows in enumerate(peaks_visible()):
+    visible = np.zeros((len(peaks.peaks_points()), len(peaks.peaks_cameras())), bool)
+    for k, rows in enumerate(peaks.peaks_visible()):
         visible[rows, k] = True
     return visible
 

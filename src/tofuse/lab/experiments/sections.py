@@ -14,8 +14,8 @@ from tofuse.engine.geometry import se3
 from tofuse.lab.experiments import figures
 from tofuse.lab.experiments.cases import GUESSES, METHODS, CaseResult, Model, Run
 from tofuse.lab.experiments.peaks import PeaksSweep
-from tofuse.lab.simulation import peaks_views
-from tofuse.lab.simulation.scenes import box, room
+from tofuse.lab.scenes import box, room
+from tofuse.lab.simulation import peaks
 
 _EXAMPLE_SIGMA = 0.09
 
@@ -248,7 +248,7 @@ def peaks_section(sweep: PeaksSweep) -> dict[str, Any]:
     """Return the template's values for the synthetic case."""
     sigma = sweep.sigmas[np.abs(sweep.sigmas - _EXAMPLE_SIGMA).argmin()]
     run = next(r for r in sweep.runs if r.sigma == sigma)
-    views, _ = peaks_views(run.sigma, run.seed)
+    views, _ = peaks.peaks_views(run.sigma, run.seed)
     before, after = figures.example(run, [v.points.astype(float) for v in views])
     rows = []
     for k, s in enumerate(sweep.sigmas):

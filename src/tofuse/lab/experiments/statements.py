@@ -17,8 +17,8 @@ from tofuse.engine.geometry import se3
 from tofuse.lab.experiments import measures
 from tofuse.lab.experiments.cases import CaseResult, Run
 from tofuse.lab.experiments.peaks import PeaksRun, PeaksSweep
-from tofuse.lab.simulation import RADIUS_M
-from tofuse.lab.simulation.scenes import box, rail, room, torso
+from tofuse.lab.scenes import box, rail, room, torso
+from tofuse.lab.simulation import peaks
 
 Outcome = Literal["agrees", "partly", "disagrees"]
 
@@ -598,9 +598,9 @@ def _overall_reduced(results: Results, method: str) -> Finding:
 def _pushed_inwards(results: Results, method: str) -> Finding:
     near_far = []
     for run in _example(results):
-        centre = np.array([0.0, 0.0, RADIUS_M])
-        inwards = RADIUS_M - np.linalg.norm(run.poses_optimised[:, :3, 3] - centre, axis=1)
-        far_side = np.linalg.norm(run.truth[:, :3, 3], axis=1) > RADIUS_M
+        centre = np.array([0.0, 0.0, peaks.RADIUS_M])
+        inwards = peaks.RADIUS_M - np.linalg.norm(run.poses_optimised[:, :3, 3] - centre, axis=1)
+        far_side = np.linalg.norm(run.truth[:, :3, 3], axis=1) > peaks.RADIUS_M
         near_far.append((float(inwards[~far_side].mean()), float(inwards[far_side].mean())))
     near_means, far_means = zip(*near_far, strict=True)
     return graded(
@@ -616,7 +616,7 @@ def _threshold(results: Results, method: str) -> Finding:
     low = sweep.position[sweep.sigmas < 0.05 - 1e-9, 0]
     high = sweep.position[sweep.sigmas > 0.05 + 1e-9, 0]
     return graded(
-        [_fraction_true(low.max() < 0.05 * RADIUS_M, high.min() > 0.05 * RADIUS_M)],
+        [_fraction_true(low.max() < 0.05 * peaks.RADIUS_M, high.min() > 0.05 * peaks.RADIUS_M)],
         f"Mean error of the chain: at most {low.max():.2f} m below sigma 0.05, at least "
         f"{high.min():.2f} m above.",
     )

@@ -68,7 +68,7 @@ class FeaturedKdTree(KdTree):
             if members:
                 x = self._points[members] - array[k]
                 matrices[k] = x.T @ x / len(members)
-        return np.linalg.eigvalsh(matrices)
+        return np.asarray(np.linalg.eigvalsh(matrices), np.float64)
 
 
 def _joined(points: Float64, features: Float64, weight: float) -> Float64:

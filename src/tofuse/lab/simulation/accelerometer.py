@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.lab.simulation.scene import Sequence
+from tofuse.lab.world import Sequence
 
 GRAVITY = 9.81
 RATE_HZ = 100.0

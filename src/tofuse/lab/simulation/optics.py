@@ -14,7 +14,7 @@ from tofuse.engine.compute import run_chunks
 from tofuse.engine.sensor import SPEED_OF_LIGHT
 from tofuse.lab.simulation import phasor_kernels as phasor
 from tofuse.lab.simulation.models import CameraModel
-from tofuse.lab.simulation.scene import Scene
+from tofuse.lab.world import Scene
 
 # Offset of secondary rays from their surface, against self-intersection.
 _RAY_OFFSET_M = 1e-4

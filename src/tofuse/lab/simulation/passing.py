@@ -16,13 +16,10 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation import paths
-from tofuse.lab.simulation.mesh import Mesh
+from tofuse.lab.scenes import HAIR, SHIRT, SKIN, TROUSERS
 from tofuse.lab.simulation.models import CameraModel
-from tofuse.lab.simulation.scene import Body, Scene, Sequence
-from tofuse.lab.simulation.scenes import HAIR, SHIRT, SKIN, TROUSERS
-from tofuse.lab.simulation.texture import Material
+from tofuse.lab.world import Body, Material, Mesh, Scene, Sequence, paths
+from tofuse.lab.world import mesh as meshes
 
 Kind = Literal["person", "box"]
 

@@ -18,7 +18,6 @@ from tofuse.formats.files import make_folder
 from tofuse.formats.geometry import write_ply
 from tofuse.formats.images import write_png
 from tofuse.formats.recordings import RecordingWriter, corrected_depth
-from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.accelerometer import accelerations
 from tofuse.lab.simulation.effects import Effects
@@ -26,6 +25,7 @@ from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.passing import Passing, add_distractor
 from tofuse.lab.simulation.peaks import peaks_cameras, peaks_points, peaks_views
 from tofuse.lab.simulation.render import RenderedFrame, render
+from tofuse.lab.world import scene as scenes
 
 # Called with the number of frames done and the total.
 Progress = Callable[[int, int], None]

@@ -12,7 +12,7 @@ from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.lab.simulation import optics, sensor
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.models import CameraModel
-from tofuse.lab.simulation.scene import Scene, Sequence
+from tofuse.lab.world import Scene, Sequence
 
 _DEFAULT = Effects()
 _FLAG_THRESHOLD_M = 0.003

@@ -12,11 +12,11 @@ from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.frames import ArraySource, RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.formats.recordings import corrected_depth
-from tofuse.lab.simulation import scene as scenes
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
-from tofuse.lab.simulation.paths import Path, look_at, rotation
 from tofuse.lab.simulation.record import RecordingPlan
+from tofuse.lab.world import Path, look_at, rotation
+from tofuse.lab.world import scene as scenes
 
 _DEFAULT = Effects()
 

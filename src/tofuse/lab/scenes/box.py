@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from tofuse.lab.simulation import Material, SceneOptions, ScenePlan, paths
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation.scenes.composition import Assembly, studio
+from tofuse.lab.scenes.composition import Assembly, studio
+from tofuse.lab.world import Material, SceneOptions, ScenePlan, paths
+from tofuse.lab.world import mesh as meshes
 
 WIDTH, DEPTH, HEIGHT = 0.300, 0.300, 0.400
 BOTTOM = 0.90

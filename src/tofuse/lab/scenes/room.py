@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.lab.simulation import Material, SceneOptions, ScenePlan, paths
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation.scenes import furniture
-from tofuse.lab.simulation.scenes.composition import Assembly, shell
+from tofuse.lab.scenes import furniture
+from tofuse.lab.scenes.composition import Assembly, shell
+from tofuse.lab.world import Material, SceneOptions, ScenePlan, paths
+from tofuse.lab.world import mesh as meshes
 
 LENGTH, WIDTH, HEIGHT = 6.0, 3.2, 2.5
 CAMERA_HEIGHT = 0.8

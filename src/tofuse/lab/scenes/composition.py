@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.lab.simulation import Material, Mesh, paths
-from tofuse.lab.simulation import mesh as meshes
+from tofuse.lab.world import Material, Mesh, paths
+from tofuse.lab.world import mesh as meshes
 
 
 class Assembly:

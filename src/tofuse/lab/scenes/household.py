@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.lab.simulation import Material, Mesh
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation.scenes.composition import Assembly
+from tofuse.lab.scenes.composition import Assembly
+from tofuse.lab.world import Material, Mesh
+from tofuse.lab.world import mesh as meshes
 
 OAK = Material("oak", 0.46, 0.2, "wood", (0.9, 0.9, 0.05))
 BIRCH = Material("birch", 0.62, 0.12, "wood", (0.7, 0.7, 0.06))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.lab.simulation import Material, SceneOptions, ScenePlan, paths
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation.scenes import furniture
-from tofuse.lab.simulation.scenes.composition import Assembly, placed, shell
+from tofuse.lab.scenes import furniture
+from tofuse.lab.scenes.composition import Assembly, placed, shell
+from tofuse.lab.world import Material, SceneOptions, ScenePlan, paths
+from tofuse.lab.world import mesh as meshes
 
 RAIL_LENGTH = 0.90
 

@@ -9,7 +9,7 @@ from typing import Literal, Self
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Int32
-from tofuse.lab.simulation import shading_kernels as kernels
+from tofuse.lab.world import shading_kernels as kernels
 
 Pattern = Literal["plain", "noise", "wood", "tiles", "print", "speckle"]
 _KINDS: dict[Pattern, int] = {

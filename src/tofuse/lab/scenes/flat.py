@@ -14,10 +14,10 @@ from scipy.interpolate import CubicSpline
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation import Material, SceneOptions, ScenePlan, paths
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation.scenes import furniture, household
-from tofuse.lab.simulation.scenes.composition import Assembly, placed
+from tofuse.lab.scenes import furniture, household
+from tofuse.lab.scenes.composition import Assembly, placed
+from tofuse.lab.world import Material, SceneOptions, ScenePlan, paths
+from tofuse.lab.world import mesh as meshes
 
 HALF, HEIGHT, WALL = 2.2, 2.5, 0.12
 DOOR, DOOR_TOP = 0.90, 2.05

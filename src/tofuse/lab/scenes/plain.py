@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from tofuse.lab.simulation import Material, SceneOptions, ScenePlan, paths
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation.scenes.composition import Assembly, shell
+from tofuse.lab.scenes.composition import Assembly, shell
+from tofuse.lab.world import Material, SceneOptions, ScenePlan, paths
+from tofuse.lab.world import mesh as meshes
 
 WALL = Material("wall", 0.65, 0.2, "noise", (0.5, 0.5, 0.5))
 SIDE = Material("side wall", 0.7, 0.15, "print", (0.4, 0.4, 0.4))

@@ -6,9 +6,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation import Material, Path, SceneOptions, ScenePlan, paths
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation.scenes.composition import Assembly
+from tofuse.lab.scenes.composition import Assembly
+from tofuse.lab.world import Material, Path, SceneOptions, ScenePlan, paths
+from tofuse.lab.world import mesh as meshes
 
 # Inner corners, and the side of a square in m.
 COLUMNS, ROWS, SQUARE_M = 8, 6, 0.1

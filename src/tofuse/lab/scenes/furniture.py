@@ -7,9 +7,9 @@ from itertools import pairwise
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.lab.simulation import Material, Mesh
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation.scenes.composition import Assembly
+from tofuse.lab.scenes.composition import Assembly
+from tofuse.lab.world import Material, Mesh
+from tofuse.lab.world import mesh as meshes
 
 PLASTIC = Material("chair frame", 0.16, 0.0, "plain", gloss=0.05)
 CHROME = Material("chair column", 0.3, 0.0, "plain", gloss=0.35)

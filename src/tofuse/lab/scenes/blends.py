@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Bool, Float64, Int64
-from tofuse.lab.simulation import Mesh
+from tofuse.lab.world import Mesh
 
 Shape = Callable[[Float64], Float64]
 

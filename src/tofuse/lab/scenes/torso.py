@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.lab.simulation import Material, Mesh, SceneOptions, ScenePlan, paths
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation.scenes import blends, furniture
-from tofuse.lab.simulation.scenes.blends import Shape, ellipsoid, limb
-from tofuse.lab.simulation.scenes.composition import Assembly, studio
+from tofuse.lab.scenes import blends, furniture
+from tofuse.lab.scenes.blends import Shape, ellipsoid, limb
+from tofuse.lab.scenes.composition import Assembly, studio
+from tofuse.lab.world import Material, Mesh, SceneOptions, ScenePlan, paths
+from tofuse.lab.world import mesh as meshes
 
 DISTANCE = 1.45
 GRID = 0.018

@@ -19,13 +19,13 @@ from tofuse.engine.arrays import Float32, Float64, Int32, Int64
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.lab.simulation import bvh_kernels as bvh
-from tofuse.lab.simulation import mesh as meshes
-from tofuse.lab.simulation import texture
-from tofuse.lab.simulation.mesh import Mesh
-from tofuse.lab.simulation.paths import Path
-from tofuse.lab.simulation.shading_kernels import Rays, Shading, Textures, Triangles, shade_hits
-from tofuse.lab.simulation.texture import Material
+from tofuse.lab.world import bvh_kernels as bvh
+from tofuse.lab.world import mesh as meshes
+from tofuse.lab.world import texture
+from tofuse.lab.world.mesh import Mesh
+from tofuse.lab.world.paths import Path
+from tofuse.lab.world.shading_kernels import Rays, Shading, Textures, Triangles, shade_hits
+from tofuse.lab.world.texture import Material
 
 # Small enough to occupy all threads, large enough to amortise the overhead of a chunk.
 _RAYS_PER_CHUNK = 4096
@@ -305,7 +305,7 @@ class SceneKind:
     summary
         Content and motion of the scene.
     module
-        Module of `tofuse.lab.simulation.scenes` that builds it.
+        Module of `tofuse.lab.scenes` that builds it.
     frames, stride
         Number of raw frames of the whole sequence, and the thesis's stride.
     turns
@@ -404,9 +404,7 @@ def build(
             remedy="leave it at 0",
         )
     options = SceneOptions(name, seed, kind.frames / FRAME_RATE_HZ, axis_offset_m)
-    plan: ScenePlan = importlib.import_module(f"tofuse.lab.simulation.scenes.{kind.module}").plan(
-        options
-    )
+    plan: ScenePlan = importlib.import_module(f"tofuse.lab.scenes.{kind.module}").plan(options)
     scene = Scene(
         name,
         plan.materials if texture else [m.uniform() for m in plan.materials],
