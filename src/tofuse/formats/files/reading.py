@@ -264,3 +264,27 @@ def is_folder(path: Path) -> bool:
         return path.is_dir()
     except OSError:
         return False
+
+
+def read_part(path: Path, offset: int, size: int) -> bytes:
+    """Return up to `size` bytes of a file from an offset; InputError if it can't be read."""
+    try:
+        with path.open("rb") as file:
+            file.seek(offset)
+            return file.read(size)
+    except OSError as error:
+        raise input_error(error, path) from error
+
+
+@contextmanager
+def library_errors(where: str | Path, remedy: str = "copy the file again") -> Iterator[None]:
+    """Turn any exception of a library that reads a damaged file into an InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        line = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"can't be read ({type(error).__name__}: {line})", where=where, remedy=remedy
+        ) from error

@@ -10,20 +10,17 @@ if TYPE_CHECKING:
         as_color,
         check_first_size,
         first_size,
-        jpeg_bytes,
         parse_image,
-        png_bytes,
         read_color,
         read_header,
         read_image,
         read_raw,
-        write_png,
     )
     from tofuse.formats.images.lzfse import lzfse_decompress
-    from tofuse.formats.images.matroska import MAGIC, Block, Matroska, Track
-    from tofuse.formats.images.pcic import BEGIN, Chunk, chunk_image, pcic_frames
+    from tofuse.formats.images import matroska
     from tofuse.formats.images.pgm import parse_pgm
     from tofuse.formats.images.tiff import read_tiff
     from tofuse.formats.images.video import Video
+    from tofuse.formats.images.writing import jpeg_bytes, png_bytes, write_png
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

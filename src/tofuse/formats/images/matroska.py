@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import input_error
+from tofuse.formats.files import reading
 
 MAGIC = b"\x1a\x45\xdf\xa3"
 
@@ -89,7 +89,7 @@ class Matroska:
                     raise InputError("is not a Matroska file", where=path, remedy="check the file")
                 self._parse()
         except OSError as error:
-            raise input_error(error, path) from error
+            raise reading.input_error(error, path) from error
 
     def read(self, block: Block) -> bytes:
         """Return the bytes of a block; InputError if it is cut off, or laced (several frames)."""
@@ -102,7 +102,7 @@ class Matroska:
                 file.seek(block.offset)
                 data = file.read(block.size)
         except OSError as error:
-            raise input_error(error, self.path) from error
+            raise reading.input_error(error, self.path) from error
         if len(data) < block.size:
             raise InputError("is cut off", where=self.path, remedy="copy the file again")
         return data

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.formats.files import exact, read_text
+from tofuse.formats.files import reading, tables
 
 FIELD = "T_target_source"
 _REMEDY = (
@@ -34,7 +34,7 @@ def read_pose(path: str | Path) -> Float64:
     InputError
         Naming file and field, if it can't be read or is not a rigid motion.
     """
-    text = read_text(path, limit=_MAX_BYTES)
+    text = reading.read_text(path, limit=_MAX_BYTES)
     if text.lstrip()[:1] in ("{", "["):
         matrix, where = _from_json(text, path)
     else:
@@ -48,7 +48,7 @@ def read_pose(path: str | Path) -> Float64:
 def pose_text(T: ArrayLike) -> str:
     """Return the four rows of a (4, 4) matrix, as `read_pose` and `numpy.loadtxt` read them."""
     rows = np.asarray(T, float).tolist()
-    return "".join(" ".join(exact(value) for value in row) + "\n" for row in rows)
+    return "".join(" ".join(tables.exact(value) for value in row) + "\n" for row in rows)
 
 
 def _from_json(text: str, path: str | Path) -> tuple[Float64, str]:

@@ -18,25 +18,8 @@ from tofuse.engine.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhol
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.parts import part
-from tofuse.formats.recordings import (
-    GREY,
-    BagSource,
-    ColorCamera,
-    Info,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    Track,
-    bag_kind,
-    camera_info,
-    checked_lens,
-    first_message,
-    forward_brown,
-    inverse_brown,
-    open_bag,
-    open_container,
-    simplest_lens,
-)
+from tofuse.formats.cameras import ColorCamera, checked_lens, lenses
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, bags
 
 
 def topics(path: Path) -> frozenset[str]:
@@ -52,17 +35,17 @@ def topics(path: Path) -> frozenset[str]:
 def _topics_of(path: Path, changed_ns: int, size: int) -> frozenset[str]:
     """See `topics`; cached, as several readers call it and opening a large bag is slow."""
     try:
-        kind = bag_kind(path)
+        kind = bags.bag_kind(path)
         if kind in (None, "mcap"):  # in which no maker's viewer records
             return frozenset()
-        bag = open_container(path) if kind == "ros1" else open_bag(path)
+        bag = bags.open_container(path) if kind == "ros1" else bags.open_bag(path)
     except InputError:
         return frozenset()
     with closing(bag):
         return frozenset(c.topic for c in bag.connections)
 
 
-class MakerBagSource(BagSource):
+class MakerBagSource(bags.BagSource):
     """A source over a bag whose topics and messages are those of a maker."""
 
     def find_streams(self, options: ReaderOptions) -> None:
@@ -103,15 +86,15 @@ class MakerBagSource(BagSource):
             self.warnings.append(f"colour is ignored: {error}")
             self.color = None
 
-    def track(self, topic: str | None) -> Track | None:
+    def track(self, topic: str | None) -> bags.Track | None:
         """Return the messages of a topic; None if there are none."""
         for connection in self.bag.connections:
             if connection.topic == topic:
-                track = Track(self.bag, connection)
+                track = bags.Track(self.bag, connection)
                 return track if len(track) else None
         return None
 
-    def required_track(self, topic: str, noun: str) -> Track:
+    def required_track(self, topic: str, noun: str) -> bags.Track:
         """Return the messages of a topic, called `noun` in the error if there are none."""
         track = self.track(topic)
         if track is None:
@@ -173,7 +156,7 @@ class RealSenseSource(MakerBagSource):
         stream = self.color.connection.topic.removesuffix("/image/data")
         lens = self._lens(stream)
         if isinstance(lens, RayTable):
-            lens = forward_brown(lens, self._brown(stream))
+            lens = lenses.forward_brown(lens, self._brown(stream))
         assert isinstance(lens, Pinhole)
         depth, color = self._extrinsics(self.stream), self._extrinsics(stream)
         common = sorted(depth.keys() & color.keys())
@@ -190,7 +173,7 @@ class RealSenseSource(MakerBagSource):
         for connection in self.bag.connections:
             if not re.fullmatch(re.escape(stream) + r"/tf/\d+", connection.topic):
                 continue
-            message = first_message(self.bag, connection.topic)
+            message = bags.first_message(self.bag, connection.topic)
             where = f"{self.path}: {connection.topic}"
             T = np.eye(4)
             try:
@@ -215,7 +198,7 @@ class RealSenseSource(MakerBagSource):
         brown = self._brown(stream)
         model = info.model.lower().replace("_", " ")
         if model.startswith("inverse brown"):
-            return inverse_brown(brown)
+            return lenses.inverse_brown(brown)
         if model.startswith("brown"):
             return brown
         raise InputError(
@@ -229,22 +212,22 @@ class RealSenseSource(MakerBagSource):
         assert isinstance(lens, BrownConrady)
         return lens
 
-    def _info(self, stream: str) -> Info:
+    def _info(self, stream: str) -> bags.Info:
         where = f"{self.path}: {stream}"
-        message = first_message(self.bag, f"{stream}/info/camera_info")
+        message = bags.first_message(self.bag, f"{stream}/info/camera_info")
         # Newer versions write text.
         return (
-            self._info_from_text(stream, where) if message is None else camera_info(message, where)
+            self._info_from_text(stream, where) if message is None else bags.camera_info(message, where)
         )
 
-    def _info_from_text(self, stream: str, where: str) -> Info:
-        text = first_message(self.bag, f"{stream}/camera_info")
+    def _info_from_text(self, stream: str, where: str) -> bags.Info:
+        text = bags.first_message(self.bag, f"{stream}/camera_info")
         if text is None:
             raise InputError("has no camera_info", where=where, remedy="use --camera")
         fields = dict(p.partition("=")[::2] for p in str(text.data).split(";"))
         keys = {"fx": "fx", "fy": "fy", "cx": "ppx", "cy": "ppy"}
         try:
-            return Info(
+            return bags.Info(
                 (int(fields["width"]), int(fields["height"])),
                 {name: float(fields[key]) for name, key in keys.items()},
                 fields.get("model", ""),
@@ -256,7 +239,7 @@ class RealSenseSource(MakerBagSource):
             ) from error
 
     def _unit(self, sensor: str) -> float:
-        message = first_message(self.bag, f"{sensor}/option/Depth_Units/value")
+        message = bags.first_message(self.bag, f"{sensor}/option/Depth_Units/value")
         try:
             unit = float(message.data) if message is not None else 0.0
         except ValueError:
@@ -321,7 +304,7 @@ class _Profile:
     translation_m: Float64
 
     def lens(self, where: str) -> Pinhole:
-        return simplest_lens(self.size, self.values, self.k, where)
+        return lenses.simplest_lens(self.size, self.values, self.k, where)
 
 
 class OrbbecSource(MakerBagSource):
@@ -330,7 +313,7 @@ class OrbbecSource(MakerBagSource):
     @staticmethod
     def open_bag(path: Path) -> Any:
         """See `BagSource.open_bag`."""
-        return open_container(path)
+        return bags.open_container(path)
 
     def find_tracks(self) -> None:
         """See `MakerBagSource.find_tracks`."""
@@ -341,7 +324,7 @@ class OrbbecSource(MakerBagSource):
         infrared = self.track(_ORBBEC_INFRARED)
         if infrared is not None:
             first = self.message(infrared, 0)
-            if (first.width, first.height) == self.profile.size and first.encoding in GREY:
+            if (first.width, first.height) == self.profile.size and first.encoding in bags.GREY:
                 self.amplitude = infrared
         self.color = self.track(_ORBBEC_COLOR)
 
@@ -377,7 +360,7 @@ class OrbbecSource(MakerBagSource):
             np.array(fields[11:14]) / 1000,
         )
 
-    def message(self, track: Track, index: int) -> Any:
+    def message(self, track: bags.Track, index: int) -> Any:
         """Read the part of an image message that is identical to ROS 1."""
         raw = bytes(track.raw(index))
         where = f"{self.path}: {track.connection.topic}, message {index}"

@@ -14,10 +14,11 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import quaternion
-from tofuse.formats.files import is_file, is_folder, read_numbers
-from tofuse.formats.recordings.organised import SAMPLES, Deprojection, find_deprojection
-from tofuse.formats.recordings.reader import CERTAIN, Sniff, files_at
-from tofuse.formats.recordings.sources import FileSource
+from tofuse.formats.files import reading, tables
+from tofuse.formats.sources.file_source import FileSource
+from tofuse.formats.sources.inputs import files_at
+from tofuse.formats.sources.organised import SAMPLES, Deprojection, find_deprojection
+from tofuse.formats.sources.reader import Sniff
 
 # The resolution of float32 is coarser than half a millimetre beyond.
 MAP_COORDINATES_M = 8192.0
@@ -59,9 +60,9 @@ class CloudFileSource(FileSource):
         self._warned_rounding = False
         self._cached: dict[int, Frame] = {}  # read to determine shift and camera
         self._deprojection: Deprojection | None = None
-        if is_folder(path):
+        if reading.is_folder(path):
             self.read_sidecars(path)
-            if self.reference is None and is_file(path / "poses.txt"):
+            if self.reference is None and reading.is_file(path / "poses.txt"):
                 self.reference = self._numbered_poses(path / "poses.txt")
         self._shift = np.zeros(3)
         if load_shifted is not None:
@@ -117,7 +118,7 @@ class CloudFileSource(FileSource):
 
     def _numbered_poses(self, path: Path) -> Float64 | None:
         """Read lines 'index x y z qw qx qy qz' with the number in the file name as index."""
-        table = read_numbers(path)
+        table = tables.read_numbers(path)
         fits = table.ndim == 2 and table.shape[1] == 8 and np.isfinite(table).all()
         if not fits or (table[:, 0] != np.rint(table[:, 0])).any():
             self.warnings.append(
@@ -192,10 +193,10 @@ def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
     files = files_at(path, *suffixes)
     if not files:
         return None
-    if is_folder(path) and is_file(path / "run.json"):
+    if reading.is_folder(path) and reading.is_file(path / "run.json"):
         return Sniff(0.1, "a result of tofuse, not a recording", "pass the recording itself")
     kinds = sorted({f.suffix.lower() for f in files})
-    return Sniff(CERTAIN, f"{len(files)} {' and '.join(kinds)} file{'s'[: len(files) > 1]}")
+    return Sniff(Sniff.CERTAIN, f"{len(files)} {' and '.join(kinds)} file{'s'[: len(files) > 1]}")
 
 
 def required_files(path: Path, *suffixes: str) -> list[Path]:
