@@ -69,7 +69,9 @@ def demo(
             )
             if scene == "peaks":
                 thesis = options.method == "thesis"
-                atomic.write_text(fresh / "peaks.toml", PEAKS_CONFIG + (PEAKS_ICP if thesis else ""))
+                atomic.write_text(
+                    fresh / "peaks.toml", PEAKS_CONFIG + (PEAKS_ICP if thesis else "")
+                )
                 options = replace(options, config=recording / "peaks.toml")
         try:
             return run([recording], options, progress, folder)

@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
-from tofuse.formats.files import locked, atomic
+from tofuse.formats.files import atomic, locked
 
 COLUMNS = (
     "name",

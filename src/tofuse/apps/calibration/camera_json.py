@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.engine.cameras import Camera, RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames import RangeFrame, Recording
-from tofuse.formats.cameras import SCHEMA, camera_fields
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import atomic, json_data, reading
 
 _LENS = ("schema", "model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
@@ -78,7 +78,7 @@ def write_camera_json(
             where=table,
             remedy="move it away, or choose an --out in another folder",
         )
-    fields = {"schema": SCHEMA} | camera_fields(camera)
+    fields = {"schema": camera_file.SCHEMA} | camera_file.camera_fields(camera)
     content = fields | {"depth_unit_m": 0.001, "depth_kind": "z"} | about
     atomic.make_folder(path.parent)
     if isinstance(camera, RayTable):

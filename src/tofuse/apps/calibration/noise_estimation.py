@@ -166,7 +166,9 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
             "contains clouds", where=recording.path, remedy="pass a recording of depth images"
         )
     prior = noise_model_for(recording)
-    stretches = [(a, b) for a, b in still.stationary_intervals(recording, prior) if b - a >= MIN_FRAMES]
+    stretches = [
+        (a, b) for a, b in still.stationary_intervals(recording, prior) if b - a >= MIN_FRAMES
+    ]
     if not stretches:
         raise _not_static_error(recording)
     samples = _concatenate([_segment_samples(recording, a, b, prior) for a, b in stretches])

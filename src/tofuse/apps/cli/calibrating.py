@@ -21,7 +21,7 @@ from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.cameras import camera_fields, read_correction, write_correction
+from tofuse.formats.cameras import camera_file, read_correction, write_correction
 from tofuse.formats.files import atomic
 from tofuse.formats.recordings import Opening, open_recording
 
@@ -118,7 +118,7 @@ def import_lens(arguments: argparse.Namespace) -> Summary:
     else:
         recording = open_recording(arguments.recording)
         metadata = recording_fields(recording)
-    fields = camera_fields(lens_file.camera)
+    fields = camera_file.camera_fields(lens_file.camera)
     lines = [f"{name} {value}" for name, value in fields.items()]
     lines.append(f"read as a file of {lens_file.format}")
     if arguments.out is not None:

@@ -84,7 +84,9 @@ def read_sessions(
         or if a result was given twice, or only one session.
     """
     folders = [
-        reading.path_of(each, "results", "pass folders, to which result.save(folder) writes results")
+        reading.path_of(
+            each, "results", "pass folders, to which result.save(folder) writes results"
+        )
         for each in results
     ]
     for a, b in combinations(folders, 2):

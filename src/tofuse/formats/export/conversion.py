@@ -17,7 +17,7 @@ from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame, Recording, depth_counts
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.cameras import SCHEMA, Rectifier, camera_fields, pinhole_of, same_distortion
+from tofuse.formats.cameras import Rectifier, camera_file, pinhole_of
 from tofuse.formats.files import atomic, staging
 from tofuse.formats.images import write_png
 from tofuse.formats.poses import write_log, write_tum
@@ -172,7 +172,7 @@ def _common_camera(cameras: list[Camera]) -> Camera:
     if all(camera == first for camera in cameras):
         return first
     if isinstance(first, Pinhole) and all(
-        isinstance(c, Pinhole) and same_distortion(c, first) for c in cameras
+        isinstance(c, Pinhole) and camera_file.same_distortion(c, first) for c in cameras
     ):
         return first
     return RayTable(first.rays())
@@ -329,7 +329,7 @@ def _finish_tum(recording: Recording, folder: Path, camera: Pinhole, written: li
     if recording.reference is not None:
         write_tum(folder / "groundtruth.txt", times, recording.reference[written])
     # The layout does not store the camera; this file is for --camera.
-    description = {"schema": SCHEMA, **camera_fields(camera)}
+    description = {"schema": camera_file.SCHEMA, **camera_file.camera_fields(camera)}
     description |= {"depth_unit_m": 1 / COUNTS_PER_M["tum"], "depth_kind": "z"}
     atomic.write_text(folder / "lens.json", json.dumps(description, indent=1) + "\n")
 

@@ -39,7 +39,9 @@ def write_obj(path: str | Path, mesh: GeometryRecord) -> None:
         image = path.with_suffix(".png" if texture.startswith(b"\x89PNG") else ".jpg")
         material = path.with_suffix(".mtl")
         atomic.write_bytes(image, texture)
-        atomic.write_text(material, f"newmtl surface\nKa 1 1 1\nKd 1 1 1\nillum 1\nmap_Kd {image.name}\n")
+        atomic.write_text(
+            material, f"newmtl surface\nKa 1 1 1\nKd 1 1 1\nillum 1\nmap_Kd {image.name}\n"
+        )
         lines += [f"mtllib {material.name}", "usemtl surface"]
     if color is not None:
         table = np.column_stack([table, np.asarray(color, float) / 255])

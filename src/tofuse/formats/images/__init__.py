@@ -1,10 +1,15 @@
-"""."""
+"""Image files: sizes and checksums are checked before anything is decoded or allocated.
+
+PNG and JPEG are read and written by functions here, which give (H, W) or (H, W, 3) arrays; the
+other functions and classes are for the formats of single cameras and apps.
+"""
 
 from typing import TYPE_CHECKING
 
 from tofuse._faces import face
 
 if TYPE_CHECKING:
+    from tofuse.formats.images import matroska
     from tofuse.formats.images.exr import parse_exr
     from tofuse.formats.images.images import (
         as_color,
@@ -16,9 +21,6 @@ if TYPE_CHECKING:
         read_image,
         read_raw,
     )
-    from tofuse.formats.images.lzfse import lzfse_decompress
-    from tofuse.formats.images import matroska
-    from tofuse.formats.images.pgm import parse_pgm
     from tofuse.formats.images.tiff import read_tiff
     from tofuse.formats.images.video import Video
     from tofuse.formats.images.writing import jpeg_bytes, png_bytes, write_png

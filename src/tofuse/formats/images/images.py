@@ -51,7 +51,9 @@ def read_header(path: str | Path) -> ImageHeader:
         If it is neither, is cut off within its header, or declares an absurd size.
     """
     head = reading.read_head(path, 64)
-    return _header(head if head.startswith(_PNG) else reading.read_bytes(path, limit=MAX_IMAGE_BYTES), path)
+    return _header(
+        head if head.startswith(_PNG) else reading.read_bytes(path, limit=MAX_IMAGE_BYTES), path
+    )
 
 
 def _header(data: bytes, path: str | Path) -> ImageHeader:
@@ -186,7 +188,9 @@ def read_image(
     InputError
         If it can't be read, is cut off or damaged, or isn't of that size and type.
     """
-    return parse_image(reading.read_bytes(path, limit=MAX_IMAGE_BYTES), path, size=size, dtype=dtype)
+    return parse_image(
+        reading.read_bytes(path, limit=MAX_IMAGE_BYTES), path, size=size, dtype=dtype
+    )
 
 
 def parse_image(

@@ -112,7 +112,10 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
     values = np.concatenate([_vectors(graph.measurements), upper], axis=1)
     vertices = zip(graph.ids, _vectors(graph.poses), strict=True)
     edges = zip(graph.ids[graph.edges], values, strict=True)
-    with atomic.replacing(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
+    with (
+        atomic.replacing(path) as temporary,
+        temporary.open("w", encoding="ascii", newline="\n") as file,
+    ):
         file.writelines(f"{VERTEX} {vertex} {_text(row)}\n" for vertex, row in vertices)
         file.writelines(f"{EDGE} {i} {j} {_text(row)}\n" for (i, j), row in edges)
 

@@ -168,7 +168,9 @@ class AdiTofSource(FileSource):
                 where=f"{place.path}: frame {index}",
                 remedy="pass frames of one mode",
             )
-        data = reading.read_part(place.path, place.offset + HEADER_BYTES, layout.length - HEADER_BYTES)
+        data = reading.read_part(
+            place.path, place.offset + HEADER_BYTES, layout.length - HEADER_BYTES
+        )
         if len(data) < layout.length - HEADER_BYTES:
             raise InputError("is cut off", where=f"{place.path}: frame {index}")
         shape, count = (layout.height, layout.width), layout.width * layout.height

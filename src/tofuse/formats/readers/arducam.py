@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, UInt8
 from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import camera_file_of, check_size
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import read_raw
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
@@ -40,7 +40,7 @@ class Arducam(Reader):
         """See `Reader.open`."""
         remedy = "save depth, not the sensor's raw phases"
         inputs.required(_images(path, "depth"), "depth_*_f32_*.raw", path, remedy)
-        camera = camera_file_of(path, options.camera, "neither lens nor unit")
+        camera = camera_file.camera_file_of(path, options.camera, "neither lens nor unit")
         return ArducamSource(path, camera)
 
 
@@ -81,7 +81,7 @@ class ArducamSource(FileSource):
     def _floats(self, image: _Image) -> Float32:
         """(H, W) values of a file."""
         values = read_raw(image.path, "<f4", image.size, "save it again")
-        check_size(values, self.camera, image.path)
+        camera_file.check_size(values, self.camera, image.path)
         return values.astype(np.float32)
 
 

@@ -19,8 +19,8 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import ColorCamera
-from tofuse.formats.images import as_color, parse_image, matroska
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.images import as_color, matroska, parse_image
 from tofuse.formats.poses import associate
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
@@ -182,7 +182,9 @@ class AzureKinectSource(FileSource):
         )
         return pixels.sampled_color(frame, image, self.color_camera, where)
 
-    def _matched_blocks(self, track: matroska.Track | None, limit: float, delay: int) -> list[matroska.Block | None]:
+    def _matched_blocks(
+        self, track: matroska.Track | None, limit: float, delay: int
+    ) -> list[matroska.Block | None]:
         """The block of another track at the time of each depth frame, or None."""
         if track is None or not track.blocks:
             return [None] * len(self.depth)
@@ -214,7 +216,9 @@ class AzureKinectSource(FileSource):
         if color is not None and color.blocks:
             self.color_camera = self._color_camera(color, T_depth, where)
 
-    def _color_camera(self, track: matroska.Track, T_depth: Float64, where: str) -> ColorCamera | None:
+    def _color_camera(
+        self, track: matroska.Track, T_depth: Float64, where: str
+    ) -> camera_file.ColorCamera | None:
         fourcc = track.private[16:20]
         if fourcc != b"MJPG":
             self.warnings.append(f"colour is {fourcc!r}, not MJPG: ignored")
@@ -227,7 +231,7 @@ class AzureKinectSource(FileSource):
         except InputError as error:
             self.warnings.append(f"colour is ignored: {error}")
             return None
-        return ColorCamera(lens, T_color @ np.linalg.inv(T_depth))
+        return camera_file.ColorCamera(lens, T_color @ np.linalg.inv(T_depth))
 
     def _sensor(self) -> str:
         calibration = getattr(self, "calibration", {})

@@ -13,7 +13,16 @@ from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import Pcd, read_pcd
-from tofuse.formats.sources import Reader, ReaderOptions, Sniff, cloud_frames, cloud_sequence, inputs, organised, per_frame
+from tofuse.formats.sources import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    cloud_frames,
+    cloud_sequence,
+    inputs,
+    organised,
+    per_frame,
+)
 
 
 @part("reader", "ply", label="validated")
@@ -27,7 +36,12 @@ class PlyClouds(Reader):
     def open(self, path: Path, options: ReaderOptions) -> cloud_sequence.CloudFileSource:
         """See `Reader.open`."""
         inputs.refuse_camera(options, "ply")
-        return cloud_sequence.CloudFileSource(path, cloud_sequence.required_files(path, ".ply"), cloud_frames.ply_frame, cloud_frames.ply_frame)
+        return cloud_sequence.CloudFileSource(
+            path,
+            cloud_sequence.required_files(path, ".ply"),
+            cloud_frames.ply_frame,
+            cloud_frames.ply_frame,
+        )
 
 
 @part("reader", "pcd", label="validated")
@@ -87,7 +101,7 @@ def _camera(files: list[Path]) -> Camera | None:
     """Return the camera of organised files, from up to `SAMPLES` readable ones; or None."""
     step = max(1, len(files) // organised.SAMPLES)
     images: list[Float32] = []
-    for file in files[::step][:organised.SAMPLES]:
+    for file in files[::step][: organised.SAMPLES]:
         try:
             pcd = read_pcd(file)
         except InputError:
@@ -96,7 +110,10 @@ def _camera(files: list[Path]) -> Camera | None:
             return None
         images.append(_image(pcd))
         points = images[-1].reshape(-1, 3)
-        if organised.find_raster(points, pcd.width) is None and organised.find_raster(points, pcd.height) is not None:
+        if (
+            organised.find_raster(points, pcd.width) is None
+            and organised.find_raster(points, pcd.height) is not None
+        ):
             raise InputError(
                 f"has WIDTH {pcd.width} and HEIGHT {pcd.height}, but rows of {pcd.height} points",
                 where=file,
@@ -128,7 +145,9 @@ class XyzClouds(Reader):
     def open(self, path: Path, options: ReaderOptions) -> cloud_sequence.CloudFileSource:
         """See `Reader.open`."""
         inputs.refuse_camera(options, "xyz")
-        return cloud_sequence.CloudFileSource(path, cloud_sequence.required_files(path, *_SUFFIXES), xyz_frame, xyz_frame)
+        return cloud_sequence.CloudFileSource(
+            path, cloud_sequence.required_files(path, *_SUFFIXES), xyz_frame, xyz_frame
+        )
 
 
 def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
@@ -181,7 +200,9 @@ class Slam6d(Reader):
         inputs.refuse_camera(options, "slam6d")
         files = cloud_sequence.required_files(path, ".3d")
         source = cloud_sequence.CloudFileSource(path, files, scan_frame)
-        poses = per_frame.poses_from_files(source, [file.with_suffix(".pose") for file in files], read_pose)
+        poses = per_frame.poses_from_files(
+            source, [file.with_suffix(".pose") for file in files], read_pose
+        )
         if poses is not None:
             source.odometry = poses
             if source.reference is None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import camera_file_of
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import read_color, read_raw
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
@@ -36,7 +36,7 @@ class Depth16(Reader):
     def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
         """See `Reader.open`."""
         files = inputs.required(_files(path), "*_depth16.bin or *.depth16", path)
-        camera = camera_file_of(path, options.camera, "neither size nor lens")
+        camera = camera_file.camera_file_of(path, options.camera, "neither size nor lens")
         return Depth16Source(files, camera)
 
 

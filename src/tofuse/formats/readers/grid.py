@@ -18,7 +18,15 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import read_pcd, read_ply
-from tofuse.formats.sources import Reader, ReaderOptions, Sniff, cloud_frames, cloud_sequence, inputs, organised
+from tofuse.formats.sources import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    cloud_frames,
+    cloud_sequence,
+    inputs,
+    organised,
+)
 
 _SUFFIXES = (".ply", ".csv", ".pcd")
 _AMPLITUDES = ("intensity", "amplitude", "i")
@@ -54,7 +62,7 @@ class Grid(Reader):
         step = max(1, len(files) // organised.SAMPLES)
         images: list[Float32] = []
         raster: organised.Raster | None = None
-        for file in files[::step][:organised.SAMPLES]:
+        for file in files[::step][: organised.SAMPLES]:
             try:
                 cells = read_cells(file)
             except InputError:
@@ -96,7 +104,11 @@ class Cells:
 
     def raster(self) -> organised.Raster | None:
         """See `find_raster`."""
-        return organised.find_raster(self.points, self.width) if len(self.points) <= MAX_POINTS else None
+        return (
+            organised.find_raster(self.points, self.width)
+            if len(self.points) <= MAX_POINTS
+            else None
+        )
 
 
 def read_cells(path: Path) -> Cells:

@@ -16,7 +16,8 @@ from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
-from tofuse.formats.images import parse_pgm, read_raw
+from tofuse.formats.images import read_raw
+from tofuse.formats.readers.pgm import parse_pgm
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, per_frame
 
 # The streams by preference, with their ambiguity range in m.
@@ -102,7 +103,9 @@ class HoloLens2Source(FileSource):
             self.warnings.append(f"{missing.name} is missing: there are no reference poses")
             return
         try:
-            T_camera_rig = per_frame.read_matrix_pose(tables.read_numbers(extrinsics).reshape(4, 4), str(extrinsics))
+            T_camera_rig = per_frame.read_matrix_pose(
+                tables.read_numbers(extrinsics).reshape(4, 4), str(extrinsics)
+            )
             table = tables.read_numbers(trajectory)
             if table.shape[-1] != 17:
                 raise InputError("has no rows of 17 numbers", where=trajectory, remedy=_REMEDY)
@@ -123,7 +126,9 @@ class HoloLens2Source(FileSource):
             T_world_rig = per_frame.read_matrix_pose(table_of_row, f"{trajectory}, row {row}")
             return T_world_rig @ se3.inverse(T_camera_rig)
 
-        self.reference = per_frame.poses_of(self, zip(self.ticks, nearest.tolist(), strict=True), pose)
+        self.reference = per_frame.poses_of(
+            self, zip(self.ticks, nearest.tolist(), strict=True), pose
+        )
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""

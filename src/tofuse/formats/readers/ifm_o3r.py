@@ -18,10 +18,18 @@ from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import MAX_SLOPE
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.readers.pcic import BEGIN, Chunk, chunk_image, pcic_frames
-from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, per_frame, pixels
+from tofuse.formats.sources import (
+    FileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    inputs,
+    per_frame,
+    pixels,
+)
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
 _IMAGES = {"flags": CONFIDENCE, "noise": NOISE, "amplitude": AMPLITUDE}
@@ -236,7 +244,7 @@ def head_camera(info: HeadInfo, width: int, height: int, where: str) -> RayTable
     x = (u - cx) / fx - skew * y
     with np.errstate(all="ignore"):
         rays = _bouguet(x, y, k) if model == BOUGUET else _fisheye(x, y, k)
-        rays[~(np.abs(rays) < MAX_SLOPE).all(-1)] = np.nan
+        rays[~(np.abs(rays) < camera_file.MAX_SLOPE).all(-1)] = np.nan
     return RayTable(rays.astype(np.float32))
 
 

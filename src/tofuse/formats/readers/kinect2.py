@@ -11,7 +11,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import checked_pinhole
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import first_size
 from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs
@@ -71,7 +71,11 @@ def _calibration(folder: Path, name: str) -> Path | None:
     if reading.is_file(folder / name):
         return folder / name
     try:
-        files = [p / name for p in reading.list_folder(folder) if reading.is_folder(p) and reading.is_file(p / name)]
+        files = [
+            p / name
+            for p in reading.list_folder(folder)
+            if reading.is_folder(p) and reading.is_file(p / name)
+        ]
     except InputError:
         return None
     return files[0] if len(files) == 1 else None
@@ -97,7 +101,7 @@ def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
     numbers = _numbers(match[1]) if match else np.zeros(0)
     if numbers.shape != (9,):
         raise InputError("has no cameraMatrix of 9 numbers", where=path, remedy="copy it again")
-    return checked_pinhole(scale * numbers.reshape(3, 3), size, path)
+    return camera_file.checked_pinhole(scale * numbers.reshape(3, 3), size, path)
 
 
 def _numbers(text: str) -> Float64:

@@ -18,7 +18,7 @@ from tofuse.engine.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhol
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import ColorCamera, checked_lens, lenses
+from tofuse.formats.cameras import camera_file, lenses
 from tofuse.formats.sources import Reader, ReaderOptions, Sniff, bags
 
 
@@ -73,7 +73,7 @@ class MakerBagSource(bags.BagSource):
         """Return the camera of the depth images."""
         raise NotImplementedError
 
-    def color_lens(self) -> ColorCamera:
+    def color_lens(self) -> camera_file.ColorCamera:
         """Return the camera of the colour images; raise InputError if it is unknown."""
         raise NotImplementedError
 
@@ -150,7 +150,7 @@ class RealSenseSource(MakerBagSource):
         """See `MakerBagSource.lens`."""
         return self._lens(self.stream)
 
-    def color_lens(self) -> ColorCamera:
+    def color_lens(self) -> camera_file.ColorCamera:
         """See `MakerBagSource.color_lens`."""
         assert self.color is not None
         stream = self.color.connection.topic.removesuffix("/image/data")
@@ -162,7 +162,7 @@ class RealSenseSource(MakerBagSource):
         common = sorted(depth.keys() & color.keys())
         if not common:
             raise InputError("has no pose relative to depth", where=f"{self.path}: {stream}")
-        return ColorCamera(lens, color[common[0]] @ se3.inverse(depth[common[0]]))
+        return camera_file.ColorCamera(lens, color[common[0]] @ se3.inverse(depth[common[0]]))
 
     def _extrinsics(self, stream: str) -> dict[str, Float64]:
         """Return transforms (4, 4) into a stream's frame, by the number of their reference.
@@ -194,7 +194,7 @@ class RealSenseSource(MakerBagSource):
     def _lens(self, stream: str) -> Camera:
         info, where = self._info(stream), f"{self.path}: {stream}"
         if not any(info.coefficients):
-            return checked_lens(Pinhole, info.size, info.values, where)
+            return camera_file.checked_lens(Pinhole, info.size, info.values, where)
         brown = self._brown(stream)
         model = info.model.lower().replace("_", " ")
         if model.startswith("inverse brown"):
@@ -208,7 +208,9 @@ class RealSenseSource(MakerBagSource):
     def _brown(self, stream: str) -> BrownConrady:
         info = self._info(stream)
         k = dict(zip(DISTORTION_ORDER["brown"], info.coefficients, strict=False))
-        lens = checked_lens(BrownConrady, info.size, info.values | k, f"{self.path}: {stream}")
+        lens = camera_file.checked_lens(
+            BrownConrady, info.size, info.values | k, f"{self.path}: {stream}"
+        )
         assert isinstance(lens, BrownConrady)
         return lens
 
@@ -217,7 +219,9 @@ class RealSenseSource(MakerBagSource):
         message = bags.first_message(self.bag, f"{stream}/info/camera_info")
         # Newer versions write text.
         return (
-            self._info_from_text(stream, where) if message is None else bags.camera_info(message, where)
+            self._info_from_text(stream, where)
+            if message is None
+            else bags.camera_info(message, where)
         )
 
     def _info_from_text(self, stream: str, where: str) -> bags.Info:
@@ -332,7 +336,7 @@ class OrbbecSource(MakerBagSource):
         """See `MakerBagSource.lens`."""
         return self.profile.lens(f"{self.path}: {_ORBBEC_DEPTH_PROFILE}")
 
-    def color_lens(self) -> ColorCamera:
+    def color_lens(self) -> camera_file.ColorCamera:
         """See `MakerBagSource.color_lens`."""
         where = f"{self.path}: {_ORBBEC_DEPTH_PROFILE}"
         lens = self._profile(_ORBBEC_COLOR_PROFILE).lens(f"{self.path}: {_ORBBEC_COLOR_PROFILE}")
@@ -342,7 +346,7 @@ class OrbbecSource(MakerBagSource):
             raise InputError("has no pose relative to colour", where=where)
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R, self.profile.translation_m
-        return ColorCamera(lens, se3.check_pose(se3.orthonormalise(T), where=where))
+        return camera_file.ColorCamera(lens, se3.check_pose(se3.orthonormalise(T), where=where))
 
     def _profile(self, topic: str) -> _Profile:
         where = f"{self.path}: {topic}"

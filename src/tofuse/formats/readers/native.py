@@ -16,19 +16,20 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.engine.sensor import DISAGREEMENT, SPEED_OF_LIGHT, DepthCorrection, combined
-from tofuse.formats.cameras import (
-    LENS_COLUMNS,
-    CameraFile,
-    checked_lens,
-    corrected_depth,
-    load_camera,
-    read_camera_file,
-    read_correction,
-    read_rays,
-)
+from tofuse.formats.cameras import camera_file, corrected_depth, read_correction
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import check_first_size, read_color, read_image
-from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, gravity_at, cloud_frames, inputs, per_frame, pixels
+from tofuse.formats.sources import (
+    FileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    cloud_frames,
+    gravity_at,
+    inputs,
+    per_frame,
+    pixels,
+)
 
 _IMAGES = (".png", ".jpg", ".jpeg")
 
@@ -55,14 +56,16 @@ class NativeSource(FileSource):
 
     concurrent = True
 
-    def __init__(self, folder: Path, camera_file: Path | None = None) -> None:
+    def __init__(self, folder: Path, camera_path: Path | None = None) -> None:
         self.folder = folder
-        self.is_clouds = not reading.is_folder(folder / "depth") and reading.is_folder(folder / "cloud")
+        self.is_clouds = not reading.is_folder(folder / "depth") and reading.is_folder(
+            folder / "cloud"
+        )
         name, suffixes = ("cloud", (".ply",)) if self.is_clouds else ("depth", (".png",))
         remedy = "check that the recording is complete"
         files = reading.files_with(folder / name, *suffixes)
         self.files = inputs.required(files, f"{suffixes[0]} files", folder / name, remedy)
-        self.description, self.camera = self._read_camera(camera_file)
+        self.description, self.camera = self._read_camera(camera_path)
         self.unit, self.kind = self.description.depth_unit_m, self.description.depth_kind
         self.amplitude_kind = self.description.amplitude_kind or "raw"
         self.ambiguity_m = self.description.ambiguity_m
@@ -75,12 +78,12 @@ class NativeSource(FileSource):
         self.sigma = self._channel_files("sigma", ".png")
         self.rays = self._channel_files("rays", ".npy")
         self.by_frequency = self._frequencies()
-        if camera_file is not None:
+        if camera_path is not None:
             self.rays = []  # the camera passed by the user applies to all frames
         self.correction = self._read_correction()
         self.imu = self._read_table("imu.csv")
         self.frame_columns = self._read_table("frames.csv", rows=len(self.files))
-        self.cameras = self._frame_lenses() if camera_file is None else []
+        self.cameras = self._frame_lenses() if camera_path is None else []
         if self.sigma and self.description.sigma_unit_m is None:
             raise InputError(
                 "is missing, and there is sigma/",
@@ -138,7 +141,7 @@ class NativeSource(FileSource):
             return lens
         if not self.rays:
             return camera
-        table = read_rays(self.rays[index])
+        table = camera_file.read_rays(self.rays[index])
         if (table.width, table.height) != (camera.width, camera.height):
             raise InputError(
                 f"is {table.width} x {table.height}, the images {camera.width} x {camera.height}",
@@ -153,34 +156,40 @@ class NativeSource(FileSource):
         if (
             columns is None
             or not isinstance(camera, Pinhole)
-            or not set(LENS_COLUMNS) <= set(columns)
+            or not set(camera_file.LENS_COLUMNS) <= set(columns)
         ):
             return []
         path, size = self.folder / "frames.csv", (camera.width, camera.height)
         common = {f.name: getattr(camera, f.name) for f in fields(camera)[2:]}
-        rows = enumerate(zip(*(columns[name].tolist() for name in LENS_COLUMNS), strict=True), 1)
+        rows = enumerate(
+            zip(*(columns[name].tolist() for name in camera_file.LENS_COLUMNS), strict=True), 1
+        )
         lenses: dict[tuple[float, ...], Pinhole] = {}
 
         def lens(numbered: tuple[int, tuple[float, ...]]) -> Pinhole:
             k, row = numbered
             if row not in lenses:  # frames with the same lens share it
-                values = common | dict(zip(LENS_COLUMNS, row, strict=True))
-                lenses[row] = checked_lens(type(camera), size, values, f"{path}, row {k}")
+                values = common | dict(zip(camera_file.LENS_COLUMNS, row, strict=True))
+                lenses[row] = camera_file.checked_lens(
+                    type(camera), size, values, f"{path}, row {k}"
+                )
             return lenses[row]
 
         return per_frame.cameras_of(rows, lens)
 
-    def _read_camera(self, camera_file: Path | None) -> tuple[CameraFile, Camera | None]:
+    def _read_camera(
+        self, camera_path: Path | None
+    ) -> tuple[camera_file.CameraFile, Camera | None]:
         path = self.folder / "camera.json"
         if not self.is_clouds:
-            return load_camera(camera_file or path)
-        if camera_file is not None:
+            return camera_file.load_camera(camera_path or path)
+        if camera_path is not None:
             raise InputError(
                 "does not apply to a recording of clouds", where="--camera", remedy="leave it out"
             )
         if reading.is_file(path):
-            return read_camera_file(path, clouds=True), None
-        return CameraFile(None, None), None
+            return camera_file.read_camera_file(path, clouds=True), None
+        return camera_file.CameraFile(None, None), None
 
     def _channel_files(self, name: str, *suffixes: str) -> list[Path]:
         folder = self.folder / name

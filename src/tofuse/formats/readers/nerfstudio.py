@@ -14,11 +14,19 @@ from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import checked_lens, image_size
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import json_data, reading
 from tofuse.formats.images import read_color, read_image
 from tofuse.formats.poses import OPENGL
-from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, per_frame, pixels
+from tofuse.formats.sources import (
+    FileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    inputs,
+    per_frame,
+    pixels,
+)
 
 NAME = "transforms.json"
 _DEPTH = ("depth_file_path", "depth_path")
@@ -77,7 +85,9 @@ class NerfstudioSource(FileSource):
         timed = bool(np.isfinite(times).all())
         super().__init__(times if timed else np.arange(len(self.frames), dtype=float))
         self.unit_m = _unit(document, file, any("depth_file_path" in f.entry for f in self.frames))
-        self.sigma_unit_m = json_data.number_in(document, "sigma_unit_scale_factor", file, 1e-4, _REMEDY)
+        self.sigma_unit_m = json_data.number_in(
+            document, "sigma_unit_scale_factor", file, 1e-4, _REMEDY
+        )
         self.metadata |= {"depth_kind": "z", "depth_unit_m": self.unit_m}
         if without_depth:
             self.warnings.append(f"{file}: {without_depth} frames have no depth: skipped")
@@ -184,7 +194,7 @@ class _Frame:
                 remedy=f"use one of {', '.join(_MODELS)}",
             )
         width, height = self.number_of("w", size[0]), self.number_of("h", size[1])
-        pixels = image_size(width, height, f"{self.where}: w")
+        pixels = camera_file.image_size(width, height, f"{self.where}: w")
         fx = self.number_of("fl_x", self._focal_length("camera_angle_x", width))
         # Pixel coordinates here start at the corner of the first pixel, in `Pinhole` at its centre.
         values = {
@@ -199,7 +209,7 @@ class _Frame:
             if not any(values[name] for name in DISTORTION_ORDER[model]):
                 model = "pinhole"
                 values = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
-        camera = checked_lens(MODELS[model], pixels, values, self.where)
+        camera = camera_file.checked_lens(MODELS[model], pixels, values, self.where)
         if abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
             raise InputError(
                 f"is of a {width:g} x {height:g} image, depth {size[0]} x {size[1]}: "

@@ -11,7 +11,7 @@ from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.frames import POSES_BY
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import image_size
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import json_data, reading
 from tofuse.formats.images import first_size
 from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, per_frame, phones
@@ -41,7 +41,11 @@ class PolycamSource(phones.PhoneSource):
     """Frames with ARKit's intrinsics, and the poses optimised by Polycam, or else ARKit's."""
 
     def __init__(self, folder: Path) -> None:
-        files = reading.files_with(folder / "depth", ".png") if reading.is_folder(folder / "depth") else []
+        files = (
+            reading.files_with(folder / "depth", ".png")
+            if reading.is_folder(folder / "depth")
+            else []
+        )
         inputs.required(files, ".png files", folder / "depth", "export 'raw data' again")
         size = first_size(files)
         super().__init__(
@@ -51,7 +55,9 @@ class PolycamSource(phones.PhoneSource):
             color=[reading.if_file(folder / "images" / f"{file.stem}.jpg") for file in files],
         )
         paths = [folder / "cameras" / f"{file.stem}.json" for file in files]
-        self.cameras = per_frame.cameras_of(paths, lambda path: _lens(json_data.read_json(path), size, path))
+        self.cameras = per_frame.cameras_of(
+            paths, lambda path: _lens(json_data.read_json(path), size, path)
+        )
         self._read_poses(folder)
 
     def _read_poses(self, folder: Path) -> None:
@@ -61,7 +67,9 @@ class PolycamSource(phones.PhoneSource):
             self.metadata[POSES_BY] = "Polycam"
         else:
             paths = [folder / "cameras" / path.name for path in paths]
-        self.reference = per_frame.poses_from_files(self, paths, lambda path: _pose(json_data.read_json(path), path))
+        self.reference = per_frame.poses_from_files(
+            self, paths, lambda path: _pose(json_data.read_json(path), path)
+        )
 
     def read_confidence(self, path: Path, size: tuple[int, int]) -> UInt8:
         """See `PhoneSource.read_confidence`."""
@@ -85,7 +93,7 @@ def _lens(metadata: dict[str, Any], size: tuple[int, int], path: Path) -> Pinhol
         metadata, ("fx", "fy", "cx", "cy", "width", "height"), path
     )
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return phones.phone_lens(K, image_size(width, height, f"{path}: width"), size, path)
+    return phones.phone_lens(K, camera_file.image_size(width, height, f"{path}: width"), size, path)
 
 
 def _pose(metadata: dict[str, Any], path: Path) -> Float64:
@@ -95,4 +103,6 @@ def _pose(metadata: dict[str, Any], path: Path) -> Float64:
 
 
 def _numbers(metadata: dict[str, Any], names: tuple[str, ...] | list[str], path: Path) -> Float64:
-    return np.array([json_data.number_in(metadata, n, path, remedy="export 'raw data' again") for n in names])
+    return np.array(
+        [json_data.number_in(metadata, n, path, remedy="export 'raw data' again") for n in names]
+    )

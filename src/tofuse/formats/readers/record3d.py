@@ -17,9 +17,10 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import image_size
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import json_data, reading
-from tofuse.formats.images import as_color, lzfse_decompress, parse_exr, parse_image
+from tofuse.formats.images import as_color, parse_exr, parse_image
+from tofuse.formats.readers.lzfse import lzfse_decompress
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, phones, pixels
 
 MAX_MEMBER_BYTES = 1 << 26
@@ -220,11 +221,11 @@ class _Metadata:
         """Return (width, height) of depth; `default` for older versions, which don't state it."""
         if default is not None and not ("dw" in self.data and "dh" in self.data):
             return default
-        return image_size(self._number("dw"), self._number("dh"), f"{self.where}: dw")
+        return camera_file.image_size(self._number("dw"), self._number("dh"), f"{self.where}: dw")
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
         K = json_data.numbers_in(self.data, "K", self.where, (3, 3), _REMEDY).T
-        full_size = image_size(self._number("w"), self._number("h"), f"{self.where}: w")
+        full_size = camera_file.image_size(self._number("w"), self._number("h"), f"{self.where}: w")
         return phones.phone_lens(K, full_size, size, f"{self.where}: K")
 
     def frame_rate(self) -> float:

@@ -11,7 +11,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import checked_pinhole, image_size
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import json_data, reading
 from tofuse.formats.images import first_size
 from tofuse.formats.poses import read_poses
@@ -51,7 +51,9 @@ class Redwood(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = inputs.required(reading.files_with(path / "depth", ".png"), ".png files", path / "depth")
+        files = inputs.required(
+            reading.files_with(path / "depth", ".png"), ".png files", path / "depth"
+        )
         warnings: list[str] = []
         camera: Pinhole | None = None
         if options.camera is None:
@@ -96,8 +98,10 @@ def _read_intrinsics(path: Path) -> Pinhole:
     data = json_data.read_json(path)
     remedy = "write it as Open3D does, column by column"
     K = json_data.numbers_in(data, "intrinsic_matrix", path, (3, 3), remedy).T
-    width, height = (json_data.number_in(data, name, path, remedy=remedy) for name in ("width", "height"))
-    return checked_pinhole(K, image_size(width, height, path), path)
+    width, height = (
+        json_data.number_in(data, name, path, remedy=remedy) for name in ("width", "height")
+    )
+    return camera_file.checked_pinhole(K, camera_file.image_size(width, height, path), path)
 
 
 def _timestamps(files: list[Path]) -> Float64:

@@ -12,7 +12,7 @@ from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import ColorCamera, check_size
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.sources import Reader, ReaderOptions, Sniff, bags, cloud_frames, organised
 
@@ -93,20 +93,26 @@ class RosSource(bags.BagSource):
             return super().read_frame(index, where)
         content, time = bags.cloud(self.depth.message(index), where), float(self.timestamps[index])
         if self.raster is None:
-            return cloud_frames.cloud_frame(index, time, content.points, amplitude=content.amplitude)
+            return cloud_frames.cloud_frame(
+                index, time, content.points, amplitude=content.amplitude
+            )
         points = content.points.reshape(content.height, content.width, 3)
-        return organised.organised_frame(points, self.raster, index, time, where, amplitude=content.amplitude)
+        return organised.organised_frame(
+            points, self.raster, index, time, where, amplitude=content.amplitude
+        )
 
     def read_depth(self, index: int, where: str) -> Float32:
         """See `BagSource.read_depth`."""
         decode = bags.decompressed if self.connection.msgtype == COMPRESSED else bags.image
         counts = decode(self.depth.message(index), where)
-        check_size(counts, self.camera, where)
+        camera_file.check_size(counts, self.camera, where)
         return depth_counts.depth_from_numbers(counts, self._unit(counts.dtype.kind))
 
     def read_color(self, track: bags.Track, index: int, where: str) -> UInt8:
         """See `BagSource.read_color`."""
-        decode = bags.decompressed_color if track.connection.msgtype == COMPRESSED else bags.color_image
+        decode = (
+            bags.decompressed_color if track.connection.msgtype == COMPRESSED else bags.color_image
+        )
         return decode(track.message(index), where)
 
     def _candidates(self) -> list[Any]:
@@ -235,7 +241,7 @@ class RosSource(bags.BagSource):
         if not (same_size and (registered or depth_frame == color_frame)):
             if T is None or not infos:
                 return False
-            self.color_camera = ColorCamera(self._lens_of(infos[0]), T)
+            self.color_camera = camera_file.ColorCamera(self._lens_of(infos[0]), T)
         self.color = track
         return True
 
@@ -279,7 +285,7 @@ class RosSource(bags.BagSource):
         """The camera of organised clouds, if they are in x right, y down, z forward; else None."""
         images = []
         step = max(1, len(self.depth) // organised.SAMPLES)
-        for k in range(0, len(self.depth), step)[:organised.SAMPLES]:
+        for k in range(0, len(self.depth), step)[: organised.SAMPLES]:
             try:
                 content = bags.cloud(self.depth.message(k), self.where(k))
             except InputError:

@@ -93,7 +93,9 @@ class _FrameMetadata:
     def pose(self) -> Float64 | None:
         if "cameraPoseARFrame" not in self.data:
             return None
-        table = json_data.numbers_in(self.data, "cameraPoseARFrame", self.path, (4, 4), _REMEDY, finite=False)
+        table = json_data.numbers_in(
+            self.data, "cameraPoseARFrame", self.path, (4, 4), _REMEDY, finite=False
+        )
         return phones.arkit_pose(table, f"{self.path}: cameraPoseARFrame")
 
 

@@ -17,7 +17,16 @@ from tofuse.engine.frames import CloudFrame
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading
-from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, cloud_frames, cloud_sequence, inputs, per_frame
+from tofuse.formats.sources import (
+    FileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    cloud_frames,
+    cloud_sequence,
+    inputs,
+    per_frame,
+)
 
 MAX_POINTS = 100_000_000
 _E57 = b"ASTM-E57"
@@ -38,7 +47,9 @@ class LasScans(Reader):
         inputs.refuse_camera(options, "las")
         files = cloud_sequence.required_files(path, ".las", ".laz")
         shift = _shift(files[0])
-        source = cloud_sequence.CloudFileSource(path, files, lambda f, k, t: _las_frame(f, k, t, shift))
+        source = cloud_sequence.CloudFileSource(
+            path, files, lambda f, k, t: _las_frame(f, k, t, shift)
+        )
         cloud_sequence.note_shift(source, path, shift)
         return source
 
@@ -179,7 +190,11 @@ class E57Scans(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        return Sniff(1.0, "an E57 file") if inputs.begins_with(inputs.file_of(path, ".e57"), _E57) else None
+        return (
+            Sniff(1.0, "an E57 file")
+            if inputs.begins_with(inputs.file_of(path, ".e57"), _E57)
+            else None
+        )
 
     def open(self, path: Path, options: ReaderOptions) -> E57Source:
         """See `Reader.open`."""
@@ -205,7 +220,9 @@ class E57Source(FileSource):
             )
         super().__init__(np.arange(len(self.counts), dtype=float))
         self.reference = per_frame.poses_of(
-            self, range(len(poses)), lambda k: per_frame.read_matrix_pose(poses[k], f"{path}: scan {k}")
+            self,
+            range(len(poses)),
+            lambda k: per_frame.read_matrix_pose(poses[k], f"{path}: scan {k}"),
         )
         read_unshifted = partial(self._read, shift=np.zeros(3))
         self._shift, self._cached = cloud_sequence.find_shift(read_unshifted, len(self.counts))

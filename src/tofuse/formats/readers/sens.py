@@ -16,10 +16,18 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import ColorCamera, checked_pinhole
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import as_color, parse_image
-from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, per_frame, pixels
+from tofuse.formats.sources import (
+    FileSource,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    inputs,
+    per_frame,
+    pixels,
+)
 
 VERSION = 4
 RAW, ZLIB, OCCI = 0, 1, 2  # compression of depth
@@ -103,7 +111,9 @@ class SensSource(FileSource):
             return frame
         where = f"{where}: colour"
         image = self._color(packed_color, where)
-        return replace(frame, color_image=pixels.sampled_color(frame, image, self.color_camera, where))
+        return replace(
+            frame, color_image=pixels.sampled_color(frame, image, self.color_camera, where)
+        )
 
     def _read_header(self, file: BinaryIO) -> int:
         version, length = struct.unpack("<IQ", self._take(file, 12))
@@ -125,10 +135,12 @@ class SensSource(FileSource):
             raise self._error(f"has {counts_per_metre} counts to a metre", "export it again")
         self.unit = 1.0 / counts_per_metre
         color_lens, T_device_color, depth_lens, T_device_depth = matrices
-        self.camera = checked_pinhole(depth_lens, self.depth_size, f"{self.path}: depth lens")
+        self.camera = camera_file.checked_pinhole(
+            depth_lens, self.depth_size, f"{self.path}: depth lens"
+        )
         if all(1 < side <= _MAX_SIDE for side in color_size) and self.color_packing in _COLORS:
-            self.color_camera = ColorCamera(
-                checked_pinhole(color_lens, color_size, f"{self.path}: color lens"),
+            self.color_camera = camera_file.ColorCamera(
+                camera_file.checked_pinhole(color_lens, color_size, f"{self.path}: color lens"),
                 self._T_color_depth(T_device_color, T_device_depth),
             )
         return count

@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.cameras import checked_pinhole
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import first_size
 from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs, per_frame
@@ -71,7 +71,9 @@ def read_pose(path: Path) -> Float64:
 
 
 def _depth_files(path: Path) -> list[tuple[int, Path]]:
-    return sorted((int(p.name[6:].split(".")[0]), p) for p in reading.files_named(path, _DEPTH.fullmatch))
+    return sorted(
+        (int(p.name[6:].split(".")[0]), p) for p in reading.files_named(path, _DEPTH.fullmatch)
+    )
 
 
 def _color(file: Path) -> Path | None:
@@ -89,4 +91,4 @@ def _camera(folder: Path, files: Sequence[Path]) -> Pinhole:
     K = tables.read_numbers(path)
     if K.shape != (3, 3):
         raise InputError("is not a 3x3 matrix", where=path, remedy="write three rows of three")
-    return checked_pinhole(K, first_size(files), path)
+    return camera_file.checked_pinhole(K, first_size(files), path)

@@ -12,7 +12,15 @@ from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import Video, first_size
-from tofuse.formats.sources import Reader, ReaderOptions, Sniff, gravity_at, inputs, per_frame, phones
+from tofuse.formats.sources import (
+    Reader,
+    ReaderOptions,
+    Sniff,
+    gravity_at,
+    inputs,
+    per_frame,
+    phones,
+)
 
 FRAME_RATE_HZ = 60.0
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -55,7 +63,9 @@ class StraySource(phones.PhoneSource):
     """
 
     def __init__(self, folder: Path) -> None:
-        files = inputs.required(reading.files_with(folder / "depth", ".png"), ".png files", folder / "depth")
+        files = inputs.required(
+            reading.files_with(folder / "depth", ".png"), ".png files", folder / "depth"
+        )
         confidence = {p.stem: p for p in _images(folder / "confidence")}
         super().__init__(
             files,

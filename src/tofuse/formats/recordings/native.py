@@ -23,13 +23,7 @@ from tofuse.engine.frames import (
 )
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.cameras import (
-    LENS_COLUMNS,
-    SCHEMA,
-    camera_fields,
-    same_distortion,
-    write_correction,
-)
+from tofuse.formats.cameras import camera_file, write_correction
 from tofuse.formats.files import atomic, tables
 from tofuse.formats.geometry import write_ply
 from tofuse.formats.images import write_png
@@ -100,9 +94,9 @@ class RecordingWriter:
         self._lenses: list[tuple[float, ...]] = []
         self._channels: frozenset[str] | None = None
         self._times: list[float] = []
-        self._description: dict[str, Any] = {"schema": SCHEMA}
+        self._description: dict[str, Any] = {"schema": camera_file.SCHEMA}
         if camera is not None:
-            self._description |= camera_fields(camera)
+            self._description |= camera_file.camera_fields(camera)
             self._description |= {"depth_unit_m": float(depth_unit_m), "depth_kind": depth_kind}
         optional: dict[str, Any] = {
             "frame_rate_hz": frame_rate_hz,
@@ -186,7 +180,7 @@ class RecordingWriter:
 
     def _write_camera(self, camera: Camera, common: Camera) -> None:
         if isinstance(common, Pinhole):
-            if not isinstance(camera, Pinhole) or not same_distortion(camera, common):
+            if not isinstance(camera, Pinhole) or not camera_file.same_distortion(camera, common):
                 raise InputError(
                     "has another lens model than the first",
                     where=f"frame {len(self)}",
@@ -194,7 +188,10 @@ class RecordingWriter:
                 )
             self._lenses.append((camera.fx, camera.fy, camera.cx, camera.cy))
             return
-        with atomic.replacing(self._frame_path("rays", ".npy")) as temporary, temporary.open("wb") as file:
+        with (
+            atomic.replacing(self._frame_path("rays", ".npy")) as temporary,
+            temporary.open("wb") as file,
+        ):
             np.save(file, np.asarray(camera.rays(), np.float32))
 
     def _check_channels(self, frame: Frame, *names: str) -> None:
@@ -258,7 +255,7 @@ class RecordingWriter:
         if imu is not None:
             tables.write_columns(self.folder / "imu.csv", imu)
         if self._lenses:
-            columns = dict(zip(LENS_COLUMNS, np.array(self._lenses).T, strict=True))
+            columns = dict(zip(camera_file.LENS_COLUMNS, np.array(self._lenses).T, strict=True))
             frames = {**(frames or {}), **columns}
         if frames is not None:
             if any(len(column) != len(self) for column in frames.values()):
@@ -269,6 +266,10 @@ class RecordingWriter:
         if isinstance(self.camera, RayTable):
             with atomic.replacing(self.folder / "rays.npy") as temporary:
                 np.save(temporary, np.asarray(self.camera.table, np.float32))
-        atomic.write_text(self.folder / "timestamps.txt", "".join(tables.exact(t) + "\n" for t in self._times))
-        atomic.write_text(self.folder / "camera.json", json.dumps(self._description, indent=1) + "\n")
+        atomic.write_text(
+            self.folder / "timestamps.txt", "".join(tables.exact(t) + "\n" for t in self._times)
+        )
+        atomic.write_text(
+            self.folder / "camera.json", json.dumps(self._description, indent=1) + "\n"
+        )
         return self.folder

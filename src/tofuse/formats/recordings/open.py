@@ -198,7 +198,11 @@ def _resolve_as(path: Path, format: str) -> list[_Located]:  # noqa: A002
         )
     reader = choices[format]
     if reader.joinable and path.is_dir() and _sniff_as(reader, path) is None:
-        parts = [p for p in reading.list_folder(path) if reading.is_folder(p) and _sniff_as(reader, p) is not None]
+        parts = [
+            p
+            for p in reading.list_folder(path)
+            if reading.is_folder(p) and _sniff_as(reader, p) is not None
+        ]
         if parts:
             return [_Located(p, reader) for p in parts]
     return [_Located(path, reader)]

@@ -1,4 +1,4 @@
-"""."""
+"""Rigs: the file rig.json of rigidly connected cameras, and their recordings as one source."""
 
 from typing import TYPE_CHECKING
 

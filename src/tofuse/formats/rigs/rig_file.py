@@ -184,7 +184,9 @@ def _camera(row: object, k: int, path: str | Path) -> RigCamera:
     if not isinstance(recording, str):
         raise InputError(f"{location}.recording is not a path", where=path, remedy=_REMEDY)
     where = f"{path}: {location}"
-    T = se3.check_pose(json_data.numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY), where=str(path))
+    T = se3.check_pose(
+        json_data.numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY), where=str(path)
+    )
     C = _covariance(row, "covariance", where) if "covariance" in row else np.zeros((6, 6))
     random = None
     if row.get("random_covariance") is not None:

@@ -19,7 +19,7 @@ from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.formats.cameras import check_size, checked_lens
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import as_color, parse_image
 from tofuse.formats.sources.file_source import FileSource
@@ -34,7 +34,9 @@ _MAGIC = {"ros1": b"#ROSBAG V2", "mcap": b"\x89MCAP0\r\n"}
 def bag_kind(path: Path) -> str | None:
     """Return "folder" for that of a ROS 2 bag, "ros1", "mcap" or "db3" for such files, or None."""
     if reading.is_folder(path):
-        is_bag = reading.is_file(path / "metadata.yaml") and reading.files_with(path, ".db3", ".mcap", ".zstd")
+        is_bag = reading.is_file(path / "metadata.yaml") and reading.files_with(
+            path, ".db3", ".mcap", ".zstd"
+        )
         return "folder" if is_bag else None
     head = reading.read_head(path, 16)
     if head.startswith(b"SQLite format 3"):
@@ -54,7 +56,9 @@ def open_bag(path: Path) -> Any:
     typesys = reading.required_package("rosbags.typesys", "ros", path)
     if reading.is_folder(path):
         for entry in reading.list_folder(path):
-            if not reading.is_file(entry) and not reading.is_folder(entry):  # rosbags would wait for a pipe
+            if not reading.is_file(entry) and not reading.is_folder(
+                entry
+            ):  # rosbags would wait for a pipe
                 raise InputError(
                     "is not a regular file", where=entry, remedy="remove it from the bag"
                 )
@@ -211,7 +215,7 @@ class BagSource(FileSource):
     def read_depth(self, index: int, where: str) -> Float32:
         """Return the depth (H, W) of a frame in m."""
         counts = image(self.message(self.depth, index), where, ENCODINGS)
-        check_size(counts, self.camera, where)
+        camera_file.check_size(counts, self.camera, where)
         return depth_counts.depth_from_counts(counts.astype(np.uint16), self.unit)
 
     def read_color(self, track: Track, index: int, where: str) -> UInt8:
@@ -231,7 +235,7 @@ class BagSource(FileSource):
             return np.zeros((self.camera.height, self.camera.width), np.float32)
         where = f"{where}, amplitude"
         counts = image(self.message(self.amplitude, k), where, GREY)
-        check_size(counts, self.camera, where)
+        camera_file.check_size(counts, self.camera, where)
         return finite_float32(counts)
 
 
@@ -408,7 +412,7 @@ def lens(message: Any, where: str) -> Pinhole:
                 f"has {len(D)} coefficients for {model}", where=where, remedy="use --camera"
             )
     coefficients = dict(zip(DISTORTION_ORDER[name], D, strict=False))
-    return checked_lens(MODELS[name], info.size, info.values | coefficients, where)
+    return camera_file.checked_lens(MODELS[name], info.size, info.values | coefficients, where)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from tofuse.engine.frames import (
     RangeFrame,
     depth_counts,
 )
-from tofuse.formats.cameras import CameraFile, ColorCamera, load_camera
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import check_first_size, read_color, read_image
 from tofuse.formats.sources.per_frame import read_timestamps, tum_poses
@@ -43,7 +43,7 @@ class FileSource(ABC):
     kind: DepthKind = "z"
     amplitude_kind: AmplitudeKind = "raw"
     ambiguity_m: float | None = None
-    color_camera: ColorCamera | None = None
+    color_camera: camera_file.ColorCamera | None = None
 
     def __init__(self, timestamps: Float64) -> None:
         self.timestamps = timestamps
@@ -57,9 +57,9 @@ class FileSource(ABC):
     def load(self, index: int) -> Frame:
         """Read frame `index`; raise InputError if it can't be read."""
 
-    def use_camera(self, path: Path, size: tuple[int, int] | None = None) -> CameraFile:
+    def use_camera(self, path: Path, size: tuple[int, int] | None = None) -> camera_file.CameraFile:
         """Take camera, unit and kind of depth from a camera.json; see `load_camera`."""
-        description, self.camera = load_camera(path, size)
+        description, self.camera = camera_file.load_camera(path, size)
         self.unit, self.kind = description.depth_unit_m, description.depth_kind
         self.color_camera = description.color or self.color_camera
         return description

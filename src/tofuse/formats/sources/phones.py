@@ -11,7 +11,7 @@ from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Pinhole, scaled
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
-from tofuse.formats.cameras import checked_pinhole
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.images import read_color, read_image
 from tofuse.formats.sources.file_source import FileSource
 from tofuse.formats.sources.per_frame import read_matrix_pose
@@ -34,7 +34,7 @@ def phone_lens(
     K: Float64, image_size: tuple[int, int], size: tuple[int, int], where: str | Path
 ) -> Pinhole:
     """Return the camera of depth images of `size` from K (3, 3) of larger colour images."""
-    full = checked_pinhole(K, image_size, where)
+    full = camera_file.checked_pinhole(K, image_size, where)
     try:
         return scaled(full, *size)
     except InputError as error:

@@ -13,7 +13,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import (
     RangeFrame,
 )
-from tofuse.formats.cameras import ColorCamera, check_size
+from tofuse.formats.cameras import camera_file
 
 
 def finite_float32(values: NDArray[Any]) -> Float32:
@@ -27,7 +27,7 @@ OCCLUSION_FRACTION = 0.05
 
 
 def sampled_color(
-    frame: RangeFrame, image: UInt8, color: ColorCamera | None, where: str | Path
+    frame: RangeFrame, image: UInt8, color: camera_file.ColorCamera | None, where: str | Path
 ) -> UInt8:
     """Return the colour (H, W, 3) of the depth pixels, by projecting their points into an image.
 
@@ -39,7 +39,7 @@ def sampled_color(
     InputError
         Naming `where`, if the image does not have the size of its camera.
     """
-    check_size(image, frame.camera if color is None else color.camera, where)
+    camera_file.check_size(image, frame.camera if color is None else color.camera, where)
     if color is None:
         return image
     T = color.T_color_depth
@@ -59,7 +59,7 @@ def sampled_color(
     return out
 
 
-def _cell(frame: RangeFrame, color: ColorCamera) -> int:
+def _cell(frame: RangeFrame, color: camera_file.ColorCamera) -> int:
     """Size in colour pixels of cells that each contain points of a continuous surface."""
     rays = frame.camera.rays()
     pitch = float(np.nanmedian(np.abs(np.diff(rays[..., 0], axis=1))))
