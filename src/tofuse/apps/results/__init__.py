@@ -6,11 +6,11 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.apps.results.folder import (
-        Contract,
-        OutputFolder,
         RECORDING,
         RESULT,
         TRACKED,
+        Contract,
+        OutputFolder,
         check_output,
         claimed,
         component_name,

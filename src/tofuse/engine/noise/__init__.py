@@ -7,10 +7,10 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.noise.choice import family_of, noise_model_for
     from tofuse.engine.noise.model import (
+        NOISE,
         AmplitudeLaw,
         ConfidenceLaw,
         Law,
-        NOISE,
         NoiseModel,
         RangeLaw,
     )

@@ -6,7 +6,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.sensor.base import Correction, Corrector
-    from tofuse.engine.sensor.camera_errors import CameraErrors, FIELDS
+    from tofuse.engine.sensor.camera_errors import FIELDS, CameraErrors
     from tofuse.engine.sensor.depth_correction import DepthCorrection
     from tofuse.engine.sensor.frequencies import DISAGREEMENT, SPEED_OF_LIGHT, combined
     from tofuse.engine.sensor.multipath_correction import Multipath

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tofuse.engine.errors import InputError
 from tofuse.engine.noise import NoiseModel
-from tofuse.formats.files import atomic, reading
+from tofuse.formats.files import atomic, json_data
 
 
 def write_noise(path: str | Path, model: NoiseModel) -> None:
@@ -17,10 +16,4 @@ def write_noise(path: str | Path, model: NoiseModel) -> None:
 
 def read_noise(path: str | Path) -> NoiseModel:
     """Read a noise.json; raise InputError if it can't be read, or is invalid."""
-    try:
-        data = json.loads(reading.read_text(path, limit=1 << 20))
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"is broken JSON ({error})", where=path, remedy="write it again by `tofuse noise`"
-        ) from error
-    return NoiseModel.from_dict(data, where=str(path))
+    return NoiseModel.from_dict(json_data.read_json(path), where=str(path))

@@ -11,7 +11,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.reading import read_text
+from tofuse.formats.files.reading import parsed, read_text
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
@@ -22,19 +22,16 @@ def read_json(path: str | Path) -> dict[str, Any]:
     InputError
         If the file can't be read, is invalid (with line and column), or is not an object.
     """
-    text = read_text(path, limit=64 << 20)
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(
-            f"is invalid JSON ({error.msg}, line {error.lineno} column {error.colno})",
-            where=path,
-            remedy="correct it there",
-        ) from error
-    except (RecursionError, ValueError) as error:
-        raise InputError("is invalid JSON", where=path, remedy="write it again") from error
+    return parse_json(read_text(path, limit=64 << 20), path)
+
+
+def parse_json(
+    text: str | bytes, where: str | Path, remedy: str = "correct it there"
+) -> dict[str, Any]:
+    """Parse a JSON object; for the parameters and errors see `reading.parsed`."""
+    data = parsed(json.loads, text, where=where, format_name="JSON", remedy=remedy)
     if not isinstance(data, dict):
-        raise InputError("is not a JSON object", where=path, remedy="write {...}")
+        raise InputError("is not a JSON object", where=where, remedy=remedy)
     return data
 
 

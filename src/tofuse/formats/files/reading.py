@@ -154,7 +154,14 @@ def damage_reported(path: str | Path, kind: str) -> Iterator[None]:
         ) from error
 
 
-def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, format_name: str) -> Any:
+def parsed(
+    parse: Callable[[Any], Any],
+    text: str | bytes,
+    *,
+    where: str | Path,
+    format_name: str,
+    remedy: str | None = None,
+) -> Any:
     """Parse external JSON or TOML.
 
     Parameters
@@ -165,8 +172,8 @@ def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, format_
         The text.
     where
         Its source, for errors.
-    format_name
-        Its format, for errors.
+    format_name, remedy
+        Its format, and the remedy, for errors.
 
     Raises
     ------
@@ -175,10 +182,9 @@ def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, format_
     """
     try:
         return parse(text)
-    except RecursionError as error:
-        raise InputError(f"is not {format_name} (nested too deeply)", where=where) from error
-    except ValueError as error:
-        raise InputError(f"is not {format_name} ({error})", where=where) from error
+    except (RecursionError, ValueError) as error:
+        reason = "nested too deeply" if isinstance(error, RecursionError) else error
+        raise InputError(f"is not {format_name} ({reason})", where=where, remedy=remedy) from error
 
 
 def parse_toml(text: str, *, where: str | Path) -> dict[str, Any]:
@@ -274,6 +280,15 @@ def read_part(path: Path, offset: int, size: int) -> bytes:
             return file.read(size)
     except OSError as error:
         raise input_error(error, path) from error
+
+
+@contextmanager
+def named(where: str | Path, remedy: str | None = None) -> Iterator[None]:
+    """Name `where` in the InputErrors of a block that checks values of a file."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(error.problem, where=where, remedy=remedy or error.remedy) from error
 
 
 @contextmanager

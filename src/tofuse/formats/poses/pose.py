@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,10 +38,8 @@ def read_pose(path: str | Path) -> Float64:
         matrix, where = _from_json(text, path)
     else:
         matrix, where = _from_numbers(text, path), str(path)
-    try:
+    with reading.named(where, _REMEDY):
         return se3.check_pose(matrix, where=where)
-    except InputError as error:
-        raise InputError(error.problem, where=where, remedy=_REMEDY) from error
 
 
 def pose_text(T: ArrayLike) -> str:
@@ -52,10 +49,7 @@ def pose_text(T: ArrayLike) -> str:
 
 
 def _from_json(text: str, path: str | Path) -> tuple[Float64, str]:
-    try:
-        data: Any = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is not JSON ({error})", where=path, remedy=_REMEDY) from error
+    data = reading.parsed(json.loads, text, where=path, format_name="JSON", remedy=_REMEDY)
     where = str(path)
     if isinstance(data, dict):
         where = f"{path}: {FIELD}"

@@ -243,10 +243,7 @@ def _colmap(rows: _Rows, path: Path) -> TimedPoses:
 
 def _transforms(text: str, path: Path) -> TimedPoses:
     """NeRF's JSON: for each frame a path and T_world_camera with the axes of OpenGL."""
-    try:
-        data: Any = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is not valid JSON ({error})", where=path) from error
+    data = reading.parsed(json.loads, text, where=path, format_name="valid JSON")
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError("has no list 'frames'", where=path, remedy=f"use {_SUPPORTED}")

@@ -203,10 +203,8 @@ class AdiTofSource(FileSource):
                 where=path,
                 remedy=_REMEDY,
             )
-        try:
+        with reading.named(f"{path}: XYZ", _REMEDY):
             return RayTable(rays)
-        except InputError as error:
-            raise InputError(error.problem, where=f"{path}: XYZ", remedy=_REMEDY) from error
 
 
 def _files(path: Path) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -20,6 +19,7 @@ from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import json_data
 from tofuse.formats.images import as_color, matroska, parse_image
 from tofuse.formats.poses import associate
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
@@ -276,15 +276,8 @@ def _calibration(data: bytes | None, where: str) -> dict[str, Any]:
         raise InputError(
             "is missing", where=where, remedy="pass the depth camera with --camera camera.json"
         )
-    try:
-        calibration = json.loads(data.rstrip(b"\0"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            "is invalid JSON", where=where, remedy="pass the depth camera with --camera"
-        ) from error
-    if not isinstance(calibration, dict):
-        raise InputError("is not a JSON object", where=where, remedy="use --camera")
-    return calibration
+    remedy = "pass the depth camera with --camera"
+    return json_data.parse_json(data.rstrip(b"\0"), where, remedy)
 
 
 def _lens(

@@ -247,10 +247,8 @@ class NativeSource(FileSource):
         if self.camera is None or not reading.is_file(path):
             return None
         correction = read_correction(path)
-        try:
+        with reading.named(path):
             correction.correct(np.ones((self.camera.height, self.camera.width), np.float32))
-        except InputError as error:
-            raise InputError(error.problem, where=path, remedy=error.remedy) from error
         return correction
 
     def _read_table(self, name: str, rows: int | None = None) -> dict[str, Float64] | None:

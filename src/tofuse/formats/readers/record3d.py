@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import zipfile
 import zlib
@@ -157,13 +156,7 @@ class _Archive:
         self.has_confidence = f"rgbd/{self.numbers[0]}.conf" in self.names
 
     def metadata(self) -> dict[str, Any]:
-        try:
-            data = json.loads(self._member("metadata"))
-        except (ValueError, RecursionError) as error:
-            raise InputError("is invalid JSON", where=self.where, remedy="export again") from error
-        if not isinstance(data, dict):
-            raise InputError("is not a JSON object", where=self.where, remedy="export it again")
-        return data
+        return json_data.parse_json(self._member("metadata"), self.where, _REMEDY)
 
     def depth(self, number: int, size: tuple[int, int]) -> Float32:
         name = f"rgbd/{number}.depth"

@@ -12,6 +12,7 @@ from tofuse.engine.cameras import Pinhole, scaled
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading
 from tofuse.formats.images import read_color, read_image
 from tofuse.formats.sources.file_source import FileSource
 from tofuse.formats.sources.per_frame import read_matrix_pose
@@ -35,10 +36,8 @@ def phone_lens(
 ) -> Pinhole:
     """Return the camera of depth images of `size` from K (3, 3) of larger colour images."""
     full = camera_file.checked_pinhole(K, image_size, where)
-    try:
+    with reading.named(where):
         return scaled(full, *size)
-    except InputError as error:
-        raise InputError(error.problem, where=where, remedy=error.remedy) from error
 
 
 class PhoneSource(FileSource):
