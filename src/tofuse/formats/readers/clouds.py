@@ -14,48 +14,37 @@ from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import Pcd, read_pcd
 from tofuse.formats.sources import (
-    Reader,
-    ReaderOptions,
-    Sniff,
     cloud_frames,
     cloud_sequence,
-    inputs,
     organised,
     per_frame,
 )
 
 
 @part("reader", "ply", label="validated")
-class PlyClouds(Reader):
+class PlyClouds(cloud_sequence.CloudReader):
     """A .ply file, or a folder of them; metres."""
 
-    def sniff(self, path: Path) -> Sniff | None:
-        """See `Reader.sniff`."""
-        return cloud_sequence.sniff_clouds(path, ".ply")
+    suffixes = (".ply",)
 
-    def open(self, path: Path, options: ReaderOptions) -> cloud_sequence.CloudFileSource:
-        """See `Reader.open`."""
-        inputs.refuse_camera(options, "ply")
+    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+        """See `CloudReader.source`."""
         return cloud_sequence.CloudFileSource(
             path,
-            cloud_sequence.required_files(path, ".ply"),
+            files,
             cloud_frames.ply_frame,
             cloud_frames.ply_frame,
         )
 
 
 @part("reader", "pcd", label="validated")
-class PcdClouds(Reader):
+class PcdClouds(cloud_sequence.CloudReader):
     """A .pcd file, or a folder of them; images if organised; metres."""
 
-    def sniff(self, path: Path) -> Sniff | None:
-        """See `Reader.sniff`."""
-        return cloud_sequence.sniff_clouds(path, ".pcd")
+    suffixes = (".pcd",)
 
-    def open(self, path: Path, options: ReaderOptions) -> cloud_sequence.CloudFileSource:
-        """See `Reader.open`."""
-        inputs.refuse_camera(options, "pcd")
-        files = cloud_sequence.required_files(path, ".pcd")
+    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+        """See `CloudReader.source`."""
         camera = _camera(files)
         if camera is None:
             return cloud_sequence.CloudFileSource(path, files, pcd_cloud, pcd_cloud)
@@ -130,7 +119,7 @@ _SUFFIXES = (".xyz", ".xyzn", ".xyzrgb")
 
 
 @part("reader", "xyz")
-class XyzClouds(Reader):
+class XyzClouds(cloud_sequence.CloudReader):
     """A .xyz, .xyzn or .xyzrgb file, or a folder of them; metres.
 
     The fourth column of four is an amplitude. Columns four to six are normals in .xyzn, and where
@@ -138,16 +127,11 @@ class XyzClouds(Reader):
     columns are ignored.
     """
 
-    def sniff(self, path: Path) -> Sniff | None:
-        """See `Reader.sniff`."""
-        return cloud_sequence.sniff_clouds(path, *_SUFFIXES)
+    suffixes = _SUFFIXES
 
-    def open(self, path: Path, options: ReaderOptions) -> cloud_sequence.CloudFileSource:
-        """See `Reader.open`."""
-        inputs.refuse_camera(options, "xyz")
-        return cloud_sequence.CloudFileSource(
-            path, cloud_sequence.required_files(path, *_SUFFIXES), xyz_frame, xyz_frame
-        )
+    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+        """See `CloudReader.source`."""
+        return cloud_sequence.CloudFileSource(path, files, xyz_frame, xyz_frame)
 
 
 def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
@@ -188,17 +172,13 @@ CENTIMETRE = 0.01
 
 
 @part("reader", "slam6d", label="validated")
-class Slam6d(Reader):
+class Slam6d(cloud_sequence.CloudReader):
     """3DTK, slam6D: a folder of scanNNN.3d with scanNNN.pose."""
 
-    def sniff(self, path: Path) -> Sniff | None:
-        """See `Reader.sniff`."""
-        return cloud_sequence.sniff_clouds(path, ".3d")
+    suffixes = (".3d",)
 
-    def open(self, path: Path, options: ReaderOptions) -> cloud_sequence.CloudFileSource:
-        """See `Reader.open`."""
-        inputs.refuse_camera(options, "slam6d")
-        files = cloud_sequence.required_files(path, ".3d")
+    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+        """See `CloudReader.source`."""
         source = cloud_sequence.CloudFileSource(path, files, scan_frame)
         poses = per_frame.poses_from_files(
             source, [file.with_suffix(".pose") for file in files], read_pose

@@ -35,17 +35,13 @@ _COPY = "copy the file again, or export it again"
 
 
 @part("reader", "las")
-class LasScans(Reader):
+class LasScans(cloud_sequence.CloudReader):
     """A .las or .laz file, or a folder of them; metres (extra `scan`)."""
 
-    def sniff(self, path: Path) -> Sniff | None:
-        """See `Reader.sniff`."""
-        return cloud_sequence.sniff_clouds(path, ".las", ".laz")
+    suffixes = (".las", ".laz")
 
-    def open(self, path: Path, options: ReaderOptions) -> cloud_sequence.CloudFileSource:
-        """See `Reader.open`."""
-        inputs.refuse_camera(options, "las")
-        files = cloud_sequence.required_files(path, ".las", ".laz")
+    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+        """See `CloudReader.source`."""
         shift = _shift(files[0])
         source = cloud_sequence.CloudFileSource(
             path, files, lambda f, k, t: _las_frame(f, k, t, shift)
