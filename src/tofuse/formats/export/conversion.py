@@ -208,7 +208,6 @@ def _finish(
 ) -> None:
     columns = getattr(recording.source, "frame_columns", None)
     source_indices = recording.indices[written]
-    lens_columns = ("fx", "fy", "cx", "cy")
     writer.finish(
         groundtruth=None if recording.reference is None else recording.reference[written],
         odometry=None if recording.odometry is None else recording.odometry[written],
@@ -219,7 +218,7 @@ def _finish(
         else {
             n: c[source_indices]
             for n, c in columns.items()
-            if not (writer.camera_per_frame and n in lens_columns)
+            if not (writer.camera_per_frame and n in camera_file.LENS_COLUMNS)
         },
     )
 

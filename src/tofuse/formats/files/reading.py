@@ -48,6 +48,15 @@ def input_error(error: OSError, path: str | Path) -> InputError:
     return InputError(problem, where=path, remedy=remedy)
 
 
+@contextmanager
+def readable(path: str | Path) -> Iterator[None]:
+    """Turn the OSErrors of a block that reads `path` into `input_error`."""
+    try:
+        yield
+    except OSError as error:
+        raise input_error(error, path) from error
+
+
 def path_of(value: object, name: str, remedy: str) -> Path:
     """Return an argument of the user as a path.
 
@@ -124,13 +133,11 @@ def read_bytes(path: str | Path, *, limit: int = MAX_BYTES) -> bytes:
 def read_head(path: str | Path, size: int) -> bytes:
     """Return the first `size` bytes of a file, fewer if it is shorter; errors as `read_bytes`."""
     path = Path(path)
-    try:
+    with readable(path):
         if path.exists() and not path.is_file():
             raise InputError("is not a regular file", where=path, remedy="pass a file")
         with path.open("rb") as file:
             return file.read(size)
-    except OSError as error:
-        raise input_error(error, path) from error
 
 
 @contextmanager
@@ -224,12 +231,10 @@ def list_folder(path: str | Path) -> list[Path]:
     InputError
         If it can't be listed.
     """
-    try:
+    with readable(path):
         return sorted(
             (p for p in Path(path).iterdir() if not p.name.startswith(".")), key=name_order
         )
-    except OSError as error:
-        raise input_error(error, path) from error
 
 
 def files_with(path: str | Path, *suffixes: str) -> list[Path]:
@@ -274,12 +279,9 @@ def is_folder(path: Path) -> bool:
 
 def read_part(path: Path, offset: int, size: int) -> bytes:
     """Return up to `size` bytes of a file from an offset; InputError if it can't be read."""
-    try:
-        with path.open("rb") as file:
-            file.seek(offset)
-            return file.read(size)
-    except OSError as error:
-        raise input_error(error, path) from error
+    with readable(path), path.open("rb") as file:
+        file.seek(offset)
+        return file.read(size)
 
 
 @contextmanager

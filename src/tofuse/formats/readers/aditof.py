@@ -214,15 +214,13 @@ def _files(path: Path) -> list[Path]:
 def _frames_in(path: Path) -> tuple[list[_FrameLocation], bool]:
     """The complete frames of a file, and whether it contains nothing else."""
     frames: list[_FrameLocation] = []
-    try:
+    with reading.readable(path):
         size = path.stat().st_size
         with path.open("rb") as file:
             offset = 0
             while layout := _layout_at(file, offset, size):
                 frames.append(_FrameLocation(path, offset, layout))
                 offset += layout.length
-    except OSError as error:
-        raise reading.input_error(error, path) from error
     return frames, offset == size
 
 

@@ -69,14 +69,11 @@ class SensSource(FileSource):
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.path = path
         super().__init__(np.zeros(0))
-        try:
-            with path.open("rb") as file:
-                self._size = file.seek(0, 2)
-                file.seek(0)
-                count = self._read_header(file)
-                frames = list(self._locate_frames(file, count))
-        except OSError as error:
-            raise reading.input_error(error, path) from error
+        with reading.readable(path), path.open("rb") as file:
+            self._size = file.seek(0, 2)
+            file.seek(0)
+            count = self._read_header(file)
+            frames = list(self._locate_frames(file, count))
         if not frames:
             raise self._error("contains no complete frame", "copy the file again")
         self.entries = [entry for entry, _, _ in frames]
