@@ -38,7 +38,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views.view_store import SampledView
-from tofuse.formats.recordings.rig import Rig, RigCamera
+from tofuse.formats.rigs.rig_file import Rig, RigCamera
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.rig import Mount, camera_ring, relative, simulate_rig, wander

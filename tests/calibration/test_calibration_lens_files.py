@@ -12,7 +12,7 @@ from tofuse.apps.calibration.lens_files import read_lens_file
 from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Rational
 from tofuse.engine.errors import InputError
-from tofuse.formats.recordings.camera_file import load_camera
+from tofuse.formats.cameras.camera_file import load_camera
 
 ROS = """image_width: 800
 image_height: 600

@@ -29,7 +29,8 @@ from tofuse.engine.results.types import Component, Reason, Reconstruction
 from tofuse.engine.results.verdicts import ADVICE, REASONS
 from tofuse.formats.export.conversion import convert
 from tofuse.formats.geometry.ply import read_ply
-from tofuse.formats.images.images import read_image, write_png
+from tofuse.formats.images.images import read_image
+from tofuse.formats.images.writing import write_png
 from tofuse.formats.poses.g2o import read_g2o
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.open import open_recording

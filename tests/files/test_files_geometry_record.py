@@ -9,7 +9,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.geometry.e57 import write_e57
 from tofuse.formats.geometry.glb import write_glb, write_gltf
-from tofuse.formats.geometry.las import write_las, write_laz
+from tofuse.formats.geometry.las import write_las
 from tofuse.formats.geometry.obj import write_obj
 from tofuse.formats.geometry.pcd import write_pcd
 from tofuse.formats.geometry.ply import write_ply
@@ -25,7 +25,6 @@ FACE = np.array([[0, 1, 2]], np.int32)
         write_glb,
         write_gltf,
         write_las,
-        write_laz,
         write_obj,
         write_pcd,
         write_ply,

@@ -21,7 +21,7 @@ from tofuse.apps.results.folder import OutputFolder, finish_interrupted, is_resu
 from tofuse.apps.results.output import write_result
 from tofuse.formats.files.atomic import write_text
 from tofuse.formats.files.staging import finish_replacing, is_interrupted, new_folder
-from tofuse.formats.recordings.rig import Rig, RigCamera, write_rig
+from tofuse.formats.rigs.rig_file import Rig, RigCamera, write_rig
 
 
 @pytest.fixture

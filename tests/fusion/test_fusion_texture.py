@@ -26,7 +26,7 @@ from tofuse.engine.mapping import texturing as paint
 from tofuse.formats.geometry.glb import linear, write_glb
 from tofuse.formats.geometry.obj import write_obj
 from tofuse.formats.geometry.ply import read_ply
-from tofuse.formats.images.images import png_bytes
+from tofuse.formats.images.writing import png_bytes
 
 CAMERA = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
 

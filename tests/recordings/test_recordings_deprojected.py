@@ -14,7 +14,7 @@ from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.recordings.open import open_recording
-from tofuse.formats.recordings.organised import find_deprojection
+from tofuse.formats.sources.organised import find_deprojection
 
 PINHOLE = Pinhole(160, 120, 140.0, 141.0, 82.3, 57.9)
 LENSES: dict[str, Camera] = {

@@ -12,8 +12,8 @@ import pytest
 import made_kinect as made
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.formats.cameras.camera_file import ColorCamera
 from tofuse.formats.readers import azure_kinect
-from tofuse.formats.recordings.camera_file import ColorCamera
 from tofuse.formats.recordings.open import open_recording
 
 SIZES = {

@@ -14,8 +14,8 @@ from tofuse.engine.cameras.depth_conversion import points_from_z
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.formats.cameras.rectify import Rectifier, pinhole_of
 from tofuse.formats.export.conversion import convert_to
-from tofuse.formats.recordings.rectify import Rectifier, pinhole_of
 
 BARREL = BrownConrady(96, 72, 70.0, 71.0, 46.0, 37.0, k1=-0.25, k2=0.06, p1=0.002)
 WIDE = Fisheye(96, 72, 36.0, 36.0, 47.5, 35.5, k1=0.02)

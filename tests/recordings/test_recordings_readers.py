@@ -27,7 +27,7 @@ from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry.se3 import exp
 from tofuse.engine.noise.choice import family_of
 from tofuse.formats.geometry.ply import write_ply
-from tofuse.formats.images.images import write_png
+from tofuse.formats.images.writing import write_png
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.recordings.open import open_recording
 

@@ -9,14 +9,8 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.formats.recordings.rig import (
-    Disagreement,
-    Rig,
-    RigCamera,
-    read_rig,
-    with_range_added,
-    write_rig,
-)
+from tofuse.formats.rigs.rig_file import Disagreement, Rig, RigCamera, read_rig, write_rig
+from tofuse.formats.rigs.rig_source import with_range_added
 from tofuse.lab.world.paths import rotation
 
 

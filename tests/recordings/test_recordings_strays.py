@@ -23,7 +23,7 @@ from tofuse.formats.poses.g2o import read_g2o
 from tofuse.formats.poses.given_loops import read_loops
 from tofuse.formats.poses.pose import read_pose
 from tofuse.formats.poses.trajectory_formats import read_poses
-from tofuse.formats.recordings.rig import read_rig
+from tofuse.formats.rigs.rig_file import read_rig
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="links and queues of other systems")
 

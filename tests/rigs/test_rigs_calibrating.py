@@ -23,7 +23,7 @@ from tofuse.engine.geometry import se3
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
-from tofuse.formats.recordings.rig import Rig, RigCamera, read_rig, write_rig
+from tofuse.formats.rigs.rig_file import Rig, RigCamera, read_rig, write_rig
 from tofuse.lab.simulation.rig import camera_ring, relative
 
 # Three cameras, neighbours 25 degrees apart.

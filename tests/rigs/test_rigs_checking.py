@@ -7,7 +7,7 @@ import pytest
 
 from tofuse.apps.rigs.checking import compare, compare_in_scene
 from tofuse.engine.geometry import se3
-from tofuse.formats.recordings.rig import Rig, RigCamera
+from tofuse.formats.rigs.rig_file import Rig, RigCamera
 
 SIGMA = np.array([0.0006] * 3 + [np.radians(0.03)] * 3)
 

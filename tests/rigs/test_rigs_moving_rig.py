@@ -18,7 +18,7 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import changed, from_method
-from tofuse.formats.recordings.rig import RigSource
+from tofuse.formats.rigs.rig_source import RigSource
 from tofuse.lab.world.paths import look_at, rotation
 
 CLOCK = 0.012

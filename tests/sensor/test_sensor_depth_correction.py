@@ -5,7 +5,7 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.sensor.depth_correction import DepthCorrection
-from tofuse.formats.recordings.correction_file import read_correction, write_correction
+from tofuse.formats.cameras.correction_file import read_correction, write_correction
 
 
 def test_curve_is_linear_between_knots_and_constant_outside() -> None:

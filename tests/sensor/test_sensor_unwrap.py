@@ -25,7 +25,7 @@ from tofuse.engine.sensor.unwrap import (
 )
 from tofuse.engine.sensor.unwrap_correction import Unwrap
 from tofuse.engine.sensor.unwrap_kernels import NEIGHBOURS, pass_messages
-from tofuse.formats.images.images import write_png
+from tofuse.formats.images.writing import write_png
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 

@@ -14,7 +14,7 @@ from tofuse.apps.results import RECORDING, OutputFolder, is_result
 from tofuse.engine.errors import OutputError
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
-from tofuse.formats.files import replacing_folder, write_text
+from tofuse.formats.files import atomic, staging
 from tofuse.lab.simulation import Effects, Passing, simulate
 
 # Settings of the thesis per scene (section 4.1): points beyond the object are removed.
@@ -58,7 +58,7 @@ def demo(
     recording = out / RECORDING
     with OutputFolder(out, overwrite=overwrite) as folder:
         expect_failure = scene == FAILURE
-        with replacing_folder(recording, lambda _: _check_simulated(recording)) as fresh:
+        with staging.replacing_folder(recording, lambda _: _check_simulated(recording)) as fresh:
             simulate_to(
                 scene,
                 fresh,
@@ -69,7 +69,9 @@ def demo(
             )
             if scene == "peaks":
                 thesis = options.method == "thesis"
-                write_text(fresh / "peaks.toml", PEAKS_CONFIG + (PEAKS_ICP if thesis else ""))
+                atomic.write_text(
+                    fresh / "peaks.toml", PEAKS_CONFIG + (PEAKS_ICP if thesis else "")
+                )
                 options = replace(options, config=recording / "peaks.toml")
         try:
             return run([recording], options, progress, folder)

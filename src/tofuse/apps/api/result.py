@@ -228,9 +228,9 @@ class Plot:
 
     def save(self, path: str | Path) -> None:
         """Write an HTML page with the drawings to a path."""
-        from tofuse.formats.files import write_text
+        from tofuse.formats.files import atomic
 
-        write_text(path, f'<!doctype html><meta charset="utf-8">{self._repr_html_()}\n')
+        atomic.write_text(path, f'<!doctype html><meta charset="utf-8">{self._repr_html_()}\n')
 
 
 def reconstruct(

@@ -14,7 +14,7 @@ from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.work import Task, work
 from tofuse.apps.batch.workers import Workers
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import read_text
+from tofuse.formats.files import reading
 
 _TIMEOUT_S = 10.0  # of requests to a scheduler
 _POLL_S = 1.0  # interval at which the workers are counted
@@ -177,7 +177,7 @@ def _first_line(error: BaseException) -> str:
 def _from_file(path: str) -> str:
     """The address in a file that a scheduler wrote."""
     try:
-        return str(json.loads(read_text(path))["address"])
+        return str(json.loads(reading.read_text(path))["address"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             "is not a file of a Dask scheduler",

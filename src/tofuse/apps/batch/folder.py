@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 
 from tofuse.apps.batch.jobs import Job
 from tofuse.engine.errors import OutputError
-from tofuse.formats.files import make_folder, write_text
+from tofuse.formats.files import atomic
 
 _UNFINISHED = ".tofuse-"  # files of a run that is in progress or was killed; `results.folder`
 
@@ -93,7 +93,7 @@ class BatchFolder:
         """
         if self.path.exists() and not self.path.is_dir():
             raise OutputError("is a file", where=self.path, remedy="pass a folder as --out")
-        make_folder(self.path)
+        atomic.make_folder(self.path)
         # Hidden files may be of another process that prepares it at the same time.
         names = {p.name for p in self.path.iterdir() if not p.name.startswith(".")}
         if names - {self.jobs.name} and not {self.jobs.name, self.csv.name} <= names:
@@ -102,7 +102,7 @@ class BatchFolder:
                 where=self.path,
                 remedy="pass a new or empty folder as --out",
             )
-        make_folder(self.jobs)
+        atomic.make_folder(self.jobs)
 
     @property
     def jobs(self) -> Path:
@@ -146,7 +146,7 @@ class BatchFolder:
     def write(self, job: Job, record: Record) -> None:
         """Write the record of a job."""
         text = json.dumps(asdict(record), indent=1, allow_nan=False)
-        write_text(self._record(job), text + "\n")
+        atomic.write_text(self._record(job), text + "\n")
 
     def finished(self, job: Job) -> bool:
         """Whether there is an up-to-date result of the job."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import name_order, parse_toml, read_head, read_text, stamps_of
+from tofuse.formats.files import reading, stamps
 
 RESERVED = ("batch.csv", "batch.html", "jobs")  # names in the output folder not for jobs
 # Other files are recordings if they are binary, or a reader recognises them.
@@ -56,7 +56,7 @@ class Job:
         """
         values = [word.partition("=")[2] for word in self.arguments]
         paths = [Path(v) for v in (self.recording, *values) if v and Path(v).is_absolute()]
-        files = [s for path in paths for s in stamps_of(path, out)]
+        files = [s for path in paths for s in stamps.stamps_of(path, out)]
         facts = {"recording": self.recording, "words": self.arguments, "files": files}
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
@@ -123,7 +123,7 @@ def _rows(path: Path) -> Iterator[tuple[Path, _Row]]:
         yield Path.cwd(), _Row(str(path), str(path))
         return
     readers = {".csv": _csv_rows, ".toml": _toml_rows}
-    for row in readers.get(path.suffix.lower(), _text_rows)(read_text(path), path):
+    for row in readers.get(path.suffix.lower(), _text_rows)(reading.read_text(path), path):
         yield path.absolute().parent, row
 
 
@@ -132,7 +132,7 @@ def _is_list(path: Path) -> bool:
         return False
     if path.suffix.lower() in _LISTS:
         return True
-    if b"\0" in read_head(path, _HEAD_BYTES):
+    if b"\0" in reading.read_head(path, _HEAD_BYTES):
         return False
     from tofuse.formats.recordings import is_recording
 
@@ -172,7 +172,7 @@ def _csv_rows(text: str, path: Path) -> Iterator[_Row]:
 
 
 def _toml_rows(text: str, path: Path) -> Iterator[_Row]:
-    data = parse_toml(text, where=path)
+    data = reading.parse_toml(text, where=path)
     shared, tables = data.pop("all", {}), data.pop("job", [])
     if data or not isinstance(shared, dict) or not isinstance(tables, list):
         raise InputError(
@@ -222,7 +222,7 @@ def _matches(row: _Row, base: Path) -> list[str]:
 
 
 def _path_order(path: Path) -> list[list[tuple[int, int, str]]]:
-    return [name_order(Path(part)) for part in path.parts]
+    return [reading.name_order(Path(part)) for part in path.parts]
 
 
 def _check_name(name: str, taken: Iterable[str], where: str) -> str:

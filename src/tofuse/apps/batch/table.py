@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
-from tofuse.formats.files import locked, write_text
+from tofuse.formats.files import atomic, locked
 
 COLUMNS = (
     "name",
@@ -78,9 +78,9 @@ def write_table(jobs: Sequence[Job], folder: BatchFolder) -> None:
     with locked(folder.lock("-table")):
         records = [(job, folder.record(job)) for job in jobs]
         ended = [(job, record) for job, record in records if record is not None and record.ended]
-        write_text(folder.csv, _csv(ended))
+        atomic.write_text(folder.csv, _csv(ended))
         running = sum(record is not None and record.state == "running" for _, record in records)
-        write_text(folder.html, _html(ended, len(jobs), running, folder))
+        atomic.write_text(folder.html, _html(ended, len(jobs), running, folder))
 
 
 def _csv(ended: Sequence[tuple[Job, Record]]) -> str:

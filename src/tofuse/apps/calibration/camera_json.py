@@ -11,8 +11,8 @@ import numpy as np
 from tofuse.engine.cameras import Camera, RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames import RangeFrame, Recording
-from tofuse.formats.files import is_file, is_folder, make_folder, replacing
-from tofuse.formats.recordings import SCHEMA, camera_fields, read_json
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import atomic, json_data, reading
 
 _LENS = ("schema", "model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
 _METADATA = (
@@ -28,8 +28,8 @@ _METADATA = (
 def recording_fields(recording: Recording) -> dict[str, Any]:
     """Return the fields of camera.json that describe a recording's images, without the lens."""
     path = Path(recording.path) / "camera.json"
-    if is_folder(Path(recording.path)) and is_file(path):
-        return {key: value for key, value in read_json(path).items() if key not in _LENS}
+    if reading.is_folder(Path(recording.path)) and reading.is_file(path):
+        return {key: value for key, value in json_data.read_json(path).items() if key not in _LENS}
     metadata = {key: recording.metadata.get(key) for key in _METADATA}
     present = {key: value for key, value in metadata.items() if value is not None}
     frame = next((f for f in recording.sample(3) if isinstance(f, RangeFrame)), None)
@@ -78,13 +78,13 @@ def write_camera_json(
             where=table,
             remedy="move it away, or choose an --out in another folder",
         )
-    fields = {"schema": SCHEMA} | camera_fields(camera)
+    fields = {"schema": camera_file.SCHEMA} | camera_file.camera_fields(camera)
     content = fields | {"depth_unit_m": 0.001, "depth_kind": "z"} | about
-    make_folder(path.parent)
+    atomic.make_folder(path.parent)
     if isinstance(camera, RayTable):
-        with replacing(table) as part:
+        with atomic.replacing(table) as part:
             np.save(part, camera.rays(), allow_pickle=False)
-    with replacing(path) as part:
+    with atomic.replacing(path) as part:
         part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return files
 
@@ -99,7 +99,7 @@ def check_new(path: Path, *, overwrite: bool) -> None:
     InputError
         If it is a folder.
     """
-    if is_folder(path):
+    if reading.is_folder(path):
         raise InputError("is a folder", where="--out", remedy="pass a file, such as camera.json")
     if path.exists() and not overwrite:
         raise OutputError("exists already", where=path, remedy="use --overwrite to replace it")

@@ -13,8 +13,8 @@ import numpy as np
 
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole, pinhole_values
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import read_text
-from tofuse.formats.recordings import checked_lens, image_size
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading
 
 _MAX_BYTES = 64 << 20
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -52,7 +52,7 @@ def read_lens_file(path: str | Path) -> LensFile:
         If it is none of these, its values are invalid, or no model here describes the lens.
     """
     path = Path(path)
-    text = read_text(path, limit=_MAX_BYTES)
+    text = reading.read_text(path, limit=_MAX_BYTES)
     matrix = _numbers(text, _MATRIX)
     if matrix is None or len(matrix) != 9:
         raise InputError(
@@ -87,10 +87,10 @@ def read_lens_file(path: str | Path) -> LensFile:
             where=path,
             remedy=f"calibrate with {len(order)}, without thin prism or tilted sensor",
         )
-    width, height = image_size(size[0], size[1], f"{path}: image size")
+    width, height = camera_file.image_size(size[0], size[1], f"{path}: image size")
     values = pinhole_values(np.reshape(matrix, (3, 3)), height, f"{path}: camera_matrix")
     values |= dict(zip(order, k, strict=False))
-    camera = checked_lens(MODELS[model], (width, height), values, path)
+    camera = camera_file.checked_lens(MODELS[model], (width, height), values, path)
     return LensFile(camera, "opencv" if ros_model is None else "ros")
 
 

@@ -24,7 +24,7 @@ from tofuse.engine.noise import (
     noise_model_for,
 )
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
-from tofuse.formats.recordings import stationary_intervals
+from tofuse.formats.recordings import still
 
 MIN_FRAMES = 3
 _MIN_PIXELS = 40  # in a bin
@@ -166,7 +166,9 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
             "contains clouds", where=recording.path, remedy="pass a recording of depth images"
         )
     prior = noise_model_for(recording)
-    stretches = [(a, b) for a, b in stationary_intervals(recording, prior) if b - a >= MIN_FRAMES]
+    stretches = [
+        (a, b) for a, b in still.stationary_intervals(recording, prior) if b - a >= MIN_FRAMES
+    ]
     if not stretches:
         raise _not_static_error(recording)
     samples = _concatenate([_segment_samples(recording, a, b, prior) for a, b in stretches])

@@ -21,14 +21,9 @@ from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.files import make_folder, replacing
-from tofuse.formats.recordings import (
-    Opening,
-    camera_fields,
-    open_recording,
-    read_correction,
-    write_correction,
-)
+from tofuse.formats.cameras import camera_file, read_correction, write_correction
+from tofuse.formats.files import atomic
+from tofuse.formats.recordings import Opening, open_recording
 
 # Data for JSON, lines to print, and warnings.
 Summary = tuple[dict[str, Any], list[str], list[str]]
@@ -84,8 +79,8 @@ def depth(arguments: argparse.Namespace) -> Summary:
     ]
     if arguments.out is not None:
         correction = fit.correction if previous is None else compose(previous, fit.correction)
-        make_folder(arguments.out.parent)
-        with replacing(arguments.out) as temporary:
+        atomic.make_folder(arguments.out.parent)
+        with atomic.replacing(arguments.out) as temporary:
             write_correction(temporary, correction)
         lines.append(f"written to {arguments.out}")
         if previous is not None:
@@ -123,7 +118,7 @@ def import_lens(arguments: argparse.Namespace) -> Summary:
     else:
         recording = open_recording(arguments.recording)
         metadata = recording_fields(recording)
-    fields = camera_fields(lens_file.camera)
+    fields = camera_file.camera_fields(lens_file.camera)
     lines = [f"{name} {value}" for name, value in fields.items()]
     lines.append(f"read as a file of {lens_file.format}")
     if arguments.out is not None:

@@ -24,7 +24,7 @@ from tofuse.apps.cli.progress import (
     progress_for,
 )
 from tofuse.engine.results import Reason, Reconstruction
-from tofuse.formats.files import write_noise
+from tofuse.formats.cameras import write_noise
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tofuse.apps.jobs import exit_status
     from tofuse.apps.jobs import run as run_pipeline
     from tofuse.engine.errors import InputError
-    from tofuse.formats.recordings import recordings_of, rig_file_in
+    from tofuse.formats.rigs import recordings_of, rig_file_in
 
     options = run_options(arguments)
     if arguments.rig is None and len(arguments.inputs) == 1:
@@ -255,7 +255,7 @@ def rig_calibrate(arguments: argparse.Namespace) -> int:
     from tofuse.apps.calibration import check_new
     from tofuse.apps.cli import rigging
     from tofuse.apps.rigs import calibrate as calibrate_rig
-    from tofuse.formats.recordings import write_rig
+    from tofuse.formats.rigs import write_rig
 
     check_new(arguments.out, overwrite=arguments.overwrite)
     with _progress_unless_json(arguments) as progress:
@@ -284,7 +284,7 @@ def rig_check(arguments: argparse.Namespace) -> int:
     """``tofuse rig check``."""
     from tofuse.apps.cli import rigging
     from tofuse.apps.rigs import check
-    from tofuse.formats.recordings import read_rig
+    from tofuse.formats.rigs import read_rig
 
     rig = read_rig(arguments.rig)
     with _progress_unless_json(arguments) as progress:

@@ -49,13 +49,13 @@ def _job(picture: str, run_arguments: Sequence[str]) -> int:
     from tofuse.apps.cli.progress import QuietProgress, emit
     from tofuse.apps.jobs import exit_status, run
     from tofuse.apps.report import encode, make_scene, render_thumbnail
-    from tofuse.formats.files import write_bytes
+    from tofuse.formats.files import atomic
 
     arguments = make_parser().parse_args(["run", *run_arguments])
     with QuietProgress() as progress:
         result = run(arguments.inputs, run_options(arguments), progress)
     rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
-    write_bytes(
+    atomic.write_bytes(
         picture, encode(render_thumbnail(make_scene(result, rows), _PICTURE_SIZE), jpeg=True)
     )
     print_result(result, arguments.out, as_json=True)

@@ -11,7 +11,7 @@ from rich.table import Table
 from tofuse.apps.results import plain
 from tofuse.apps.rigs import Calibration, CameraMotion
 from tofuse.engine.geometry import se3
-from tofuse.formats.recordings import Rig
+from tofuse.formats.rigs import Rig
 
 
 def tables(rig: Rig) -> list[Table]:

@@ -9,7 +9,7 @@ from tofuse.engine.arrays import Float32, UInt8
 from tofuse.engine.cameras import BrownConrady, Fisheye, Pinhole, Rational
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.formats.files import exact, make_folder, write_text
+from tofuse.formats.files import atomic, tables
 
 # COLMAP's name of a lens model, and its parameters after fx, fy, cx, cy.
 _MODELS: dict[type, tuple[str, tuple[str, ...]]] = {
@@ -52,13 +52,13 @@ def write_colmap(result: Path, folder: Path, every: int, pinhole: bool = False) 
         camera = cameras.setdefault(lens(posed.camera), len(cameras) + 1)
         T = se3.inverse(posed.T_world_camera)
         x, y, z, w = quaternion.from_matrix(T[:3, :3])
-        row = " ".join(exact(value) for value in (w, x, y, z, *T[:3, 3]))
+        row = " ".join(tables.exact(value) for value in (w, x, y, z, *T[:3, 3]))
         # The second line of an image, its 2D points, is empty.
         lines += [f"{number} {row} {camera} {posed.name}", ""]
     images.finish()
     if not lines:
         raise InputError("has no readable frame with a pose", where=result)
-    sparse = make_folder(folder / "sparse" / "0")
+    sparse = atomic.make_folder(folder / "sparse" / "0")
     table = [f"{number} {camera}" for camera, number in cameras.items()]
     _write(sparse / "cameras.txt", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", table)
     _write(
@@ -80,7 +80,7 @@ def lens(camera: Pinhole) -> str:
         model, names = "OPENCV", names[:4]  # supported by more programs
     numbers = [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
     numbers += [getattr(camera, name) if name else 0.0 for name in names]
-    return f"{model} {camera.width} {camera.height} " + " ".join(exact(n) for n in numbers)
+    return f"{model} {camera.width} {camera.height} " + " ".join(tables.exact(n) for n in numbers)
 
 
 def _points(points: Float32, color: UInt8) -> list[str]:
@@ -92,4 +92,4 @@ def _points(points: Float32, color: UInt8) -> list[str]:
 
 
 def _write(path: Path, columns: str, lines: list[str]) -> None:
-    write_text(path, "\n".join([f"# {columns}", *lines]) + "\n")
+    atomic.write_text(path, "\n".join([f"# {columns}", *lines]) + "\n")

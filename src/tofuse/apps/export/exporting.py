@@ -28,7 +28,7 @@ from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion import GeometryRecord, Mesh, texture
 from tofuse.formats.export import exchange
-from tofuse.formats.files import make_folder, replacing_folder, stamp
+from tofuse.formats.files import atomic, staging, stamps
 from tofuse.formats.images import jpeg_bytes
 from tofuse.formats.poses import associate, read_tum, write_kitti, write_log
 
@@ -158,7 +158,7 @@ def _folder(path: Path) -> Iterator[Path]:
                 remedy="move it away, or pass another --out",
             )
 
-    with replacing_folder(path, check) as folder:
+    with staging.replacing_folder(path, check) as folder:
         yield folder
 
 
@@ -238,7 +238,7 @@ def export(
         )
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
-    make_folder(target)
+    atomic.make_folder(target)
     with claimed(target), _unchanged(folder):
         for path in files.values():
             if path.exists() and not overwrite:
@@ -258,9 +258,9 @@ def _unchanged(folder: Path) -> Iterator[None]:
 
     The result itself is not locked: it may be read-only.
     """
-    before = stamp(folder / RESULT.marker)
+    before = stamps.stamp(folder / RESULT.marker)
     yield
-    if not is_result(folder) or stamp(folder / RESULT.marker) != before:
+    if not is_result(folder) or stamps.stamp(folder / RESULT.marker) != before:
         raise InputError(
             "was replaced by another run while it was read",
             where=folder,

@@ -27,9 +27,10 @@ from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.fusion import texture
 from tofuse.engine.noise import noise_model_for
 from tofuse.engine.sensor import CameraErrors, Corrector
-from tofuse.formats.files import make_folder
+from tofuse.formats.cameras import Rectifier, pinhole_of
+from tofuse.formats.files import atomic
 from tofuse.formats.images import write_png
-from tofuse.formats.recordings import FileSource, Rectifier, pinhole_of
+from tofuse.formats.sources import FileSource
 
 DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # m per count
 IMAGES, DEPTH, SIGMA, MASKS = "images", "depth", "sigma", "masks"
@@ -251,7 +252,7 @@ class ImageFolder:
             self._png(MASKS, name, np.full(shape, 255, np.uint8))
 
     def _png(self, kind: str, name: str, image: NDArray[Any]) -> None:
-        write_png(make_folder(self.folder / kind) / name, image)
+        write_png(atomic.make_folder(self.folder / kind) / name, image)
 
 
 def _counts(metres: Float32, unit_m: float) -> UInt16:

@@ -22,7 +22,7 @@ from tofuse.apps.export.image_folder import (
 from tofuse.engine.cameras import DISTORTION_ORDER, BrownConrady, Camera, Fisheye, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files import write_text
+from tofuse.formats.files import atomic
 from tofuse.formats.geometry import write_ply
 from tofuse.formats.poses import OPENGL
 
@@ -93,7 +93,7 @@ def write_nerfstudio(result: Path, folder: Path, every: int, pinhole: bool = Fal
     header |= {"frames": []}
     text = json.dumps(header, indent=1, allow_nan=False).removesuffix("[]\n}")
     lines = ",\n  ".join(json.dumps(frame, allow_nan=False) for frame in frames)
-    write_text(folder / "transforms.json", f"{text}[\n  {lines}\n ]\n}}\n")
+    atomic.write_text(folder / "transforms.json", f"{text}[\n  {lines}\n ]\n}}\n")
 
 
 _MODELS: dict[type[Camera], str] = {

@@ -19,7 +19,7 @@ from tofuse.engine.mapping import (
     texturing,
 )
 from tofuse.engine.sensor import range_and_amplitude
-from tofuse.formats.files import parse_toml, read_text
+from tofuse.formats.files import reading
 from tofuse.formats.recordings import OpeningOptions
 
 _SAMPLED = 8  # frames that are checked for the input of --unwrap
@@ -178,4 +178,4 @@ def read_changes(path: str | Path) -> dict[str, Any]:
         if not isinstance(config, dict):
             raise InputError("contains no config", where=path, remedy="pass a run.json of tofuse")
         return config
-    return parse_toml(read_text(path), where=path)
+    return reading.parse_toml(reading.read_text(path), where=path)

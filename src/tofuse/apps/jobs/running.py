@@ -29,7 +29,7 @@ from tofuse.engine.mapping import Config, adaptation, priors, reconstructing, te
 from tofuse.engine.progress import Progress, Silent, Stopwatch
 from tofuse.engine.results import Reason, Reconstruction, in_main_model, verdicts
 from tofuse.engine.sensor import Unwrap
-from tofuse.formats.files import stamps_of
+from tofuse.formats.files import stamps
 from tofuse.formats.poses import read_loops
 from tofuse.formats.recordings import Opening
 
@@ -173,7 +173,7 @@ def _tracked_file(
         "options": repr(replace(options, out=Path(), overwrite=False, threads=None)),
         "config": plain(job.config.to_dict()),
         "seed": job.seed,
-        "files": [stamps_of(path.absolute(), out) for path in paths],
+        "files": [stamps.stamps_of(path.absolute(), out) for path in paths],
     }
     key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     return TrackedFile(out / TRACKED, key, progress.note)

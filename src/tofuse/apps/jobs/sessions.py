@@ -28,7 +28,7 @@ from tofuse.engine.frames import Recording
 from tofuse.engine.mapping import Config, adaptation, changed, from_method, kind_of
 from tofuse.engine.progress import Progress
 from tofuse.engine.tracking import Keyframes, Status, given
-from tofuse.formats.files import path_of
+from tofuse.formats.files import reading
 from tofuse.formats.recordings import Opening
 
 _REMEDY = "pass the --out of `tofuse run`"
@@ -84,7 +84,9 @@ def read_sessions(
         or if a result was given twice, or only one session.
     """
     folders = [
-        path_of(each, "results", "pass folders, to which result.save(folder) writes results")
+        reading.path_of(
+            each, "results", "pass folders, to which result.save(folder) writes results"
+        )
         for each in results
     ]
     for a, b in combinations(folders, 2):

@@ -26,7 +26,7 @@ from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.mapping import FrameLog
 from tofuse.engine.tracking import FrameTime, Step, Tracker, moving_objects
 from tofuse.engine.views import PreparedView
-from tofuse.formats.files import Arrays, read_npz, replacing
+from tofuse.formats.files import atomic, npz
 
 # Tracking that took less, in s, is repeated.
 _MIN_TRACKING_S = 10.0
@@ -107,7 +107,7 @@ class TrackedFile:
         if not self._path.exists():
             return None
         try:
-            arrays = read_npz(self._path)
+            arrays = npz.read_npz(self._path)
             if arrays["key"].tolist() == self._key:
                 replaying = ReplayingTracker(tracker, arrays)
                 self._note("goes on after the tracking of an interrupted run")
@@ -123,9 +123,9 @@ class TrackedFile:
         self.remove()
         return None
 
-    def _store(self, arrays: Arrays) -> None:
+    def _store(self, arrays: npz.Arrays) -> None:
         try:
-            with replacing(self._path, durable=False) as part, part.open("wb") as file:
+            with atomic.replacing(self._path, durable=False) as part, part.open("wb") as file:
                 np.savez(file, allow_pickle=False, key=np.array(self._key), **arrays)
         except OutputError as error:
             self._note(
@@ -194,7 +194,7 @@ class ReplayingTracker(Tracker):
         Indices of the frames with a step.
     """
 
-    def __init__(self, tracker: Tracker, arrays: Arrays) -> None:
+    def __init__(self, tracker: Tracker, arrays: npz.Arrays) -> None:
         self._prepare = tracker.prepare
         self._steps = dict(_unpacked_steps(arrays))
         self.indices = list(self._steps)
@@ -230,7 +230,7 @@ class ReplayingTracker(Tracker):
         return self._predicted.get(now.index)
 
 
-def _packed(log: FrameLog, tracker: LoggingTracker) -> Arrays:
+def _packed(log: FrameLog, tracker: LoggingTracker) -> npz.Arrays:
     """Return the steps of a log as arrays."""
     steps = [(e.record.index, e.step) for e in log.entries if e.step is not None]
     registrations = [
@@ -263,7 +263,7 @@ def _plain_step(index: int, step: Step) -> list[Any]:
     return [index, step.registration is not None, links, *_attributes(step, _PLAIN_STEP)]
 
 
-def _unpacked_steps(arrays: Arrays) -> Iterator[tuple[int, Step]]:
+def _unpacked_steps(arrays: npz.Arrays) -> Iterator[tuple[int, Step]]:
     """Yield the steps in arrays of `_packed`, by frame index."""
     registrations = _unpacked_registrations(arrays)
     for plain, pose in zip(_parsed(arrays["steps"]), arrays["poses"], strict=True):
@@ -279,7 +279,7 @@ def _unpacked_steps(arrays: Arrays) -> Iterator[tuple[int, Step]]:
         yield index, step
 
 
-def _unpacked_registrations(arrays: Arrays) -> Iterator[Registration]:
+def _unpacked_registrations(arrays: npz.Arrays) -> Iterator[Registration]:
     names = ("T_target_source", "information", "runner_up")
     matrices = zip(*(map(_matrix, arrays[name]) for name in names), strict=True)
     rows = zip(
@@ -297,7 +297,7 @@ def _attributes(item: Step | Registration, names: Sequence[str]) -> list[Any]:
     return [getattr(item, name) for name in names]
 
 
-def _split(arrays: Arrays, name: str) -> list[NDArray[Any]]:
+def _split(arrays: npz.Arrays, name: str) -> list[NDArray[Any]]:
     """Return the parts of an array whose lengths are in another one."""
     return np.split(arrays[name], np.cumsum(arrays[f"n_{name}"]))[:-1]
 

@@ -16,7 +16,7 @@ import numpy as np
 from tofuse.apps.live.device import DeviceError, Stream
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
-from tofuse.formats.files import new_folder
+from tofuse.formats.files import staging
 from tofuse.formats.recordings import RecordingWriter
 
 _JOIN_TIMEOUT_S = 5.0  # for a camera's last frame
@@ -82,7 +82,7 @@ def record(
     """
     if (seconds is not None and not seconds > 0) or (frames is not None and frames < 1):
         raise InputError("there is nothing to record", remedy="use more seconds, or frames")
-    with new_folder(folder) as temporary, _Reader(stream) as reader:
+    with staging.new_folder(folder) as temporary, _Reader(stream) as reader:
         first = reader.next()
         if first is None:
             raise reader.error or DeviceError("sent no frame", where=stream.settings.sensor)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.frames import CloudFrame, Frame
-from tofuse.formats.recordings import Rig
+from tofuse.formats.rigs import Rig
 
 
 @dataclass(frozen=True, eq=False)

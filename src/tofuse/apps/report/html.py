@@ -12,7 +12,7 @@ from tofuse._version import __version__
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.policy import secured
 from tofuse.engine.results import Reconstruction
-from tofuse.formats.files import write_text
+from tofuse.formats.files import atomic
 
 # Files of the pages' script; each uses functions of the previous ones.
 SCRIPTS = (
@@ -52,7 +52,7 @@ def write_page(path: Path, template: str, **values: Any) -> None:
     OutputError
         If the file can't be written; an earlier one is unchanged then.
     """
-    write_text(path, secured(page(template, **values)))
+    atomic.write_text(path, secured(page(template, **values)))
 
 
 def page(template: str, **values: Any) -> str:

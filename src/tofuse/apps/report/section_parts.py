@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import frame_ranges
 from tofuse.engine.geometry import se3
 from tofuse.engine.results import Component, SessionChange, SessionPair
-from tofuse.formats.recordings import RigCamera
+from tofuse.formats.rigs import RigCamera
 
 _COLORS = 6  # of components in the style sheet; further ones reuse them
 _MAX_PAIRS = 10  # of cameras with a distance in the picture of a rig

@@ -14,18 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tofuse.engine.errors import InputError, OutputError, output_error
-from tofuse.formats.files import (
-    UNFINISHED,
-    Claim,
-    StagedFolder,
-    beside,
-    finish_replacing,
-    is_interrupted,
-    path_of,
-    read_text,
-)
+from tofuse.formats.files import Claim, atomic, reading, staging
 
-TRACKED = f"{UNFINISHED}tracked.npz"  # tracked frames of an interrupted run
+TRACKED = f"{atomic.UNFINISHED}tracked.npz"  # tracked frames of an interrupted run
 RECORDING = "recording"  # written by `tofuse demo` next to its result, and kept with it
 
 # Files of a result, by `tofuse run` and `tofuse export`; all of them are removed with it.
@@ -91,9 +82,9 @@ class Contract:
             relative = Path(parent).relative_to(folder)
             if parent == str(folder):
                 folders[:] = [f for f in folders if f != RECORDING or prefix]
-            folders[:] = sorted(f for f in folders if not f.startswith(UNFINISHED))
+            folders[:] = sorted(f for f in folders if not f.startswith(atomic.UNFINISHED))
             links = [f for f in folders if (Path(parent) / f).is_symlink()]
-            for name in (*links, *sorted(n for n in names if not n.startswith(UNFINISHED))):
+            for name in (*links, *sorted(n for n in names if not n.startswith(atomic.UNFINISHED))):
                 path = (relative / name).as_posix()
                 known = self.files.fullmatch(prefix + path) or _OF_SYSTEMS.fullmatch(path)
                 if not known or (Path(parent) / name).is_symlink():
@@ -101,7 +92,7 @@ class Contract:
         return None
 
 
-class OutputFolder(StagedFolder):
+class OutputFolder(staging.StagedFolder):
     """A folder that a run may write into, locked against other processes.
 
     The constructor checks everything that can be checked before hours of work: that the folder is
@@ -131,7 +122,7 @@ class OutputFolder(StagedFolder):
             If it contains anything but an earlier result, or a result and `overwrite` is not set,
             or another process writes into it, or it can't be written.
         """
-        self.path = path_of(path, "folder", "pass the path of a folder")
+        self.path = reading.path_of(path, "folder", "pass the path of a folder")
         self._contract, self._overwrite = contract or RESULT, overwrite
         super().__init__(self.path, self._check_content, kept=RECORDING)
         self._overwrite = True  # of a recording that is simulated meanwhile
@@ -146,7 +137,7 @@ class OutputFolder(StagedFolder):
                     remedy="create its target, or pass another --out",
                 )
             return
-        entries = {p.name for p in folder.iterdir() if not p.name.startswith(UNFINISHED)}
+        entries = {p.name for p in folder.iterdir() if not p.name.startswith(atomic.UNFINISHED)}
         if not entries:
             return
         if not self._contract.is_ours(folder) and entries - {RECORDING}:
@@ -198,7 +189,7 @@ def claimed(folder: Path) -> Iterator[None]:
         If another process writes into it, or it can't be written.
     """
     result = result_folder(folder)
-    claim = Claim(beside(result, "lock"), target=result) if is_result(result) else None
+    claim = Claim(staging.beside(result, "lock"), target=result) if is_result(result) else None
     try:
         yield
     finally:
@@ -222,12 +213,12 @@ def finish_interrupted(folder: Path) -> None:
         If another process is replacing it, or that can't be finished.
     """
     place = Path(os.path.realpath(folder))
-    if not is_interrupted(place):
+    if not staging.is_interrupted(place):
         return
     try:
-        claim = Claim(beside(place, "lock"), target=folder)
+        claim = Claim(staging.beside(place, "lock"), target=folder)
         try:
-            finish_replacing(place, RECORDING)
+            staging.finish_replacing(place, RECORDING)
         finally:
             claim.release()
     except (OutputError, OSError) as error:
@@ -248,7 +239,7 @@ def is_result(folder: Path) -> bool:
 def read_json_object(path: Path) -> dict[str, object] | None:
     """Return the object in a JSON file; None if it can't be read or is something else."""
     try:
-        data = json.loads(read_text(path))
+        data = json.loads(reading.read_text(path))
     except (InputError, ValueError, RecursionError):
         return None
     return data if isinstance(data, dict) else None

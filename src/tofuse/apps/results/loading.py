@@ -29,7 +29,7 @@ from tofuse.engine.results import (
     SessionPair,
     SessionRecord,
 )
-from tofuse.formats.files import path_of
+from tofuse.formats.files import reading
 from tofuse.formats.geometry import read_ply
 from tofuse.formats.poses import read_g2o
 from tofuse.formats.readers import read_las
@@ -46,7 +46,7 @@ def load_result(folder: str | Path) -> Reconstruction:
     InputError
         If it is not an output folder, or its files are damaged or of different runs.
     """
-    folder = path_of(folder, "folder", "pass the folder of a result")
+    folder = reading.path_of(folder, "folder", "pass the folder of a result")
     finish_interrupted(folder)
     if not folder.is_dir() or not is_result(folder):
         raise InputError(

@@ -20,10 +20,11 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import write_text
+from tofuse.formats.files import atomic
 from tofuse.formats.geometry import write_ply
 from tofuse.formats.poses import pose_text
-from tofuse.formats.recordings import MAP_COORDINATES_M, SingleView
+from tofuse.formats.recordings import SingleView
+from tofuse.formats.sources import cloud_sequence
 
 MARKER = "registration.json"
 FILES = ("transform.txt", "aligned.ply", "report.html", MARKER)
@@ -276,11 +277,11 @@ def write_pair(
         If a file can't be written; existing files are unchanged then.
     """
     with folder.staging() as staging:
-        write_text(staging / "transform.txt", pose_text(result.T_target_source))
+        atomic.write_text(staging / "transform.txt", pose_text(result.T_target_source))
         write_aligned(result, staging / "aligned.ply")
         report(result, staging / "report.html")
         text = json.dumps(pair_json(result), indent=1, allow_nan=False)
-        write_text(staging / MARKER, text + "\n")
+        atomic.write_text(staging / MARKER, text + "\n")
 
 
 def write_aligned(result: PairResult, path: Path) -> None:
@@ -298,5 +299,5 @@ def write_aligned(result: PairResult, path: Path) -> None:
             color=frame.color,
             scalars={} if frame.amplitude is None else {"intensity": frame.amplitude},
         ),
-        double=bool(np.abs(points).max(initial=0) > MAP_COORDINATES_M),
+        double=bool(np.abs(points).max(initial=0) > cloud_sequence.MAP_COORDINATES_M),
     )

@@ -19,7 +19,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import Refinement, calibration_check
 from tofuse.engine.results import FrameRecord, Reason, Reconstruction, SelfCalibration
-from tofuse.formats.files import damage_reported, parsed, read_text
+from tofuse.formats.files import reading
 from tofuse.formats.poses import read_tum
 
 
@@ -225,7 +225,7 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
         If it can't be read, or is not a `run.json` of schema 1.
     """
     path = Path(path)
-    data = parsed(json.loads, read_text(path), where=path, format_name="JSON")
+    data = reading.parsed(json.loads, reading.read_text(path), where=path, format_name="JSON")
     if not isinstance(data, dict) or data.get("schema") != 1:
         raise InputError("is not a run.json of schema 1", where=path)
     return data
@@ -233,7 +233,7 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
 
 def run_json_checked(path: Path) -> AbstractContextManager[None]:
     """Turn errors of a block that reads fields of a `run.json` into InputError."""
-    return damage_reported(path, "a run.json")
+    return reading.damage_reported(path, "a run.json")
 
 
 def rotation_up_world(data: Mapping[str, Any], path: Path) -> Float64:
@@ -244,7 +244,7 @@ def rotation_up_world(data: Mapping[str, Any], path: Path) -> Float64:
     InputError
         If it is missing, or not a pose.
     """
-    with damage_reported(path, f"a {path.name}"):
+    with reading.damage_reported(path, f"a {path.name}"):
         return se3.check_pose(data["T_up_world"], where=f"{path}: T_up_world")[:3, :3]
 
 

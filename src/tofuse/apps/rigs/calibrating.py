@@ -17,7 +17,7 @@ from tofuse.apps.rigs.static_rig import StaticRig, calibrate_static, is_static
 from tofuse.engine.compute import threads as using_threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.progress import Progress, Silent
-from tofuse.formats.recordings import Disagreement, Rig, RigCamera
+from tofuse.formats.rigs import Disagreement, Rig, RigCamera
 
 Motion = Literal["auto", "still", "moving"]
 

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.formats.recordings import Rig, RigCamera
+from tofuse.formats.rigs import Rig, RigCamera
 
 # Significance level: probability of a false alarm for a whole rig.
 LEVEL = 0.01

@@ -24,7 +24,7 @@ from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import joint_alignment, pairwise_measurements, propagate_poses
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.stored_views import SampledView, Spacing, pair_equations
-from tofuse.formats.recordings import RigCamera, RigSource
+from tofuse.formats.rigs import RigCamera, RigSource
 
 # Median distance between the surfaces of two cameras, m, and number of pixels, by pair a < b.
 SurfaceDistances = dict[tuple[int, int], tuple[float, int]]

@@ -31,7 +31,7 @@ from tofuse.engine.results import Reason, Reconstruction, verdicts
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.tracking import given
 from tofuse.formats.poses import write_tum
-from tofuse.formats.recordings import Disagreement, Rig, RigSource, read_rig, recordings_of
+from tofuse.formats.rigs import Disagreement, Rig, RigSource, read_rig, recordings_of
 
 # No loops are searched: poses of the rig are final.
 _NO_LOOPS = Nearby(min_gap=1_000_000)

@@ -32,7 +32,7 @@ from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.progress import Progress
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.views import PreparedView
-from tofuse.formats.recordings import average_of, change_between
+from tofuse.formats.recordings import still
 
 # A camera is static if this fraction of its pixels measure the same surface in this fraction of the
 # sampled frames.
@@ -86,7 +86,7 @@ def is_static(camera: Camera) -> bool:
     frames = camera.images(_SAMPLED_FRAMES)
     if len(frames) < 3:
         model = noise_model_for(camera.recording)
-        return len(frames) < 2 or change_between(frames[0], frames[1], model).still
+        return len(frames) < 2 or still.change_between(frames[0], frames[1], model).still
     return bool(_static_fraction(frames) >= _STATIC_PIXELS)
 
 
@@ -308,14 +308,14 @@ def _is_dynamic(camera: Camera) -> bool:
     """Whether the scene changes by more than noise."""
     frames = camera.images(_SAMPLED_FRAMES)
     model = noise_model_for(camera.recording)
-    return any(not change_between(frames[0], f, model).still for f in frames[1:])
+    return any(not still.change_between(frames[0], f, model).still for f in frames[1:])
 
 
 def _average(camera: Camera) -> RangeFrame:
     frames = camera.images(_MAX_AVERAGED)
     if len(frames) == 1:
         return frames[0]
-    return average_of(frames, noise_model_for(camera.recording))
+    return still.average_of(frames, noise_model_for(camera.recording))
 
 
 def _common_times(cameras: Sequence[Camera], offsets: Float64) -> Float64:

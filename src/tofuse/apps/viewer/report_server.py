@@ -27,7 +27,7 @@ from tofuse.apps.results import (
 from tofuse.apps.viewer.server import HOST, choose_port, is_same_origin
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
-from tofuse.formats.files import read_bytes
+from tofuse.formats.files import reading
 
 _FRAME = re.compile(r"/frame/(\d{1,9})\.png", re.ASCII)
 _HTML, _PNG, _PLY = "text/html; charset=utf-8", "image/png", "application/octet-stream"
@@ -96,12 +96,12 @@ def report_pages(folder: Path) -> dict[str, tuple[str, bytes]]:
         raise InputError(
             "is not a result (no run.json)", where=folder, remedy="pass the --out of `tofuse run`"
         )
-    pages = {"/": (_HTML, read_bytes(folder / "report.html"))}
+    pages = {"/": (_HTML, reading.read_bytes(folder / "report.html"))}
     for path in sorted(folder.glob("component-*/report.html")):
         if component_number(path.parent) is not None:
-            pages[f"/{path.parent.name}/report.html"] = _HTML, read_bytes(path)
+            pages[f"/{path.parent.name}/report.html"] = _HTML, reading.read_bytes(path)
     if (folder / "changes.ply").is_file():
-        pages["/changes.ply"] = _PLY, read_bytes(folder / "changes.ply")
+        pages["/changes.ply"] = _PLY, reading.read_bytes(folder / "changes.ply")
     return pages
 
 

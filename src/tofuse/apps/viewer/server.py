@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from tofuse.apps.report import script_hashes
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import required_package
+from tofuse.formats.files import reading
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -45,7 +45,7 @@ def serve(port: int | None = None) -> ViserServer:
     InputError
         If viser is not installed, or the port is in use.
     """
-    viser = required_package("viser", "viewer", "the viewer")
+    viser = reading.required_package("viser", "viewer", "the viewer")
     chosen = choose_port(port)
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     # Standard output is for results.

@@ -1,4 +1,7 @@
-"""."""
+"""Export: recordings in the layouts of other programs, clouds and meshes in their file formats.
+
+`convert` and `convert_to` write folders; `exchange` chooses a file format by the suffix.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -17,18 +17,12 @@ from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame, Recording, depth_counts
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.files import make_folder, new_folder, write_text
+from tofuse.formats.cameras import Rectifier, camera_file, pinhole_of
+from tofuse.formats.files import atomic, staging
 from tofuse.formats.images import write_png
 from tofuse.formats.poses import write_log, write_tum
 from tofuse.formats.readers import NativeSource
-from tofuse.formats.recordings import (
-    SCHEMA,
-    RecordingWriter,
-    Rectifier,
-    camera_fields,
-    pinhole_of,
-    same_distortion,
-)
+from tofuse.formats.recordings import RecordingWriter
 
 FINEST_UNIT_M = 1e-4
 MIN_SIGMA_UNIT_M = 1e-5
@@ -69,7 +63,7 @@ def convert(
     OutputError
         If the folder isn't empty, or can't be written.
     """
-    with new_folder(folder) as temporary:
+    with staging.new_folder(folder) as temporary:
         count, warnings = _write(recording, temporary, progress)
     return Conversion(Path(folder), count, tuple(warnings))
 
@@ -178,7 +172,7 @@ def _common_camera(cameras: list[Camera]) -> Camera:
     if all(camera == first for camera in cameras):
         return first
     if isinstance(first, Pinhole) and all(
-        isinstance(c, Pinhole) and same_distortion(c, first) for c in cameras
+        isinstance(c, Pinhole) and camera_file.same_distortion(c, first) for c in cameras
     ):
         return first
     return RayTable(first.rays())
@@ -214,7 +208,6 @@ def _finish(
 ) -> None:
     columns = getattr(recording.source, "frame_columns", None)
     source_indices = recording.indices[written]
-    lens_columns = ("fx", "fy", "cx", "cy")
     writer.finish(
         groundtruth=None if recording.reference is None else recording.reference[written],
         odometry=None if recording.odometry is None else recording.odometry[written],
@@ -225,7 +218,7 @@ def _finish(
         else {
             n: c[source_indices]
             for n, c in columns.items()
-            if not (writer.camera_per_frame and n in lens_columns)
+            if not (writer.camera_per_frame and n in camera_file.LENS_COLUMNS)
         },
     )
 
@@ -262,7 +255,7 @@ def convert_to(
     OutputError
         If the folder isn't empty, or can't be written.
     """
-    with new_folder(folder) as temporary:
+    with staging.new_folder(folder) as temporary:
         count, warnings = _write_layout(recording, temporary, layout)
     return Conversion(Path(folder), count, tuple(warnings))
 
@@ -297,8 +290,8 @@ def _write_layout(recording: Recording, folder: Path, layout: Layout) -> tuple[i
         out_of_range += int((counts >= depth_counts.MAX_COUNTS).sum())
         counts[counts >= depth_counts.MAX_COUNTS] = 0
         name = f"{_name(len(written), item.timestamp - float(recording.timestamps[0]))}.png"
-        write_png(make_folder(folder / "depth") / name, counts.astype(np.uint16))
-        write_png(make_folder(folder / color_folder) / name, _color(frame, white))
+        write_png(atomic.make_folder(folder / "depth") / name, counts.astype(np.uint16))
+        write_png(atomic.make_folder(folder / color_folder) / name, _color(frame, white))
         written.append(k)
     if rectifier is None:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
@@ -331,19 +324,19 @@ def _finish_tum(recording: Recording, folder: Path, camera: Pinhole, written: li
             f"{time:.6f} {name}/{_name(k, time - recording.timestamps[0])}.png\n"
             for k, time in enumerate(times)
         ]
-        write_text(folder / f"{name}.txt", "# timestamp filename\n" + "".join(lines))
+        atomic.write_text(folder / f"{name}.txt", "# timestamp filename\n" + "".join(lines))
     if recording.reference is not None:
         write_tum(folder / "groundtruth.txt", times, recording.reference[written])
     # The layout does not store the camera; this file is for --camera.
-    description = {"schema": SCHEMA, **camera_fields(camera)}
+    description = {"schema": camera_file.SCHEMA, **camera_file.camera_fields(camera)}
     description |= {"depth_unit_m": 1 / COUNTS_PER_M["tum"], "depth_kind": "z"}
-    write_text(folder / "lens.json", json.dumps(description, indent=1) + "\n")
+    atomic.write_text(folder / "lens.json", json.dumps(description, indent=1) + "\n")
 
 
 def _finish_open3d(recording: Recording, folder: Path, camera: Pinhole, written: list[int]) -> None:
     columns = [camera.fx, 0.0, 0.0, 0.0, camera.fy, 0.0, camera.cx, camera.cy, 1.0]
     description = {"width": camera.width, "height": camera.height, "intrinsic_matrix": columns}
-    write_text(folder / "camera_intrinsic.json", json.dumps(description, indent=1) + "\n")
+    atomic.write_text(folder / "camera_intrinsic.json", json.dumps(description, indent=1) + "\n")
     if recording.reference is not None:
         poses = recording.reference[written]
         posed = np.isfinite(poses[:, 0, 0])

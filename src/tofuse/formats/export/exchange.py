@@ -12,13 +12,12 @@ from tofuse._version import __version__
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord, display_colors
-from tofuse.formats.files import path_of, required_package, write_bytes
+from tofuse.formats.files import atomic, reading
 from tofuse.formats.geometry import (
     write_e57,
     write_glb,
     write_gltf,
     write_las,
-    write_laz,
     write_obj,
     write_pcd,
     write_ply,
@@ -56,7 +55,7 @@ def save(record: GeometryRecord, path: str | Path, R_up_world: Float64 = _R_GLTF
     """
     formats = _CLOUDS if record.faces is None else _MESHES
     suffixes = ", ".join(formats)
-    file = path_of(path, "path", f"pass the path of a file that ends in one of {suffixes}")
+    file = reading.path_of(path, "path", f"pass the path of a file that ends in one of {suffixes}")
     write = formats.get(file.suffix.lower())
     if write is None:
         raise InputError(
@@ -67,7 +66,7 @@ def save(record: GeometryRecord, path: str | Path, R_up_world: Float64 = _R_GLTF
 
 def to_trimesh(record: GeometryRecord) -> Any:
     """Return a `trimesh.Trimesh` or `trimesh.PointCloud`, in the frame of the record."""
-    trimesh = required_package("trimesh", None, "to_trimesh")
+    trimesh = reading.required_package("trimesh", None, "to_trimesh")
     if record.faces is None:
         return trimesh.PointCloud(record.points, colors=record.color)
     return trimesh.Trimesh(
@@ -81,7 +80,7 @@ def to_trimesh(record: GeometryRecord) -> Any:
 
 def to_open3d(record: GeometryRecord) -> Any:
     """Return an Open3D `TriangleMesh` or `PointCloud`, in the frame of the record."""
-    o3d = required_package("open3d", None, "to_open3d")
+    o3d = reading.required_package("open3d", None, "to_open3d")
     vector = o3d.utility.Vector3dVector
     if record.faces is None:
         geometry = o3d.geometry.PointCloud(vector(record.points))
@@ -117,8 +116,7 @@ def _las(record: GeometryRecord, path: str | Path, _: Float64) -> None:
     columns = dict(record.scalars)
     if record.normals is not None:
         columns |= {f"normal {a}": record.normals[:, k] for k, a in enumerate("xyz")}
-    write = write_laz if Path(path).suffix.lower() == ".laz" else write_las
-    write(
+    write_las(
         path,
         GeometryRecord(record.points, color=record.color, scalars=columns),
         descriptions=_DESCRIPTIONS,
@@ -127,7 +125,7 @@ def _las(record: GeometryRecord, path: str | Path, _: Float64) -> None:
 
 
 def _stl(mesh: GeometryRecord, path: str | Path, R: Float64) -> None:
-    write_bytes(path, to_trimesh(_for_display(mesh, R)).export(file_type="stl"))
+    atomic.write_bytes(path, to_trimesh(_for_display(mesh, R)).export(file_type="stl"))
 
 
 _Write = Callable[[GeometryRecord, str | Path, Float64], None]

@@ -48,6 +48,15 @@ def input_error(error: OSError, path: str | Path) -> InputError:
     return InputError(problem, where=path, remedy=remedy)
 
 
+@contextmanager
+def readable(path: str | Path) -> Iterator[None]:
+    """Turn the OSErrors of a block that reads `path` into `input_error`."""
+    try:
+        yield
+    except OSError as error:
+        raise input_error(error, path) from error
+
+
 def path_of(value: object, name: str, remedy: str) -> Path:
     """Return an argument of the user as a path.
 
@@ -124,13 +133,11 @@ def read_bytes(path: str | Path, *, limit: int = MAX_BYTES) -> bytes:
 def read_head(path: str | Path, size: int) -> bytes:
     """Return the first `size` bytes of a file, fewer if it is shorter; errors as `read_bytes`."""
     path = Path(path)
-    try:
+    with readable(path):
         if path.exists() and not path.is_file():
             raise InputError("is not a regular file", where=path, remedy="pass a file")
         with path.open("rb") as file:
             return file.read(size)
-    except OSError as error:
-        raise input_error(error, path) from error
 
 
 @contextmanager
@@ -154,7 +161,14 @@ def damage_reported(path: str | Path, kind: str) -> Iterator[None]:
         ) from error
 
 
-def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, format_name: str) -> Any:
+def parsed(
+    parse: Callable[[Any], Any],
+    text: str | bytes,
+    *,
+    where: str | Path,
+    format_name: str,
+    remedy: str | None = None,
+) -> Any:
     """Parse external JSON or TOML.
 
     Parameters
@@ -165,8 +179,8 @@ def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, format_
         The text.
     where
         Its source, for errors.
-    format_name
-        Its format, for errors.
+    format_name, remedy
+        Its format, and the remedy, for errors.
 
     Raises
     ------
@@ -175,10 +189,9 @@ def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, format_
     """
     try:
         return parse(text)
-    except RecursionError as error:
-        raise InputError(f"is not {format_name} (nested too deeply)", where=where) from error
-    except ValueError as error:
-        raise InputError(f"is not {format_name} ({error})", where=where) from error
+    except (RecursionError, ValueError) as error:
+        reason = "nested too deeply" if isinstance(error, RecursionError) else error
+        raise InputError(f"is not {format_name} ({reason})", where=where, remedy=remedy) from error
 
 
 def parse_toml(text: str, *, where: str | Path) -> dict[str, Any]:
@@ -218,12 +231,10 @@ def list_folder(path: str | Path) -> list[Path]:
     InputError
         If it can't be listed.
     """
-    try:
+    with readable(path):
         return sorted(
             (p for p in Path(path).iterdir() if not p.name.startswith(".")), key=name_order
         )
-    except OSError as error:
-        raise input_error(error, path) from error
 
 
 def files_with(path: str | Path, *suffixes: str) -> list[Path]:
@@ -264,3 +275,33 @@ def is_folder(path: Path) -> bool:
         return path.is_dir()
     except OSError:
         return False
+
+
+def read_part(path: Path, offset: int, size: int) -> bytes:
+    """Return up to `size` bytes of a file from an offset; InputError if it can't be read."""
+    with readable(path), path.open("rb") as file:
+        file.seek(offset)
+        return file.read(size)
+
+
+@contextmanager
+def named(where: str | Path, remedy: str | None = None) -> Iterator[None]:
+    """Name `where` in the InputErrors of a block that checks values of a file."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(error.problem, where=where, remedy=remedy or error.remedy) from error
+
+
+@contextmanager
+def library_errors(where: str | Path, remedy: str = "copy the file again") -> Iterator[None]:
+    """Turn any exception of a library that reads a damaged file into an InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        line = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"can't be read ({type(error).__name__}: {line})", where=where, remedy=remedy
+        ) from error

@@ -1,4 +1,7 @@
-"""."""
+"""Files of clouds and meshes: PLY and PCD in both directions, the other formats as output.
+
+All functions take or return a `GeometryRecord`, check its shapes, and replace a file as a whole.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -7,7 +10,7 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.formats.geometry.e57 import write_e57
     from tofuse.formats.geometry.glb import write_glb, write_gltf
-    from tofuse.formats.geometry.las import write_las, write_laz
+    from tofuse.formats.geometry.las import write_las
     from tofuse.formats.geometry.obj import write_obj
     from tofuse.formats.geometry.pcd import Pcd, read_pcd, write_pcd
     from tofuse.formats.geometry.ply import read_ply, write_ply

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files import replacing, required_package
+from tofuse.formats.files import atomic, reading
 
 _NORMALS = "http://www.libe57.org/E57_EXT_surface_normals.txt"
 _TOFUSE = "https://tofuse.org/e57"
@@ -37,7 +37,7 @@ def write_e57(path: str | Path, cloud: GeometryRecord) -> None:
         If the shapes disagree, the library is not installed, or there are no points.
     """
     cloud.check(path)
-    pye57 = required_package("pye57", "scan", path)
+    pye57 = reading.required_package("pye57", "scan", path)
     if not len(cloud):
         raise InputError("there are no points", where=path, remedy="E57 can't store an empty cloud")
     xyz = np.asarray(cloud.points, np.float32)
@@ -49,7 +49,7 @@ def write_e57(path: str | Path, cloud: GeometryRecord) -> None:
         rgb = np.asarray(cloud.color, np.uint8)
         columns |= {f"color{c}": rgb[:, k] for k, c in enumerate(("Red", "Green", "Blue"))}
     columns |= {f"tofuse:{key}": np.asarray(values) for key, values in cloud.scalars.items()}
-    with replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         file = pye57.E57(str(temporary), mode="w")
         try:
             _write(file, pye57.libe57, columns, with_normals=cloud.normals is not None)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import UInt8, UInt16
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files import write_bytes, write_text
+from tofuse.formats.files import atomic
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963
@@ -47,7 +47,7 @@ def write_glb(
     InputError
         If the shapes disagree.
     """
-    write_bytes(path, *_binary(*_document(path, mesh, T_scene_node, name, generator)))
+    atomic.write_bytes(path, *_binary(*_document(path, mesh, T_scene_node, name, generator)))
 
 
 def _binary(document: dict[str, Any], body: bytearray) -> list[bytes | bytearray]:
@@ -67,7 +67,7 @@ def write_gltf(path: str | Path, mesh: GeometryRecord, *, generator: str = "tofu
     for buffer in document.get("buffers", ()):
         text = base64.b64encode(body).decode()
         buffer["uri"] = f"data:application/octet-stream;base64,{text}"
-    write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+    atomic.write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def _document(

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files import replacing, write_bytes
+from tofuse.formats.files import atomic
 
-_HEADER_BYTES, _FIELD_BYTES = 375, 192
 _SCALE_M = 1e-4  # rounds by half of that; 31 bits of it span 200 km
 _PLAIN, _WITH_COLOR = 6, 7  # point data record formats
-_BLOCK_POINTS = 1 << 19  # written to a compressed file at a time
-_IS_WKT = 16  # required by the standard for these formats
-_TYPES = {"u1": 1, "i1": 2, "u2": 3, "i2": 4, "u4": 5, "i4": 6, "u8": 7, "i8": 8, "f4": 9, "f8": 10}
+_BLOCK_POINTS = 1 << 19  # written at a time
 
 
 def write_las(
@@ -33,64 +27,13 @@ def write_las(
     Parameters
     ----------
     path
-        The file; see `replacing` for errors.
+        The file, compressed (Isenburg 2013) if its name ends in .laz; see `replacing` for errors.
     cloud
         Its scalars keep their types.
     descriptions
         Of scalars, by name; names and descriptions are cut to 32 characters.
     software
         The writing program, as the header states it.
-
-    Raises
-    ------
-    InputError
-        If the shapes disagree.
-    """
-    cloud.check(path)
-    xyz = np.asarray(cloud.points, np.float64)
-    color, extra = cloud.color, cloud.scalars
-    columns: list[tuple[str, Any]] = [
-        ("xyz", ("<i4", (3,))), ("intensity", "<u2"), ("returns", "u1"), ("flags", "u1"),
-        ("class", "u1"), ("user", "u1"), ("angle", "<i2"), ("source", "<u2"), ("time", "<f8"),
-    ]  # fmt: skip
-    if color is not None:
-        columns.append(("color", ("<u2", (3,))))
-    columns += [(f"extra {name}", values.dtype.newbyteorder("<")) for name, values in extra.items()]
-    rows = np.zeros(len(xyz), [_column(name, kind) for name, kind in columns])
-    offset = np.floor(xyz.mean(0)) if len(xyz) else np.zeros(3)
-    rows["xyz"] = np.round((xyz - offset) / _SCALE_M)
-    rows["returns"] = 1 | 1 << 4  # return 1 of 1
-    if color is not None:
-        rows["color"] = np.asarray(color, np.uint16) * 257
-    for name, values in extra.items():
-        rows[f"extra {name}"] = values
-    records = b""
-    if extra:
-        texts = descriptions or {}
-        fields = b"".join(_field(name, v, texts.get(name, "")) for name, v in extra.items())
-        records = (
-            struct.pack("<H16sHH32s", 0, b"LASF_Spec", 4, len(fields), b"Extra Bytes") + fields
-        )
-    low, high = (xyz.min(0), xyz.max(0)) if len(xyz) else (np.zeros(3), np.zeros(3))
-    header = struct.pack(
-        "<4sHHIHH8sBB32s32sHHHIIBHI5I12dQQIQ15Q",
-        b"LASF", 0, _IS_WKT, 0, 0, 0, b"", 1, 4, b"", software.encode()[:32], 0, 0, _HEADER_BYTES,
-        _HEADER_BYTES + len(records), 1 if records else 0,
-        _PLAIN if color is None else _WITH_COLOR, rows.itemsize, 0, 0, 0, 0, 0, 0,
-        *[_SCALE_M] * 3, *offset, high[0], low[0], high[1], low[1], high[2], low[2],
-        0, 0, 0, len(rows), len(rows), *[0] * 14,
-    )  # fmt: skip
-    write_bytes(path, header + records + rows.tobytes())
-
-
-def write_laz(
-    path: str | Path,
-    cloud: GeometryRecord,
-    *,
-    descriptions: Mapping[str, str] | None = None,
-    software: str = "tofuse",
-) -> None:
-    """Write the content of `write_las`, compressed (Isenburg 2013), block by block.
 
     Raises
     ------
@@ -115,12 +58,18 @@ def write_laz(
             for name, values in extra.items()
         ]
     )
+    compressed = Path(path).suffix.lower() == ".laz"
     backend = laspy.LazBackend.Lazrs  # single-threaded: with several, the order of chunks varies
     with (
-        replacing(path) as temporary,
+        atomic.replacing(path) as temporary,
         temporary.open("wb") as file,
         laspy.open(
-            file, mode="w", header=header, do_compress=True, laz_backend=backend, closefd=False
+            file,
+            mode="w",
+            header=header,
+            do_compress=compressed,
+            laz_backend=backend,
+            closefd=False,
         ) as writer,
     ):
         for start in range(0, len(xyz), _BLOCK_POINTS):
@@ -136,15 +85,3 @@ def write_laz(
             for name, values in extra.items():
                 rows[name] = values[block]
             writer.write_points(rows)
-
-
-def _column(name: str, kind: Any) -> tuple[Any, ...]:
-    return (name, *kind) if isinstance(kind, tuple) else (name, kind)
-
-
-def _field(name: str, values: NDArray[Any], description: str) -> bytes:
-    """The descriptor of a column of extra bytes."""
-    code = _TYPES[f"{values.dtype.kind}{values.dtype.itemsize}"]
-    start = struct.pack("<HBB32s", 0, code, 0, name.encode()[:32])
-    padding = b"\0" * (_FIELD_BYTES - len(start) - 32)
-    return start + padding + struct.pack("32s", description.encode()[:32])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files import write_bytes, write_text
+from tofuse.formats.files import atomic
 
 
 def write_obj(path: str | Path, mesh: GeometryRecord) -> None:
@@ -38,8 +38,10 @@ def write_obj(path: str | Path, mesh: GeometryRecord) -> None:
     if texture is not None:
         image = path.with_suffix(".png" if texture.startswith(b"\x89PNG") else ".jpg")
         material = path.with_suffix(".mtl")
-        write_bytes(image, texture)
-        write_text(material, f"newmtl surface\nKa 1 1 1\nKd 1 1 1\nillum 1\nmap_Kd {image.name}\n")
+        atomic.write_bytes(image, texture)
+        atomic.write_text(
+            material, f"newmtl surface\nKa 1 1 1\nKd 1 1 1\nillum 1\nmap_Kd {image.name}\n"
+        )
         lines += [f"mtllib {material.name}", "usemtl surface"]
     if color is not None:
         table = np.column_stack([table, np.asarray(color, float) / 255])
@@ -56,7 +58,7 @@ def write_obj(path: str | Path, mesh: GeometryRecord) -> None:
     faces = np.zeros((0, 3), int) if mesh.faces is None else mesh.faces
     indices = np.repeat(np.asarray(faces, np.int64) + 1, repeat, axis=1)
     lines += _rows("f", indices, " ".join([corner] * 3))
-    write_text(path, "\n".join(lines) + "\n")
+    atomic.write_text(path, "\n".join(lines) + "\n")
 
 
 def _rows(keyword: str, table: NDArray[Any], number_format: str) -> Sequence[str]:

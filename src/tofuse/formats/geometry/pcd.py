@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord, stacked
-from tofuse.formats.files import read_bytes, write_bytes
+from tofuse.formats.files import atomic, reading
 
 MAX_POINTS = 1 << 28
 _NORMALS = ("normal_x", "normal_y", "normal_z")
@@ -78,7 +78,7 @@ def read_pcd(path: str | Path) -> Pcd:
         If it is not a PCD file, is cut off or damaged, declares more than it contains, or lacks
         x, y or z.
     """
-    data = read_bytes(path)
+    data = reading.read_bytes(path)
     header = _read_header(data, path)
     if not all(name in header.names for name in "xyz"):
         raise InputError(
@@ -270,4 +270,4 @@ def write_pcd(path: str | Path, cloud: GeometryRecord) -> None:
         f"POINTS {count}",
         "DATA binary\n",
     ]
-    write_bytes(path, "\n".join(header).encode() + rows.tobytes())
+    atomic.write_bytes(path, "\n".join(header).encode() + rows.tobytes())

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float32, Int32, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord, stacked
-from tofuse.formats.files import read_bytes, replacing
+from tofuse.formats.files import atomic, reading
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -68,7 +68,7 @@ def read_ply(path: str | Path) -> GeometryRecord:
         If it is not a PLY file, is cut off, declares more than it contains, or has no vertices with
         x, y and z.
     """
-    data = read_bytes(path)
+    data = reading.read_bytes(path)
     kind, elements, comments, body = _read_header(data, path)
     columns: dict[str, _Columns] = {}
     reader = (
@@ -368,7 +368,7 @@ def write_ply(path: str | Path, record: GeometryRecord, *, double: bool = False)
     if faces is not None:
         header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     header.append("end_header\n")
-    with replacing(path) as temporary, temporary.open("wb") as file:
+    with atomic.replacing(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
         for block in _blocks(len(points)):
             rows = np.empty(block.stop - block.start, row)

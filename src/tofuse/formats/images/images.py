@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import read_bytes, read_head, write_bytes
+from tofuse.formats.files import reading
 
 MAX_PIXELS = 1 << 26  # 8192 x 8192: far beyond any depth camera, and 400 MB of colour
 MAX_IMAGE_BYTES = 1 << 29
@@ -50,8 +50,10 @@ def read_header(path: str | Path) -> ImageHeader:
     InputError
         If it is neither, is cut off within its header, or declares an absurd size.
     """
-    head = read_head(path, 64)
-    return _header(head if head.startswith(_PNG) else read_bytes(path, limit=MAX_IMAGE_BYTES), path)
+    head = reading.read_head(path, 64)
+    return _header(
+        head if head.startswith(_PNG) else reading.read_bytes(path, limit=MAX_IMAGE_BYTES), path
+    )
 
 
 def _header(data: bytes, path: str | Path) -> ImageHeader:
@@ -186,7 +188,9 @@ def read_image(
     InputError
         If it can't be read, is cut off or damaged, or isn't of that size and type.
     """
-    return parse_image(read_bytes(path, limit=MAX_IMAGE_BYTES), path, size=size, dtype=dtype)
+    return parse_image(
+        reading.read_bytes(path, limit=MAX_IMAGE_BYTES), path, size=size, dtype=dtype
+    )
 
 
 def parse_image(
@@ -278,7 +282,7 @@ def read_raw(path: str | Path, dtype: str, size: tuple[int, int], remedy: str) -
     InputError
         If it can't be read, or has another size.
     """
-    data = read_bytes(path, limit=MAX_IMAGE_BYTES)
+    data = reading.read_bytes(path, limit=MAX_IMAGE_BYTES)
     pixel, (width, height) = np.dtype(dtype), size
     if len(data) != pixel.itemsize * width * height:
         raise InputError(
@@ -287,46 +291,3 @@ def read_raw(path: str | Path, dtype: str, size: tuple[int, int], remedy: str) -
             remedy=remedy,
         )
     return np.frombuffer(data, pixel).reshape(height, width, *pixel.shape)
-
-
-def png_bytes(image: NDArray[np.generic]) -> bytes:
-    """Encode (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB, as PNG."""
-    import cv2
-
-    image = np.asarray(image)
-    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
-        raise InputError(
-            f"is an array of shape {image.shape} and type {image.dtype}",
-            where="image",
-            remedy="pass (H, W) uint8 or uint16, or (H, W, 3) uint8",
-        )
-    if image.ndim == 3:
-        image = np.ascontiguousarray(image[..., ::-1])
-    pixels: NDArray[Any] = image
-    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3])
-    if not ok:
-        raise InputError(f"of shape {image.shape} can't be encoded as PNG", where="image")
-    return bytes(data)
-
-
-def jpeg_bytes(image: UInt8, quality: int = 92) -> bytes:
-    """Encode (H, W, 3) uint8 RGB as JPEG."""
-    import cv2
-
-    pixels: NDArray[Any] = np.ascontiguousarray(np.asarray(image, np.uint8)[..., ::-1])
-    ok, data = cv2.imencode(
-        ".jpg",
-        pixels,
-        [
-            *(cv2.IMWRITE_JPEG_QUALITY, quality),
-            *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
-        ],
-    )
-    if not ok:
-        raise InputError(f"of shape {image.shape} can't be encoded as JPEG", where="image")
-    return bytes(data)
-
-
-def write_png(path: str | Path, image: NDArray[np.generic]) -> None:
-    """Write (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB; see `replacing` for errors."""
-    write_bytes(path, png_bytes(image))

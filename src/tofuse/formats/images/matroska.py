@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import input_error
+from tofuse.formats.files import reading
 
 MAGIC = b"\x1a\x45\xdf\xa3"
 
@@ -82,14 +82,11 @@ class Matroska:
         self._scale_ns = 1_000_000
         self._blocks = 0
         self._resume = 0
-        try:
-            with path.open("rb") as self._file:
-                self._size = os.fstat(self._file.fileno()).st_size
-                if self._read_at(0, 4) != MAGIC:
-                    raise InputError("is not a Matroska file", where=path, remedy="check the file")
-                self._parse()
-        except OSError as error:
-            raise input_error(error, path) from error
+        with reading.readable(path), path.open("rb") as self._file:
+            self._size = os.fstat(self._file.fileno()).st_size
+            if self._read_at(0, 4) != MAGIC:
+                raise InputError("is not a Matroska file", where=path, remedy="check the file")
+            self._parse()
 
     def read(self, block: Block) -> bytes:
         """Return the bytes of a block; InputError if it is cut off, or laced (several frames)."""
@@ -97,12 +94,7 @@ class Matroska:
             raise InputError(
                 f"has a block at byte {block.offset} that isn't a single frame", where=self.path
             )
-        try:
-            with self.path.open("rb") as file:
-                file.seek(block.offset)
-                data = file.read(block.size)
-        except OSError as error:
-            raise input_error(error, self.path) from error
+        data = reading.read_part(self.path, block.offset, block.size)
         if len(data) < block.size:
             raise InputError("is cut off", where=self.path, remedy="copy the file again")
         return data

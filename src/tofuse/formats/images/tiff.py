@@ -9,7 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import read_bytes
+from tofuse.formats.files import reading
 from tofuse.formats.images.images import MAX_IMAGE_BYTES, check_camera_size, check_pixels, decoded
 
 # Tags of the TIFF 6.0 specification.
@@ -36,7 +36,7 @@ def read_tiff(path: str | Path, size: tuple[int, int] | None = None) -> NDArray[
     """
     import cv2
 
-    data = read_bytes(path, limit=MAX_IMAGE_BYTES)
+    data = reading.read_bytes(path, limit=MAX_IMAGE_BYTES)
     width, height = tiff_size(data, path)
     check_camera_size(width, height, size, path)
     image = decoded(data, cv2.IMREAD_UNCHANGED, (height, width), path)

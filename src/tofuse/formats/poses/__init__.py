@@ -1,4 +1,8 @@
-"""."""
+"""Files of trajectories, pose graphs, single poses and loops.
+
+`read_poses` detects the format of a trajectory; `read_tum` and the writers are for one format each.
+Poses are T_world_camera, (N, 4, 4), with NaN where unknown; `associate` pairs them by time.
+"""
 
 from typing import TYPE_CHECKING
 

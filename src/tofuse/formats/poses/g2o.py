@@ -16,7 +16,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.graph import PoseGraph
-from tofuse.formats.files import read_text, replacing
+from tofuse.formats.files import atomic, reading
 
 VERTEX = "VERTEX_SE3:QUAT"
 EDGE = "EDGE_SE3:QUAT"
@@ -41,7 +41,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
         unit, information that is not positive semidefinite (or is all zero), a duplicate vertex,
         an edge to a missing vertex or from a vertex to itself.
     """
-    lines = read_text(path).splitlines()
+    lines = reading.read_text(path).splitlines()
     position: dict[int, int] = {}
     vertices: list[list[float]] = []
     ends: list[tuple[int, int]] = []
@@ -112,7 +112,10 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
     values = np.concatenate([_vectors(graph.measurements), upper], axis=1)
     vertices = zip(graph.ids, _vectors(graph.poses), strict=True)
     edges = zip(graph.ids[graph.edges], values, strict=True)
-    with replacing(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
+    with (
+        atomic.replacing(path) as temporary,
+        temporary.open("w", encoding="ascii", newline="\n") as file,
+    ):
         file.writelines(f"{VERTEX} {vertex} {_text(row)}\n" for vertex, row in vertices)
         file.writelines(f"{EDGE} {i} {j} {_text(row)}\n" for (i, j), row in edges)
 

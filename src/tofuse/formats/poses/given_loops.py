@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.loops import PriorLoop
-from tofuse.formats.files import read_text
+from tofuse.formats.files import reading
 
 _UNIT = 1e-2  # tolerance of a quaternion's length, for files with few digits
 
@@ -27,7 +27,7 @@ def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[
         doesn't exist, a loop from a frame to itself, a duplicate pair.
     """
     loops: dict[tuple[int, int], PriorLoop] = {}
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(reading.read_text(path).splitlines(), start=1):
         words = line.split("#", 1)[0].split()
         if not words:
             continue

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.formats.files import exact, read_text
+from tofuse.formats.files import reading, tables
 
 FIELD = "T_target_source"
 _REMEDY = (
@@ -34,28 +33,23 @@ def read_pose(path: str | Path) -> Float64:
     InputError
         Naming file and field, if it can't be read or is not a rigid motion.
     """
-    text = read_text(path, limit=_MAX_BYTES)
+    text = reading.read_text(path, limit=_MAX_BYTES)
     if text.lstrip()[:1] in ("{", "["):
         matrix, where = _from_json(text, path)
     else:
         matrix, where = _from_numbers(text, path), str(path)
-    try:
+    with reading.named(where, _REMEDY):
         return se3.check_pose(matrix, where=where)
-    except InputError as error:
-        raise InputError(error.problem, where=where, remedy=_REMEDY) from error
 
 
 def pose_text(T: ArrayLike) -> str:
     """Return the four rows of a (4, 4) matrix, as `read_pose` and `numpy.loadtxt` read them."""
     rows = np.asarray(T, float).tolist()
-    return "".join(" ".join(exact(value) for value in row) + "\n" for row in rows)
+    return "".join(" ".join(tables.exact(value) for value in row) + "\n" for row in rows)
 
 
 def _from_json(text: str, path: str | Path) -> tuple[Float64, str]:
-    try:
-        data: Any = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is not JSON ({error})", where=path, remedy=_REMEDY) from error
+    data = reading.parsed(json.loads, text, where=path, format_name="JSON", remedy=_REMEDY)
     where = str(path)
     if isinstance(data, dict):
         where = f"{path}: {FIELD}"

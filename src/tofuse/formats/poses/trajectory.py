@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.formats.files import exact, read_text, write_text
+from tofuse.formats.files import atomic, reading, tables
 
 ASSOCIATION_LIMIT_S = 0.02
 
@@ -31,7 +31,7 @@ def read_tum(path: str | Path) -> tuple[Float64, Float64]:
     """
     rows: list[list[float]] = []
     numbers: list[int] = []
-    for number, cells in rows_of(read_text(path)):
+    for number, cells in rows_of(reading.read_text(path)):
         where = f"{path}, line {number}"
         try:
             row = [float(cell) for cell in cells]
@@ -108,7 +108,7 @@ def write_tum(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) -> None
 
     Every number is the shortest text that reads back as the same float64.
     """
-    write_text(path, tum_text(timestamps, poses))
+    atomic.write_text(path, tum_text(timestamps, poses))
 
 
 def tum_text(timestamps: ArrayLike, poses: ArrayLike) -> str:
@@ -126,7 +126,7 @@ def tum_text(timestamps: ArrayLike, poses: ArrayLike) -> str:
     if not len(times):
         return ""
     table = np.column_stack([times, T[:, :3, 3], quaternion.from_matrix(T[:, :3, :3])])
-    return "".join(" ".join(exact(v) for v in row) + "\n" for row in table)
+    return "".join(" ".join(tables.exact(v) for v in row) + "\n" for row in table)
 
 
 def write_kitti(path: str | Path, poses: ArrayLike) -> None:
@@ -136,7 +136,7 @@ def write_kitti(path: str | Path, poses: ArrayLike) -> None:
     """
     T = _finite_poses(poses)
     rows = T[:, :3].reshape(-1, 12).tolist()
-    write_text(path, "".join(" ".join(exact(v) for v in row) + "\n" for row in rows))
+    atomic.write_text(path, "".join(" ".join(tables.exact(v) for v in row) + "\n" for row in rows))
 
 
 def write_log(path: str | Path, poses: ArrayLike, numbers: ArrayLike) -> None:
@@ -152,8 +152,8 @@ def write_log(path: str | Path, poses: ArrayLike, numbers: ArrayLike) -> None:
     for n, T in zip(
         np.asarray(numbers)[finite].tolist(), _finite_poses(poses).tolist(), strict=True
     ):
-        lines += [f"{n} {n} {n + 1}", *(" ".join(exact(v) for v in row) for row in T)]
-    write_text(path, "".join(f"{line}\n" for line in lines))
+        lines += [f"{n} {n} {n + 1}", *(" ".join(tables.exact(v) for v in row) for row in T)]
+    atomic.write_text(path, "".join(f"{line}\n" for line in lines))
 
 
 def _finite_poses(poses: ArrayLike) -> Float64:

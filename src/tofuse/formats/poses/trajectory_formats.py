@@ -19,7 +19,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import input_error, is_file, is_folder, read_text
+from tofuse.formats.files import reading
 from tofuse.formats.poses.trajectory import associated_poses, poses_of_rows, read_tum, rows_of
 
 # Files with the poses in a folder; the first that exists is used.
@@ -103,15 +103,15 @@ def read_poses(path: str | Path) -> TimedPoses:
         If there is none, it can't be read, or its format is unknown.
     """
     path = Path(path)
-    if is_folder(path):
-        file = next((path / name for name in NAMES if is_file(path / name)), None)
+    if reading.is_folder(path):
+        file = next((path / name for name in NAMES if reading.is_file(path / name)), None)
         if file is None:
             raise InputError(f"contains none of {', '.join(NAMES)}", where=path)
         path = file
     suffix = path.suffix.lower()
     if suffix == ".npy":
         return _numpy(path)
-    text = read_text(path)
+    text = reading.read_text(path)
     if suffix == ".json":
         return _transforms(text, path)
     rows = list(rows_of(text))
@@ -243,10 +243,7 @@ def _colmap(rows: _Rows, path: Path) -> TimedPoses:
 
 def _transforms(text: str, path: Path) -> TimedPoses:
     """NeRF's JSON: for each frame a path and T_world_camera with the axes of OpenGL."""
-    try:
-        data: Any = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is not valid JSON ({error})", where=path) from error
+    data = reading.parsed(json.loads, text, where=path, format_name="valid JSON")
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError("has no list 'frames'", where=path, remedy=f"use {_SUPPORTED}")
@@ -269,7 +266,7 @@ def _numpy(path: Path) -> TimedPoses:
         # Mapped, so that a damaged header can't cause an allocation larger than the file.
         table = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as error:
-        raise input_error(error, path) from error
+        raise reading.input_error(error, path) from error
     except Exception as error:  # NumPy evaluates the header as Python, which can raise anything
         raise InputError("is not an array", where=path, remedy="write it by numpy.save") from error
     if table.ndim != 3 or table.shape[1:] not in ((4, 4), (3, 4)) or table.dtype.kind not in "fiu":

@@ -1,4 +1,7 @@
-"""."""
+"""Readers, one module for each recording format; `open_recording` finds them by their registration.
+
+Only what other parts of the program know about single formats is imported from here.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -16,8 +16,8 @@ from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts, evenly_spaced
 from tofuse.engine.parts import part
-from tofuse.formats.files import input_error, is_file
-from tofuse.formats.recordings import FileSource, Reader, ReaderOptions, Sniff, files_at, read_part
+from tofuse.formats.files import reading
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
 
 HEADER_BYTES = 128
 # Width, height, kind of output, bits of depth, of brightness and of confidence, 11 other bytes,
@@ -168,7 +168,9 @@ class AdiTofSource(FileSource):
                 where=f"{place.path}: frame {index}",
                 remedy="pass frames of one mode",
             )
-        data = read_part(place.path, place.offset + HEADER_BYTES, layout.length - HEADER_BYTES)
+        data = reading.read_part(
+            place.path, place.offset + HEADER_BYTES, layout.length - HEADER_BYTES
+        )
         if len(data) < layout.length - HEADER_BYTES:
             raise InputError("is cut off", where=f"{place.path}: frame {index}")
         shape, count = (layout.height, layout.width), layout.width * layout.height
@@ -201,28 +203,24 @@ class AdiTofSource(FileSource):
                 where=path,
                 remedy=_REMEDY,
             )
-        try:
+        with reading.named(f"{path}: XYZ", _REMEDY):
             return RayTable(rays)
-        except InputError as error:
-            raise InputError(error.problem, where=f"{path}: XYZ", remedy=_REMEDY) from error
 
 
 def _files(path: Path) -> list[Path]:
-    return [file for file in files_at(path, ".bin") if is_file(file)]
+    return [file for file in inputs.files_at(path, ".bin") if reading.is_file(file)]
 
 
 def _frames_in(path: Path) -> tuple[list[_FrameLocation], bool]:
     """The complete frames of a file, and whether it contains nothing else."""
     frames: list[_FrameLocation] = []
-    try:
+    with reading.readable(path):
         size = path.stat().st_size
         with path.open("rb") as file:
             offset = 0
             while layout := _layout_at(file, offset, size):
                 frames.append(_FrameLocation(path, offset, layout))
                 offset += layout.length
-    except OSError as error:
-        raise input_error(error, path) from error
     return frames, offset == size
 
 

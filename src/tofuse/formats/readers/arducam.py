@@ -11,18 +11,10 @@ import numpy as np
 from tofuse.engine.arrays import Float32, UInt8
 from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_named, is_file
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading
 from tofuse.formats.images import read_raw
-from tofuse.formats.recordings import (
-    UNCERTAIN,
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    camera_file_of,
-    check_size,
-    required,
-)
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
 
 # Width and height in pixels, and the time at which the file was written in ms.
 _NAME = re.compile(r"(depth|confidence)_(\d{1,5})_(\d{1,5})_f32_(\d{1,15})\.raw")
@@ -39,16 +31,16 @@ class Arducam(Reader):
         if not images:
             return None
         evidence = f"{len(images)} depth images of Arducam's examples"
-        if is_file(path / "camera.json"):
+        if reading.is_file(path / "camera.json"):
             return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format arducam with --camera: lens and unit are not in such files"
-        return Sniff(UNCERTAIN, evidence, remedy)
+        return Sniff(Sniff.UNCERTAIN, evidence, remedy)
 
     def open(self, path: Path, options: ReaderOptions) -> ArducamSource:
         """See `Reader.open`."""
         remedy = "save depth, not the sensor's raw phases"
-        required(_images(path, "depth"), "depth_*_f32_*.raw", path, remedy)
-        camera = camera_file_of(path, options.camera, "neither lens nor unit")
+        inputs.required(_images(path, "depth"), "depth_*_f32_*.raw", path, remedy)
+        camera = camera_file.camera_file_of(path, options.camera, "neither lens nor unit")
         return ArducamSource(path, camera)
 
 
@@ -89,14 +81,14 @@ class ArducamSource(FileSource):
     def _floats(self, image: _Image) -> Float32:
         """(H, W) values of a file."""
         values = read_raw(image.path, "<f4", image.size, "save it again")
-        check_size(values, self.camera, image.path)
+        camera_file.check_size(values, self.camera, image.path)
         return values.astype(np.float32)
 
 
 def _images(path: Path, kind: str) -> list[_Image]:
     """The images of a kind in a folder, in the order of time."""
     images = []
-    for file in files_named(path, _NAME.fullmatch):
+    for file in reading.files_named(path, _NAME.fullmatch):
         match = _NAME.fullmatch(file.name)
         assert match is not None
         if match[1] == kind:

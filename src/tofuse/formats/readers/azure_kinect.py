@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -19,19 +18,11 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.formats.images import MAGIC, Block, Matroska, Track, as_color, parse_image
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import json_data
+from tofuse.formats.images import as_color, matroska, parse_image
 from tofuse.formats.poses import associate
-from tofuse.formats.recordings import (
-    ColorCamera,
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    begins_with,
-    file_of,
-    required_file,
-    sampled_color,
-)
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
 
 @dataclass(frozen=True)
@@ -115,12 +106,12 @@ class AzureKinect(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        matches = begins_with(file_of(path, ".mkv"), MAGIC)
+        matches = inputs.begins_with(inputs.file_of(path, ".mkv"), matroska.MAGIC)
         return Sniff(1.0, "a Matroska file") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> AzureKinectSource:
         """See `Reader.open`."""
-        return AzureKinectSource(required_file(path, ".mkv"), options)
+        return AzureKinectSource(inputs.required_file(path, ".mkv"), options)
 
 
 class AzureKinectSource(FileSource):
@@ -129,7 +120,7 @@ class AzureKinectSource(FileSource):
     amplitude_kind = "ir"
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
-        self.file = Matroska(path)
+        self.file = matroska.Matroska(path)
         tracks = {track.name.upper(): track for track in self.file.tracks}
         depth = tracks.get("DEPTH")
         if depth is None or not depth.blocks:
@@ -169,7 +160,7 @@ class AzureKinectSource(FileSource):
         color = self._color_image(index, frame)
         return frame if color is None else replace(frame, color_image=color)
 
-    def _image(self, block: Block) -> UInt16:
+    def _image(self, block: matroska.Block) -> UInt16:
         width, height = self.size
         data = self.file.read(block)
         if len(data) != 2 * width * height:
@@ -189,9 +180,11 @@ class AzureKinectSource(FileSource):
         image = as_color(
             parse_image(self.file.read(block), where, size=(camera.width, camera.height))
         )
-        return sampled_color(frame, image, self.color_camera, where)
+        return pixels.sampled_color(frame, image, self.color_camera, where)
 
-    def _matched_blocks(self, track: Track | None, limit: float, delay: int) -> list[Block | None]:
+    def _matched_blocks(
+        self, track: matroska.Track | None, limit: float, delay: int
+    ) -> list[matroska.Block | None]:
         """The block of another track at the time of each depth frame, or None."""
         if track is None or not track.blocks:
             return [None] * len(self.depth)
@@ -204,7 +197,7 @@ class AzureKinectSource(FileSource):
             )
         return [track.blocks[k] if k >= 0 else None for k in pairs]
 
-    def _read_cameras(self, options: ReaderOptions, color: Track | None) -> None:
+    def _read_cameras(self, options: ReaderOptions, color: matroska.Track | None) -> None:
         if options.camera is None:
             self._read_calibration(color)
         else:
@@ -214,7 +207,7 @@ class AzureKinectSource(FileSource):
         if self.color_camera is None:
             self.color = [None] * len(self.depth)
 
-    def _read_calibration(self, color: Track | None) -> None:
+    def _read_calibration(self, color: matroska.Track | None) -> None:
         name = self.file.tags.get("K4A_CALIBRATION_FILE", "calibration.json")
         where = f"{self.file.path}: {name}"
         self.calibration = _calibration(self.file.attachments.get(name), where)
@@ -223,7 +216,9 @@ class AzureKinectSource(FileSource):
         if color is not None and color.blocks:
             self.color_camera = self._color_camera(color, T_depth, where)
 
-    def _color_camera(self, track: Track, T_depth: Float64, where: str) -> ColorCamera | None:
+    def _color_camera(
+        self, track: matroska.Track, T_depth: Float64, where: str
+    ) -> camera_file.ColorCamera | None:
         fourcc = track.private[16:20]
         if fourcc != b"MJPG":
             self.warnings.append(f"colour is {fourcc!r}, not MJPG: ignored")
@@ -236,7 +231,7 @@ class AzureKinectSource(FileSource):
         except InputError as error:
             self.warnings.append(f"colour is ignored: {error}")
             return None
-        return ColorCamera(lens, T_color @ np.linalg.inv(T_depth))
+        return camera_file.ColorCamera(lens, T_color @ np.linalg.inv(T_depth))
 
     def _sensor(self) -> str:
         calibration = getattr(self, "calibration", {})
@@ -244,7 +239,7 @@ class AzureKinectSource(FileSource):
         return f"{name[:40]} (ToF)" if "femto" in name.lower() else "Azure Kinect (ToF)"
 
 
-def _image_size(track: Track, path: Path) -> tuple[int, int]:
+def _image_size(track: matroska.Track, path: Path) -> tuple[int, int]:
     """(width, height) of a track's images, checked against the header of its bitmaps."""
     if len(track.private) < 20:
         raise InputError(f"describes no images in its track {track.name}", where=path)
@@ -281,15 +276,8 @@ def _calibration(data: bytes | None, where: str) -> dict[str, Any]:
         raise InputError(
             "is missing", where=where, remedy="pass the depth camera with --camera camera.json"
         )
-    try:
-        calibration = json.loads(data.rstrip(b"\0"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            "is invalid JSON", where=where, remedy="pass the depth camera with --camera"
-        ) from error
-    if not isinstance(calibration, dict):
-        raise InputError("is not a JSON object", where=where, remedy="use --camera")
-    return calibration
+    remedy = "pass the depth camera with --camera"
+    return json_data.parse_json(data.rstrip(b"\0"), where, remedy)
 
 
 def _lens(

@@ -11,57 +11,44 @@ from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.parts import part
-from tofuse.formats.files import parse_numbers, read_numbers, read_text
+from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import Pcd, read_pcd
-from tofuse.formats.recordings import (
-    SAMPLES,
-    CloudFileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    cloud_frame,
-    common_camera,
-    find_raster,
-    organised_frame,
-    ply_frame,
-    poses_from_files,
-    refuse_camera,
-    required_files,
-    sniff_clouds,
-    to_float32,
+from tofuse.formats.sources import (
+    cloud_frames,
+    cloud_sequence,
+    organised,
+    per_frame,
 )
 
 
 @part("reader", "ply", label="validated")
-class PlyClouds(Reader):
+class PlyClouds(cloud_sequence.CloudReader):
     """A .ply file, or a folder of them; metres."""
 
-    def sniff(self, path: Path) -> Sniff | None:
-        """See `Reader.sniff`."""
-        return sniff_clouds(path, ".ply")
+    suffixes = (".ply",)
 
-    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
-        """See `Reader.open`."""
-        refuse_camera(options, "ply")
-        return CloudFileSource(path, required_files(path, ".ply"), ply_frame, ply_frame)
+    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+        """See `CloudReader.source`."""
+        return cloud_sequence.CloudFileSource(
+            path,
+            files,
+            cloud_frames.ply_frame,
+            cloud_frames.ply_frame,
+        )
 
 
 @part("reader", "pcd", label="validated")
-class PcdClouds(Reader):
+class PcdClouds(cloud_sequence.CloudReader):
     """A .pcd file, or a folder of them; images if organised; metres."""
 
-    def sniff(self, path: Path) -> Sniff | None:
-        """See `Reader.sniff`."""
-        return sniff_clouds(path, ".pcd")
+    suffixes = (".pcd",)
 
-    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
-        """See `Reader.open`."""
-        refuse_camera(options, "pcd")
-        files = required_files(path, ".pcd")
+    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+        """See `CloudReader.source`."""
         camera = _camera(files)
         if camera is None:
-            return CloudFileSource(path, files, pcd_cloud, pcd_cloud)
-        source = CloudFileSource(
+            return cloud_sequence.CloudFileSource(path, files, pcd_cloud, pcd_cloud)
+        source = cloud_sequence.CloudFileSource(
             path, files, lambda file, index, time: pcd_image(file, index, time, camera)
         )
         source.metadata["depth_kind"] = "z"
@@ -72,7 +59,7 @@ def pcd_cloud(path: Path, index: int, timestamp: float, shift: Float64 | None = 
     """Read a file as a cloud, minus `shift` (3,) in m; its viewpoint is the sensor's position."""
     pcd = read_pcd(path)
     cloud = pcd.cloud
-    return cloud_frame(
+    return cloud_frames.cloud_frame(
         index,
         timestamp,
         cloud.points,
@@ -87,7 +74,7 @@ def pcd_cloud(path: Path, index: int, timestamp: float, shift: Float64 | None = 
 def pcd_image(path: Path, index: int, timestamp: float, camera: Camera) -> Frame:
     """Read an organised file as an image of `camera`; see `organised_frame`."""
     pcd = read_pcd(path)
-    return organised_frame(
+    return organised.organised_frame(
         _image(pcd),
         camera,
         index,
@@ -101,9 +88,9 @@ def pcd_image(path: Path, index: int, timestamp: float, camera: Camera) -> Frame
 
 def _camera(files: list[Path]) -> Camera | None:
     """Return the camera of organised files, from up to `SAMPLES` readable ones; or None."""
-    step = max(1, len(files) // SAMPLES)
+    step = max(1, len(files) // organised.SAMPLES)
     images: list[Float32] = []
-    for file in files[::step][:SAMPLES]:
+    for file in files[::step][: organised.SAMPLES]:
         try:
             pcd = read_pcd(file)
         except InputError:
@@ -112,24 +99,27 @@ def _camera(files: list[Path]) -> Camera | None:
             return None
         images.append(_image(pcd))
         points = images[-1].reshape(-1, 3)
-        if find_raster(points, pcd.width) is None and find_raster(points, pcd.height) is not None:
+        if (
+            organised.find_raster(points, pcd.width) is None
+            and organised.find_raster(points, pcd.height) is not None
+        ):
             raise InputError(
                 f"has WIDTH {pcd.width} and HEIGHT {pcd.height}, but rows of {pcd.height} points",
                 where=file,
                 remedy="swap WIDTH and HEIGHT",
             )
-    return common_camera(images)
+    return organised.common_camera(images)
 
 
 def _image(pcd: Pcd) -> Float32:
-    return to_float32(pcd.cloud.points).reshape(pcd.height, pcd.width, 3)
+    return cloud_frames.to_float32(pcd.cloud.points).reshape(pcd.height, pcd.width, 3)
 
 
 _SUFFIXES = (".xyz", ".xyzn", ".xyzrgb")
 
 
 @part("reader", "xyz")
-class XyzClouds(Reader):
+class XyzClouds(cloud_sequence.CloudReader):
     """A .xyz, .xyzn or .xyzrgb file, or a folder of them; metres.
 
     The fourth column of four is an amplitude. Columns four to six are normals in .xyzn, and where
@@ -137,19 +127,16 @@ class XyzClouds(Reader):
     columns are ignored.
     """
 
-    def sniff(self, path: Path) -> Sniff | None:
-        """See `Reader.sniff`."""
-        return sniff_clouds(path, *_SUFFIXES)
+    suffixes = _SUFFIXES
 
-    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
-        """See `Reader.open`."""
-        refuse_camera(options, "xyz")
-        return CloudFileSource(path, required_files(path, *_SUFFIXES), xyz_frame, xyz_frame)
+    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+        """See `CloudReader.source`."""
+        return cloud_sequence.CloudFileSource(path, files, xyz_frame, xyz_frame)
 
 
 def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
     """Read one file; `shift` (3,) in m is subtracted from the coordinates."""
-    table = read_numbers(path)
+    table = tables.read_numbers(path)
     if table.shape[1] < 3:
         raise InputError(f"has {table.shape[1]} numbers per line", where=path, remedy="write x y z")
     points = _float32(table[:, :3]) if shift is None else table[:, :3]
@@ -164,7 +151,7 @@ def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = 
             normals = _float32(columns)
         elif ((columns >= 0) & (columns <= 255) & (columns == np.rint(columns))).all():
             color = columns.astype(np.uint8)
-    return cloud_frame(
+    return cloud_frames.cloud_frame(
         index, timestamp, points, normals, amplitude=amplitude, color=color, shift=shift
     )
 
@@ -185,19 +172,17 @@ CENTIMETRE = 0.01
 
 
 @part("reader", "slam6d", label="validated")
-class Slam6d(Reader):
+class Slam6d(cloud_sequence.CloudReader):
     """3DTK, slam6D: a folder of scanNNN.3d with scanNNN.pose."""
 
-    def sniff(self, path: Path) -> Sniff | None:
-        """See `Reader.sniff`."""
-        return sniff_clouds(path, ".3d")
+    suffixes = (".3d",)
 
-    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
-        """See `Reader.open`."""
-        refuse_camera(options, "slam6d")
-        files = required_files(path, ".3d")
-        source = CloudFileSource(path, files, scan_frame)
-        poses = poses_from_files(source, [file.with_suffix(".pose") for file in files], read_pose)
+    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+        """See `CloudReader.source`."""
+        source = cloud_sequence.CloudFileSource(path, files, scan_frame)
+        poses = per_frame.poses_from_files(
+            source, [file.with_suffix(".pose") for file in files], read_pose
+        )
         if poses is not None:
             source.odometry = poses
             if source.reference is None:
@@ -210,9 +195,9 @@ class Slam6d(Reader):
 
 def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     """Read one scan: lines of x y z [reflectance ...], optionally after a line with their count."""
-    text = read_text(path)
+    text = reading.read_text(path)
     first = text.split("\n", 1)[0].split()
-    table = parse_numbers(text, path, skip=int(len(first) == 1))
+    table = tables.parse_numbers(text, path, skip=int(len(first) == 1))
     if table.shape[1] < 3:
         raise InputError(f"has {table.shape[1]} numbers per line", where=path)
     with np.errstate(over="ignore"):
@@ -220,12 +205,12 @@ def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     # The scanner writes (0, 0, 0) for missing measurements.
     points[(points == 0).all(1)] = np.nan
     amplitude = table[:, 3].astype(np.float32) if table.shape[1] == 4 else None
-    return cloud_frame(index, timestamp, points, amplitude=amplitude)
+    return cloud_frames.cloud_frame(index, timestamp, points, amplitude=amplitude)
 
 
 def read_pose(path: Path) -> Float64:
     """Return T_world_scan (4, 4) of a .pose: cm and Euler angles in degrees, left-handed."""
-    numbers = read_numbers(path).ravel()
+    numbers = tables.read_numbers(path).ravel()
     if len(numbers) != 6 or not np.isfinite(numbers).all():
         raise InputError(
             f"has {len(numbers)} numbers", where=path, remedy="write x y z and three angles"

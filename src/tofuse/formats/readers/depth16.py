@@ -8,18 +8,10 @@ import numpy as np
 
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_named, if_file, is_file
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading
 from tofuse.formats.images import read_color, read_raw
-from tofuse.formats.recordings import (
-    UNCERTAIN,
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    camera_file_of,
-    required,
-    resized,
-)
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
 _SUFFIXES = ("_depth16.bin", ".depth16")
 _BITS = 13
@@ -36,15 +28,15 @@ class Depth16(Reader):
         if not files:
             return None
         evidence = f"{len(files)} DEPTH16 images"
-        if is_file(path / "camera.json"):
+        if reading.is_file(path / "camera.json"):
             return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format depth16 with --camera: size and lens are not in such files"
-        return Sniff(UNCERTAIN, evidence, remedy)
+        return Sniff(Sniff.UNCERTAIN, evidence, remedy)
 
     def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
         """See `Reader.open`."""
-        files = required(_files(path), "*_depth16.bin or *.depth16", path)
-        camera = camera_file_of(path, options.camera, "neither size nor lens")
+        files = inputs.required(_files(path), "*_depth16.bin or *.depth16", path)
+        camera = camera_file.camera_file_of(path, options.camera, "neither size nor lens")
         return Depth16Source(files, camera)
 
 
@@ -77,14 +69,14 @@ class Depth16Source(FileSource):
             index,
             depth,
             confidence_image=confidence.astype(np.uint8),
-            color_image=None if color is None else resized(read_color(color), size, color),
+            color_image=None if color is None else pixels.resized(read_color(color), size, color),
         )
 
 
 def _files(path: Path) -> list[Path]:
-    return files_named(path, lambda name: name.lower().endswith(_SUFFIXES))
+    return reading.files_named(path, lambda name: name.lower().endswith(_SUFFIXES))
 
 
 def _color(file: Path) -> Path | None:
     suffix = next(suffix for suffix in _SUFFIXES if file.name.lower().endswith(suffix))
-    return if_file(file.with_name(f"{file.name[: -len(suffix)]}_image.jpg"))
+    return reading.if_file(file.with_name(f"{file.name[: -len(suffix)]}_image.jpg"))

@@ -8,9 +8,9 @@ import numpy as np
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_with, is_file
+from tofuse.formats.files import reading
 from tofuse.formats.images import read_header
-from tofuse.formats.recordings import CERTAIN, DepthImageSource, Reader, ReaderOptions, Sniff
+from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff
 
 
 @part("reader", "depth-png")
@@ -19,19 +19,19 @@ class DepthPng(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        if not (is_file(path) and path.suffix.lower() == ".png"):
+        if not (reading.is_file(path) and path.suffix.lower() == ".png"):
             return None
         header = read_header(path)
         if header.bits != 16 or header.channels != 1:
             return None
-        return Sniff(CERTAIN, "a 16-bit PNG")
+        return Sniff(Sniff.CERTAIN, "a 16-bit PNG")
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        if not is_file(path):
+        if not reading.is_file(path):
             raise InputError("is not a file", where=path, remedy="pass one depth .png")
         camera = options.camera
-        if camera is None and is_file(path.parent / "camera.json"):
+        if camera is None and reading.is_file(path.parent / "camera.json"):
             camera = path.parent / "camera.json"
         if camera is None:
             raise InputError("is a depth image without a camera", where=path, remedy=_remedy(path))
@@ -41,7 +41,7 @@ class DepthPng(Reader):
 def _remedy(path: Path) -> str:
     """The remedy; for an image of a native folder, to open the folder's frame instead."""
     folder = path.parent.parent
-    if path.parent.name == "depth" and is_file(folder / "camera.json"):
-        number = files_with(path.parent, ".png").index(path)
+    if path.parent.name == "depth" and reading.is_file(folder / "camera.json"):
+        number = reading.files_with(path.parent, ".png").index(path)
         return f"use {folder}#{number}, which is this frame of its recording"
     return "pass --camera camera.json with lens, depth_unit_m and depth_kind"

@@ -16,23 +16,16 @@ from tofuse.engine.frames import RangeFrame
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.formats.files import is_file, is_folder, parse_numbers, read_text
+from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import read_pcd, read_ply
-from tofuse.formats.recordings import (
-    SAMPLES,
-    CloudFileSource,
-    Raster,
+from tofuse.formats.sources import (
     Reader,
     ReaderOptions,
     Sniff,
-    common_camera,
-    files_at,
-    find_raster,
-    organised_frame,
-    ray_origin_offset,
-    refuse_camera,
-    required_files,
-    to_float32,
+    cloud_frames,
+    cloud_sequence,
+    inputs,
+    organised,
 )
 
 _SUFFIXES = (".ply", ".csv", ".pcd")
@@ -51,8 +44,8 @@ class Grid(Reader):
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         try:
-            files = files_at(path, *_SUFFIXES)
-            if not files or (is_folder(path) and is_file(path / "run.json")):
+            files = inputs.files_at(path, *_SUFFIXES)
+            if not files or (reading.is_folder(path) and reading.is_file(path / "run.json")):
                 return None
             status = files[0].stat()
             raster = _first_raster(files[0], status.st_mtime_ns, status.st_size)
@@ -62,14 +55,14 @@ class Grid(Reader):
             return None
         return Sniff(1.0, f"{len(files)} clouds of {raster.width} x {raster.height} pixels")
 
-    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
+    def open(self, path: Path, options: ReaderOptions) -> cloud_sequence.CloudFileSource:
         """See `Reader.open`."""
-        refuse_camera(options, "grid")
-        files = required_files(path, *_SUFFIXES)
-        step = max(1, len(files) // SAMPLES)
+        inputs.refuse_camera(options, "grid")
+        files = cloud_sequence.required_files(path, *_SUFFIXES)
+        step = max(1, len(files) // organised.SAMPLES)
         images: list[Float32] = []
-        raster: Raster | None = None
-        for file in files[::step][:SAMPLES]:
+        raster: organised.Raster | None = None
+        for file in files[::step][: organised.SAMPLES]:
             try:
                 cells = read_cells(file)
             except InputError:
@@ -81,14 +74,14 @@ class Grid(Reader):
             raise _not_organised(path)
         scale = 1e-3 if _median_z(images[0]) > MM_FROM else 1.0
         images = [image * np.float32(scale) for image in images]
-        offset, camera = 0.0, common_camera(images)
+        offset, camera = 0.0, organised.common_camera(images)
         if camera is None:
-            offset = ray_origin_offset(images)
-            camera = common_camera([_shifted(image, offset) for image in images])
+            offset = organised.ray_origin_offset(images)
+            camera = organised.common_camera([_shifted(image, offset) for image in images])
         if camera is None:
             raise _not_organised(path)
         frames = _Frames(raster, camera, scale, offset)
-        source = CloudFileSource(path, files, frames.load)
+        source = cloud_sequence.CloudFileSource(path, files, frames.load)
         source.metadata |= {"depth_kind": "z"}
         if offset:
             source.warnings.append(
@@ -109,9 +102,13 @@ class Cells:
     color: UInt8 | None = None
     width: int | None = None
 
-    def raster(self) -> Raster | None:
+    def raster(self) -> organised.Raster | None:
         """See `find_raster`."""
-        return find_raster(self.points, self.width) if len(self.points) <= MAX_POINTS else None
+        return (
+            organised.find_raster(self.points, self.width)
+            if len(self.points) <= MAX_POINTS
+            else None
+        )
 
 
 def read_cells(path: Path) -> Cells:
@@ -135,15 +132,15 @@ def _read(path: Path) -> Cells:
 
 
 def _cells(cloud: GeometryRecord, width: int | None) -> Cells:
-    return Cells(to_float32(cloud.points), cloud.amplitude, cloud.color, width)
+    return Cells(cloud_frames.to_float32(cloud.points), cloud.amplitude, cloud.color, width)
 
 
 def _read_csv(path: Path) -> Cells:
-    text = read_text(path)
+    text = reading.read_text(path)
     head = text[: text.find("\n")].lower().replace(";", ",").replace("\t", ",")
     names = [cell.strip(' "#').split("[")[0].split("(")[0].strip() for cell in head.split(",")]
     has_header = {"x", "y", "z"} <= set(names)
-    table = parse_numbers(text, path, skip=int(has_header))
+    table = tables.parse_numbers(text, path, skip=int(has_header))
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError("has no x, y and z per line", where=path, remedy="export x, y, z")
     columns = {n: k for k, n in enumerate(names) if k < table.shape[1]} if has_header else {}
@@ -152,8 +149,8 @@ def _read_csv(path: Path) -> Cells:
     if not has_header and table.shape[1] == 4:
         column = 3
     with np.errstate(over="ignore"):
-        points = to_float32(table[:, indices])
-        amplitude = None if column is None else to_float32(table[:, column])
+        points = cloud_frames.to_float32(table[:, indices])
+        amplitude = None if column is None else cloud_frames.to_float32(table[:, column])
     return Cells(points, amplitude)
 
 
@@ -161,7 +158,7 @@ def _read_csv(path: Path) -> Cells:
 class _Frames:
     """Converts the points of each file to an image."""
 
-    raster: Raster
+    raster: organised.Raster
     camera: Camera
     scale: float
     offset: float
@@ -173,7 +170,7 @@ class _Frames:
         points = _shifted(points * np.float32(self.scale), self.offset)
         if not complete:
             points, cells = self._to_pixels(points, cells, path)
-        return organised_frame(
+        return organised.organised_frame(
             points,
             self.camera,
             index,
@@ -244,7 +241,7 @@ def _not_organised(path: Path) -> InputError:
 
 
 @lru_cache(maxsize=4)
-def _first_raster(file: Path, changed_ns: int, size: int) -> Raster | None:
+def _first_raster(file: Path, changed_ns: int, size: int) -> organised.Raster | None:
     """The raster of a file's points; None if there is none, or if the reader pcd applies."""
     cells = read_cells(file)
     raster = cells.raster()

@@ -15,19 +15,10 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.formats.files import input_error, is_file, is_folder, list_folder, read_numbers
-from tofuse.formats.images import parse_pgm, read_raw
-from tofuse.formats.recordings import (
-    PER_FRAME,
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    poses_of,
-    read_matrix_pose,
-    read_part,
-    refuse_camera,
-)
+from tofuse.formats.files import reading, tables
+from tofuse.formats.images import read_raw
+from tofuse.formats.readers.pgm import parse_pgm
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, per_frame
 
 # The streams by preference, with their ambiguity range in m.
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
@@ -48,7 +39,7 @@ class HoloLens2(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> HoloLens2Source:
         """See `Reader.open`."""
-        refuse_camera(options, "hololens2", PER_FRAME)
+        inputs.refuse_camera(options, "hololens2", inputs.PER_FRAME)
         streams = _streams(path)
         if not streams:
             raise InputError(
@@ -107,13 +98,15 @@ class HoloLens2Source(FileSource):
             folder / f"{stream}_extrinsics.txt",
             folder / f"{stream}_rig2world.txt",
         )
-        if not is_file(extrinsics) or not is_file(trajectory):
-            missing = trajectory if is_file(extrinsics) else extrinsics
+        if not reading.is_file(extrinsics) or not reading.is_file(trajectory):
+            missing = trajectory if reading.is_file(extrinsics) else extrinsics
             self.warnings.append(f"{missing.name} is missing: there are no reference poses")
             return
         try:
-            T_camera_rig = read_matrix_pose(read_numbers(extrinsics).reshape(4, 4), str(extrinsics))
-            table = read_numbers(trajectory)
+            T_camera_rig = per_frame.read_matrix_pose(
+                tables.read_numbers(extrinsics).reshape(4, 4), str(extrinsics)
+            )
+            table = tables.read_numbers(trajectory)
             if table.shape[-1] != 17:
                 raise InputError("has no rows of 17 numbers", where=trajectory, remedy=_REMEDY)
         except (InputError, ValueError) as error:
@@ -130,10 +123,12 @@ class HoloLens2Source(FileSource):
                 return None
             row = order[position]
             table_of_row = table[row, 1:].reshape(4, 4)
-            T_world_rig = read_matrix_pose(table_of_row, f"{trajectory}, row {row}")
+            T_world_rig = per_frame.read_matrix_pose(table_of_row, f"{trajectory}, row {row}")
             return T_world_rig @ se3.inverse(T_camera_rig)
 
-        self.reference = poses_of(self, zip(self.ticks, nearest.tolist(), strict=True), pose)
+        self.reference = per_frame.poses_of(
+            self, zip(self.ticks, nearest.tolist(), strict=True), pose
+        )
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
@@ -158,7 +153,7 @@ class HoloLens2Source(FileSource):
         where = f"{path}: {tick}{'_ab' if bright else ''}.pgm"
         if size > _MAX_BYTES:
             raise InputError("is too large", where=where, remedy=_REMEDY)
-        image = parse_pgm(read_part(path, begin, size), where)
+        image = parse_pgm(reading.read_part(path, begin, size), where)
         if image.dtype != np.uint16 or min(image.shape) < 2:
             raise InputError("is not a 16-bit image", where=where, remedy=_REMEDY)
         return image
@@ -166,13 +161,13 @@ class HoloLens2Source(FileSource):
 
 def _streams(path: Path) -> list[str]:
     """The depth streams with a lens and images."""
-    if not is_folder(path):
+    if not reading.is_folder(path):
         return []
     return [
         name
         for name in _STREAMS
-        if is_file(path / f"{name}_lut.bin")
-        and (is_file(path / f"{name}.tar") or is_folder(path / name))
+        if reading.is_file(path / f"{name}_lut.bin")
+        and (reading.is_file(path / f"{name}.tar") or reading.is_folder(path / name))
     ]
 
 
@@ -186,13 +181,13 @@ def _images(folder: Path, stream: str) -> tuple[_Images, bool]:
     Also whether the archive is complete: it ends with blocks of zeros.
     """
     images: _Images = {}
-    if is_folder(folder / stream):
-        for path in list_folder(folder / stream):
+    if reading.is_folder(folder / stream):
+        for path in reading.list_folder(folder / stream):
             match = _NAME.fullmatch(path.name)
-            if match and is_file(path):
+            if match and reading.is_file(path):
                 images[int(match[1]), match[2] is not None] = (path, 0, path.stat().st_size)
     path = folder / f"{stream}.tar"
-    if images or not is_file(path):
+    if images or not reading.is_file(path):
         return images, True
     try:
         with tarfile.open(path, "r:") as archive:
@@ -206,7 +201,7 @@ def _images(folder: Path, stream: str) -> tuple[_Images, bool]:
             file.seek(end)
             complete = file.read(tarfile.BLOCKSIZE) == bytes(tarfile.BLOCKSIZE)
     except OSError as error:
-        raise input_error(error, path) from error
+        raise reading.input_error(error, path) from error
     except (tarfile.TarError, ValueError, EOFError) as error:
         if not images:
             raise InputError("is a damaged archive", where=path, remedy=_REMEDY) from error

@@ -18,21 +18,17 @@ from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.files import read_bytes, read_head, required_package
-from tofuse.formats.images import BEGIN, Chunk, chunk_image, pcic_frames
-from tofuse.formats.recordings import (
-    MAX_SLOPE,
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading
+from tofuse.formats.readers.pcic import BEGIN, Chunk, chunk_image, pcic_frames
+from tofuse.formats.sources import (
     FileSource,
     Reader,
     ReaderOptions,
     Sniff,
-    begins_with,
-    file_of,
-    finite_float32,
-    interpolated,
-    library_errors,
-    refuse_camera,
-    required_file,
+    inputs,
+    per_frame,
+    pixels,
 )
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
@@ -46,14 +42,14 @@ class IfmO3r(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        file = file_of(path, ".data", ".pcic", ".bin")
-        matches = file is not None and BEGIN in read_head(file, 64)
+        file = inputs.file_of(path, ".data", ".pcic", ".bin")
+        matches = file is not None and BEGIN in reading.read_head(file, 64)
         return Sniff(1.0, "a PCIC stream") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> IfmO3rSource:
         """See `Reader.open`."""
-        refuse_camera(options, "ifm-o3r")
-        return IfmO3rSource(required_file(path, ".data", ".pcic", ".bin"))
+        inputs.refuse_camera(options, "ifm-o3r")
+        return IfmO3rSource(inputs.required_file(path, ".data", ".pcic", ".bin"))
 
 
 class IfmO3rSource(FileSource):
@@ -61,7 +57,7 @@ class IfmO3rSource(FileSource):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.data = read_bytes(path, limit=_MAX_BYTES)
+        self.data = reading.read_bytes(path, limit=_MAX_BYTES)
         self.frames = pcic_frames(self.data, path)
         super().__init__(_times(self.frames))
         self.metadata |= {
@@ -128,7 +124,7 @@ def _times(frames: list[dict[int, Chunk] | InputError]) -> Float64:
             times[k] = next(iter(chunks.values())).time
     if not np.isfinite(times).any():
         return np.arange(len(times), dtype=float)
-    return interpolated(times)
+    return per_frame.interpolated(times)
 
 
 BOUGUET, FISHEYE = 0, 2
@@ -219,7 +215,7 @@ def head_frame(
             raise InputError("has flags that are not integers", where=where)
         depth = np.where(flags & _INVALID, np.float32(0), depth)
     if amplitude is not None:
-        amplitude = finite_float32(amplitude)
+        amplitude = pixels.finite_float32(amplitude)
     return RangeFrame(
         index,
         timestamp,
@@ -227,7 +223,7 @@ def head_frame(
         depth,
         "range",
         amplitude,
-        sigma_image=None if noise is None else finite_float32(info.metres(noise)),
+        sigma_image=None if noise is None else pixels.finite_float32(info.metres(noise)),
     )
 
 
@@ -248,7 +244,7 @@ def head_camera(info: HeadInfo, width: int, height: int, where: str) -> RayTable
     x = (u - cx) / fx - skew * y
     with np.errstate(all="ignore"):
         rays = _bouguet(x, y, k) if model == BOUGUET else _fisheye(x, y, k)
-        rays[~(np.abs(rays) < MAX_SLOPE).all(-1)] = np.nan
+        rays[~(np.abs(rays) < camera_file.MAX_SLOPE).all(-1)] = np.nan
     return RayTable(rays.astype(np.float32))
 
 
@@ -293,13 +289,13 @@ class IfmH5(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        matches = begins_with(file_of(path, ".h5", ".hdf5"), _MAGIC)
+        matches = inputs.begins_with(inputs.file_of(path, ".h5", ".hdf5"), _MAGIC)
         return Sniff(0.95, "an HDF5 file") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> IfmH5Source:
         """See `Reader.open`."""
-        refuse_camera(options, "ifm-h5")
-        return IfmH5Source(required_file(path, ".h5", ".hdf5"), options.topic)
+        inputs.refuse_camera(options, "ifm-h5")
+        return IfmH5Source(inputs.required_file(path, ".h5", ".hdf5"), options.topic)
 
 
 class IfmH5Source(FileSource):
@@ -307,9 +303,9 @@ class IfmH5Source(FileSource):
 
     def __init__(self, path: Path, stream: str | None) -> None:
         self.path = path
-        h5py = required_package("h5py", "hdf5", path)
+        h5py = reading.required_package("h5py", "hdf5", path)
         self._lock = threading.Lock()
-        with library_errors(path):
+        with reading.library_errors(path):
             file = h5py.File(path, "r")
             weakref.finalize(self, file.close)
             self._find(file, stream)
@@ -359,7 +355,7 @@ class IfmH5Source(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         where = f"{self.path}: {self.name}, frame {index}"
-        with library_errors(where):
+        with reading.library_errors(where):
             with self._lock:
                 row = self.rows[index]
             return self._frame(row, index, where)

@@ -11,17 +11,10 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_named, is_file, is_folder, list_folder, read_text
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading
 from tofuse.formats.images import first_size
-from tofuse.formats.recordings import (
-    UNCERTAIN,
-    DepthImageSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    checked_pinhole,
-    required,
-)
+from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs
 
 _DEPTH = re.compile(r"([0-9]{1,9})_depth\.png", re.IGNORECASE)
 # Camera of an image, and its scale relative to the calibration, by the image size.
@@ -39,20 +32,20 @@ class Kinect2(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        files = files_named(path, _DEPTH.fullmatch)
+        files = reading.files_named(path, _DEPTH.fullmatch)
         if not files:
             return None
         if any(_calibration(path, name) is not None for name, _ in _VIEWS.values()):
             return Sniff(1.0, f"{len(files)} *_depth.png and calib_*.yaml")
         return Sniff(
-            UNCERTAIN,
+            Sniff.UNCERTAIN,
             f"{len(files)} *_depth.png but no calibration",
             "put kinect2_bridge's calib_ir.yaml and calib_color.yaml into the same folder",
         )
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = required(files_named(path, _DEPTH.fullmatch), "NNNN_depth.png", path)
+        files = inputs.required(reading.files_named(path, _DEPTH.fullmatch), "NNNN_depth.png", path)
         color = [_color(file) for file in files]
         source = DepthImageSource(
             files,
@@ -70,15 +63,19 @@ class Kinect2(Reader):
 def _color(file: Path) -> Path | None:
     stem = file.name[: -len("_depth.png")]
     candidates = (file.with_name(f"{stem}_color{suffix}") for suffix in (".jpg", ".png"))
-    return next((path for path in candidates if is_file(path)), None)
+    return next((path for path in candidates if reading.is_file(path)), None)
 
 
 def _calibration(folder: Path, name: str) -> Path | None:
     """The calibration in the folder of the images, or in its only subfolder that has one."""
-    if is_file(folder / name):
+    if reading.is_file(folder / name):
         return folder / name
     try:
-        files = [p / name for p in list_folder(folder) if is_folder(p) and is_file(p / name)]
+        files = [
+            p / name
+            for p in reading.list_folder(folder)
+            if reading.is_folder(p) and reading.is_file(p / name)
+        ]
     except InputError:
         return None
     return files[0] if len(files) == 1 else None
@@ -100,11 +97,11 @@ def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
             where=folder,
             remedy="copy it from kinect2_bridge/data/ and your camera's number, or use --camera",
         )
-    match = _MATRIX.search(read_text(path, limit=1 << 20))
+    match = _MATRIX.search(reading.read_text(path, limit=1 << 20))
     numbers = _numbers(match[1]) if match else np.zeros(0)
     if numbers.shape != (9,):
         raise InputError("has no cameraMatrix of 9 numbers", where=path, remedy="copy it again")
-    return checked_pinhole(scale * numbers.reshape(3, 3), size, path)
+    return camera_file.checked_pinhole(scale * numbers.reshape(3, 3), size, path)
 
 
 def _numbers(text: str) -> Float64:

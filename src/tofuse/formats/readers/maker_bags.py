@@ -18,25 +18,8 @@ from tofuse.engine.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhol
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.parts import part
-from tofuse.formats.recordings import (
-    GREY,
-    BagSource,
-    ColorCamera,
-    Info,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    Track,
-    bag_kind,
-    camera_info,
-    checked_lens,
-    first_message,
-    forward_brown,
-    inverse_brown,
-    open_bag,
-    open_container,
-    simplest_lens,
-)
+from tofuse.formats.cameras import camera_file, lenses
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, bags
 
 
 def topics(path: Path) -> frozenset[str]:
@@ -52,17 +35,17 @@ def topics(path: Path) -> frozenset[str]:
 def _topics_of(path: Path, changed_ns: int, size: int) -> frozenset[str]:
     """See `topics`; cached, as several readers call it and opening a large bag is slow."""
     try:
-        kind = bag_kind(path)
+        kind = bags.bag_kind(path)
         if kind in (None, "mcap"):  # in which no maker's viewer records
             return frozenset()
-        bag = open_container(path) if kind == "ros1" else open_bag(path)
+        bag = bags.open_container(path) if kind == "ros1" else bags.open_bag(path)
     except InputError:
         return frozenset()
     with closing(bag):
         return frozenset(c.topic for c in bag.connections)
 
 
-class MakerBagSource(BagSource):
+class MakerBagSource(bags.BagSource):
     """A source over a bag whose topics and messages are those of a maker."""
 
     def find_streams(self, options: ReaderOptions) -> None:
@@ -90,7 +73,7 @@ class MakerBagSource(BagSource):
         """Return the camera of the depth images."""
         raise NotImplementedError
 
-    def color_lens(self) -> ColorCamera:
+    def color_lens(self) -> camera_file.ColorCamera:
         """Return the camera of the colour images; raise InputError if it is unknown."""
         raise NotImplementedError
 
@@ -103,15 +86,15 @@ class MakerBagSource(BagSource):
             self.warnings.append(f"colour is ignored: {error}")
             self.color = None
 
-    def track(self, topic: str | None) -> Track | None:
+    def track(self, topic: str | None) -> bags.Track | None:
         """Return the messages of a topic; None if there are none."""
         for connection in self.bag.connections:
             if connection.topic == topic:
-                track = Track(self.bag, connection)
+                track = bags.Track(self.bag, connection)
                 return track if len(track) else None
         return None
 
-    def required_track(self, topic: str, noun: str) -> Track:
+    def required_track(self, topic: str, noun: str) -> bags.Track:
         """Return the messages of a topic, called `noun` in the error if there are none."""
         track = self.track(topic)
         if track is None:
@@ -167,19 +150,19 @@ class RealSenseSource(MakerBagSource):
         """See `MakerBagSource.lens`."""
         return self._lens(self.stream)
 
-    def color_lens(self) -> ColorCamera:
+    def color_lens(self) -> camera_file.ColorCamera:
         """See `MakerBagSource.color_lens`."""
         assert self.color is not None
         stream = self.color.connection.topic.removesuffix("/image/data")
         lens = self._lens(stream)
         if isinstance(lens, RayTable):
-            lens = forward_brown(lens, self._brown(stream))
+            lens = lenses.forward_brown(lens, self._brown(stream))
         assert isinstance(lens, Pinhole)
         depth, color = self._extrinsics(self.stream), self._extrinsics(stream)
         common = sorted(depth.keys() & color.keys())
         if not common:
             raise InputError("has no pose relative to depth", where=f"{self.path}: {stream}")
-        return ColorCamera(lens, color[common[0]] @ se3.inverse(depth[common[0]]))
+        return camera_file.ColorCamera(lens, color[common[0]] @ se3.inverse(depth[common[0]]))
 
     def _extrinsics(self, stream: str) -> dict[str, Float64]:
         """Return transforms (4, 4) into a stream's frame, by the number of their reference.
@@ -190,7 +173,7 @@ class RealSenseSource(MakerBagSource):
         for connection in self.bag.connections:
             if not re.fullmatch(re.escape(stream) + r"/tf/\d+", connection.topic):
                 continue
-            message = first_message(self.bag, connection.topic)
+            message = bags.first_message(self.bag, connection.topic)
             where = f"{self.path}: {connection.topic}"
             T = np.eye(4)
             try:
@@ -211,11 +194,11 @@ class RealSenseSource(MakerBagSource):
     def _lens(self, stream: str) -> Camera:
         info, where = self._info(stream), f"{self.path}: {stream}"
         if not any(info.coefficients):
-            return checked_lens(Pinhole, info.size, info.values, where)
+            return camera_file.checked_lens(Pinhole, info.size, info.values, where)
         brown = self._brown(stream)
         model = info.model.lower().replace("_", " ")
         if model.startswith("inverse brown"):
-            return inverse_brown(brown)
+            return lenses.inverse_brown(brown)
         if model.startswith("brown"):
             return brown
         raise InputError(
@@ -225,26 +208,30 @@ class RealSenseSource(MakerBagSource):
     def _brown(self, stream: str) -> BrownConrady:
         info = self._info(stream)
         k = dict(zip(DISTORTION_ORDER["brown"], info.coefficients, strict=False))
-        lens = checked_lens(BrownConrady, info.size, info.values | k, f"{self.path}: {stream}")
+        lens = camera_file.checked_lens(
+            BrownConrady, info.size, info.values | k, f"{self.path}: {stream}"
+        )
         assert isinstance(lens, BrownConrady)
         return lens
 
-    def _info(self, stream: str) -> Info:
+    def _info(self, stream: str) -> bags.Info:
         where = f"{self.path}: {stream}"
-        message = first_message(self.bag, f"{stream}/info/camera_info")
+        message = bags.first_message(self.bag, f"{stream}/info/camera_info")
         # Newer versions write text.
         return (
-            self._info_from_text(stream, where) if message is None else camera_info(message, where)
+            self._info_from_text(stream, where)
+            if message is None
+            else bags.camera_info(message, where)
         )
 
-    def _info_from_text(self, stream: str, where: str) -> Info:
-        text = first_message(self.bag, f"{stream}/camera_info")
+    def _info_from_text(self, stream: str, where: str) -> bags.Info:
+        text = bags.first_message(self.bag, f"{stream}/camera_info")
         if text is None:
             raise InputError("has no camera_info", where=where, remedy="use --camera")
         fields = dict(p.partition("=")[::2] for p in str(text.data).split(";"))
         keys = {"fx": "fx", "fy": "fy", "cx": "ppx", "cy": "ppy"}
         try:
-            return Info(
+            return bags.Info(
                 (int(fields["width"]), int(fields["height"])),
                 {name: float(fields[key]) for name, key in keys.items()},
                 fields.get("model", ""),
@@ -256,7 +243,7 @@ class RealSenseSource(MakerBagSource):
             ) from error
 
     def _unit(self, sensor: str) -> float:
-        message = first_message(self.bag, f"{sensor}/option/Depth_Units/value")
+        message = bags.first_message(self.bag, f"{sensor}/option/Depth_Units/value")
         try:
             unit = float(message.data) if message is not None else 0.0
         except ValueError:
@@ -321,7 +308,7 @@ class _Profile:
     translation_m: Float64
 
     def lens(self, where: str) -> Pinhole:
-        return simplest_lens(self.size, self.values, self.k, where)
+        return lenses.simplest_lens(self.size, self.values, self.k, where)
 
 
 class OrbbecSource(MakerBagSource):
@@ -330,7 +317,7 @@ class OrbbecSource(MakerBagSource):
     @staticmethod
     def open_bag(path: Path) -> Any:
         """See `BagSource.open_bag`."""
-        return open_container(path)
+        return bags.open_container(path)
 
     def find_tracks(self) -> None:
         """See `MakerBagSource.find_tracks`."""
@@ -341,7 +328,7 @@ class OrbbecSource(MakerBagSource):
         infrared = self.track(_ORBBEC_INFRARED)
         if infrared is not None:
             first = self.message(infrared, 0)
-            if (first.width, first.height) == self.profile.size and first.encoding in GREY:
+            if (first.width, first.height) == self.profile.size and first.encoding in bags.GREY:
                 self.amplitude = infrared
         self.color = self.track(_ORBBEC_COLOR)
 
@@ -349,7 +336,7 @@ class OrbbecSource(MakerBagSource):
         """See `MakerBagSource.lens`."""
         return self.profile.lens(f"{self.path}: {_ORBBEC_DEPTH_PROFILE}")
 
-    def color_lens(self) -> ColorCamera:
+    def color_lens(self) -> camera_file.ColorCamera:
         """See `MakerBagSource.color_lens`."""
         where = f"{self.path}: {_ORBBEC_DEPTH_PROFILE}"
         lens = self._profile(_ORBBEC_COLOR_PROFILE).lens(f"{self.path}: {_ORBBEC_COLOR_PROFILE}")
@@ -359,7 +346,7 @@ class OrbbecSource(MakerBagSource):
             raise InputError("has no pose relative to colour", where=where)
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R, self.profile.translation_m
-        return ColorCamera(lens, se3.check_pose(se3.orthonormalise(T), where=where))
+        return camera_file.ColorCamera(lens, se3.check_pose(se3.orthonormalise(T), where=where))
 
     def _profile(self, topic: str) -> _Profile:
         where = f"{self.path}: {topic}"
@@ -377,7 +364,7 @@ class OrbbecSource(MakerBagSource):
             np.array(fields[11:14]) / 1000,
         )
 
-    def message(self, track: Track, index: int) -> Any:
+    def message(self, track: bags.Track, index: int) -> Any:
         """Read the part of an image message that is identical to ROS 1."""
         raw = bytes(track.raw(index))
         where = f"{self.path}: {track.connection.topic}, message {index}"

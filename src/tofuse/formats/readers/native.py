@@ -16,35 +16,19 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.engine.sensor import DISAGREEMENT, SPEED_OF_LIGHT, DepthCorrection, combined
-from tofuse.formats.files import (
-    files_with,
-    is_file,
-    is_folder,
-    list_folder,
-    read_columns,
-    read_text,
-)
+from tofuse.formats.cameras import camera_file, corrected_depth, read_correction
+from tofuse.formats.files import reading, tables
 from tofuse.formats.images import check_first_size, read_color, read_image
-from tofuse.formats.recordings import (
-    CERTAIN,
-    LENS_COLUMNS,
-    UNCERTAIN,
-    CameraFile,
+from tofuse.formats.sources import (
     FileSource,
     Reader,
     ReaderOptions,
     Sniff,
-    cameras_of,
-    checked_lens,
-    corrected_depth,
+    cloud_frames,
     gravity_at,
-    load_camera,
-    ply_frame,
-    read_camera_file,
-    read_correction,
-    read_rays,
-    required,
-    sampled_color,
+    inputs,
+    per_frame,
+    pixels,
 )
 
 _IMAGES = (".png", ".jpg", ".jpeg")
@@ -72,14 +56,16 @@ class NativeSource(FileSource):
 
     concurrent = True
 
-    def __init__(self, folder: Path, camera_file: Path | None = None) -> None:
+    def __init__(self, folder: Path, camera_path: Path | None = None) -> None:
         self.folder = folder
-        self.is_clouds = not is_folder(folder / "depth") and is_folder(folder / "cloud")
+        self.is_clouds = not reading.is_folder(folder / "depth") and reading.is_folder(
+            folder / "cloud"
+        )
         name, suffixes = ("cloud", (".ply",)) if self.is_clouds else ("depth", (".png",))
         remedy = "check that the recording is complete"
-        files = files_with(folder / name, *suffixes)
-        self.files = required(files, f"{suffixes[0]} files", folder / name, remedy)
-        self.description, self.camera = self._read_camera(camera_file)
+        files = reading.files_with(folder / name, *suffixes)
+        self.files = inputs.required(files, f"{suffixes[0]} files", folder / name, remedy)
+        self.description, self.camera = self._read_camera(camera_path)
         self.unit, self.kind = self.description.depth_unit_m, self.description.depth_kind
         self.amplitude_kind = self.description.amplitude_kind or "raw"
         self.ambiguity_m = self.description.ambiguity_m
@@ -92,12 +78,12 @@ class NativeSource(FileSource):
         self.sigma = self._channel_files("sigma", ".png")
         self.rays = self._channel_files("rays", ".npy")
         self.by_frequency = self._frequencies()
-        if camera_file is not None:
+        if camera_path is not None:
             self.rays = []  # the camera passed by the user applies to all frames
         self.correction = self._read_correction()
         self.imu = self._read_table("imu.csv")
         self.frame_columns = self._read_table("frames.csv", rows=len(self.files))
-        self.cameras = self._frame_lenses() if camera_file is None else []
+        self.cameras = self._frame_lenses() if camera_path is None else []
         if self.sigma and self.description.sigma_unit_m is None:
             raise InputError(
                 "is missing, and there is sigma/",
@@ -112,7 +98,7 @@ class NativeSource(FileSource):
         """See `FileSource.load`."""
         timestamp = float(self.timestamps[index])
         if self.camera is None:
-            return ply_frame(self.files[index], index, timestamp)
+            return cloud_frames.ply_frame(self.files[index], index, timestamp)
         camera = self._camera_of(index, self.camera)
         if self.by_frequency:
             depth = self._unwrapped_depth(index, camera)
@@ -125,7 +111,7 @@ class NativeSource(FileSource):
         images: dict[str, Any] = {"camera": camera}
         if self.color:
             path, frame = self.color[index], self.image(index, depth, camera=camera)
-            images["color_image"] = sampled_color(
+            images["color_image"] = pixels.sampled_color(
                 frame, read_color(path), self.description.color, path
             )
         if self.amplitude:
@@ -155,7 +141,7 @@ class NativeSource(FileSource):
             return lens
         if not self.rays:
             return camera
-        table = read_rays(self.rays[index])
+        table = camera_file.read_rays(self.rays[index])
         if (table.width, table.height) != (camera.width, camera.height):
             raise InputError(
                 f"is {table.width} x {table.height}, the images {camera.width} x {camera.height}",
@@ -170,40 +156,46 @@ class NativeSource(FileSource):
         if (
             columns is None
             or not isinstance(camera, Pinhole)
-            or not set(LENS_COLUMNS) <= set(columns)
+            or not set(camera_file.LENS_COLUMNS) <= set(columns)
         ):
             return []
         path, size = self.folder / "frames.csv", (camera.width, camera.height)
         common = {f.name: getattr(camera, f.name) for f in fields(camera)[2:]}
-        rows = enumerate(zip(*(columns[name].tolist() for name in LENS_COLUMNS), strict=True), 1)
+        rows = enumerate(
+            zip(*(columns[name].tolist() for name in camera_file.LENS_COLUMNS), strict=True), 1
+        )
         lenses: dict[tuple[float, ...], Pinhole] = {}
 
         def lens(numbered: tuple[int, tuple[float, ...]]) -> Pinhole:
             k, row = numbered
             if row not in lenses:  # frames with the same lens share it
-                values = common | dict(zip(LENS_COLUMNS, row, strict=True))
-                lenses[row] = checked_lens(type(camera), size, values, f"{path}, row {k}")
+                values = common | dict(zip(camera_file.LENS_COLUMNS, row, strict=True))
+                lenses[row] = camera_file.checked_lens(
+                    type(camera), size, values, f"{path}, row {k}"
+                )
             return lenses[row]
 
-        return cameras_of(rows, lens)
+        return per_frame.cameras_of(rows, lens)
 
-    def _read_camera(self, camera_file: Path | None) -> tuple[CameraFile, Camera | None]:
+    def _read_camera(
+        self, camera_path: Path | None
+    ) -> tuple[camera_file.CameraFile, Camera | None]:
         path = self.folder / "camera.json"
         if not self.is_clouds:
-            return load_camera(camera_file or path)
-        if camera_file is not None:
+            return camera_file.load_camera(camera_path or path)
+        if camera_path is not None:
             raise InputError(
                 "does not apply to a recording of clouds", where="--camera", remedy="leave it out"
             )
-        if is_file(path):
-            return read_camera_file(path, clouds=True), None
-        return CameraFile(None, None), None
+        if reading.is_file(path):
+            return camera_file.read_camera_file(path, clouds=True), None
+        return camera_file.CameraFile(None, None), None
 
     def _channel_files(self, name: str, *suffixes: str) -> list[Path]:
         folder = self.folder / name
-        if self.is_clouds or not is_folder(folder):
+        if self.is_clouds or not reading.is_folder(folder):
             return []
-        files = files_with(folder, *suffixes)
+        files = reading.files_with(folder, *suffixes)
         if len(files) != len(self.files):
             raise self._count_error(folder, f"{len(files)} images")
         if [f.stem for f in files] != [f.stem for f in self.files]:
@@ -213,21 +205,21 @@ class NativeSource(FileSource):
     def _frequencies(self) -> dict[float, list[Path]]:
         """The depth images by modulation frequency in Hz, if several were recorded separately."""
         folder = self.folder / "frequencies"
-        if self.is_clouds or not is_folder(folder):
+        if self.is_clouds or not reading.is_folder(folder):
             return {}
         images: dict[float, list[Path]] = {}
-        for subfolder in list_folder(folder):
+        for subfolder in reading.list_folder(folder):
             try:
                 hertz = float(subfolder.name)
             except ValueError:
                 hertz = math.nan
-            if not 1e5 <= hertz <= 1e10 or not is_folder(subfolder):
+            if not 1e5 <= hertz <= 1e10 or not reading.is_folder(subfolder):
                 raise InputError(
                     "isn't a frequency",
                     where=subfolder,
                     remedy="name the folder in Hz, as 30000000",
                 )
-            images[hertz] = files_with(subfolder, ".png")
+            images[hertz] = reading.files_with(subfolder, ".png")
             if len(images[hertz]) != len(self.files):
                 raise self._count_error(subfolder, f"{len(images[hertz])} images")
         if len(images) == 1:
@@ -252,20 +244,18 @@ class NativeSource(FileSource):
 
     def _read_correction(self) -> DepthCorrection | None:
         path = self.folder / "correction.npz"
-        if self.camera is None or not is_file(path):
+        if self.camera is None or not reading.is_file(path):
             return None
         correction = read_correction(path)
-        try:
+        with reading.named(path):
             correction.correct(np.ones((self.camera.height, self.camera.width), np.float32))
-        except InputError as error:
-            raise InputError(error.problem, where=path, remedy=error.remedy) from error
         return correction
 
     def _read_table(self, name: str, rows: int | None = None) -> dict[str, Float64] | None:
         path = self.folder / name
-        if not is_file(path):
+        if not reading.is_file(path):
             return None
-        columns = read_columns(path)
+        columns = tables.read_columns(path)
         length = len(next(iter(columns.values())))
         if rows is not None and length != rows:
             raise self._count_error(path, f"{length} rows")
@@ -323,7 +313,7 @@ class NativeSource(FileSource):
             self.metadata["corrected"] = self.correction is not None
             if self.sigma:
                 self.metadata["sigma_unit_m"] = description.sigma_unit_m
-        if is_folder(self.folder / "truth"):
+        if reading.is_folder(self.folder / "truth"):
             self.metadata["truth"] = str(self.folder / "truth")
 
 
@@ -335,32 +325,32 @@ class Native(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        if not is_folder(path):
+        if not reading.is_folder(path):
             return None
-        images = next((n for n in ("depth", "cloud") if is_folder(path / n)), None)
-        if is_file(path / "camera.json"):
+        images = next((n for n in ("depth", "cloud") if reading.is_folder(path / n)), None)
+        if reading.is_file(path / "camera.json"):
             try:
-                text = read_text(path / "camera.json")
+                text = reading.read_text(path / "camera.json")
             except InputError:
                 text = ""
             if "intrinsic_matrix" in text and '"schema"' not in text:
                 return None
             if images is None:
-                return Sniff(CERTAIN, "a camera.json but neither depth/ nor cloud/")
+                return Sniff(Sniff.CERTAIN, "a camera.json but neither depth/ nor cloud/")
             return Sniff(1.0, f"camera.json and {images}/")
         if images == "depth":
             return Sniff(
-                UNCERTAIN,
+                Sniff.UNCERTAIN,
                 "depth/ but no camera.json",
                 "write one (docs/formats.md), or use --format native --camera camera.json",
             )
-        return Sniff(CERTAIN, "cloud/") if images == "cloud" else None
+        return Sniff(Sniff.CERTAIN, "cloud/") if images == "cloud" else None
 
     def open(self, path: Path, options: ReaderOptions) -> NativeSource:
         """See `Reader.open`."""
-        if not is_folder(path):
+        if not reading.is_folder(path):
             raise InputError("is not a folder", where=path, remedy="pass the recording's folder")
-        if not is_folder(path / "depth") and not is_folder(path / "cloud"):
+        if not reading.is_folder(path / "depth") and not reading.is_folder(path / "cloud"):
             raise InputError(
                 "has neither depth/ nor cloud/",
                 where=path,

@@ -14,23 +14,18 @@ from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
-from tofuse.formats.files import is_file, name_order, read_head
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import json_data, reading
 from tofuse.formats.images import read_color, read_image
 from tofuse.formats.poses import OPENGL
-from tofuse.formats.recordings import (
-    PER_FRAME,
+from tofuse.formats.sources import (
     FileSource,
     Reader,
     ReaderOptions,
     Sniff,
-    checked_lens,
-    image_size,
-    number_in,
-    poses_of,
-    read_json,
-    read_matrix_pose,
-    refuse_camera,
-    resized,
+    inputs,
+    per_frame,
+    pixels,
 )
 
 NAME = "transforms.json"
@@ -54,14 +49,14 @@ class Nerfstudio(Reader):
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         file = _file(path)
-        head = read_head(file, _HEAD_BYTES) if is_file(file) else b""
+        head = reading.read_head(file, _HEAD_BYTES) if reading.is_file(file) else b""
         if file.name == NAME and any(f'"{key}"'.encode() in head for key in _DEPTH):
             return Sniff(1.0, f"{NAME} with depth")
         return None
 
     def open(self, path: Path, options: ReaderOptions) -> NerfstudioSource:
         """See `Reader.open`."""
-        refuse_camera(options, "nerfstudio", PER_FRAME)
+        inputs.refuse_camera(options, "nerfstudio", inputs.PER_FRAME)
         return NerfstudioSource(_file(path))
 
 
@@ -72,7 +67,7 @@ class NerfstudioSource(FileSource):
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        document = read_json(file)
+        document = json_data.read_json(file)
         entries = document.get("frames")
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
             raise InputError("has no list of frames", where=file, remedy=_REMEDY)
@@ -90,13 +85,15 @@ class NerfstudioSource(FileSource):
         timed = bool(np.isfinite(times).all())
         super().__init__(times if timed else np.arange(len(self.frames), dtype=float))
         self.unit_m = _unit(document, file, any("depth_file_path" in f.entry for f in self.frames))
-        self.sigma_unit_m = number_in(document, "sigma_unit_scale_factor", file, 1e-4, _REMEDY)
+        self.sigma_unit_m = json_data.number_in(
+            document, "sigma_unit_scale_factor", file, 1e-4, _REMEDY
+        )
         self.metadata |= {"depth_kind": "z", "depth_unit_m": self.unit_m}
         if without_depth:
             self.warnings.append(f"{file}: {without_depth} frames have no depth: skipped")
         if not timed:
             self.warnings.append(f"{file}: no timestamps: frame numbers serve as seconds")
-        self.reference = poses_of(self, self.frames, _Frame.pose)
+        self.reference = per_frame.poses_of(self, self.frames, _Frame.pose)
 
     def full_resolution_color(self, index: int) -> UInt8 | None:
         """See `FileSource.full_resolution_color`."""
@@ -122,7 +119,7 @@ class NerfstudioSource(FileSource):
             index,
             depth,
             camera=camera,
-            color_image=None if color is None else resized(read_color(color), size, color),
+            color_image=None if color is None else pixels.resized(read_color(color), size, color),
             sigma_image=sigma_image,
         )
 
@@ -155,7 +152,7 @@ class _Frame:
 
     @property
     def key(self) -> list[tuple[int, int, str]]:
-        return name_order(Path(str(self.entry.get("file_path", self.number))))
+        return reading.name_order(Path(str(self.entry.get("file_path", self.number))))
 
     def path(self, *names: str) -> Path | None:
         """Return the path under the first of these keys that the entry has."""
@@ -169,7 +166,7 @@ class _Frame:
         if base is None:
             return None
         candidates = (base.with_name(base.name + suffix) for suffix in _IMAGES)
-        return next((path for path in candidates if is_file(path)), None)
+        return next((path for path in candidates if reading.is_file(path)), None)
 
     def pose(self) -> Float64:
         where = f"{self.where}: transform_matrix"
@@ -179,12 +176,12 @@ class _Frame:
             raise InputError("isn't made of numbers", where=where, remedy=_REMEDY) from error
         if table.shape == (3, 4):
             table = np.concatenate([table, [[0, 0, 0, 1]]])
-        return read_matrix_pose(np.atleast_2d(table), where) @ OPENGL
+        return per_frame.read_matrix_pose(np.atleast_2d(table), where) @ OPENGL
 
     def number_of(self, name: str, default: float | None = None) -> float:
         if name in self.entry:
-            return number_in(self.entry, name, self.where, default, _REMEDY)
-        return number_in(self.common, name, self.file, default, _REMEDY)
+            return json_data.number_in(self.entry, name, self.where, default, _REMEDY)
+        return json_data.number_in(self.common, name, self.file, default, _REMEDY)
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
         """Return the camera scaled from the file's image size to the depth's (width, height)."""
@@ -197,7 +194,7 @@ class _Frame:
                 remedy=f"use one of {', '.join(_MODELS)}",
             )
         width, height = self.number_of("w", size[0]), self.number_of("h", size[1])
-        pixels = image_size(width, height, f"{self.where}: w")
+        pixels = camera_file.image_size(width, height, f"{self.where}: w")
         fx = self.number_of("fl_x", self._focal_length("camera_angle_x", width))
         # Pixel coordinates here start at the corner of the first pixel, in `Pinhole` at its centre.
         values = {
@@ -212,7 +209,7 @@ class _Frame:
             if not any(values[name] for name in DISTORTION_ORDER[model]):
                 model = "pinhole"
                 values = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
-        camera = checked_lens(MODELS[model], pixels, values, self.where)
+        camera = camera_file.checked_lens(MODELS[model], pixels, values, self.where)
         if abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
             raise InputError(
                 f"is of a {width:g} x {height:g} image, depth {size[0]} x {size[1]}: "
@@ -245,7 +242,7 @@ def _unit(document: dict[str, Any], file: Path, nerfstudio: bool) -> float:
     """Metres per count: as stated in the file, or nerfstudio's millimetre."""
     for name in ("depth_unit_scale_factor", "integer_depth_scale"):
         if name in document:
-            unit = number_in(document, name, file, remedy=_REMEDY)
+            unit = json_data.number_in(document, name, file, remedy=_REMEDY)
             if not 1e-9 <= unit <= 1:
                 raise InputError(f"is {unit:g}", where=f"{file}: {name}", remedy="use metres")
             return unit

@@ -14,21 +14,16 @@ from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, RayTable, pi
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
-from tofuse.formats.files import read_head, read_npz
-from tofuse.formats.recordings import (
-    AMPLITUDE_KINDS,
-    MAX_SLOPE,
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import npz, reading
+from tofuse.formats.sources import (
     FileSource,
     Reader,
     ReaderOptions,
     Sniff,
-    check_timestamps,
-    checked_lens,
-    file_of,
-    finite_float32,
-    load_camera,
-    read_matrix_pose,
-    required_file,
+    inputs,
+    per_frame,
+    pixels,
 )
 
 MAX_BYTES = 1 << 30
@@ -48,9 +43,9 @@ class Npz(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        file = file_of(path, ".npz")
+        file = inputs.file_of(path, ".npz")
         try:
-            if file is not None and read_head(file, 2) == b"PK":
+            if file is not None and reading.read_head(file, 2) == b"PK":
                 with zipfile.ZipFile(file) as archive:
                     if "depth.npy" in archive.namelist():
                         return Sniff(1.0, "a NumPy archive with depth")
@@ -60,7 +55,7 @@ class Npz(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> NpzSource:
         """See `Reader.open`."""
-        return NpzSource(required_file(path, ".npz"), options)
+        return NpzSource(inputs.required_file(path, ".npz"), options)
 
 
 class NpzSource(FileSource):
@@ -80,7 +75,9 @@ class NpzSource(FileSource):
             )
         self.depth = depth
         self.kind = self._text(arrays, "depth_kind", "z", ("z", "range"))
-        self.amplitude_kind = self._text(arrays, "amplitude_kind", "raw", AMPLITUDE_KINDS)
+        self.amplitude_kind = self._text(
+            arrays, "amplitude_kind", "raw", camera_file.AMPLITUDE_KINDS
+        )
         self.camera, self.unit = self._read_camera(arrays, options)
         self.images = {
             name: self._images(arrays[name], name, ndim)
@@ -88,7 +85,7 @@ class NpzSource(FileSource):
             if name in arrays
         }
         super().__init__(self._times(arrays))
-        check_timestamps(self.timestamps, Path(f"{path}: timestamps"), self.warnings)
+        per_frame.check_timestamps(self.timestamps, Path(f"{path}: timestamps"), self.warnings)
         self.reference = self._poses(arrays, "reference")
         self.odometry = self._poses(arrays, "odometry")
         self.metadata |= {"depth_kind": self.kind}
@@ -107,7 +104,9 @@ class NpzSource(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         images = {
-            f"{name}_image": finite_float32(stack[index]) if name in _FLOATS else stack[index]
+            f"{name}_image": pixels.finite_float32(stack[index])
+            if name in _FLOATS
+            else stack[index]
             for name, stack in self.images.items()
         }
         return self.image(
@@ -129,7 +128,7 @@ class NpzSource(FileSource):
         height, width = self.depth.shape[1:]
         camera: Camera
         if options.camera is not None:
-            description, camera = load_camera(options.camera, (width, height))
+            description, camera = camera_file.load_camera(options.camera, (width, height))
             self.kind = description.depth_kind
             if self.depth.dtype.kind != "f":  # floats are in metres
                 unit = description.depth_unit_m
@@ -137,7 +136,7 @@ class NpzSource(FileSource):
             rays = self._floats(arrays, "rays")
             if rays.shape != (height, width, 2):
                 raise self._error("rays", f"has shape {rays.shape}", "save (H, W, 2), as depth")
-            rays[~(np.abs(rays) < MAX_SLOPE).all(-1)] = np.nan
+            rays[~(np.abs(rays) < camera_file.MAX_SLOPE).all(-1)] = np.nan
             try:
                 camera = RayTable(rays.astype(np.float32))
             except InputError as error:
@@ -175,7 +174,7 @@ class NpzSource(FileSource):
             )
         values |= dict(zip(order, distortion, strict=False))
         numbers = {name: float(value) for name, value in values.items()}
-        return checked_lens(MODELS[model], (width, height), numbers, f"{self.path}: K")
+        return camera_file.checked_lens(MODELS[model], (width, height), numbers, f"{self.path}: K")
 
     def _images(self, stack: NDArray[Any], name: str, ndim: int) -> NDArray[Any]:
         stack = stack[None] if stack.ndim == ndim - 1 else stack
@@ -206,7 +205,9 @@ class NpzSource(FileSource):
         if poses.shape != (len(self.depth), 4, 4):
             raise self._error(name, f"has shape {poses.shape}", "save (N, 4, 4) T_world_camera")
         where = f"{self.path}: {name}"
-        return np.stack([read_matrix_pose(T, f"{where}[{k}]") for k, T in enumerate(poses)])
+        return np.stack(
+            [per_frame.read_matrix_pose(T, f"{where}[{k}]") for k, T in enumerate(poses)]
+        )
 
     def _floats(self, arrays: dict[str, NDArray[Any]], name: str) -> Float64:
         if arrays[name].dtype.kind not in "fui":
@@ -234,4 +235,4 @@ class NpzSource(FileSource):
 
 def _load(path: Path) -> dict[str, NDArray[Any]]:
     """Read all arrays; reject an implausible decompressed size."""
-    return read_npz(path, limit=MAX_BYTES)
+    return npz.read_npz(path, limit=MAX_BYTES)

@@ -11,25 +11,10 @@ from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.frames import POSES_BY
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_with, if_file, is_file, is_folder
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import json_data, reading
 from tofuse.formats.images import first_size
-from tofuse.formats.recordings import (
-    CONFIDENCE_MAX,
-    PER_FRAME,
-    PhoneSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    arkit_pose,
-    cameras_of,
-    image_size,
-    number_in,
-    phone_lens,
-    poses_from_files,
-    read_json,
-    refuse_camera,
-    required,
-)
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, per_frame, phones
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 _LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and 255
@@ -42,50 +27,58 @@ class Polycam(Reader):
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         folder = _keyframes(path)
-        if is_folder(folder / "depth") and is_folder(folder / "cameras"):
+        if reading.is_folder(folder / "depth") and reading.is_folder(folder / "cameras"):
             return Sniff(1.0, f"{folder.name}/ with depth/ and cameras/")
         return None
 
-    def open(self, path: Path, options: ReaderOptions) -> PhoneSource:
+    def open(self, path: Path, options: ReaderOptions) -> phones.PhoneSource:
         """See `Reader.open`."""
-        refuse_camera(options, "polycam", PER_FRAME)
+        inputs.refuse_camera(options, "polycam", inputs.PER_FRAME)
         return PolycamSource(_keyframes(path))
 
 
-class PolycamSource(PhoneSource):
+class PolycamSource(phones.PhoneSource):
     """Frames with ARKit's intrinsics, and the poses optimised by Polycam, or else ARKit's."""
 
     def __init__(self, folder: Path) -> None:
-        files = files_with(folder / "depth", ".png") if is_folder(folder / "depth") else []
-        required(files, ".png files", folder / "depth", "export 'raw data' again")
+        files = (
+            reading.files_with(folder / "depth", ".png")
+            if reading.is_folder(folder / "depth")
+            else []
+        )
+        inputs.required(files, ".png files", folder / "depth", "export 'raw data' again")
         size = first_size(files)
         super().__init__(
             files,
             _times(files),
-            confidence=[if_file(folder / "confidence" / file.name) for file in files],
-            color=[if_file(folder / "images" / f"{file.stem}.jpg") for file in files],
+            confidence=[reading.if_file(folder / "confidence" / file.name) for file in files],
+            color=[reading.if_file(folder / "images" / f"{file.stem}.jpg") for file in files],
         )
         paths = [folder / "cameras" / f"{file.stem}.json" for file in files]
-        self.cameras = cameras_of(paths, lambda path: _lens(read_json(path), size, path))
+        self.cameras = per_frame.cameras_of(
+            paths, lambda path: _lens(json_data.read_json(path), size, path)
+        )
         self._read_poses(folder)
 
     def _read_poses(self, folder: Path) -> None:
         """Read Polycam's optimised poses, else ARKit's; never a mix, as they differ too much."""
         paths = [folder / "corrected_cameras" / f"{file.stem}.json" for file in self.files]
-        if any(is_file(path) for path in paths):
+        if any(reading.is_file(path) for path in paths):
             self.metadata[POSES_BY] = "Polycam"
         else:
             paths = [folder / "cameras" / path.name for path in paths]
-        self.reference = poses_from_files(self, paths, lambda path: _pose(read_json(path), path))
+        self.reference = per_frame.poses_from_files(
+            self, paths, lambda path: _pose(json_data.read_json(path), path)
+        )
 
     def read_confidence(self, path: Path, size: tuple[int, int]) -> UInt8:
         """See `PhoneSource.read_confidence`."""
         stored = super().read_confidence(path, size)
-        return np.round(stored * (CONFIDENCE_MAX / _LEVELS)).astype(np.uint8)
+        return np.round(stored * (phones.CONFIDENCE_MAX / _LEVELS)).astype(np.uint8)
 
 
 def _keyframes(path: Path) -> Path:
-    return path / "keyframes" if is_folder(path / "keyframes") else path
+    return path / "keyframes" if reading.is_folder(path / "keyframes") else path
 
 
 def _times(files: list[Path]) -> Float64:
@@ -100,14 +93,16 @@ def _lens(metadata: dict[str, Any], size: tuple[int, int], path: Path) -> Pinhol
         metadata, ("fx", "fy", "cx", "cy", "width", "height"), path
     )
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return phone_lens(K, image_size(width, height, f"{path}: width"), size, path)
+    return phones.phone_lens(K, camera_file.image_size(width, height, f"{path}: width"), size, path)
 
 
 def _pose(metadata: dict[str, Any], path: Path) -> Float64:
     table = np.eye(4)
     table[:3] = np.reshape(_numbers(metadata, _POSE, path), (3, 4))
-    return arkit_pose(table, str(path))
+    return phones.arkit_pose(table, str(path))
 
 
 def _numbers(metadata: dict[str, Any], names: tuple[str, ...] | list[str], path: Path) -> Float64:
-    return np.array([number_in(metadata, n, path, remedy="export 'raw data' again") for n in names])
+    return np.array(
+        [json_data.number_in(metadata, n, path, remedy="export 'raw data' again") for n in names]
+    )

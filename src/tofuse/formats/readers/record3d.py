@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import zipfile
 import zlib
@@ -17,35 +16,11 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
-from tofuse.formats.files import (
-    files_named,
-    input_error,
-    is_file,
-    is_folder,
-    read_bytes,
-    required_package,
-)
-from tofuse.formats.images import as_color, lzfse_decompress, parse_exr, parse_image
-from tofuse.formats.recordings import (
-    ARKIT_AXES,
-    CONFIDENCE_MAX,
-    PER_FRAME,
-    SENSOR,
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    begins_with,
-    file_of,
-    image_size,
-    number_in,
-    numbers_in,
-    phone_lens,
-    read_json,
-    refuse_camera,
-    required,
-    resized,
-)
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import json_data, reading
+from tofuse.formats.images import as_color, parse_exr, parse_image
+from tofuse.formats.readers.lzfse import lzfse_decompress
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, phones, pixels
 
 MAX_MEMBER_BYTES = 1 << 26
 _MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")
@@ -59,17 +34,17 @@ class Record3D(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        if is_folder(path):
-            if is_file(path / "metadata.json") and _numbered(path / "depth", _EXR):
+        if reading.is_folder(path):
+            if reading.is_file(path / "metadata.json") and _numbered(path / "depth", _EXR):
                 return Sniff(1.0, "metadata.json and depth/*.exr")
             return None
-        matches = begins_with(file_of(path, ".r3d"), b"PK\x03\x04")
+        matches = inputs.begins_with(inputs.file_of(path, ".r3d"), b"PK\x03\x04")
         return Sniff(1.0, "a .r3d archive") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> Record3DSource:
         """See `Reader.open`."""
-        refuse_camera(options, "record3d", PER_FRAME)
-        return Record3DSource(_Folder(path) if is_folder(path) else _Archive(path))
+        inputs.refuse_camera(options, "record3d", inputs.PER_FRAME)
+        return Record3DSource(_Folder(path) if reading.is_folder(path) else _Archive(path))
 
 
 class Record3DSource(FileSource):
@@ -99,9 +74,9 @@ class Record3DSource(FileSource):
             inside = numbers < len(poses)
             self.reference = np.full((len(numbers), 4, 4), np.nan)
             self.reference[inside] = poses[numbers[inside]]
-        self.metadata |= {"sensor": SENSOR, "depth_kind": "z", POSES_BY: "ARKit"}
+        self.metadata |= {"sensor": phones.SENSOR, "depth_kind": "z", POSES_BY: "ARKit"}
         if store.has_confidence:
-            self.metadata["confidence_max"] = CONFIDENCE_MAX
+            self.metadata["confidence_max"] = phones.CONFIDENCE_MAX
         else:
             self.warnings.append("the export contains no confidence")
 
@@ -116,7 +91,7 @@ class Record3DSource(FileSource):
         depth = self.store.depth(number, self.size)
         color = self.store.color(number)
         if color is not None:
-            color = resized(as_color(parse_image(*color)), self.size, color[1])
+            color = pixels.resized(as_color(parse_image(*color)), self.size, color[1])
         confidence = self.store.confidence(number, self.size)
         return self.image(index, depth, confidence_image=confidence, color_image=color)
 
@@ -131,14 +106,14 @@ class _Folder:
         self.where = path / "metadata.json"
         self.path = path
         self.files = _numbered(path / "depth", _EXR)
-        self.numbers = required(sorted(self.files), ".exr files", path / "depth", _REMEDY)
+        self.numbers = inputs.required(sorted(self.files), ".exr files", path / "depth", _REMEDY)
 
     def metadata(self) -> dict[str, Any]:
-        return read_json(self.where)
+        return json_data.read_json(self.where)
 
     def depth(self, number: int, size: tuple[int, int]) -> Float32:
         path = self.files[number]
-        channels = parse_exr(read_bytes(path, limit=MAX_MEMBER_BYTES), path)
+        channels = parse_exr(reading.read_bytes(path, limit=MAX_MEMBER_BYTES), path)
         # A grey image has one channel, of any name.
         depth = next((channels[n] for n in ("R", "Z", "Y") if n in channels), None)
         if depth is None:
@@ -151,8 +126,8 @@ class _Folder:
     def color(self, number: int) -> tuple[bytes, Path] | None:
         for suffix in (".jpg", ".png"):
             path = self.path / "rgb" / f"{number}{suffix}"
-            if is_file(path):
-                return read_bytes(path, limit=MAX_MEMBER_BYTES), path
+            if reading.is_file(path):
+                return reading.read_bytes(path, limit=MAX_MEMBER_BYTES), path
         return None
 
 
@@ -164,12 +139,12 @@ class _Archive:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.where = Path(f"{path}: metadata")
-        required_package("lzfse", "phones", path)
+        reading.required_package("lzfse", "phones", path)
         try:
             self.archive = zipfile.ZipFile(path)
             self.names = set(self.archive.namelist())
         except OSError as error:
-            raise input_error(error, path) from error
+            raise reading.input_error(error, path) from error
         except (zipfile.BadZipFile, ValueError, NotImplementedError, RuntimeError) as error:
             raise InputError(
                 f"is a damaged archive ({error})", where=path, remedy="copy the file again"
@@ -181,13 +156,7 @@ class _Archive:
         self.has_confidence = f"rgbd/{self.numbers[0]}.conf" in self.names
 
     def metadata(self) -> dict[str, Any]:
-        try:
-            data = json.loads(self._member("metadata"))
-        except (ValueError, RecursionError) as error:
-            raise InputError("is invalid JSON", where=self.where, remedy="export again") from error
-        if not isinstance(data, dict):
-            raise InputError("is not a JSON object", where=self.where, remedy="export it again")
-        return data
+        return json_data.parse_json(self._member("metadata"), self.where, _REMEDY)
 
     def depth(self, number: int, size: tuple[int, int]) -> Float32:
         name = f"rgbd/{number}.depth"
@@ -220,7 +189,7 @@ class _Archive:
         except KeyError as error:
             raise InputError("is missing", where=where, remedy="export it again") from error
         except OSError as error:
-            raise input_error(error, where) from error
+            raise reading.input_error(error, where) from error
         except (
             zipfile.BadZipFile,
             zlib.error,
@@ -245,12 +214,12 @@ class _Metadata:
         """Return (width, height) of depth; `default` for older versions, which don't state it."""
         if default is not None and not ("dw" in self.data and "dh" in self.data):
             return default
-        return image_size(self._number("dw"), self._number("dh"), f"{self.where}: dw")
+        return camera_file.image_size(self._number("dw"), self._number("dh"), f"{self.where}: dw")
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
-        K = numbers_in(self.data, "K", self.where, (3, 3), _REMEDY).T
-        full_size = image_size(self._number("w"), self._number("h"), f"{self.where}: w")
-        return phone_lens(K, full_size, size, f"{self.where}: K")
+        K = json_data.numbers_in(self.data, "K", self.where, (3, 3), _REMEDY).T
+        full_size = camera_file.image_size(self._number("w"), self._number("h"), f"{self.where}: w")
+        return phones.phone_lens(K, full_size, size, f"{self.where}: K")
 
     def frame_rate(self) -> float:
         rate = self._number("fps", 60.0)
@@ -260,26 +229,26 @@ class _Metadata:
         """Return the timestamps in s of all frames, or None if they aren't given."""
         if "frameTimestamps" not in self.data:
             return None
-        times = numbers_in(self.data, "frameTimestamps", self.where, (-1,), _REMEDY)
+        times = json_data.numbers_in(self.data, "frameTimestamps", self.where, (-1,), _REMEDY)
         return times if len(times) else None
 
     def poses(self) -> Float64 | None:
         """T_world_camera (N, 4, 4) of all frames, NaN where tracking was lost; or None."""
         if "poses" not in self.data:
             return None
-        table = numbers_in(self.data, "poses", self.where, (-1, 7), _REMEDY, finite=False)
+        table = json_data.numbers_in(self.data, "poses", self.where, (-1, 7), _REMEDY, finite=False)
         norms = quaternion.length(table[:, :4])
         valid = (np.abs(norms - 1) < 0.01) & (np.abs(table[:, 4:]) < 1e6).all(1)
         poses = np.full((len(table), 4, 4), np.nan)
         poses[valid] = quaternion.to_pose(table[valid, :4], table[valid, 4:])
-        return poses @ ARKIT_AXES
+        return poses @ phones.ARKIT_AXES
 
     def _number(self, field: str, default: float | None = None) -> float:
-        return number_in(self.data, field, self.where, default, _REMEDY)
+        return json_data.number_in(self.data, field, self.where, default, _REMEDY)
 
 
 def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
-    return {int(file.stem): file for file in files_named(folder, pattern.fullmatch)}
+    return {int(file.stem): file for file in reading.files_named(folder, pattern.fullmatch)}
 
 
 def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float32:

@@ -11,22 +11,11 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_with, is_file, is_folder, read_text
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import json_data, reading
 from tofuse.formats.images import first_size
 from tofuse.formats.poses import read_poses
-from tofuse.formats.recordings import (
-    UNCERTAIN,
-    DepthImageSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    checked_pinhole,
-    image_size,
-    number_in,
-    numbers_in,
-    read_json,
-    required,
-)
+from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs
 
 # Open3D's PinholeCameraIntrinsicParameters.PrimeSenseDefault.
 SENSOR, SIZE = "PrimeSense (structured light)", (640, 480)
@@ -42,27 +31,29 @@ class Redwood(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        if not is_folder(path / "depth") or is_file(path / "depth.txt"):
+        if not reading.is_folder(path / "depth") or reading.is_file(path / "depth.txt"):
             return None
-        color = next((n for n in _COLOR_FOLDERS if is_folder(path / n)), None)
+        color = next((n for n in _COLOR_FOLDERS if reading.is_folder(path / n)), None)
         if color is None:
             return None
         camera = _camera_file(path)
         if camera is not None:
             return Sniff(1.0, f"depth/, {color}/ and {camera.name}")
-        if is_file(path / "trajectory.log"):
+        if reading.is_file(path / "trajectory.log"):
             return Sniff(1.0, f"depth/, {color}/ and trajectory.log")
-        if is_file(path / "camera.json"):
+        if reading.is_file(path / "camera.json"):
             return None
         return Sniff(
-            UNCERTAIN,
+            Sniff.UNCERTAIN,
             f"depth/ and {color}/ but no camera",
             "use --format redwood (a PrimeSense camera, millimetres), with --camera for another",
         )
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = required(files_with(path / "depth", ".png"), ".png files", path / "depth")
+        files = inputs.required(
+            reading.files_with(path / "depth", ".png"), ".png files", path / "depth"
+        )
         warnings: list[str] = []
         camera: Pinhole | None = None
         if options.camera is None:
@@ -83,18 +74,18 @@ class Redwood(Reader):
             options=options,
         )
         source.warnings += warnings
-        if is_file(path / "trajectory.log"):
+        if reading.is_file(path / "trajectory.log"):
             source.reference = _poses(path / "trajectory.log", len(files))
-        if is_file(path / "odometry.log"):
+        if reading.is_file(path / "odometry.log"):
             source.odometry = _poses(path / "odometry.log", len(files))
         return source
 
 
 def _camera_file(path: Path) -> Path | None:
     """The .json with an intrinsic_matrix, if there is one; InputError if several differ."""
-    files = [f for f in files_with(path, ".json") if is_file(f)]
-    cameras = [f for f in files if "intrinsic_matrix" in read_text(f)]
-    if len({read_text(f) for f in cameras}) > 1:
+    files = [f for f in reading.files_with(path, ".json") if reading.is_file(f)]
+    cameras = [f for f in files if "intrinsic_matrix" in reading.read_text(f)]
+    if len({reading.read_text(f) for f in cameras}) > 1:
         raise InputError(
             f"has several cameras: {', '.join(f.name for f in cameras)}",
             where=path,
@@ -104,11 +95,13 @@ def _camera_file(path: Path) -> Path | None:
 
 
 def _read_intrinsics(path: Path) -> Pinhole:
-    data = read_json(path)
+    data = json_data.read_json(path)
     remedy = "write it as Open3D does, column by column"
-    K = numbers_in(data, "intrinsic_matrix", path, (3, 3), remedy).T
-    width, height = (number_in(data, name, path, remedy=remedy) for name in ("width", "height"))
-    return checked_pinhole(K, image_size(width, height, path), path)
+    K = json_data.numbers_in(data, "intrinsic_matrix", path, (3, 3), remedy).T
+    width, height = (
+        json_data.number_in(data, name, path, remedy=remedy) for name in ("width", "height")
+    )
+    return camera_file.checked_pinhole(K, camera_file.image_size(width, height, path), path)
 
 
 def _timestamps(files: list[Path]) -> Float64:
@@ -121,10 +114,10 @@ def _timestamps(files: list[Path]) -> Float64:
 
 
 def _color_files(path: Path, files: list[Path], warnings: list[str]) -> list[Path | None] | None:
-    folder = next((path / n for n in _COLOR_FOLDERS if is_folder(path / n)), None)
+    folder = next((path / n for n in _COLOR_FOLDERS if reading.is_folder(path / n)), None)
     if folder is None:
         return None
-    color = files_with(folder, ".png", ".jpg", ".jpeg")
+    color = reading.files_with(folder, ".png", ".jpg", ".jpeg")
     if len(color) == len(files):
         return list(color)
     numbered = {number: file for file in color if (number := _number(file)) is not None}

@@ -12,34 +12,9 @@ from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.parts import part
-from tofuse.formats.recordings import (
-    COLORS,
-    ENCODINGS,
-    GREY,
-    MAX_GAP_S,
-    REMEDY,
-    SAMPLES,
-    BagSource,
-    ColorCamera,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    Track,
-    Transforms,
-    bag_kind,
-    check_size,
-    cloud,
-    cloud_frame,
-    color_image,
-    common_camera,
-    decompressed,
-    decompressed_color,
-    frame_name,
-    image,
-    lens,
-    library_errors,
-    organised_frame,
-)
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, bags, cloud_frames, organised
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -55,7 +30,7 @@ class Ros(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        kind = bag_kind(path)
+        kind = bags.bag_kind(path)
         if kind is None:
             return None
         return Sniff(0.95, "metadata.yaml and a bag" if kind == "folder" else "a bag")
@@ -65,7 +40,7 @@ class Ros(Reader):
         return RosSource(path, options)
 
 
-class RosSource(BagSource):
+class RosSource(bags.BagSource):
     """Messages of the chosen topic, or of the one most likely to contain depth.
 
     Attributes
@@ -80,7 +55,7 @@ class RosSource(BagSource):
     def find_streams(self, options: ReaderOptions) -> None:
         """See `BagSource.find_streams`."""
         self.connection = self._choose(options.topic)
-        self.depth = Track(self.bag, self.connection)
+        self.depth = bags.Track(self.bag, self.connection)
         if not len(self.depth):
             raise InputError(f"has no message of {self.connection.topic}", where=self.path)
         self.set_timestamps()
@@ -91,7 +66,7 @@ class RosSource(BagSource):
             self._find_color(transforms)
             self.metadata["depth_kind"] = self.kind
             if self.connection.msgtype == IMAGE:
-                kind = np.dtype(ENCODINGS[self._encoding(self.connection)]).kind
+                kind = np.dtype(bags.ENCODINGS[self._encoding(self.connection)]).kind
                 self.metadata["depth_unit_m"] = self._unit(kind)
         else:
             if options.camera is not None:
@@ -116,22 +91,28 @@ class RosSource(BagSource):
         """See `BagSource.read_frame`."""
         if self.connection.msgtype != CLOUD:
             return super().read_frame(index, where)
-        content, time = cloud(self.depth.message(index), where), float(self.timestamps[index])
+        content, time = bags.cloud(self.depth.message(index), where), float(self.timestamps[index])
         if self.raster is None:
-            return cloud_frame(index, time, content.points, amplitude=content.amplitude)
+            return cloud_frames.cloud_frame(
+                index, time, content.points, amplitude=content.amplitude
+            )
         points = content.points.reshape(content.height, content.width, 3)
-        return organised_frame(points, self.raster, index, time, where, amplitude=content.amplitude)
+        return organised.organised_frame(
+            points, self.raster, index, time, where, amplitude=content.amplitude
+        )
 
     def read_depth(self, index: int, where: str) -> Float32:
         """See `BagSource.read_depth`."""
-        decode = decompressed if self.connection.msgtype == COMPRESSED else image
+        decode = bags.decompressed if self.connection.msgtype == COMPRESSED else bags.image
         counts = decode(self.depth.message(index), where)
-        check_size(counts, self.camera, where)
+        camera_file.check_size(counts, self.camera, where)
         return depth_counts.depth_from_numbers(counts, self._unit(counts.dtype.kind))
 
-    def read_color(self, track: Track, index: int, where: str) -> UInt8:
+    def read_color(self, track: bags.Track, index: int, where: str) -> UInt8:
         """See `BagSource.read_color`."""
-        decode = decompressed_color if track.connection.msgtype == COMPRESSED else color_image
+        decode = (
+            bags.decompressed_color if track.connection.msgtype == COMPRESSED else bags.color_image
+        )
         return decode(track.message(index), where)
 
     def _candidates(self) -> list[Any]:
@@ -153,7 +134,7 @@ class RosSource(BagSource):
                 remedy="choose one of these with --topic",
             )
         for connection in self._candidates():
-            if connection.msgtype != IMAGE or self._encoding(connection) in ENCODINGS:
+            if connection.msgtype != IMAGE or self._encoding(connection) in bags.ENCODINGS:
                 return connection
         raise InputError(
             f"has no topic of depth images or clouds (there are: {topics[:300] or 'none'})",
@@ -193,24 +174,24 @@ class RosSource(BagSource):
             if c.msgtype == INFO and c.topic.rsplit("/", 1)[0] in (folder, folder.rsplit("/", 1)[0])
         ]
 
-    def _transforms(self) -> Transforms:
+    def _transforms(self) -> bags.Transforms:
         try:
-            with library_errors(self.path, REMEDY):
-                return Transforms.read(self.bag)
+            with reading.library_errors(self.path, bags.REMEDY):
+                return bags.Transforms.read(self.bag)
         except InputError as error:
             self.warnings.append(f"tf is ignored: {error}")
-            return Transforms({})
+            return bags.Transforms({})
 
-    def _frame_of(self, track: Track) -> str:
+    def _frame_of(self, track: bags.Track) -> str:
         """Name of the tf frame of the messages."""
-        return frame_name(track.message(0).header.frame_id)
+        return bags.frame_name(track.message(0).header.frame_id)
 
-    def _read_poses(self, transforms: Transforms) -> None:
+    def _read_poses(self, transforms: bags.Transforms) -> None:
         """Read the poses of the depth camera from tf."""
         if not transforms:
             return
         try:
-            with library_errors(self.where(0), REMEDY):
+            with reading.library_errors(self.where(0), bags.REMEDY):
                 frame = self._frame_of(self.depth)
         except InputError as error:  # affects only this frame
             self.warnings.append(f"tf is ignored: {error}")
@@ -226,14 +207,14 @@ class RosSource(BagSource):
             if np.isfinite(poses).any():
                 self.reference = poses
 
-    def _find_color(self, transforms: Transforms) -> None:
+    def _find_color(self, transforms: bags.Transforms) -> None:
         """Find a colour camera with known intrinsics and pose relative to depth."""
         missing: list[str] = []
         for connection in sorted(self.bag.connections, key=lambda c: (c.msgtype, c.topic)):
-            if not self._is_color(connection) or not len(track := Track(self.bag, connection)):
+            if not self._is_color(connection) or not len(track := bags.Track(self.bag, connection)):
                 continue
             try:
-                with library_errors(self.path, REMEDY):
+                with reading.library_errors(self.path, bags.REMEDY):
                     found = self._relate_color(track, transforms)
             except InputError as error:
                 missing.append(f"{connection.topic} ({error.problem})")
@@ -248,7 +229,7 @@ class RosSource(BagSource):
                 "(its camera_info, and tf_static between the two cameras)"
             )
 
-    def _relate_color(self, track: Track, transforms: Transforms) -> bool:
+    def _relate_color(self, track: bags.Track, transforms: bags.Transforms) -> bool:
         """Use a colour camera, if its intrinsics and pose relative to depth are known."""
         topic = track.connection.topic
         first = self.read_color(track, 0, f"{self.path}: {topic}")
@@ -260,7 +241,7 @@ class RosSource(BagSource):
         if not (same_size and (registered or depth_frame == color_frame)):
             if T is None or not infos:
                 return False
-            self.color_camera = ColorCamera(self._lens_of(infos[0]), T)
+            self.color_camera = camera_file.ColorCamera(self._lens_of(infos[0]), T)
         self.color = track
         return True
 
@@ -270,27 +251,27 @@ class RosSource(BagSource):
             return False
         if connection.msgtype == COMPRESSED:
             return True
-        return connection.msgtype == IMAGE and self._encoding(connection).lower() in COLORS
+        return connection.msgtype == IMAGE and self._encoding(connection).lower() in bags.COLORS
 
     def _lens_of(self, info: Any) -> Pinhole:
         where = f"{self.path}: {info.topic}"
         for _, _, raw in self.bag.messages(connections=[info]):
-            return lens(self.bag.deserialize(raw, info.msgtype), where)
+            return bags.lens(self.bag.deserialize(raw, info.msgtype), where)
         raise InputError("has no message", where=where, remedy="use --camera camera.json")
 
-    def _find_amplitude(self) -> Track | None:
+    def _find_amplitude(self) -> bags.Track | None:
         """The amplitude track of the same sensor: its images match the depth's size and times."""
         for connection in sorted(self.bag.connections, key=lambda c: c.topic):
             is_named = any(keyword in connection.topic.lower() for keyword in _AMPLITUDE_KEYWORDS)
             if connection.msgtype != IMAGE or connection.topic == self.connection.topic:
                 continue
-            if not is_named or self._encoding(connection) not in GREY:
+            if not is_named or self._encoding(connection) not in bags.GREY:
                 continue
-            track = Track(self.bag, connection)
+            track = bags.Track(self.bag, connection)
             first = track.message(0)
             if (first.height, first.width) != (self.camera.height, self.camera.width):
                 continue
-            has_match = [track.nearest(t, MAX_GAP_S) is not None for t in self.timestamps]
+            has_match = [track.nearest(t, bags.MAX_GAP_S) is not None for t in self.timestamps]
             if sum(has_match) > 0.5 * len(has_match):
                 self.metadata["amplitude_topic"] = connection.topic
                 return track
@@ -303,16 +284,16 @@ class RosSource(BagSource):
     def _organised(self) -> Camera | None:
         """The camera of organised clouds, if they are in x right, y down, z forward; else None."""
         images = []
-        step = max(1, len(self.depth) // SAMPLES)
-        for k in range(0, len(self.depth), step)[:SAMPLES]:
+        step = max(1, len(self.depth) // organised.SAMPLES)
+        for k in range(0, len(self.depth), step)[: organised.SAMPLES]:
             try:
-                content = cloud(self.depth.message(k), self.where(k))
+                content = bags.cloud(self.depth.message(k), self.where(k))
             except InputError:
                 continue
             if min(content.width, content.height) < 2:
                 return None
             images.append(content.points.reshape(content.height, content.width, 3))
-        return common_camera(images)
+        return organised.common_camera(images)
 
 
 def _rank(connection: Any) -> int | None:

@@ -13,24 +13,9 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_named, if_file, is_file
+from tofuse.formats.files import json_data, reading
 from tofuse.formats.images import first_size
-from tofuse.formats.recordings import (
-    IMAGE_SIZE,
-    PER_FRAME,
-    PhoneSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    arkit_pose,
-    interpolated,
-    numbers_in,
-    phone_lens,
-    poses_of,
-    read_json,
-    refuse_camera,
-    required,
-)
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, per_frame, phones
 
 _DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
 _REMEDY = "export the recording again"
@@ -42,22 +27,22 @@ class ScannerApp(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        files = files_named(path, _DEPTH.fullmatch)
-        if any(is_file(_file_of_frame(file, "frame", ".json")) for file in files[:9]):
+        files = reading.files_named(path, _DEPTH.fullmatch)
+        if any(reading.is_file(_file_of_frame(file, "frame", ".json")) for file in files[:9]):
             return Sniff(1.0, f"{len(files)} depth_*.png with frame_*.json")
         return None
 
-    def open(self, path: Path, options: ReaderOptions) -> PhoneSource:
+    def open(self, path: Path, options: ReaderOptions) -> phones.PhoneSource:
         """See `Reader.open`."""
-        refuse_camera(options, "3dscannerapp", PER_FRAME)
-        files = files_named(path, _DEPTH.fullmatch)
-        required(files, "depth_*.png", path, "export with all data")
+        inputs.refuse_camera(options, "3dscannerapp", inputs.PER_FRAME)
+        files = reading.files_named(path, _DEPTH.fullmatch)
+        inputs.required(files, "depth_*.png", path, "export with all data")
         size = first_size(files)
-        source = PhoneSource(
+        source = phones.PhoneSource(
             files,
             np.full(len(files), np.nan),
-            confidence=[if_file(_file_of_frame(file, "conf", ".png")) for file in files],
-            color=[if_file(_file_of_frame(file, "frame", ".jpg")) for file in files],
+            confidence=[reading.if_file(_file_of_frame(file, "conf", ".png")) for file in files],
+            color=[reading.if_file(_file_of_frame(file, "frame", ".jpg")) for file in files],
         )
         entries: list[_FrameMetadata | None] = []
         for k, file in enumerate(files):
@@ -73,8 +58,8 @@ class ScannerApp(Reader):
             entries.append(entry)
         if not np.isfinite(source.timestamps).any():
             raise next(c for c in source.cameras if isinstance(c, InputError))
-        source.timestamps = interpolated(source.timestamps)
-        source.reference = poses_of(
+        source.timestamps = per_frame.interpolated(source.timestamps)
+        source.reference = per_frame.poses_of(
             source, entries, lambda entry: None if entry is None else entry.pose()
         )
         return source
@@ -90,26 +75,28 @@ class _FrameMetadata:
 
     @classmethod
     def read(cls, path: Path) -> _FrameMetadata:
-        data = read_json(path)
-        return cls(path, data, float(numbers_in(data, "time", path, (1,), _REMEDY)[0]))
+        data = json_data.read_json(path)
+        return cls(path, data, float(json_data.numbers_in(data, "time", path, (1,), _REMEDY)[0]))
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
-        K = numbers_in(self.data, "intrinsics", self.path, (3, 3), _REMEDY)
-        image = IMAGE_SIZE
+        K = json_data.numbers_in(self.data, "intrinsics", self.path, (3, 3), _REMEDY)
+        image = phones.IMAGE_SIZE
         if "projectionMatrix" in self.data:
             # Its diagonal is 2 * focal length / image size.
-            P = numbers_in(self.data, "projectionMatrix", self.path, (4, 4), _REMEDY)
+            P = json_data.numbers_in(self.data, "projectionMatrix", self.path, (4, 4), _REMEDY)
             with np.errstate(all="ignore"):
                 width, height = 2 * np.diag(K)[:2] / np.diag(P)[:2]
             if 100 < width < 16384 and 100 < height < 16384:
                 image = (round(float(width)), round(float(height)))
-        return phone_lens(K, image, size, f"{self.path}: intrinsics")
+        return phones.phone_lens(K, image, size, f"{self.path}: intrinsics")
 
     def pose(self) -> Float64 | None:
         if "cameraPoseARFrame" not in self.data:
             return None
-        table = numbers_in(self.data, "cameraPoseARFrame", self.path, (4, 4), _REMEDY, finite=False)
-        return arkit_pose(table, f"{self.path}: cameraPoseARFrame")
+        table = json_data.numbers_in(
+            self.data, "cameraPoseARFrame", self.path, (4, 4), _REMEDY, finite=False
+        )
+        return phones.arkit_pose(table, f"{self.path}: cameraPoseARFrame")
 
 
 def _file_of_frame(file: Path, name: str, suffix: str) -> Path:

@@ -16,26 +16,16 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
-from tofuse.formats.files import read_head, required_package
-from tofuse.formats.recordings import (
-    CloudFileSource,
+from tofuse.formats.files import reading
+from tofuse.formats.sources import (
     FileSource,
     Reader,
     ReaderOptions,
     Sniff,
-    begins_with,
-    cloud_frame,
-    file_of,
-    find_shift,
-    library_errors,
-    map_shift,
-    note_shift,
-    poses_of,
-    read_matrix_pose,
-    refuse_camera,
-    required_file,
-    required_files,
-    sniff_clouds,
+    cloud_frames,
+    cloud_sequence,
+    inputs,
+    per_frame,
 )
 
 MAX_POINTS = 100_000_000
@@ -45,31 +35,29 @@ _COPY = "copy the file again, or export it again"
 
 
 @part("reader", "las")
-class LasScans(Reader):
+class LasScans(cloud_sequence.CloudReader):
     """A .las or .laz file, or a folder of them; metres (extra `scan`)."""
 
-    def sniff(self, path: Path) -> Sniff | None:
-        """See `Reader.sniff`."""
-        return sniff_clouds(path, ".las", ".laz")
+    suffixes = (".las", ".laz")
 
-    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
-        """See `Reader.open`."""
-        refuse_camera(options, "las")
-        files = required_files(path, ".las", ".laz")
+    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+        """See `CloudReader.source`."""
         shift = _shift(files[0])
-        source = CloudFileSource(path, files, lambda f, k, t: _las_frame(f, k, t, shift))
-        note_shift(source, path, shift)
+        source = cloud_sequence.CloudFileSource(
+            path, files, lambda f, k, t: _las_frame(f, k, t, shift)
+        )
+        cloud_sequence.note_shift(source, path, shift)
         return source
 
 
 def _las_header(path: Path) -> Any:
     import laspy
 
-    head = read_head(path, 375)
+    head = reading.read_head(path, 375)
     if head[:4] != b"LASF":
         raise InputError("isn't a LAS file", where=path, remedy="check the file")
     _check_records(head, path)
-    with library_errors(path, _COPY), laspy.open(path) as file:
+    with reading.library_errors(path, _COPY), laspy.open(path) as file:
         header = file.header
     count, size = int(header.point_count), int(header.point_format.size)
     file_size = path.stat().st_size
@@ -81,7 +69,7 @@ def _las_header(path: Path) -> Any:
             remedy=_COPY,
         )
     if compressed and count:
-        with library_errors(path, _COPY):
+        with reading.library_errors(path, _COPY):
             _check_chunks(path, header)
     return header
 
@@ -153,7 +141,7 @@ def _shift(path: Path) -> Float64:
     low, high = np.asarray(header.mins, float), np.asarray(header.maxs, float)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return np.zeros(3)
-    return map_shift(low, high)
+    return cloud_sequence.map_shift(low, high)
 
 
 def read_las(path: Path) -> Any:
@@ -167,13 +155,13 @@ def read_las(path: Path) -> Any:
     import laspy
 
     _las_header(path)
-    with library_errors(path, _COPY):
+    with reading.library_errors(path, _COPY):
         return laspy.read(path)
 
 
 def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> CloudFrame:
     points = read_las(path)
-    with library_errors(path, _COPY):
+    with reading.library_errors(path, _COPY):
         xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1)
         names = set(points.point_format.dimension_names)
         amplitude = np.asarray(points["intensity"], np.float32)
@@ -182,7 +170,7 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
             values = np.stack([np.asarray(points[c]) for c in ("red", "green", "blue")], 1)
             # The standard uses 16 bits; many programs write 8-bit values.
             color = (values >> 8 if values.max(initial=0) > 255 else values).astype(np.uint8)
-    return cloud_frame(
+    return cloud_frames.cloud_frame(
         index,
         timestamp,
         xyz,
@@ -198,12 +186,16 @@ class E57Scans(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        return Sniff(1.0, "an E57 file") if begins_with(file_of(path, ".e57"), _E57) else None
+        return (
+            Sniff(1.0, "an E57 file")
+            if inputs.begins_with(inputs.file_of(path, ".e57"), _E57)
+            else None
+        )
 
     def open(self, path: Path, options: ReaderOptions) -> E57Source:
         """See `Reader.open`."""
-        refuse_camera(options, "e57")
-        return E57Source(required_file(path, ".e57"))
+        inputs.refuse_camera(options, "e57")
+        return E57Source(inputs.required_file(path, ".e57"))
 
 
 class E57Source(FileSource):
@@ -211,10 +203,10 @@ class E57Source(FileSource):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if read_head(path, 8) != _E57:
+        if reading.read_head(path, 8) != _E57:
             raise InputError("isn't an E57 file", where=path, remedy="check the file")
-        self._pye57 = required_package("pye57", "scan", path)
-        with library_errors(path, _COPY), closing(self._pye57.E57(str(path))) as file:
+        self._pye57 = reading.required_package("pye57", "scan", path)
+        with reading.library_errors(path, _COPY), closing(self._pye57.E57(str(path))) as file:
             headers = [file.get_header(k) for k in range(file.scan_count)]
             self.counts = [int(header.point_count) for header in headers]
             poses = [self._pose(header) for header in headers]
@@ -223,12 +215,14 @@ class E57Source(FileSource):
                 "contains no scan", where=path, remedy="export scans, not only pictures"
             )
         super().__init__(np.arange(len(self.counts), dtype=float))
-        self.reference = poses_of(
-            self, range(len(poses)), lambda k: read_matrix_pose(poses[k], f"{path}: scan {k}")
+        self.reference = per_frame.poses_of(
+            self,
+            range(len(poses)),
+            lambda k: per_frame.read_matrix_pose(poses[k], f"{path}: scan {k}"),
         )
         read_unshifted = partial(self._read, shift=np.zeros(3))
-        self._shift, self._cached = find_shift(read_unshifted, len(self.counts))
-        note_shift(self, path, self._shift)
+        self._shift, self._cached = cloud_sequence.find_shift(read_unshifted, len(self.counts))
+        cloud_sequence.note_shift(self, path, self._shift)
 
     def load(self, index: int) -> CloudFrame:
         """See `FileSource.load`."""
@@ -243,7 +237,7 @@ class E57Source(FileSource):
                 where=where,
                 remedy="export the scan with fewer points",
             )
-        with library_errors(where, _COPY), closing(self._pye57.E57(str(self.path))) as file:
+        with reading.library_errors(where, _COPY), closing(self._pye57.E57(str(self.path))) as file:
             data = file.read_scan(
                 index, intensity=True, colors=True, ignore_missing_fields=True, transform=False
             )
@@ -253,7 +247,7 @@ class E57Source(FileSource):
             color = np.stack([np.asarray(data[f"color{c}"]) for c in ("Red", "Green", "Blue")], 1)
             color = color.astype(np.uint8)
         amplitude = data.get("intensity")
-        return cloud_frame(
+        return cloud_frames.cloud_frame(
             index,
             float(index),
             points,

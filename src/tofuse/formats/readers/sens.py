@@ -16,23 +16,17 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.formats.files import input_error
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading
 from tofuse.formats.images import as_color, parse_image
-from tofuse.formats.recordings import (
-    ColorCamera,
+from tofuse.formats.sources import (
     FileSource,
     Reader,
     ReaderOptions,
     Sniff,
-    begins_with,
-    check_timestamps,
-    checked_pinhole,
-    file_of,
-    poses_of,
-    read_matrix_pose,
-    read_part,
-    required_file,
-    sampled_color,
+    inputs,
+    per_frame,
+    pixels,
 )
 
 VERSION = 4
@@ -52,12 +46,12 @@ class Sens(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        matches = begins_with(file_of(path, ".sens"), struct.pack("<I", VERSION))
+        matches = inputs.begins_with(inputs.file_of(path, ".sens"), struct.pack("<I", VERSION))
         return Sniff(1.0, "a .sens file") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> SensSource:
         """See `Reader.open`."""
-        return SensSource(required_file(path, ".sens"), options)
+        return SensSource(inputs.required_file(path, ".sens"), options)
 
 
 @dataclass(frozen=True)
@@ -75,27 +69,24 @@ class SensSource(FileSource):
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.path = path
         super().__init__(np.zeros(0))
-        try:
-            with path.open("rb") as file:
-                self._size = file.seek(0, 2)
-                file.seek(0)
-                count = self._read_header(file)
-                frames = list(self._locate_frames(file, count))
-        except OSError as error:
-            raise input_error(error, path) from error
+        with reading.readable(path), path.open("rb") as file:
+            self._size = file.seek(0, 2)
+            file.seek(0)
+            count = self._read_header(file)
+            frames = list(self._locate_frames(file, count))
         if not frames:
             raise self._error("contains no complete frame", "copy the file again")
         self.entries = [entry for entry, _, _ in frames]
         times = np.array([time for _, time, _ in frames]) / _TIMES_PER_S
         self.timestamps = times if times.any() else np.arange(len(frames)) / _RATE_HZ
-        check_timestamps(self.timestamps, path, self.warnings)
+        per_frame.check_timestamps(self.timestamps, path, self.warnings)
         if len(frames) < count:
             self.warnings.append(f"{path}: cut off after {len(frames)} of {count} frames")
         # The format stores minus infinity where tracking was lost.
-        self.reference = poses_of(
+        self.reference = per_frame.poses_of(
             self,
             range(len(frames)),
-            lambda k: read_matrix_pose(frames[k][2], f"{path}: pose of frame {k}"),
+            lambda k: per_frame.read_matrix_pose(frames[k][2], f"{path}: pose of frame {k}"),
         )
         if options.camera is not None:
             self.use_camera(options.camera, self.depth_size)
@@ -109,7 +100,7 @@ class SensSource(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         entry, where = self.entries[index], f"{self.path}: frame {index}"
-        data = read_part(self.path, entry.start, entry.color + entry.depth)
+        data = reading.read_part(self.path, entry.start, entry.color + entry.depth)
         packed_color, packed_depth = data[: entry.color], data[entry.color :]
         counts = self._depth(packed_depth, where)
         frame = self.image(index, depth_counts.depth_from_counts(counts, self.unit))
@@ -117,7 +108,9 @@ class SensSource(FileSource):
             return frame
         where = f"{where}: colour"
         image = self._color(packed_color, where)
-        return replace(frame, color_image=sampled_color(frame, image, self.color_camera, where))
+        return replace(
+            frame, color_image=pixels.sampled_color(frame, image, self.color_camera, where)
+        )
 
     def _read_header(self, file: BinaryIO) -> int:
         version, length = struct.unpack("<IQ", self._take(file, 12))
@@ -139,10 +132,12 @@ class SensSource(FileSource):
             raise self._error(f"has {counts_per_metre} counts to a metre", "export it again")
         self.unit = 1.0 / counts_per_metre
         color_lens, T_device_color, depth_lens, T_device_depth = matrices
-        self.camera = checked_pinhole(depth_lens, self.depth_size, f"{self.path}: depth lens")
+        self.camera = camera_file.checked_pinhole(
+            depth_lens, self.depth_size, f"{self.path}: depth lens"
+        )
         if all(1 < side <= _MAX_SIDE for side in color_size) and self.color_packing in _COLORS:
-            self.color_camera = ColorCamera(
-                checked_pinhole(color_lens, color_size, f"{self.path}: color lens"),
+            self.color_camera = camera_file.ColorCamera(
+                camera_file.checked_pinhole(color_lens, color_size, f"{self.path}: color lens"),
                 self._T_color_depth(T_device_color, T_device_depth),
             )
         return count
@@ -151,7 +146,7 @@ class SensSource(FileSource):
         """T_color_depth (4, 4); identity if not given."""
         try:
             poses = [
-                read_matrix_pose(T, f"{self.path}: extrinsics")
+                per_frame.read_matrix_pose(T, f"{self.path}: extrinsics")
                 for T in (T_device_color, T_device_depth)
             ]
         except InputError as error:

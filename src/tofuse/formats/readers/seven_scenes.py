@@ -12,18 +12,10 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_named, is_file, read_numbers
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading, tables
 from tofuse.formats.images import first_size
-from tofuse.formats.recordings import (
-    DepthImageSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    checked_pinhole,
-    poses_from_files,
-    read_matrix_pose,
-    required,
-)
+from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs, per_frame
 
 FRAME_RATE_HZ = 30.0
 SENSOR, SIZE = "Kinect v1 (structured light)", (640, 480)
@@ -43,7 +35,7 @@ class SevenScenes(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        numbered = required(_depth_files(path), "frame-*.depth.png", path)
+        numbered = inputs.required(_depth_files(path), "frame-*.depth.png", path)
         numbers = np.array([number for number, _ in numbered])
         files = [file for _, file in numbered]
         color = [image for file in files if (image := _color(file)) is not None]
@@ -66,7 +58,7 @@ class SevenScenes(Reader):
         elif color:
             source.warnings.append("colour is not registered to depth in 7-Scenes: used unchanged")
         stems = [file.name[: -len(".depth.png")] for file in files]
-        source.reference = poses_from_files(
+        source.reference = per_frame.poses_from_files(
             source, [path / f"{stem}.pose.txt" for stem in stems], read_pose
         )
         source.metadata["frame_rate_hz"] = FRAME_RATE_HZ
@@ -75,26 +67,28 @@ class SevenScenes(Reader):
 
 def read_pose(path: Path) -> Float64:
     """Return T_world_camera (4, 4) of a .pose.txt; NaN if tracking was lost."""
-    return read_matrix_pose(read_numbers(path), str(path))
+    return per_frame.read_matrix_pose(tables.read_numbers(path), str(path))
 
 
 def _depth_files(path: Path) -> list[tuple[int, Path]]:
-    return sorted((int(p.name[6:].split(".")[0]), p) for p in files_named(path, _DEPTH.fullmatch))
+    return sorted(
+        (int(p.name[6:].split(".")[0]), p) for p in reading.files_named(path, _DEPTH.fullmatch)
+    )
 
 
 def _color(file: Path) -> Path | None:
     stem = file.name[: -len(".depth.png")]
     for suffix in (".color.png", ".color.jpg"):
-        if is_file(file.with_name(stem + suffix)):
+        if reading.is_file(file.with_name(stem + suffix)):
             return file.with_name(stem + suffix)
     return None
 
 
 def _camera(folder: Path, files: Sequence[Path]) -> Pinhole:
     path = folder / "camera-intrinsics.txt"
-    if not is_file(path):
+    if not reading.is_file(path):
         return DEFAULT_CAMERA
-    K = read_numbers(path)
+    K = tables.read_numbers(path)
     if K.shape != (3, 3):
         raise InputError("is not a 3x3 matrix", where=path, remedy="write three rows of three")
-    return checked_pinhole(K, first_size(files), path)
+    return camera_file.checked_pinhole(K, first_size(files), path)

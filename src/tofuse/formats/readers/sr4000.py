@@ -12,17 +12,8 @@ from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.files import is_file, read_head, read_text
-from tofuse.formats.recordings import (
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    files_at,
-    interpolated,
-    refuse_camera,
-    required,
-)
+from tofuse.formats.files import reading
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, per_frame
 
 FRAME_RATE_HZ = 32.0
 # Modulated at 30 MHz, the factory default.
@@ -51,19 +42,19 @@ class Sr4000(Reader):
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         files = _files(path)
-        if any(b"calibrated distance" in read_head(f, 256).lower() for f in files[:3]):
+        if any(b"calibrated distance" in reading.read_head(f, 256).lower() for f in files[:3]):
             return Sniff(1.0, f"{len(files)} .dat files of a SwissRanger")
         return None
 
     def open(self, path: Path, options: ReaderOptions) -> Sr4000Source:
         """See `Reader.open`."""
-        refuse_camera(options, "sr4000")
+        inputs.refuse_camera(options, "sr4000")
         remedy = "pass the export's folder"
-        return Sr4000Source(required(_files(path), ".dat files", path, remedy))
+        return Sr4000Source(inputs.required(_files(path), ".dat files", path, remedy))
 
 
 def _files(path: Path) -> list[Path]:
-    return files_at(path, ".dat")
+    return inputs.files_at(path, ".dat")
 
 
 class Sr4000Source(FileSource):
@@ -99,7 +90,7 @@ class Sr4000Source(FileSource):
             return
         if missing:
             self.warnings.append(f"{missing} frames have no timestamp: interpolated")
-        times = interpolated(times)
+        times = per_frame.interpolated(times)
         # Frames stay in sequence where the camera's counter restarts.
         step = np.diff(times, prepend=times[0])
         if (step < 0).any():
@@ -135,7 +126,7 @@ class Sr4000Source(FileSource):
 
 def _time_stamp(path: Path) -> float:
     """Timestamp in s from the last lines of a file; NaN if there is none."""
-    if not is_file(path):  # reading a FIFO would block, a device never end
+    if not reading.is_file(path):  # reading a FIFO would block, a device never end
         return float("nan")
     try:
         with path.open("rb") as file:
@@ -150,7 +141,7 @@ def _time_stamp(path: Path) -> float:
 def _read_blocks(path: Path) -> dict[str, Float64]:
     """Return the (H, W) blocks of a file by short name."""
     blocks: dict[str, Float64] = {}
-    for section in read_text(path).split("%")[1:]:
+    for section in reading.read_text(path).split("%")[1:]:
         title, _, body = section.partition("\n")
         name = _BLOCKS.get(title.strip().lower())
         if name is None:

@@ -10,20 +10,16 @@ from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_with, is_file, is_folder, read_columns, read_numbers
+from tofuse.formats.files import reading, tables
 from tofuse.formats.images import Video, first_size
-from tofuse.formats.recordings import (
-    IMAGE_SIZE,
-    PER_FRAME,
-    PhoneSource,
+from tofuse.formats.sources import (
     Reader,
     ReaderOptions,
     Sniff,
     gravity_at,
-    interpolated,
-    phone_lens,
-    refuse_camera,
-    required,
+    inputs,
+    per_frame,
+    phones,
 )
 
 FRAME_RATE_HZ = 60.0
@@ -47,17 +43,17 @@ class Stray(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        if is_folder(path / "depth") and is_file(path / "odometry.csv"):
+        if reading.is_folder(path / "depth") and reading.is_file(path / "odometry.csv"):
             return Sniff(1.0, "depth/ and odometry.csv")
         return None
 
     def open(self, path: Path, options: ReaderOptions) -> StraySource:
         """See `Reader.open`."""
-        refuse_camera(options, "stray", PER_FRAME)
+        inputs.refuse_camera(options, "stray", inputs.PER_FRAME)
         return StraySource(path)
 
 
-class StraySource(PhoneSource):
+class StraySource(phones.PhoneSource):
     """Frames with ARKit's poses, which the app writes in this package's convention.
 
     Attributes
@@ -67,7 +63,9 @@ class StraySource(PhoneSource):
     """
 
     def __init__(self, folder: Path) -> None:
-        files = required(files_with(folder / "depth", ".png"), ".png files", folder / "depth")
+        files = inputs.required(
+            reading.files_with(folder / "depth", ".png"), ".png files", folder / "depth"
+        )
         confidence = {p.stem: p for p in _images(folder / "confidence")}
         super().__init__(
             files,
@@ -91,7 +89,7 @@ class StraySource(PhoneSource):
         return super().color_path(index) if self.video is None else self.video.path
 
     def _open_video(self, path: Path) -> Video | None:
-        if not is_file(path):
+        if not reading.is_file(path):
             self.warnings.append(f"{path.name} is missing: there is no colour")
             return None
         try:
@@ -108,10 +106,10 @@ class StraySource(PhoneSource):
         return video
 
     def _read_imu(self, path: Path) -> dict[str, Float64] | None:
-        if not is_file(path):
+        if not reading.is_file(path):
             return None
         try:
-            columns = read_columns(path)
+            columns = tables.read_columns(path)
         except InputError as error:
             self.warnings.append(f"{error}: ignored")
             return None
@@ -125,7 +123,7 @@ class StraySource(PhoneSource):
     def _read_odometry(self, folder: Path) -> None:
         """Read timestamps, poses and, from newer versions of the app, per-frame intrinsics."""
         path = folder / "odometry.csv"
-        columns = read_columns(path)
+        columns = tables.read_columns(path)
         missing = [name for name in ("timestamp", "frame", *_POSE) if name not in columns]
         if missing:
             raise InputError(
@@ -142,7 +140,7 @@ class StraySource(PhoneSource):
             )
         if not valid.all():
             self.warnings.append(f"{path}: {int((~valid).sum())} frames have no row: interpolated")
-        self.timestamps = interpolated(times)
+        self.timestamps = per_frame.interpolated(times)
         poses = np.full((len(row), 4, 4), np.nan)
         table = np.stack([columns[name] for name in _POSE], 1)[row]
         posed = (row >= 0) & np.isfinite(table).all(1) & (np.abs(table) < 1e6).all(1)
@@ -153,13 +151,13 @@ class StraySource(PhoneSource):
 
     def _read_lenses(self, folder: Path, columns: dict[str, Float64], row: Intp) -> None:
         size = first_size(self.files)
-        image = IMAGE_SIZE if self.video is None else (self.video.width, self.video.height)
-        if is_file(folder / "camera_matrix.csv"):
+        image = phones.IMAGE_SIZE if self.video is None else (self.video.width, self.video.height)
+        if reading.is_file(folder / "camera_matrix.csv"):
             path = folder / "camera_matrix.csv"
-            K = read_numbers(path)
+            K = tables.read_numbers(path)
             if K.shape != (3, 3):
                 raise InputError("is not a 3x3 matrix", where=path, remedy="copy it again")
-            common = phone_lens(K, image, size, path)
+            common = phones.phone_lens(K, image, size, path)
             self.cameras = [common] * len(row)
         elif not all(name in columns for name in _LENS):
             raise InputError(
@@ -174,7 +172,7 @@ class StraySource(PhoneSource):
                 fx, fy, cx, cy = (columns[name][row[k]] for name in _LENS)
                 K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
                 try:
-                    self.cameras[k] = phone_lens(
+                    self.cameras[k] = phones.phone_lens(
                         K, image, size, f"{folder / 'odometry.csv'}, frame {k}"
                     )
                 except InputError as error:
@@ -182,4 +180,4 @@ class StraySource(PhoneSource):
 
 
 def _images(folder: Path) -> list[Path]:
-    return files_with(folder, ".png") if is_folder(folder) else []
+    return reading.files_with(folder, ".png") if reading.is_folder(folder) else []

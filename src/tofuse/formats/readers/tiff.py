@@ -10,17 +10,9 @@ import numpy as np
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
-from tofuse.formats.files import files_with, is_folder
+from tofuse.formats.files import reading
 from tofuse.formats.images import read_tiff
-from tofuse.formats.recordings import (
-    UNCERTAIN,
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    finite_float32,
-    required,
-)
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
 _SUFFIXES = (".tif", ".tiff")
 _RANGE = ".range"
@@ -34,20 +26,22 @@ class Tiff(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        files = files_with(path, *_SUFFIXES) if is_folder(path) else []
+        files = reading.files_with(path, *_SUFFIXES) if reading.is_folder(path) else []
         if any(_is_range(file) for file in files):
             return Sniff(1.0, f"{len(files)} .tif files, *.range.tif among them")
         if not files:
             return None
         return Sniff(
-            UNCERTAIN, f"{len(files)} .tif files", "use --format tiff and --camera camera.json"
+            Sniff.UNCERTAIN,
+            f"{len(files)} .tif files",
+            "use --format tiff and --camera camera.json",
         )
 
     def open(self, path: Path, options: ReaderOptions) -> TiffSource:
         """See `Reader.open`."""
-        files = files_with(path, *_SUFFIXES) if is_folder(path) else []
+        files = reading.files_with(path, *_SUFFIXES) if reading.is_folder(path) else []
         depth = [f for f in files if _is_range(f)] or [f for f in files if not _is_other(f)]
-        required(depth, ".tif of depth", path, "pass the folder of images")
+        inputs.required(depth, ".tif of depth", path, "pass the folder of images")
         if options.camera is None:
             raise InputError(
                 "has no camera: the layout of .t3c files isn't published, and TIFF has none",
@@ -89,7 +83,7 @@ class TiffSource(FileSource):
         size = (self.camera.width, self.camera.height)
         amplitude = None
         if self.amplitude:
-            amplitude = finite_float32(read_tiff(self.amplitude[index], size))
+            amplitude = pixels.finite_float32(read_tiff(self.amplitude[index], size))
         depth = depth_counts.depth_from_numbers(read_tiff(self.depth[index], size), self.unit)
         return self.image(index, depth, amplitude_image=amplitude)
 

@@ -11,16 +11,9 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import BrownConrady
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import is_file, is_folder, read_text
+from tofuse.formats.files import reading
 from tofuse.formats.poses import associate
-from tofuse.formats.recordings import (
-    DepthImageSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    check_timestamps,
-    tum_poses,
-)
+from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, per_frame
 
 DEPTH_UNIT_M = 1 / 5000
 COLOR_LIMIT_S = 0.1
@@ -46,7 +39,7 @@ class Tum(Reader):
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        if is_folder(path) and is_file(path / "depth.txt"):
+        if reading.is_folder(path) and reading.is_file(path / "depth.txt"):
             return Sniff(1.0, "depth.txt")
         return None
 
@@ -61,14 +54,14 @@ class Tum(Reader):
                 remedy="pass the colour camera with --camera camera.json",
             )
         warnings: list[str] = []
-        check_timestamps(times, path / "depth.txt", warnings)
+        per_frame.check_timestamps(times, path / "depth.txt", warnings)
         color: list[Path | None] | None = None
-        if is_file(path / "rgb.txt"):
+        if reading.is_file(path / "rgb.txt"):
             color_times, color_files = _read_list(path / "rgb.txt")
             # A depth image without a colour image takes that of a neighbour: only for display.
             pairs = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
             if (pairs >= 0).any():
-                exists = [is_file(file) for file in color_files]
+                exists = [reading.is_file(file) for file in color_files]
                 color = [color_files[k] if k >= 0 and exists[k] else None for k in pairs]
                 if not any(color):
                     warnings.append("none of the colour images exists: colour is ignored")
@@ -86,8 +79,8 @@ class Tum(Reader):
             options=options,
         )
         source.warnings += warnings
-        if is_file(path / "groundtruth.txt"):
-            source.reference = tum_poses(source, path / "groundtruth.txt")
+        if reading.is_file(path / "groundtruth.txt"):
+            source.reference = per_frame.tum_poses(source, path / "groundtruth.txt")
         return source
 
 
@@ -102,7 +95,7 @@ def camera_of(path: Path) -> BrownConrady | None:
 
 def _read_list(path: Path) -> tuple[Float64, list[Path]]:
     times, files = [], []
-    for number, line in enumerate(read_text(path).splitlines(), 1):
+    for number, line in enumerate(reading.read_text(path).splitlines(), 1):
         cells = line.split("#", 1)[0].split()
         if not cells:
             continue

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -24,22 +23,11 @@ from tofuse.engine.frames import (
 )
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.files import exact, make_folder, replacing, write_columns, write_text
+from tofuse.formats.cameras import camera_file, write_correction
+from tofuse.formats.files import atomic, tables
 from tofuse.formats.geometry import write_ply
 from tofuse.formats.images import write_png
 from tofuse.formats.poses import write_tum
-from tofuse.formats.recordings.camera_file import SCHEMA, camera_fields
-from tofuse.formats.recordings.correction_file import write_correction
-
-# Columns of frames.csv that give each frame its own lens.
-LENS_COLUMNS = ("fx", "fy", "cx", "cy")
-
-
-def same_distortion(a: Pinhole, b: Pinhole) -> bool:
-    """Whether two lenses differ only in focal lengths and principal point."""
-    return type(a) is type(b) and all(
-        getattr(a, f.name) == getattr(b, f.name) for f in fields(a) if f.name not in LENS_COLUMNS
-    )
 
 
 class RecordingWriter:
@@ -96,7 +84,7 @@ class RecordingWriter:
         color_registered: bool = True,
         camera_per_frame: bool = False,
     ) -> None:
-        self.folder = make_folder(folder)
+        self.folder = atomic.make_folder(folder)
         if any(self.folder.iterdir()):
             raise OutputError("isn't empty", where=self.folder, remedy="choose a new folder")
         self.camera = camera
@@ -106,9 +94,9 @@ class RecordingWriter:
         self._lenses: list[tuple[float, ...]] = []
         self._channels: frozenset[str] | None = None
         self._times: list[float] = []
-        self._description: dict[str, Any] = {"schema": SCHEMA}
+        self._description: dict[str, Any] = {"schema": camera_file.SCHEMA}
         if camera is not None:
-            self._description |= camera_fields(camera)
+            self._description |= camera_file.camera_fields(camera)
             self._description |= {"depth_unit_m": float(depth_unit_m), "depth_kind": depth_kind}
         optional: dict[str, Any] = {
             "frame_rate_hz": frame_rate_hz,
@@ -139,7 +127,7 @@ class RecordingWriter:
         self._times.append(float(frame.timestamp))
 
     def _frame_path(self, channel: str, suffix: str) -> Path:
-        return make_folder(self.folder / channel) / f"{len(self):06d}{suffix}"
+        return atomic.make_folder(self.folder / channel) / f"{len(self):06d}{suffix}"
 
     def _write_cloud(self, frame: CloudFrame) -> None:
         if self.camera is not None:
@@ -192,7 +180,7 @@ class RecordingWriter:
 
     def _write_camera(self, camera: Camera, common: Camera) -> None:
         if isinstance(common, Pinhole):
-            if not isinstance(camera, Pinhole) or not same_distortion(camera, common):
+            if not isinstance(camera, Pinhole) or not camera_file.same_distortion(camera, common):
                 raise InputError(
                     "has another lens model than the first",
                     where=f"frame {len(self)}",
@@ -200,7 +188,10 @@ class RecordingWriter:
                 )
             self._lenses.append((camera.fx, camera.fy, camera.cx, camera.cy))
             return
-        with replacing(self._frame_path("rays", ".npy")) as temporary, temporary.open("wb") as file:
+        with (
+            atomic.replacing(self._frame_path("rays", ".npy")) as temporary,
+            temporary.open("wb") as file,
+        ):
             np.save(file, np.asarray(camera.rays(), np.float32))
 
     def _check_channels(self, frame: Frame, *names: str) -> None:
@@ -259,22 +250,26 @@ class RecordingWriter:
             if poses is not None:
                 write_tum(self.folder / f"{name}.txt", self._times, poses)
         if correction is not None:
-            with replacing(self.folder / "correction.npz") as temporary:
+            with atomic.replacing(self.folder / "correction.npz") as temporary:
                 write_correction(temporary, correction)
         if imu is not None:
-            write_columns(self.folder / "imu.csv", imu)
+            tables.write_columns(self.folder / "imu.csv", imu)
         if self._lenses:
-            columns = dict(zip(LENS_COLUMNS, np.array(self._lenses).T, strict=True))
+            columns = dict(zip(camera_file.LENS_COLUMNS, np.array(self._lenses).T, strict=True))
             frames = {**(frames or {}), **columns}
         if frames is not None:
             if any(len(column) != len(self) for column in frames.values()):
                 raise InputError(
                     f"columns don't have {len(self)} values", where=self.folder / "frames.csv"
                 )
-            write_columns(self.folder / "frames.csv", frames)
+            tables.write_columns(self.folder / "frames.csv", frames)
         if isinstance(self.camera, RayTable):
-            with replacing(self.folder / "rays.npy") as temporary:
+            with atomic.replacing(self.folder / "rays.npy") as temporary:
                 np.save(temporary, np.asarray(self.camera.table, np.float32))
-        write_text(self.folder / "timestamps.txt", "".join(exact(t) + "\n" for t in self._times))
-        write_text(self.folder / "camera.json", json.dumps(self._description, indent=1) + "\n")
+        atomic.write_text(
+            self.folder / "timestamps.txt", "".join(tables.exact(t) + "\n" for t in self._times)
+        )
+        atomic.write_text(
+            self.folder / "camera.json", json.dumps(self._description, indent=1) + "\n"
+        )
         return self.folder

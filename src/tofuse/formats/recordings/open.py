@@ -15,13 +15,13 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import NOISE_MODEL, Frame, Recording, Source
 from tofuse.engine.parts import discover, name_of, registered
-from tofuse.formats.files import input_error, is_file, is_folder, list_folder, path_of, read_noise
+from tofuse.formats.cameras import read_noise
+from tofuse.formats.files import reading
 from tofuse.formats.poses import TimedPoses, read_poses
-from tofuse.formats.recordings.cloud_sequence import describe_shift
-from tofuse.formats.recordings.reader import CERTAIN, Reader, ReaderOptions, Sniff
-from tofuse.formats.recordings.rig import RigSource, read_rig, recordings_of, rig_file_in
-from tofuse.formats.recordings.sources import JoinedSource, LimitedSource
+from tofuse.formats.recordings.joined import JoinedSource, LimitedSource
 from tofuse.formats.recordings.still import average_still
+from tofuse.formats.rigs import RigSource, read_rig, recordings_of, rig_file_in
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, cloud_sequence
 
 # Proprietary recordings: problem and remedy by suffix.
 CLOSED = {
@@ -78,7 +78,7 @@ def open_recording(
         be read.
     """
     for path in paths:
-        path_of(path, "path", "pass a path, or several: tofuse.open(a, b)")
+        reading.path_of(path, "path", "pass a path, or several: tofuse.open(a, b)")
     if not paths:
         raise InputError("no recording was given", remedy="pass a path")
     _check_depths(min_depth, max_depth)
@@ -100,7 +100,7 @@ def open_recording(
         source = JoinedSource(sources, _short_names([item.path for item in located]))
     _check_usable(source, paths[0])
     noise_file = Path(paths[0]) / "noise.json"
-    if len(paths) == 1 and is_folder(noise_file.parent) and is_file(noise_file):
+    if len(paths) == 1 and reading.is_folder(noise_file.parent) and reading.is_file(noise_file):
         source.metadata[NOISE_MODEL] = read_noise(noise_file)
     if min_depth is not None or max_depth is not None:
         source = LimitedSource(
@@ -156,10 +156,10 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
     try:
         path.stat()
     except OSError as error:
-        raise input_error(error, path) from error
+        raise reading.input_error(error, path) from error
     except ValueError as error:
         raise InputError(f"is not a path ({error})", where=repr(str(path))) from error
-    children = list_folder(path) if path.is_dir() else []
+    children = reading.list_folder(path) if path.is_dir() else []
     if path.is_dir() and not children:
         raise InputError("is an empty folder", where=path, remedy="pass a recording")
     if format is not None:
@@ -167,7 +167,9 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
     sniffs = _sniff(path)
     # A camera.json or names of one format outweigh a cloud in the same folder.
     best = max((sniff.confidence for sniff in sniffs.values()), default=0.0)
-    confident = {n: sniff for n, sniff in sniffs.items() if sniff.confidence >= max(best, CERTAIN)}
+    confident = {
+        n: sniff for n, sniff in sniffs.items() if sniff.confidence >= max(best, Sniff.CERTAIN)
+    }
     if len(confident) == 1:
         return [_Located(path, readers()[next(iter(confident))])]
     if len(confident) > 1:
@@ -196,7 +198,11 @@ def _resolve_as(path: Path, format: str) -> list[_Located]:  # noqa: A002
         )
     reader = choices[format]
     if reader.joinable and path.is_dir() and _sniff_as(reader, path) is None:
-        parts = [p for p in list_folder(path) if is_folder(p) and _sniff_as(reader, p) is not None]
+        parts = [
+            p
+            for p in reading.list_folder(path)
+            if reading.is_folder(p) and _sniff_as(reader, p) is not None
+        ]
         if parts:
             return [_Located(p, reader) for p in parts]
     return [_Located(path, reader)]
@@ -217,19 +223,19 @@ def _sniff(path: Path) -> dict[str, Sniff]:
 
 def is_recording(path: Path) -> bool:
     """Whether a reader recognises a file or folder as a recording of its format."""
-    return any(sniff.confidence >= CERTAIN for sniff in _sniff(path).values())
+    return any(sniff.confidence >= Sniff.CERTAIN for sniff in _sniff(path).values())
 
 
 def _recordings_in(path: Path) -> list[_Located]:
     """The recordings in a folder, if any; InputError if they can't be joined."""
-    if not is_folder(path):
+    if not reading.is_folder(path):
         return []
     format_of: dict[Path, str] = {}
-    for folder in list_folder(path):
-        if not is_folder(folder):
+    for folder in reading.list_folder(path):
+        if not reading.is_folder(folder):
             continue
         sniffs = _sniff(folder)
-        confident = [name for name, s in sniffs.items() if s.confidence >= CERTAIN]
+        confident = [name for name, s in sniffs.items() if s.confidence >= Sniff.CERTAIN]
         if confident:
             format_of[folder] = max(confident, key=lambda name: sniffs[name].confidence)
     if not format_of:
@@ -494,7 +500,7 @@ def open_view(
         )
     shift = np.asarray(recording.metadata.get("shift_m", np.zeros(3)), float)
     # The shift is returned with the view, so a warning about it would mislead.
-    shift_note = describe_shift(shift)
+    shift_note = cloud_sequence.describe_shift(shift)
     warnings = tuple(line for line in recording.warnings if not line.endswith(shift_note))
     return SingleView(name, path, recording.format, index, frame, shift, warnings)
 

@@ -14,7 +14,7 @@ from tofuse.engine.filters import apply_filters
 from tofuse.engine.frames import ArraySource, Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Config
-from tofuse.formats.recordings import corrected_depth
+from tofuse.formats.cameras import corrected_depth
 from tofuse.lab.simulation import Effects, RecordingPlan, plan
 
 # About 1 cm apart in a room, so that distances are accurate to half of that.

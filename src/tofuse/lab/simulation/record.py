@@ -14,10 +14,11 @@ from tofuse.engine.frames import ArraySource, RangeFrame, Recording
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.files import make_folder
+from tofuse.formats.cameras import corrected_depth
+from tofuse.formats.files import atomic
 from tofuse.formats.geometry import write_ply
 from tofuse.formats.images import write_png
-from tofuse.formats.recordings import RecordingWriter, corrected_depth
+from tofuse.formats.recordings import RecordingWriter
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.accelerometer import accelerations
 from tofuse.lab.simulation.effects import Effects
@@ -272,7 +273,7 @@ def write(
         amplitude_kind=model.amplitude_kind,
     )
     truth = writer.folder / "truth"
-    flags, depths = make_folder(truth / "flags"), make_folder(truth / "depth")
+    flags, depths = atomic.make_folder(truth / "flags"), atomic.make_folder(truth / "depth")
     for k, rendered in enumerate(planned.frames(progress)):
         writer.add(rendered.frame)
         write_png(flags / f"{k:06d}.png", rendered.flags)
@@ -304,7 +305,7 @@ def _write_peaks(
     for frame in recording:
         writer.add(frame)
     T_camera_object = se3.inverse(peaks_cameras()[0])
-    truth = make_folder(writer.folder / "truth")
+    truth = atomic.make_folder(writer.folder / "truth")
     write_ply(truth / "surface.ply", GeometryRecord(se3.transform(T_camera_object, peaks_points())))
     return writer.finish(groundtruth=recording.reference)
 

@@ -11,7 +11,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.frames import ArraySource, RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.formats.recordings import corrected_depth
+from tofuse.formats.cameras import corrected_depth
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import RecordingPlan

@@ -13,7 +13,7 @@ from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import DISTORTION_ORDER, Camera
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.recordings import simplest_lens
+from tofuse.formats.cameras import lenses
 
 _POLL_MS = 100
 
@@ -136,4 +136,4 @@ def _image(frame: Any) -> Float32:
 def _camera(lens: Any, distortion: Any, size: tuple[int, int]) -> Camera:
     intrinsics = {name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")}
     coefficients = {name: float(getattr(distortion, name)) for name in DISTORTION_ORDER["rational"]}
-    return simplest_lens(size, intrinsics, coefficients, "Orbbec")
+    return lenses.simplest_lens(size, intrinsics, coefficients, "Orbbec")

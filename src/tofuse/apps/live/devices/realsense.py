@@ -11,7 +11,7 @@ from tofuse.apps.live import TIMEOUT_S, DeviceError, Settings, Stream, no_frame,
 from tofuse.engine.cameras import BrownConrady, Camera, Pinhole
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
-from tofuse.formats.recordings import inverse_brown
+from tofuse.formats.cameras import lenses
 
 
 @part("device", "realsense")
@@ -124,7 +124,7 @@ def _camera(rs: Any, lens: Any) -> Camera:
     if lens.model == rs.distortion.brown_conrady:
         return BrownConrady(*size, *intrinsics, *coefficients)
     if lens.model == rs.distortion.inverse_brown_conrady:
-        return inverse_brown(BrownConrady(*size, *intrinsics, *coefficients))
+        return lenses.inverse_brown(BrownConrady(*size, *intrinsics, *coefficients))
     raise DeviceError(
         f"has a lens of the model {lens.model}",
         where="RealSense",

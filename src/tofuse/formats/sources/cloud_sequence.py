@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,10 +15,12 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import quaternion
-from tofuse.formats.files import is_file, is_folder, read_numbers
-from tofuse.formats.recordings.organised import SAMPLES, Deprojection, find_deprojection
-from tofuse.formats.recordings.reader import CERTAIN, Sniff, files_at
-from tofuse.formats.recordings.sources import FileSource
+from tofuse.engine.parts import name_of
+from tofuse.formats.files import reading, tables
+from tofuse.formats.sources import inputs
+from tofuse.formats.sources.file_source import FileSource
+from tofuse.formats.sources.organised import SAMPLES, Deprojection, find_deprojection
+from tofuse.formats.sources.reader import Reader, ReaderOptions, Sniff
 
 # The resolution of float32 is coarser than half a millimetre beyond.
 MAP_COORDINATES_M = 8192.0
@@ -59,9 +62,9 @@ class CloudFileSource(FileSource):
         self._warned_rounding = False
         self._cached: dict[int, Frame] = {}  # read to determine shift and camera
         self._deprojection: Deprojection | None = None
-        if is_folder(path):
+        if reading.is_folder(path):
             self.read_sidecars(path)
-            if self.reference is None and is_file(path / "poses.txt"):
+            if self.reference is None and reading.is_file(path / "poses.txt"):
                 self.reference = self._numbered_poses(path / "poses.txt")
         self._shift = np.zeros(3)
         if load_shifted is not None:
@@ -117,7 +120,7 @@ class CloudFileSource(FileSource):
 
     def _numbered_poses(self, path: Path) -> Float64 | None:
         """Read lines 'index x y z qw qx qy qz' with the number in the file name as index."""
-        table = read_numbers(path)
+        table = tables.read_numbers(path)
         fits = table.ndim == 2 and table.shape[1] == 8 and np.isfinite(table).all()
         if not fits or (table[:, 0] != np.rint(table[:, 0])).any():
             self.warnings.append(
@@ -187,20 +190,32 @@ def note_shift(source: FileSource, path: Path, shift: Float64) -> None:
     source.odometry = None if source.odometry is None else source.odometry @ T_file_frame
 
 
-def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
-    """Detect a file or a folder of files with one of the suffixes."""
-    files = files_at(path, *suffixes)
-    if not files:
-        return None
-    if is_folder(path) and is_file(path / "run.json"):
-        return Sniff(0.1, "a result of tofuse, not a recording", "pass the recording itself")
-    kinds = sorted({f.suffix.lower() for f in files})
-    return Sniff(CERTAIN, f"{len(files)} {' and '.join(kinds)} file{'s'[: len(files) > 1]}")
+class CloudReader(Reader):
+    """A reader of files with one cloud each: a file with one of the `suffixes`, or a folder."""
+
+    suffixes: ClassVar[tuple[str, ...]]
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        files = inputs.files_at(path, *self.suffixes)
+        if not files:
+            return None
+        if reading.is_folder(path) and reading.is_file(path / "run.json"):
+            return Sniff(0.1, "a result of tofuse, not a recording", "pass the recording itself")
+        kinds = sorted({f.suffix.lower() for f in files})
+        evidence = f"{len(files)} {' and '.join(kinds)} file{'s'[: len(files) > 1]}"
+        return Sniff(Sniff.CERTAIN, evidence)
+
+    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
+        """See `Reader.open`."""
+        inputs.refuse_camera(options, name_of(self))
+        return self.source(path, required_files(path, *self.suffixes))
+
+    @abstractmethod
+    def source(self, path: Path, files: list[Path]) -> CloudFileSource:
+        """Return the source of the files at a path, which is one of them or their folder."""
 
 
 def required_files(path: Path, *suffixes: str) -> list[Path]:
-    """Return the same as `cloud_files`; InputError if there are none."""
-    files = files_at(path, *suffixes)
-    if not files:
-        raise InputError(f"has no {suffixes[0]} files", where=path, remedy="check the path")
-    return files
+    """Return the files at a path, see `inputs.files_at`; InputError if there are none."""
+    return inputs.required(inputs.files_at(path, *suffixes), f"{suffixes[0]} files", path)

@@ -11,9 +11,12 @@ from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Pinhole, scaled
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading
 from tofuse.formats.images import read_color, read_image
-from tofuse.formats.recordings.camera_file import checked_pinhole
-from tofuse.formats.recordings.sources import FileSource, read_matrix_pose
+from tofuse.formats.sources.file_source import FileSource
+from tofuse.formats.sources.per_frame import read_matrix_pose
+from tofuse.formats.sources.pixels import resized
 
 # ARKit's camera looks along -z with y up.
 ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -32,11 +35,9 @@ def phone_lens(
     K: Float64, image_size: tuple[int, int], size: tuple[int, int], where: str | Path
 ) -> Pinhole:
     """Return the camera of depth images of `size` from K (3, 3) of larger colour images."""
-    full = checked_pinhole(K, image_size, where)
-    try:
+    full = camera_file.checked_pinhole(K, image_size, where)
+    with reading.named(where):
         return scaled(full, *size)
-    except InputError as error:
-        raise InputError(error.problem, where=where, remedy=error.remedy) from error
 
 
 class PhoneSource(FileSource):
@@ -118,19 +119,3 @@ class PhoneSource(FileSource):
     def _read_color(self, index: int, size: tuple[int, int]) -> UInt8 | None:
         full = self.full_resolution_color(index)
         return None if full is None else resized(full, size, self.color_path(index))
-
-
-def resized(image: UInt8, size: tuple[int, int], where: Path) -> UInt8:
-    """Return an image (H, W, 3) downscaled by area to the `size` (width, height) of depth."""
-    import cv2
-
-    height, width = image.shape[:2]
-    # With another aspect ratio it has another view than depth.
-    if abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
-        raise InputError(
-            f"is {width} x {height} pixels, depth {size[0]} x {size[1]}: another aspect ratio",
-            where=where,
-            remedy="export the images again",
-        )
-    out: UInt8 = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return out

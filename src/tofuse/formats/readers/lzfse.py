@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import required_package
+from tofuse.formats.files import reading
 
 # Each block begins with these letters. It has at most 40,000 literals and 10,000 copies of up to
 # 2359 bytes, and the encoder fills it with at least a few kilobytes.
@@ -21,7 +21,7 @@ def lzfse_decompress(data: bytes, size: int, path: str | Path) -> bytes:
     InputError
         If it is damaged, cut off, or of another size, or the package `lzfse` is not installed.
     """
-    lzfse = required_package("lzfse", "phones", path)
+    lzfse = reading.required_package("lzfse", "phones", path)
     # The package has no limit of the size.
     if (
         len(data) > 2 * size + _HEADERS

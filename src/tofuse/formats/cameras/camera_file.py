@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,7 @@ from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, Ray
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import AmplitudeKind, DepthKind
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import input_error, is_file, read_text
+from tofuse.formats.files import json_data, reading
 
 # Limits for any camera: a frame per month to a million per second; ambiguity ranges of modulation
 # at 15 GHz to 1.5 kHz.
@@ -106,113 +104,6 @@ class CameraFile:
         return {name: value for name, value in values.items() if value is not None}
 
 
-def read_json(path: str | Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises
-    ------
-    InputError
-        If the file can't be read, is invalid (with line and column), or is not an object.
-    """
-    text = read_text(path, limit=64 << 20)
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(
-            f"is invalid JSON ({error.msg}, line {error.lineno} column {error.colno})",
-            where=path,
-            remedy="correct it there",
-        ) from error
-    except (RecursionError, ValueError) as error:
-        raise InputError("is invalid JSON", where=path, remedy="write it again") from error
-    if not isinstance(data, dict):
-        raise InputError("is not a JSON object", where=path, remedy="write {...}")
-    return data
-
-
-def number_in(
-    data: Mapping[str, Any],
-    name: str,
-    where: str | Path,
-    default: float | None = None,
-    remedy: str = "use a number",
-) -> float:
-    """Return a number of JSON data.
-
-    Parameters
-    ----------
-    data
-        The object.
-    name
-        Its field.
-    where
-        The file, for errors.
-    default
-        The value if it is missing; required unless given.
-    remedy
-        The remedy.
-
-    Raises
-    ------
-    InputError
-        If it is missing and has no default, is not a number, or does not fit into a float.
-    """
-    value = data.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        problem = "is missing" if value is None else f"is {value!r:.60}"
-        raise InputError(problem, where=f"{where}: {name}", remedy=remedy)
-    try:
-        return float(value)
-    except OverflowError as error:
-        raise InputError("is too large", where=f"{where}: {name}", remedy=remedy) from error
-
-
-def numbers_in(
-    data: Mapping[str, Any],
-    name: str,
-    where: str | Path,
-    shape: tuple[int, ...],
-    remedy: str,
-    *,
-    finite: bool = True,
-) -> Float64:
-    """Return an array of numbers of JSON data.
-
-    Parameters
-    ----------
-    data
-        The object.
-    name
-        Its field, which contains lists of numbers, nested or not.
-    where
-        The file, for errors.
-    shape
-        Of the array; -1 in it stands for any length.
-    remedy
-        The remedy.
-    finite
-        Whether all numbers have to be finite.
-
-    Raises
-    ------
-    InputError
-        If it is missing, has another count of numbers, or contains anything else.
-    """
-    place = f"{where}: {name}"
-    if data.get(name) is None:
-        raise InputError("is missing", where=place, remedy=remedy)
-    try:
-        values = np.array(data[name], float).reshape(shape)
-        valid = not finite or np.isfinite(values).all()
-    except (TypeError, ValueError, OverflowError):
-        valid = False
-    if not valid:
-        counts = " x ".join("N" if count < 0 else str(count) for count in shape)
-        noun = "finite numbers" if finite else "numbers"
-        raise InputError(f"is not {counts} {noun}", where=place, remedy=remedy)
-    return values
-
-
 def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     """Read and check a camera.json.
 
@@ -228,7 +119,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     InputError
         Naming file and field, with a remedy.
     """
-    data = read_json(path)
+    data = json_data.read_json(path)
     get = _Fields(data, str(path))
     schema = data.get("schema")
     if schema != SCHEMA or isinstance(schema, bool):
@@ -290,7 +181,7 @@ def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[
             remedy="pass the camera of these images",
         )
     table = path.parent / "rays.npy"
-    if not is_file(table):
+    if not reading.is_file(table):
         if description.camera is None:
             raise InputError(
                 "is 'rays' and there is no rays.npy",
@@ -325,7 +216,7 @@ def camera_file_of(folder: Path, camera_file: Path | None, content: str) -> Path
         If there is no such file.
     """
     path = camera_file or folder / "camera.json"
-    if not is_file(path):
+    if not reading.is_file(path):
         raise InputError(
             f"is missing: such files contain {content}",
             where=path,
@@ -365,7 +256,7 @@ def read_rays(path: Path) -> RayTable:
             raise ValueError("all rays are the same")
         return RayTable(np.where(finite, rays, np.nan).astype(np.float32))
     except OSError as error:
-        raise input_error(error, path) from error
+        raise reading.input_error(error, path) from error
     except InputError as error:
         raise InputError(error.problem, where=path, remedy=error.remedy) from error
     except Exception as error:  # NumPy evaluates the header as Python, which can raise anything
@@ -405,7 +296,7 @@ class _Fields:
     def number(self, field: str, *, required: bool = False, hint: str = "a number") -> float | None:
         if self.data.get(field) is None and not required:
             return None
-        value = number_in(self.data, field, self.where, remedy=f"use {hint}")
+        value = json_data.number_in(self.data, field, self.where, remedy=f"use {hint}")
         if not math.isfinite(value):
             raise self.error(field, f"is {value}", f"use a finite {hint.removeprefix('a ')}")
         return value
@@ -562,3 +453,14 @@ def _color(get: _Fields) -> ColorCamera | None:
     except (TypeError, ValueError, OverflowError) as error:
         raise get.error(field, "is not a 4x4 matrix", "use four rows of four numbers") from error
     return ColorCamera(camera, se3.check_pose(matrix, where=f"{get.where}: {field}"))
+
+
+# Columns of frames.csv that give each frame its own lens.
+LENS_COLUMNS = ("fx", "fy", "cx", "cy")
+
+
+def same_distortion(a: Pinhole, b: Pinhole) -> bool:
+    """Whether two lenses differ only in focal lengths and principal point."""
+    return type(a) is type(b) and all(
+        getattr(a, f.name) == getattr(b, f.name) for f in fields(a) if f.name not in LENS_COLUMNS
+    )

@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, BrownConrady, Pinhole, RayTable
 from tofuse.engine.errors import InputError
-from tofuse.formats.recordings.camera_file import checked_lens
+from tofuse.formats.cameras.camera_file import checked_lens
 
 
 def inverse_brown(lens: BrownConrady) -> RayTable:

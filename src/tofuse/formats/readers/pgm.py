@@ -9,7 +9,6 @@ import numpy as np
 
 from tofuse.engine.arrays import UInt8, UInt16
 from tofuse.engine.errors import InputError
-from tofuse.formats.images.images import check_pixels
 
 _SPACE = rb"(?:\s+(?:#[^\n]*\n)?)+"
 _HEADER = re.compile(rb"P5" + (_SPACE + rb"(\d{1,5})") * 3 + rb"\s")
@@ -27,9 +26,10 @@ def parse_pgm(data: bytes, where: str | Path) -> UInt8 | UInt16:
     if header is None:
         raise InputError("is not a binary PGM image", where=where, remedy="copy the file again")
     width, height, max_value = (int(text) for text in header.groups())
-    check_pixels(width, height, where)
-    if not 0 < max_value < 65536:
-        raise InputError(f"declares values up to {max_value}", where=where)
+    if not (width and height and 0 < max_value < 65536):
+        raise InputError(
+            f"declares {width} x {height} pixels with values up to {max_value}", where=where
+        )
     dtype = np.dtype(">u2" if max_value > 255 else "u1")
     size = width * height * dtype.itemsize
     if len(data) < header.end() + size:

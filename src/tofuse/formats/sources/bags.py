@@ -19,23 +19,12 @@ from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.formats.files import (
-    files_with,
-    is_file,
-    is_folder,
-    list_folder,
-    read_head,
-    required_package,
-)
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading
 from tofuse.formats.images import as_color, parse_image
-from tofuse.formats.recordings.camera_file import check_size, checked_lens
-from tofuse.formats.recordings.reader import ReaderOptions
-from tofuse.formats.recordings.sources import (
-    FileSource,
-    finite_float32,
-    library_errors,
-    sampled_color,
-)
+from tofuse.formats.sources.file_source import FileSource
+from tofuse.formats.sources.pixels import finite_float32, sampled_color
+from tofuse.formats.sources.reader import ReaderOptions
 
 REMEDY = "check the bag, or reindex it"
 MAX_GAP_S = 0.02  # between the images of one frame
@@ -44,10 +33,12 @@ _MAGIC = {"ros1": b"#ROSBAG V2", "mcap": b"\x89MCAP0\r\n"}
 
 def bag_kind(path: Path) -> str | None:
     """Return "folder" for that of a ROS 2 bag, "ros1", "mcap" or "db3" for such files, or None."""
-    if is_folder(path):
-        is_bag = is_file(path / "metadata.yaml") and files_with(path, ".db3", ".mcap", ".zstd")
+    if reading.is_folder(path):
+        is_bag = reading.is_file(path / "metadata.yaml") and reading.files_with(
+            path, ".db3", ".mcap", ".zstd"
+        )
         return "folder" if is_bag else None
-    head = read_head(path, 16)
+    head = reading.read_head(path, 16)
     if head.startswith(b"SQLite format 3"):
         return "db3" if path.suffix.lower() == ".db3" else None
     return next((kind for kind, magic in _MAGIC.items() if head.startswith(magic)), None)
@@ -61,11 +52,13 @@ def open_bag(path: Path) -> Any:
     InputError
         If rosbags is missing, or can't open it.
     """
-    highlevel = required_package("rosbags.highlevel", "ros", path)
-    typesys = required_package("rosbags.typesys", "ros", path)
-    if is_folder(path):
-        for entry in list_folder(path):
-            if not is_file(entry) and not is_folder(entry):  # rosbags would wait for a pipe
+    highlevel = reading.required_package("rosbags.highlevel", "ros", path)
+    typesys = reading.required_package("rosbags.typesys", "ros", path)
+    if reading.is_folder(path):
+        for entry in reading.list_folder(path):
+            if not reading.is_file(entry) and not reading.is_folder(
+                entry
+            ):  # rosbags would wait for a pipe
                 raise InputError(
                     "is not a regular file", where=entry, remedy="remove it from the bag"
                 )
@@ -78,12 +71,12 @@ def open_container(path: Path) -> Any:
 
     The message definitions in the bags of some makers are incomplete.
     """
-    rosbag1 = required_package("rosbags.rosbag1", "ros", path)
+    rosbag1 = reading.required_package("rosbags.rosbag1", "ros", path)
     return _opened(path, lambda: rosbag1.Reader(path))
 
 
 def _opened(path: Path, reader: Callable[[], Any]) -> Any:
-    with library_errors(path, REMEDY):
+    with reading.library_errors(path, REMEDY):
         try:
             bag = reader()
             bag.open()
@@ -179,7 +172,7 @@ class BagSource(FileSource):
         self.bag = self.open_bag(path)
         weakref.finalize(self, self.bag.close)
         super().__init__(np.zeros(0))
-        with library_errors(path, REMEDY):
+        with reading.library_errors(path, REMEDY):
             self.find_streams(options)
 
     @staticmethod
@@ -200,7 +193,7 @@ class BagSource(FileSource):
     def load(self, index: int) -> Frame:
         """See `FileSource.load`."""
         where = self.where(index)
-        with library_errors(where, REMEDY):
+        with reading.library_errors(where, REMEDY):
             return self.read_frame(index, where)
 
     def where(self, index: int) -> str:
@@ -222,7 +215,7 @@ class BagSource(FileSource):
     def read_depth(self, index: int, where: str) -> Float32:
         """Return the depth (H, W) of a frame in m."""
         counts = image(self.message(self.depth, index), where, ENCODINGS)
-        check_size(counts, self.camera, where)
+        camera_file.check_size(counts, self.camera, where)
         return depth_counts.depth_from_counts(counts.astype(np.uint16), self.unit)
 
     def read_color(self, track: Track, index: int, where: str) -> UInt8:
@@ -242,7 +235,7 @@ class BagSource(FileSource):
             return np.zeros((self.camera.height, self.camera.width), np.float32)
         where = f"{where}, amplitude"
         counts = image(self.message(self.amplitude, k), where, GREY)
-        check_size(counts, self.camera, where)
+        camera_file.check_size(counts, self.camera, where)
         return finite_float32(counts)
 
 
@@ -419,7 +412,7 @@ def lens(message: Any, where: str) -> Pinhole:
                 f"has {len(D)} coefficients for {model}", where=where, remedy="use --camera"
             )
     coefficients = dict(zip(DISTORTION_ORDER[name], D, strict=False))
-    return checked_lens(MODELS[name], info.size, info.values | coefficients, where)
+    return camera_file.checked_lens(MODELS[name], info.size, info.values | coefficients, where)
 
 
 @dataclass(frozen=True)

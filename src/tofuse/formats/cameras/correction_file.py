@@ -11,7 +11,7 @@ from tofuse.engine.cameras import Camera, depth_conversion
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import DepthKind
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.files import read_npz, replacing
+from tofuse.formats.files import atomic, npz, reading
 
 _MAX_BYTES = 1 << 30
 
@@ -24,25 +24,19 @@ def write_correction(path: str | Path, correction: DepthCorrection) -> None:
     arrays = {"range_m": correction.range_m, "bias_m": correction.bias_m}
     if correction.pixel_bias_m is not None:
         arrays["pixel_bias_m"] = correction.pixel_bias_m
-    with replacing(path) as part, part.open("wb") as file:
+    with atomic.replacing(path) as part, part.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def read_correction(path: str | Path) -> DepthCorrection:
     """Read what `write_correction` writes; InputError if it is invalid or absurdly large."""
-    try:
-        arrays = read_npz(path, limit=_MAX_BYTES, names=frozenset(KEYS))
-    except InputError as error:
-        raise InputError(
-            error.problem, where=path, remedy="write it again, or delete it to go without"
-        ) from error
+    with reading.named(path, "write it again, or delete it to go without"):
+        arrays = npz.read_npz(path, limit=_MAX_BYTES, names=frozenset(KEYS))
     for key in KEYS[:2]:
         if key not in arrays:
             raise InputError(f"has no {key}", where=path, remedy=f"use the keys {list(KEYS)}")
-    try:
+    with reading.named(path):
         return DepthCorrection(arrays["range_m"], arrays["bias_m"], arrays.get("pixel_bias_m"))
-    except InputError as error:
-        raise InputError(error.problem, where=path, remedy=error.remedy) from error
 
 
 def corrected_depth(

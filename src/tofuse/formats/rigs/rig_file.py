@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.cameras import ray_lengths
+from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import if_file, write_text
-from tofuse.formats.recordings.camera_file import number_in, numbers_in, read_json
+from tofuse.formats.files import atomic, json_data, reading
 
 SCHEMA = 1
 FILE_NAME = "rig.json"
@@ -121,7 +118,7 @@ def _camera_data(camera: RigCamera) -> dict[str, Any]:
 
 def write_rig(path: str | Path, rig: Rig) -> None:
     """Write a rig.json; see `replacing` for errors."""
-    write_text(path, json.dumps(rig.to_dict(), indent=1) + "\n")
+    atomic.write_text(path, json.dumps(rig.to_dict(), indent=1) + "\n")
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -132,7 +129,7 @@ def read_rig(path: str | Path) -> Rig:
     InputError
         Naming the invalid field.
     """
-    data = read_json(path)
+    data = json_data.read_json(path)
     schema = data.get("schema")
     if schema != SCHEMA or isinstance(schema, bool):
         problem = f"schema is {schema!r}" if "schema" in data else "schema is missing"
@@ -158,7 +155,7 @@ def read_rig(path: str | Path) -> Rig:
 
 def rig_file_in(folder: str | Path) -> Path | None:
     """Return the rig.json in a folder; None if there is none."""
-    return if_file(Path(folder) / FILE_NAME)
+    return reading.if_file(Path(folder) / FILE_NAME)
 
 
 def recordings_of(rig_file: Path) -> dict[str, Path]:
@@ -187,7 +184,9 @@ def _camera(row: object, k: int, path: str | Path) -> RigCamera:
     if not isinstance(recording, str):
         raise InputError(f"{location}.recording is not a path", where=path, remedy=_REMEDY)
     where = f"{path}: {location}"
-    T = se3.check_pose(numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY), where=str(path))
+    T = se3.check_pose(
+        json_data.numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY), where=str(path)
+    )
     C = _covariance(row, "covariance", where) if "covariance" in row else np.zeros((6, 6))
     random = None
     if row.get("random_covariance") is not None:
@@ -198,7 +197,7 @@ def _camera(row: object, k: int, path: str | Path) -> RigCamera:
 
 
 def _covariance(row: dict[str, Any], name: str, where: str) -> Float64:
-    C = numbers_in(row, name, where, (6, 6), _REMEDY)
+    C = json_data.numbers_in(row, name, where, (6, 6), _REMEDY)
     min_eigenvalue = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
     tolerance = 1e-6 * max(np.abs(C).max(), 1e-9)
     if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or min_eigenvalue < -tolerance:
@@ -225,110 +224,9 @@ def _unplaced(rows: object, path: str | Path) -> dict[str, str]:
 def _number(
     row: dict[str, Any], name: str, limit: float, where: str, default: float | None = None
 ) -> float:
-    value = number_in(row, name, where, default, _REMEDY)
+    value = json_data.number_in(row, name, where, default, _REMEDY)
     if not abs(value) <= limit:
         raise InputError(
             f"is {value:g}, not at most {limit:g}", where=f"{where}: {name}", remedy=_REMEDY
         )
     return value
-
-
-# Largest time difference within an instant, as a fraction of the frame interval.
-_SAME_INSTANT = 0.6
-
-
-class RigSource:
-    """Images of all cameras in temporal order, with depth offsets relative to the first camera.
-
-    Parameters
-    ----------
-    rig
-        The rig; its cameras have the order of the recordings.
-    recordings
-        One for each camera.
-
-    Attributes
-    ----------
-    instant, camera
-        (N,) number of the instant and of the camera of each frame.
-    """
-
-    reference: Float64 | None = None
-    odometry: Float64 | None = None
-    gravity: Float64 | None = None
-
-    def __init__(self, rig: Rig, recordings: Sequence[Recording]) -> None:
-        self.rig = rig
-        self._recordings = list(recordings)
-        rows = self._rows()
-        if not len(rows):
-            raise InputError(
-                "no images of its cameras are of the same time",
-                where="the rig",
-                remedy="pass recordings of the same time, or calibrate the clocks again",
-            )
-        self.instant, self.camera, self._row = rows.T
-        self.timestamps = np.array(
-            [
-                float(recordings[c].timestamps[row]) + rig.cameras[c].time_offset_s
-                for _, c, row in rows
-            ]
-        )
-        self.warnings: list[str] = [
-            f"{camera.name}: {warning}"
-            for camera, recording in zip(rig.cameras, recordings, strict=True)
-            for warning in recording.warnings
-        ]
-        if not any(camera.covariance.any() for camera in rig.cameras[1:]):
-            self.warnings.append(
-                "the rig has no covariances: the accuracy leaves out errors of its cameras' poses"
-            )
-        self.metadata: dict[str, Any] = {
-            key: value
-            for key, value in recordings[0].metadata.items()
-            if all(r.metadata.get(key) == value for r in recordings)
-        }
-        self.metadata["cameras"] = [camera.name for camera in rig.cameras]
-
-    def _rows(self) -> Intp:
-        """(N, 3) instant, camera, and position in the recording of each frame."""
-        times = [
-            recording.timestamps + camera.time_offset_s
-            for recording, camera in zip(self._recordings, self.rig.cameras, strict=True)
-        ]
-        single = all(len(t) == 1 for t in times)
-        rows: list[tuple[int, int, int]] = []
-        instant = 0
-        for k, t in enumerate(times[0]):
-            images = [(0, k)]
-            for c, other in enumerate(times[1:], 1):
-                nearest = int(np.abs(other - t).argmin())
-                interval = float(np.median(np.diff(other))) if len(other) > 1 else 0.0
-                if single or abs(other[nearest] - t) <= _SAME_INSTANT * interval:
-                    images.append((c, nearest))
-            if len(images) == len(times):
-                rows += [(instant, c, row) for c, row in images]
-                instant += 1
-        return np.array(rows, np.intp).reshape(-1, 3)
-
-    @property
-    def T_rig_camera(self) -> Float64:
-        """(N, 4, 4) mounting pose of the camera of each frame."""
-        return np.stack([self.rig.cameras[c].T_rig_camera for c in self.camera])
-
-    def read(self, index: int) -> Frame:
-        """See `Source.read`."""
-        camera = int(self.camera[index])
-        frame = self._recordings[camera][int(self._row[index])]
-        if isinstance(frame, RangeFrame):
-            frame = with_range_added(frame, -self.rig.cameras[camera].depth_offset_m)
-        return replace(frame, index=index, timestamp=float(self.timestamps[index]))
-
-
-def with_range_added(frame: RangeFrame, metres: float) -> RangeFrame:
-    """Return the image with `metres` added to its ranges."""
-    if metres == 0:
-        return frame
-    scale = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
-    depth = np.where(frame.valid, np.maximum(frame.depth + metres * scale, 0), 0)
-    return replace(frame, depth=np.nan_to_num(depth).astype(np.float32))

@@ -1,0 +1,107 @@
+"""Sources made of others: several in sequence, or restricted to a range of depths."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.frames import (
+    Frame,
+    RangeFrame,
+    Source,
+)
+
+
+class JoinedSource:
+    """Several sources in sequence."""
+
+    def __init__(self, parts: Sequence[Source], names: Sequence[str]) -> None:
+        self.parts = list(parts)
+        self.concurrent = all(getattr(p, "concurrent", False) for p in self.parts)
+        counts = [len(p.timestamps) for p in self.parts]
+        self.starts = np.concatenate([[0], np.cumsum(counts)]).astype(int)
+        self.warnings = _joined_warnings(self.parts, names)
+        self.timestamps = self._joined_times(names)
+        self.reference = _joined([p.reference for p in self.parts], counts, (4, 4))
+        self.odometry = _joined([p.odometry for p in self.parts], counts, (4, 4))
+        self.gravity = _joined([p.gravity for p in self.parts], counts, (4,))
+        self.metadata: dict[str, Any] = dict(self.parts[0].metadata)
+        for part in self.parts[1:]:
+            # Only values common to all parts.
+            self.metadata = {
+                key: value
+                for key, value in self.metadata.items()
+                if key in part.metadata and part.metadata[key] == value
+            }
+        self.metadata["parts"] = [
+            {"name": name, "frames": count} for name, count in zip(names, counts, strict=True)
+        ]
+
+    def _joined_times(self, names: Sequence[str]) -> Float64:
+        times: list[Float64] = []
+        for part, name in zip(self.parts, names, strict=True):
+            part_times = part.timestamps
+            last = max((float(t.max()) for t in times), default=-np.inf)
+            if part_times.min() <= last:
+                steps = np.diff(part_times)
+                step = float(np.median(steps)) if len(steps) else 1.0
+                shift = last + max(step, 1e-3) - float(part_times.min())
+                part_times = part_times + shift
+                self.warnings.append(f"{name}: timestamps start again, shifted by {shift:.6g} s")
+            times.append(part_times)
+        return np.concatenate(times)
+
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        part = int(np.searchsorted(self.starts, index, side="right")) - 1
+        frame = self.parts[part].read(index - int(self.starts[part]))
+        return replace(frame, index=index, timestamp=float(self.timestamps[index]))
+
+
+def _joined_warnings(parts: Sequence[Source], names: Sequence[str]) -> list[str]:
+    """The parts' warnings, each once, naming the part where they differ."""
+    lines: dict[str, list[str]] = {}
+    for part, name in zip(parts, names, strict=True):
+        for line in part.warnings:
+            lines.setdefault(line, []).append(name)
+    return [
+        line if len(where) == len(parts) or where[0] in line else f"{', '.join(where)}: {line}"
+        for line, where in lines.items()
+    ]
+
+
+def _joined(
+    arrays: Sequence[Float64 | None], counts: Sequence[int], shape: tuple[int, ...]
+) -> Float64 | None:
+    if all(array is None for array in arrays):
+        return None
+    parts = zip(arrays, counts, strict=True)
+    return np.concatenate(
+        [np.full((n, *shape), np.nan) if array is None else array for array, n in parts]
+    )
+
+
+class LimitedSource:
+    """A source restricted to points between two depths in m: z of images, distance in clouds."""
+
+    def __init__(self, source: Source, min_depth: float, max_depth: float) -> None:
+        self.source, self.min_depth, self.max_depth = source, min_depth, max_depth
+        self.concurrent = getattr(source, "concurrent", False)
+        self.timestamps = source.timestamps
+        self.reference = source.reference
+        self.odometry = source.odometry
+        self.gravity = source.gravity
+        self.warnings = source.warnings
+        self.metadata = source.metadata
+
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        frame = self.source.read(index)
+        if isinstance(frame, RangeFrame):
+            return frame.keep((frame.z >= self.min_depth) & (frame.z <= self.max_depth))
+        distance = np.linalg.norm(frame.points - frame.origin, axis=1)
+        return frame.keep((distance >= self.min_depth) & (distance <= self.max_depth))

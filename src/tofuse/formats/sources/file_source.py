@@ -1,0 +1,191 @@
+"""Sources for readers: files, depth images, colour, pose files, joined recordings, depth limits."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.cameras import Camera
+from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.frames import (
+    AmplitudeKind,
+    DepthKind,
+    Frame,
+    RangeFrame,
+    depth_counts,
+)
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading
+from tofuse.formats.images import check_first_size, read_color, read_image
+from tofuse.formats.sources.per_frame import read_timestamps, tum_poses
+from tofuse.formats.sources.reader import ReaderOptions
+
+
+class FileSource(ABC):
+    """A source whose frames are files; an error in one of them affects only its frame.
+
+    Attributes
+    ----------
+    concurrent
+        Whether several threads can read frames concurrently: `load` has no side effects.
+    camera, unit, kind, amplitude_kind, ambiguity_m
+        Of depth images: the common camera, metres per count, and those of `RangeFrame`.
+    color_camera
+        None if colour is registered to depth, or there is none.
+    """
+
+    concurrent = False
+    camera: Camera
+    unit: float = 0.001
+    kind: DepthKind = "z"
+    amplitude_kind: AmplitudeKind = "raw"
+    ambiguity_m: float | None = None
+    color_camera: camera_file.ColorCamera | None = None
+
+    def __init__(self, timestamps: Float64) -> None:
+        self.timestamps = timestamps
+        self.reference: Float64 | None = None
+        self.odometry: Float64 | None = None
+        self.gravity: Float64 | None = None
+        self.warnings: list[str] = []
+        self.metadata: dict[str, Any] = {}
+
+    @abstractmethod
+    def load(self, index: int) -> Frame:
+        """Read frame `index`; raise InputError if it can't be read."""
+
+    def use_camera(self, path: Path, size: tuple[int, int] | None = None) -> camera_file.CameraFile:
+        """Take camera, unit and kind of depth from a camera.json; see `load_camera`."""
+        description, self.camera = camera_file.load_camera(path, size)
+        self.unit, self.kind = description.depth_unit_m, description.depth_kind
+        self.color_camera = description.color or self.color_camera
+        return description
+
+    def image(self, index: int, depth: Float32, **others: Any) -> RangeFrame:
+        """Return frame `index` with this depth and other attributes of `RangeFrame` by name."""
+        common = {
+            "camera": self.camera if "camera" not in others else None,
+            "depth_kind": self.kind,
+            "amplitude_kind": self.amplitude_kind,
+            "ambiguity_m": self.ambiguity_m,
+        }
+        time = float(self.timestamps[index])
+        return RangeFrame(index=index, timestamp=time, depth=depth, **(common | others))
+
+    def full_resolution_color(self, index: int) -> UInt8 | None:
+        """Return the colour of a frame at its recorded resolution, if it has the view of depth.
+
+        (H, W, 3) RGB, or None if there is none. Raise InputError if it can't be read.
+        """
+        return None
+
+    def read_sidecars(self, folder: Path) -> None:
+        """Read timestamps.txt, groundtruth.txt and odometry.txt, as far as the folder has them."""
+        path = folder / "timestamps.txt"
+        if reading.is_file(path):
+            self.timestamps = read_timestamps(path, len(self.timestamps), self.warnings)
+        if reading.is_file(folder / "groundtruth.txt"):
+            self.reference = tum_poses(self, folder / "groundtruth.txt")
+        if reading.is_file(folder / "odometry.txt"):
+            self.odometry = tum_poses(self, folder / "odometry.txt")
+
+    def note_missing_color(self, color: Sequence[object]) -> None:
+        """Warn if some of the frames have no colour: None in `color`."""
+        colored = sum(item is not None for item in color)
+        if 0 < colored < len(color):
+            self.warnings.append(f"only {colored} of {len(color)} frames have colour")
+
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        try:
+            return self.load(index)
+        except UnreadableFrameError:
+            raise
+        except InputError as error:
+            raise UnreadableFrameError(
+                error.problem, where=error.where, remedy=error.remedy
+            ) from error
+        except MemoryError as error:
+            raise UnreadableFrameError("needs more memory than is available") from error
+
+
+class DepthImageSource(FileSource):
+    """Depth images, with colour images registered to them where given.
+
+    Parameters
+    ----------
+    files
+        16-bit PNGs, one for each frame.
+    timestamps
+        (N,) seconds.
+    camera, depth_unit_m
+        Of all frames, unless `options` has a camera.json, which replaces both.
+    color
+        None, or one image per frame, None where there is none.
+    color_registered
+        Whether colour is registered to depth.
+    sensor
+        Name of the camera, unless `options` has a camera.json that names it; empty if unknown.
+    options
+        Of the reader.
+
+    Raises
+    ------
+    InputError
+        If the camera does not have the size of the images.
+    """
+
+    concurrent = True
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        timestamps: Float64,
+        camera: Camera | None,
+        depth_unit_m: float,
+        *,
+        color: Sequence[Path | None] | None = None,
+        color_registered: bool = True,
+        sensor: str = "",
+        options: ReaderOptions | None = None,
+    ) -> None:
+        super().__init__(timestamps)
+        self.files, self.color = list(files), None if color is None else list(color)
+        self.color_registered = color_registered
+        where = "the camera of this format"
+        if options is not None and options.camera is not None:
+            sensor = self.use_camera(options.camera).sensor or sensor
+            where = str(options.camera)
+        elif camera is None:
+            raise InputError(
+                "has no camera", where=self.files[0].parent, remedy="pass one with --camera"
+            )
+        else:
+            self.camera, self.unit = camera, depth_unit_m
+        size = (self.camera.width, self.camera.height)
+        self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
+        if sensor:
+            self.metadata["sensor"] = sensor
+        self.note_missing_color(self.color or ())
+        remedy = "pass the camera of these images with --camera"
+        check_first_size(self.files, size, where, remedy)
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        size = (self.camera.width, self.camera.height)
+        counts = read_image(self.files[index], size=size, dtype="uint16")
+        color = None
+        path = None if self.color is None else self.color[index]
+        if path is not None:
+            color = read_color(path)
+            if color.shape[:2] != counts.shape:
+                raise InputError(
+                    f"is {color.shape[1]} x {color.shape[0]} pixels, depth {size[0]} x {size[1]}",
+                    where=path,
+                    remedy="register colour to depth, or leave it out",
+                )
+        depth = depth_counts.depth_from_counts(counts, self.unit)
+        return self.image(index, depth, color_image=color, color_registered=self.color_registered)
