@@ -45,8 +45,7 @@ from tofuse.engine.fusion.layout import Layout
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.model import ModelBuilder
 from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.fusion.range_view import RangeView
-from tofuse.engine.fusion.stored_views import StoredViews
+from tofuse.engine.fusion.range_view import RangeView, StoredViews
 from tofuse.engine.fusion.tsdf import Volume, fitting_voxel, fuse_surface
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import Config, from_method

@@ -6,8 +6,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.fusion import texture
-    from tofuse.engine.fusion.cloud import Cloud, as_cloud
-    from tofuse.engine.fusion.colors import display_colors
+    from tofuse.engine.fusion.cloud import Cloud, as_cloud, display_colors
     from tofuse.engine.fusion.geometry_record import GeometryRecord, stacked
     from tofuse.engine.fusion.mesh import Mesh, mesh_of
     from tofuse.engine.fusion.model import Model, ModelBuilder

@@ -15,8 +15,7 @@ from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.fusion.range_view import RangeView
-from tofuse.engine.fusion.stored_views import StoredClouds, StoredViews
+from tofuse.engine.fusion.range_view import RangeView, StoredClouds, StoredViews
 from tofuse.engine.fusion.tsdf import fitting_voxel, fuse_surface
 from tofuse.engine.refinement import without_errors
 from tofuse.engine.views import PreparedView

@@ -6,17 +6,23 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.graph import (
-        bridges,
         castellani,
         external_sensors,
         graph_covariances,
         levenberg,
-        measured_graph,
         minimisation,
         robust,
         solver,
         sparse,
     )
-    from tofuse.engine.graph.graph import GraphPart, LoopRecord, Optimisation, Optimiser, PoseGraph
+    from tofuse.engine.graph.graph import (
+        GraphPart,
+        LoopRecord,
+        Measured,
+        Optimisation,
+        Optimiser,
+        PoseGraph,
+        build_graph,
+    )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

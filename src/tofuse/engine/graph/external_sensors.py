@@ -17,8 +17,7 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import Gravity, PoseGraph
-from tofuse.engine.graph.measured_graph import Measured
+from tofuse.engine.graph.graph import Gravity, Measured, PoseGraph
 from tofuse.engine.graph.minimisation import vertical
 from tofuse.engine.parts import part
 

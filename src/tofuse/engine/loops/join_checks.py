@@ -12,18 +12,16 @@ from tofuse.engine.alignment import Link, Registration, projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.loops.gaps import (
+from tofuse.engine.loops.merged_components import (
     CONVERGENCE,
+    DRIFT,
+    MergedComponent,
+    MergedComponents,
     TrackedComponent,
     View,
     end_speeds,
     largest_motion,
     motion_over,
-)
-from tofuse.engine.loops.merged_components import (
-    DRIFT,
-    MergedComponent,
-    MergedComponents,
     transformed,
 )
 from tofuse.engine.search import (

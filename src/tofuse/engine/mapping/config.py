@@ -14,11 +14,30 @@ from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.fusion import Fusion
 from tofuse.engine.graph import Optimiser, external_sensors
 from tofuse.engine.loops import Joining, LoopDetector
-from tofuse.engine.mapping.budget import voxels_mb
 from tofuse.engine.refinement import NoRefinement, RefinementMethod
 from tofuse.engine.search import SearchOptions
 from tofuse.engine.sensor import Correction
 from tofuse.engine.tracking import Odometry
+
+# Fractions of the total. The remainder is for the program itself (about 400 MB), frames being
+# processed, data computed from stored views, and the result.
+_VOXELS, _VIEWS, _CHECKED = 0.3, 0.03, 0.005
+
+
+def voxels_mb(memory_mb: int) -> int:
+    """Return the memory of fusion for voxels, MB; see `Fusion.memory_mb`."""
+    return max(1, int(_VOXELS * memory_mb))
+
+
+def checked_bytes(memory_mb: int) -> int:
+    """Return the memory for the images of the final comparison, bytes."""
+    return int(_CHECKED * memory_mb * 1_000_000)
+
+
+def views_bytes(memory_mb: int) -> int:
+    """Return the memory for the prepared views of loops and refinement, bytes."""
+    return int(_VIEWS * memory_mb * 1_000_000)
+
 
 ViewKind = Literal["range", "cloud"]
 

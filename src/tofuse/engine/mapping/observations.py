@@ -14,8 +14,7 @@ from tofuse.engine.compute import Scratch, Spill, job_pool, thread_count
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.fusion import ModelBuilder, as_cloud
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping.budget import checked_bytes, views_bytes
-from tofuse.engine.mapping.config import Config
+from tofuse.engine.mapping.config import Config, checked_bytes, views_bytes
 from tofuse.engine.mapping.preparation import FilteredFrame
 from tofuse.engine.quality import cross_view_agreement, frame_samples
 from tofuse.engine.stored_views import Spacing, Spilled, ViewStore

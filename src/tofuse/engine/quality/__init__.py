@@ -14,6 +14,6 @@ if TYPE_CHECKING:
         trajectory_errors,
     )
     from tofuse.engine.quality.change_detection import Change, changes
-    from tofuse.engine.quality.pair_measurements import measured_pairs
+    from tofuse.engine.quality.pose_deviation import measured_pairs
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -6,7 +6,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.refinement import calibration_check, joint_alignment, plane_refinement
-    from tofuse.engine.refinement.pose_priors import Priors
+    from tofuse.engine.refinement.joint_alignment import Priors
     from tofuse.engine.refinement.refinement import (
         AlreadyRefined,
         Joint,

@@ -24,13 +24,13 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.camera_response import response
 from tofuse.engine.refinement.joint_alignment import (
     AlignedViews,
+    Priors,
     Refined,
     align_views,
     refine,
     spread_evenly,
 )
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap
-from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.refinement.split_half import aligned_motion
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels

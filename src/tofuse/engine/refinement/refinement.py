@@ -14,16 +14,15 @@ from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import Spill
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import external_sensors, measured_graph
+from tofuse.engine.graph import Measured, external_sensors
 from tofuse.engine.parts import part
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
     check_calibration,
     combine_checks,
 )
-from tofuse.engine.refinement.joint_alignment import Refined, refine, support_fell
+from tofuse.engine.refinement.joint_alignment import Priors, Refined, refine, support_fell
 from tofuse.engine.refinement.loop_drift import loop_gap
-from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.refinement.split_half import split_half_errors
 from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps
 from tofuse.engine.stored_views import (
@@ -90,7 +89,7 @@ class Refinement:
     moved_rad: float = 0.0
     support: tuple[float, float] = (0.0, 0.0)
     errors: dict[str, float] = field(default_factory=dict)
-    edges: tuple[measured_graph.Measured, ...] = ()
+    edges: tuple[Measured, ...] = ()
     calibration_check: CalibrationCheck | None = None
     non_overlap_edges: tuple[tuple[int, int], ...] = ()
     split_m: float = 0.0
@@ -178,8 +177,8 @@ class AlreadyRefined(RefinementMethod):
         By frame indices: measurements of pairs of views, and other edges.
     """
 
-    measured: tuple[measured_graph.Measured, ...]
-    non_overlap_edges: tuple[measured_graph.Measured, ...]
+    measured: tuple[Measured, ...]
+    non_overlap_edges: tuple[Measured, ...]
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `RefinementMethod.start`."""
@@ -386,9 +385,7 @@ def _calibration_check(submap: RefinedSubmap, options: Joint) -> CalibrationChec
     return CalibrationCheck(gap=gap)
 
 
-def pairwise_measurements(
-    ids: Sequence[int], refined: Refined
-) -> tuple[measured_graph.Measured, ...]:
+def pairwise_measurements(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:
     """Return the measurements of single pairs, with reduced information.
 
     All pairs of a view share its errors, so the information is divided by their number.
@@ -404,7 +401,7 @@ def pairwise_measurements(
     partners = np.bincount(pairs.ravel(), minlength=len(ids))
     divisors = _CORRELATED_PIXELS * 0.5 * partners[pairs].sum(1)
     return tuple(
-        measured_graph.Measured(ids[i], ids[j], T, H / divisor)
+        Measured(ids[i], ids[j], T, H / divisor)
         for (i, j), T, H, divisor in zip(
             pairs, refined.measured, refined.information, divisors, strict=True
         )

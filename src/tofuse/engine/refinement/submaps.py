@@ -20,6 +20,7 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import PoseGraph, levenberg
 from tofuse.engine.refinement.joint_alignment import (
+    Priors,
     Refined,
     Support,
     refine,
@@ -27,7 +28,6 @@ from tofuse.engine.refinement.joint_alignment import (
     support_fell,
     support_of,
 )
-from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.stored_views import (
     HasCoarseView,
     SampledView,

@@ -18,7 +18,7 @@ from tofuse.engine.compute import run_chunks
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
-from tofuse.engine.stored_views.shared_error_kernels import marginalise_shared_errors
+from tofuse.engine.stored_views.pair_equation_kernels import marginalise_shared_errors
 from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.engine.views import residual_kernels
 
