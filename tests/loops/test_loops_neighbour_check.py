@@ -13,7 +13,7 @@ from tofuse.engine.graph.graph import LoopRecord
 from tofuse.engine.loops.loops import ClosedLoop
 from tofuse.engine.loops.revisits import degraded_neighbours
 from tofuse.engine.mapping.backend import BackEnd
-from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.progress import Stopwatch
 from tofuse.engine.tracking.base import Step
 

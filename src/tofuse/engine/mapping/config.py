@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -123,21 +123,6 @@ PACKAGES = (
     "tofuse.engine.refinement",
     "tofuse.lab.methods",
 )
-
-
-def methods() -> dict[str, Callable[[ViewKind], Config]]:
-    """Return the named configurations, `default` first."""
-    from tofuse.engine.mapping import methods as named
-
-    return {"default": named.default, "thesis": named.thesis}
-
-
-def from_method(name: str, kind: ViewKind = "range") -> Config:
-    """Return the configuration of that name for a kind of view; InputError if there is none."""
-    available = methods()
-    if name not in available:
-        raise InputError(f"is {name!r}", where="--method", remedy=f"use one of {list(available)}")
-    return available[name](kind)
 
 
 def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config:
