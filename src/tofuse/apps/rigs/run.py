@@ -23,7 +23,7 @@ from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured
 from tofuse.engine.loops import Nearby
-from tofuse.engine.mapping import Config, priors, reconstructing
+from tofuse.engine.mapping import Config, adaptation, reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import AlreadyRefined, NoRefinement
@@ -174,7 +174,10 @@ def reconstruct_rig(
         fusion_config, refinement=AlreadyRefined(measured, (*tracked, *calibration_edges))
     )
     result = reconstructing.reconstruct(
-        priors.with_odometry(recording, frame_poses), refined_config, seed=seed, progress=progress
+        adaptation.with_odometry(recording, frame_poses),
+        refined_config,
+        seed=seed,
+        progress=progress,
     )
     names = [camera.name for camera in rig.cameras]
     rig_fields = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}

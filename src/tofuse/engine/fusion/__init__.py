@@ -7,8 +7,8 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.fusion import texture
     from tofuse.engine.fusion.cloud import Cloud, as_cloud, display_colors
-    from tofuse.engine.fusion.geometry_record import GeometryRecord, stacked
-    from tofuse.engine.fusion.mesh import Mesh, mesh_of
+    from tofuse.engine.fusion.geometry_record import GeometryRecord
+    from tofuse.engine.fusion.mesh import Mesh
     from tofuse.engine.fusion.model import Model, ModelBuilder
     from tofuse.engine.fusion.options import Fusion
     from tofuse.engine.fusion.pose_errors import UNKNOWN_M, with_pose_errors

@@ -5,7 +5,7 @@ Colours of a model for display; black marks points without a colour in any image
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -71,10 +71,6 @@ class Cloud(Exportable):
 
     def __repr__(self) -> str:
         return f"Cloud: {len(self):,} points over {self.diagonal_m:.3g} m"
-
-    def record(self) -> GeometryRecord:
-        """Return the record for file writers, in the world frame, float64."""
-        return replace(self.local_record(), points=self.points.astype(np.float64) + self.offset)
 
     def local_record(self) -> GeometryRecord:
         """Return the record relative to `offset`, float32."""

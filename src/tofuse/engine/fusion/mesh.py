@@ -140,16 +140,26 @@ class Mesh(Exportable):
     views: Int32
     offset: Float64
 
+    @classmethod
+    def of(cls, record: GeometryRecord) -> Mesh:
+        """Return the mesh of a file's record; what it lacks of normals and scalars is zero."""
+        zeros = np.zeros(len(record))
+        faces, normals = record.faces, record.normals
+        return cls(
+            record.points.astype(np.float32),
+            np.zeros((0, 3), np.int32) if faces is None else faces,
+            np.zeros((len(record), 3), np.float32) if normals is None else normals,
+            record.color,
+            record.scalars.get("sigma", zeros).astype(np.float32),
+            record.scalars.get("views", zeros).astype(np.int32),
+            np.zeros(3),
+        )
+
     def __len__(self) -> int:
         return len(self.vertices)
 
     def __repr__(self) -> str:
         return f"Mesh: {len(self):,} vertices, {len(self.faces):,} faces"
-
-    def record(self) -> GeometryRecord:
-        """Return the record for file writers, in the world frame, float64."""
-        points = self.vertices.astype(np.float64) + self.offset
-        return replace(self.local_record(), points=points)
 
     def local_record(self) -> GeometryRecord:
         """Return the record relative to `offset`, float32."""
@@ -377,21 +387,6 @@ class Mesh(Exportable):
             ..., 0
         ]
         return centroids + step.clip(-0.5 * cell_m, 0.5 * cell_m)
-
-
-def mesh_of(record: GeometryRecord) -> Mesh:
-    """Return the mesh of a file's record; what it lacks of normals and scalars is zero."""
-    zeros = np.zeros(len(record))
-    faces, normals = record.faces, record.normals
-    return Mesh(
-        record.points.astype(np.float32),
-        np.zeros((0, 3), np.int32) if faces is None else faces,
-        np.zeros((len(record), 3), np.float32) if normals is None else normals,
-        record.color,
-        record.scalars.get("sigma", zeros).astype(np.float32),
-        record.scalars.get("views", zeros).astype(np.int32),
-        np.zeros(3),
-    )
 
 
 def _means(values: NDArray[np.generic], group: Intp, count: Intp) -> Float64:

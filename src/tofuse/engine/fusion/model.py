@@ -57,7 +57,6 @@ class ModelBuilder:
             spill = Spill(options.memory_mb * 1_000_000 // 10)
         self._ranges = StoredViews(spill)
         self._clouds = StoredClouds(spill)
-        self._bytes = 0
         self._voxel_m = 0.01  # of clouds
 
     def add(self, frame: Frame, surface: PreparedView | None, max_points: int) -> None:
@@ -77,19 +76,12 @@ class ModelBuilder:
                 self._voxel_m = self._options.voxel_m or choose_voxel(frame)
             self._clouds.add(as_cloud(frame, max_points))
             return
-        view = RangeView.of(frame, surface)
-        self._ranges.add(view)
-        self._bytes += view.nbytes
+        self._ranges.add(RangeView.of(frame, surface))
 
     @property
     def views(self) -> int:
         """Number of stored views."""
         return len(self._ranges) + len(self._clouds)
-
-    @property
-    def nbytes(self) -> int:
-        """Size of the images of these views, in memory or on disk."""
-        return self._bytes
 
     def fuse(
         self,

@@ -10,7 +10,6 @@ if TYPE_CHECKING:
         external_sensors,
         graph_covariances,
         levenberg,
-        minimisation,
         robust,
         solver,
         sparse,

@@ -12,6 +12,7 @@ from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph import robust
 
 # Squared error of an edge, in units of its information, up to which it may be rounding.
 ROUNDING = 1e-12
@@ -41,6 +42,18 @@ class Gravity:
     sigma: Float64
     world: Float64 | None = None
     gate: float = np.inf
+
+    def vertical(self, observed: Float64) -> Float64:
+        """Return the (3,) robust mean of directions (g, 3) observed in the world, by their sigmas."""
+        weight = 1 / self.sigma**2
+        if np.isinf(self.gate):
+            return np.asarray((observed * weight[:, None]).sum(0), np.float64)
+        down = np.median(observed, axis=0)  # robust to outliers
+        for _ in range(10):
+            down = down / max(float(np.linalg.norm(down)), 1e-12)
+            x = ((observed - down) ** 2).sum(1) * weight
+            down = (observed * (weight * robust.weight("huber", x, 1.0))[:, None]).sum(0)
+        return np.asarray(down, np.float64)
 
 
 @dataclass(frozen=True, eq=False)

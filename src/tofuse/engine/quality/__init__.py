@@ -14,6 +14,5 @@ if TYPE_CHECKING:
         trajectory_errors,
     )
     from tofuse.engine.quality.change_detection import Change, changes
-    from tofuse.engine.quality.pose_deviation import measured_pairs
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

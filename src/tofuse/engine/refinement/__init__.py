@@ -14,7 +14,6 @@ if TYPE_CHECKING:
         Refinement,
         RefinementMethod,
         Refiner,
-        accepted_with,
         pairwise_measurements,
         propagate_poses,
         without_errors,

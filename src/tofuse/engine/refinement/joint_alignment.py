@@ -18,7 +18,7 @@ from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64, Int64, Intp
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import external_sensors, minimisation, robust, sparse
+from tofuse.engine.graph import external_sensors, robust, sparse
 from tofuse.engine.stored_views import SampledView, overlaps, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
@@ -526,7 +526,7 @@ def _add_gravity(
     vertices, d = gravity.vertices, gravity.directions
     R = poses[vertices, :3, :3]
     observed = (R @ d[..., None])[..., 0]
-    down = minimisation.vertical(observed, gravity)
+    down = gravity.vertical(observed)
     down /= np.linalg.norm(down)
     tangent = np.linalg.svd(down[None])[2][1:].T  # (3, 2) tangent directions
     e = observed - down

@@ -25,7 +25,6 @@ from tofuse.engine.refinement.refinement import (
     Refinement,
     RefinementMethod,
     Refiner,
-    accepted_with,
     with_unsupported_views_fixed,
 )
 from tofuse.engine.stored_views import Spacing, ViewStore
@@ -105,7 +104,7 @@ class _Planes(Refiner):
         lost = aligned.after < aligned.before - MAX_LOSS
         after = with_unsupported_views_fixed(before, aligned.poses, lost)
         edges = tuple(_edges(aligned, [view.index for view in views], lost))
-        return replace(accepted_with(unchanged, positions, after), edges=edges)
+        return replace(unchanged.accepted(positions, after), edges=edges)
 
 
 def _edges(aligned: Aligned, ids: Sequence[int], lost: Bool) -> list[Measured]:

@@ -95,6 +95,17 @@ class Refinement:
     split_m: float = 0.0
     split_rad: float = 0.0
 
+    def accepted(self, positions: Intp, after: Float64) -> Refinement:
+        """Return the refinement that keeps the poses `after` of the frames at `positions`."""
+        motion = se3.log(se3.inverse(self.poses[positions]) @ after)
+        return replace(
+            self,
+            poses=propagate_poses(self.poses, positions, after),
+            kept=True,
+            moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
+            moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
+        )
+
 
 class Refiner(Protocol):
     """State of a refinement of one recording.
@@ -281,7 +292,7 @@ class _Joint(Refiner):
             after = before
         split_m, split_rad = evidence.split()
         return replace(
-            accepted_with(unchanged, positions, after),
+            unchanged.accepted(positions, after),
             calibration_check=evidence.calibration(),
             split_m=split_m,
             split_rad=split_rad,
@@ -463,28 +474,6 @@ def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:
     )
     corrected[:, :2] += errors.get("focal", 0.0) * p[:, :2]
     return corrected.astype(np.float32)
-
-
-def accepted_with(unchanged: Refinement, positions: Intp, after: Float64) -> Refinement:
-    """Return the accepted refinement in which the poses at `positions` become `after`.
-
-    Parameters
-    ----------
-    unchanged
-        The refinement as if it were rejected.
-    positions
-        (M,) ascending positions of the refined views.
-    after
-        (M, 4, 4) T_world_camera.
-    """
-    motion = se3.log(se3.inverse(unchanged.poses[positions]) @ after)
-    return replace(
-        unchanged,
-        poses=propagate_poses(unchanged.poses, positions, after),
-        kept=True,
-        moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
-        moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
-    )
 
 
 def propagate_poses(poses: Float64, positions: Intp, after: Float64) -> Float64:
