@@ -1,4 +1,9 @@
-"""."""
+"""Fusion of posed views into a model: a surface from signed distances, or a cloud of averages.
+
+A `ModelBuilder` stores views until their final poses are known and fuses them, by the options
+`Fusion`, into a `Model` of a `Cloud` and a `Mesh`, both with standard deviations. Files are
+written from a `GeometryRecord`. `texture` paints a mesh; `T_up_world` turns it upright.
+"""
 
 from typing import TYPE_CHECKING
 

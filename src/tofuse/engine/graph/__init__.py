@@ -1,4 +1,10 @@
-"""."""
+"""Pose graphs: poses, measured motions between them, and their optimisation.
+
+A `PoseGraph` is built of `Measured` motions. An `Optimiser` corrects its poses and rejects wrong
+loops: `levenberg` (the default) or `castellani` (the thesis), by the `solver` of sparse systems
+(`sparse`) with `robust` kernels. `graph_covariances` says how uncertain the poses are;
+`external_sensors` adds gravity and odometry.
+"""
 
 from typing import TYPE_CHECKING
 

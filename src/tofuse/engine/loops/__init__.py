@@ -1,4 +1,10 @@
-"""."""
+"""Loop closures: registrations of views that are far apart in time but show the same place.
+
+A `LoopDetector` (`Revisits` for images, `Nearby` for clouds) starts `Loops`, which are given
+views and return `ClosedLoop`s, accepted or rejected with a reason. `Joining` connects a
+`TrackedComponent` to others that were tracked separately, and returns each connected `Group` with
+its `Join`s.
+"""
 
 from typing import TYPE_CHECKING
 

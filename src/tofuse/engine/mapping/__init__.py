@@ -1,4 +1,9 @@
-"""."""
+"""The whole reconstruction: frames in; poses, model and accuracy out.
+
+A `Mapper` takes frames one by one and reconstructs them by a `Config`, which `from_method` looks
+up by name and `changed` modifies. `reconstructing` feeds it a recording, after `adaptation` of
+the configuration to the recording. `texturing` paints the finished model.
+"""
 
 from typing import TYPE_CHECKING
 

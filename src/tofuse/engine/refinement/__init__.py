@@ -1,4 +1,9 @@
-"""."""
+"""Joint refinement: the poses of all overlapping views are optimised together, after loop closure.
+
+A `RefinementMethod` (`Joint` for images, `plane_refinement` for clouds) starts a `Refiner`, which
+returns a `Refinement`: poses, edges for the pose graph, and evidence of their errors, from a
+`calibration_check` and from halves of the images. `joint_alignment` is its least-squares problem.
+"""
 
 from typing import TYPE_CHECKING
 
