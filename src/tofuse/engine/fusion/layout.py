@@ -17,7 +17,7 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.fusion.block_kernels import EDGE, EMPTY, HALF, VOXELS, insert_keys
-from tofuse.engine.fusion.range_view import RangeView, Views, summaries
+from tofuse.engine.fusion.range_view import Views, summaries
 from tofuse.engine.fusion.tsdf_kernels import max_informative_depth, near_cubes
 from tofuse.engine.geometry import se3
 
@@ -228,11 +228,19 @@ def _surface_blocks(
 ) -> Int64:
     """Return the keys of the blocks near surfaces, ascending."""
 
+    stride = min(free_space_stride, 2)
+
     def touched(start: int, stop: int) -> Int64:
         table, count = np.full(1 << 12, EMPTY, np.int64), 0
         for k in range(start, stop):
-            keys = cubes_near(
-                views[k], poses[k], block_m, reach_m, _BLOCK_SPACING, k, min(free_space_stride, 2)
+            keys = near_cubes(
+                views[k].stored,
+                poses[k],
+                block_m,
+                reach_m,
+                _BLOCK_SPACING,
+                first_pixel(k, stride),
+                stride,
             )
             table, count = insert_keys(table, count, keys)
         return table[table != EMPTY]
@@ -242,36 +250,6 @@ def _surface_blocks(
     return np.unique(np.concatenate(run_chunks(touched, len(views), _CHUNKS)))
 
 
-def cubes_near(
-    view: RangeView,
-    T_world_camera: Float64,
-    cube_m: float,
-    reach_m: float,
-    spacing: float,
-    number: int,
-    stride: int,
-) -> Int64:
-    """Return the keys of the cubes near the surface of a view, by every `stride`-th pixel.
-
-    Parameters
-    ----------
-    view, T_world_camera
-        The view and its (4, 4) pose.
-    cube_m, reach_m
-        Edge of the cubes and truncation distance, m.
-    spacing
-        Of samples along a normal, as a fraction of the edge.
-    number
-        Number of the view, which determines its first pixel.
-    stride
-        Every n-th column and row is used.
-    """
-    return near_cubes(
-        view.stored,
-        T_world_camera,
-        cube_m,
-        reach_m,
-        spacing,
-        (number % stride, number // stride % stride),
-        stride,
-    )
+def first_pixel(number: int, stride: int) -> tuple[int, int]:
+    """Return row and column of the first of every `stride`-th pixel, which depend on the view."""
+    return number % stride, number // stride % stride

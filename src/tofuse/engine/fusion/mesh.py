@@ -299,9 +299,7 @@ class Mesh(Exportable):
             group, count = self._cluster(cell)
             remaining = with_distinct_corners(group[self.faces])
             if len(remaining) <= faces:
-                return self._merge_groups(
-                    group, count, remaining, self._optimal_positions(group, count, cell)
-                )
+                return self._merged(group, count, remaining, cell)
             # A larger step than a flat surface would need.
             cell *= float(np.clip((len(remaining) / faces) ** 0.6, 1.02, 2.0))
 
@@ -321,9 +319,11 @@ class Mesh(Exportable):
             return self
         group, count = self._cluster(cell_m)
         remaining = with_distinct_corners(group[self.faces])
-        return self._merge_groups(
-            group, count, remaining, self._optimal_positions(group, count, cell_m)
-        )
+        return self._merged(group, count, remaining, cell_m)
+
+    def _merged(self, group: Intp, count: Intp, faces: Int32, cell_m: float) -> Mesh:
+        positions = self._optimal_positions(group, count, cell_m)
+        return self._merge_groups(group, count, faces, positions)
 
     def _cluster(self, cell_m: float) -> tuple[Intp, Intp]:
         """Return the group of each vertex (N,), and the size of each group (G,)."""

@@ -364,25 +364,6 @@ class StoredViews:
         return (self._spill.get(number) for number in self._numbers)
 
 
-class StoredClouds:
-    """Clouds in a store, read on demand."""
-
-    def __init__(self, spill: Spill[CloudFrame]) -> None:
-        self._spill = spill
-        self._numbers: list[tuple[int, int]] = []  # of the frame, and in the store
-
-    def add(self, cloud: CloudFrame) -> None:
-        """Store a cloud; raises as `StoredViews.add`."""
-        self._numbers.append((cloud.index, self._spill.put(cloud)))
-
-    def of(self, indices: Container[int]) -> Iterator[CloudFrame]:
-        """Read the clouds of these frame indices, one at a time."""
-        return (self._spill.get(number) for index, number in self._numbers if index in indices)
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-
 def summaries(views: Views) -> Sequence[ViewSummary]:
     """Return the summaries of all views, without reading those that are on disk."""
     if isinstance(views, StoredViews):

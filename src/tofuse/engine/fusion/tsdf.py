@@ -34,7 +34,7 @@ from tofuse.engine.fusion.layout import (
     Frusta,
     Layout,
     Region,
-    cubes_near,
+    first_pixel,
 )
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.options import Fusion
@@ -46,6 +46,7 @@ from tofuse.engine.fusion.tsdf_kernels import (
     Decoding,
     apply_free_space,
     integrate,
+    near_cubes,
     unpack_view,
 )
 from tofuse.engine.geometry import se3
@@ -313,9 +314,9 @@ class Volume:
                 view = views[s]
                 unpack_view(view.stored, projection.frame, decoding, batch, s)
                 if self.free_space_stride > 1:
-                    number = int(numbers[s])
-                    cubes = cubes_near(
-                        view, poses[s], cube_m, self.reach_m, CUBE_SPACING, number, 2
+                    first = first_pixel(int(numbers[s]), 2)
+                    cubes = near_cubes(
+                        view.stored, poses[s], cube_m, self.reach_m, CUBE_SPACING, first, 2
                     )
                     mark_octants(cubes, *self.index, near_surface[s])
                 # Albedo is ignored if other views have colour.

@@ -44,7 +44,7 @@ class Gravity:
     gate: float = np.inf
 
     def vertical(self, observed: Float64) -> Float64:
-        """Return the (3,) robust mean of directions (g, 3) observed in the world, by their sigmas."""
+        """Return the (3,) robust mean of directions (g, 3) observed in the world."""
         weight = 1 / self.sigma**2
         if np.isinf(self.gate):
             return np.asarray((observed * weight[:, None]).sum(0), np.float64)

@@ -144,7 +144,6 @@ class FrameLog:
     interruptions: list[int] = field(default_factory=list)
     repeated: list[int] = field(default_factory=list)
     _steps: dict[int, Step] = field(default_factory=dict, init=False, repr=False)
-    _n_indexed: int = field(default=0, init=False, repr=False)
 
     def add(
         self,
@@ -160,6 +159,7 @@ class FrameLog:
             r = step.registration
             r = None if r is None else replace(r, errors=())
             step = replace(step, registration=r, surface=None, moving=None)
+            self._steps[record.index] = step
         number = len(self.interruptions)
         self.entries.append(Entry(record, step, number, T_odometry, gravity, moving))
 
@@ -206,11 +206,6 @@ class FrameLog:
 
     def step_of(self, frame: int) -> Step:
         """Return the tracking result of a frame with a pose."""
-        if self._n_indexed != len(self.entries):
-            for entry in self.entries[self._n_indexed :]:
-                if entry.step is not None:
-                    self._steps[entry.record.index] = entry.step
-            self._n_indexed = len(self.entries)
         return self._steps[frame]
 
     def numbered(self, numbers: Mapping[int, int]) -> FrameLog:

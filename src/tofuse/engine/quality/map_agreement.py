@@ -33,7 +33,7 @@ from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory_errors import finite_or_none
+from tofuse.engine.quality.trajectory_errors import associate, finite_or_none
 from tofuse.engine.quality.view_agreement_kernels import (
     agreement_sums,
     project_by_lens,
@@ -340,16 +340,11 @@ def poses_of_frames(times: ArrayLike, pose_times: ArrayLike, poses: ArrayLike) -
 
     Returns
     -------
-    (M, 4, 4), NaN for frames without a pose. Of several poses for a frame the last one is used.
+    (M, 4, 4), NaN for frames without a pose.
     """
-    times, pose_times = np.asarray(times, float), np.asarray(pose_times, float)
-    frame_poses = np.full((len(times), 4, 4), np.nan)
-    if len(times) == 0:
-        return frame_poses
-    for time, T in zip(pose_times, np.asarray(poses, float), strict=True):
-        k = int(np.abs(times - time).argmin())
-        if abs(times[k] - time) < 0.02:
-            frame_poses[k] = T
+    frame_poses = np.full((np.size(times), 4, 4), np.nan)
+    frames, rows = associate(times, pose_times).T
+    frame_poses[frames] = np.asarray(poses, float)[rows]
     return frame_poses
 
 

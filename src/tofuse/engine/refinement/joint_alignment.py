@@ -205,20 +205,10 @@ def refine(
         poses = bodies.view_poses(bodies.body_poses(poses))
     start = poses
     aligned = align_views(
-        views,
-        poses,
-        options,
-        calibrate=calibrate,
-        priors=priors,
-        pairs=pairs,
-        bodies=bodies,
+        views, poses, options, calibrate=calibrate, priors=priors, pairs=pairs, bodies=bodies
     )
-    poses, errors, state, fixed_errors = (
-        aligned.poses,
-        aligned.errors,
-        aligned.state,
-        aligned.fixed_errors,
-    )
+    poses, errors, state = aligned.poses, aligned.errors, aligned.state
+    fixed_errors = aligned.fixed_errors
     count = len(state.target) // 2
     pairs = np.stack([state.target[:count], state.source[:count]], 1)
     final_round = options.rounds[-1]

@@ -154,19 +154,14 @@ class RefinementMethod(Protocol):
 
 @part("refinement", "none")
 @dataclass(frozen=True)
-class NoRefinement(RefinementMethod):
-    """Leaves the poses as they are after the optimisation."""
+class NoRefinement(RefinementMethod, Refiner):
+    """Leaves all poses as they are."""
+
+    needs_points: ClassVar[bool] = False
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `RefinementMethod.start`."""
-        return _Idle()
-
-
-class _Idle(Refiner):
-    needs_points: ClassVar[bool] = False
-
-    def push(self, view: Frame, T_component_camera: Float64) -> None:
-        """See `Refiner.push`: views are not needed."""
+        return self
 
     def finish(
         self,
@@ -179,7 +174,7 @@ class _Idle(Refiner):
 
 
 @dataclass(frozen=True, eq=False)
-class AlreadyRefined(RefinementMethod):
+class AlreadyRefined(RefinementMethod, Refiner):
     """Keeps poses that were refined before, with the measurements of that refinement.
 
     Attributes
@@ -188,17 +183,13 @@ class AlreadyRefined(RefinementMethod):
         By frame indices: measurements of pairs of views, and other edges.
     """
 
+    needs_points: ClassVar[bool] = False
     measured: tuple[Measured, ...]
     non_overlap_edges: tuple[Measured, ...]
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `RefinementMethod.start`."""
-        return _AlreadyRefined(self)
-
-
-class _AlreadyRefined(_Idle):
-    def __init__(self, previous: AlreadyRefined) -> None:
-        self._previous = previous
+        return self
 
     def finish(
         self,
@@ -208,12 +199,12 @@ class _AlreadyRefined(_Idle):
     ) -> Refinement:
         """See `Refiner.finish`."""
         posed = set(ids)
-        edges = (*self._previous.measured, *self._previous.non_overlap_edges)
+        edges = (*self.measured, *self.non_overlap_edges)
         return Refinement(
             poses,
             kept=True,
             edges=tuple(e for e in edges if {e.i, e.j} <= posed),
-            non_overlap_edges=tuple((e.i, e.j) for e in self._previous.non_overlap_edges),
+            non_overlap_edges=tuple((e.i, e.j) for e in self.non_overlap_edges),
         )
 
 
@@ -256,9 +247,6 @@ class _Joint(Refiner):
     def __init__(self, options: Joint, views: ViewStore[PreparedView]) -> None:
         self._options = options
         self._store = views
-
-    def push(self, view: Frame, T_component_camera: Float64) -> None:
-        """See `Refiner.push`. The views are in the store."""
 
     def finish(
         self,
