@@ -22,14 +22,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import Camera, Fisheye, Pinhole
-from tofuse.engine.compute import run_chunks
+from tofuse.engine.compute import run_all
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
@@ -253,21 +253,16 @@ def pair_agreement(
 def consistency_of_images(images: Sequence[SurfaceImage], poses: ArrayLike) -> Consistency:
     """Map consistency of prepared views under poses (N, 4, 4) T_world_camera, over all pairs.
 
-    Independent of the number of threads; must not be called inside a chunk of `run_chunks`.
+    Independent of the number of threads.
     """
     T = np.asarray(poses, float)
     pairs = [(i, j) for i in range(len(images)) for j in range(i + 1, len(images))]
 
-    def work(start: int, stop: int) -> list[PairAgreement]:
-        overlapping = []
-        for i, j in pairs[start:stop]:
-            pair = pair_agreement(images[i], images[j], se3.inverse(T[i]) @ T[j], i, j)
-            if pair is not None:
-                overlapping.append(pair)
-        return overlapping
+    def compared(i: int, j: int) -> PairAgreement | None:
+        return pair_agreement(images[i], images[j], se3.inverse(T[i]) @ T[j], i, j)
 
-    agreements = tuple(p for chunk in run_chunks(work, len(pairs), chunks=64) for p in chunk)
-    return Consistency.of(agreements, len(images))
+    agreements = run_all([partial(compared, i, j) for i, j in pairs])
+    return Consistency.of([pair for pair in agreements if pair is not None], len(images))
 
 
 def map_consistency(

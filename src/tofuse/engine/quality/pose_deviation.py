@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from scipy.special import fdtri, gammaincinv
 
 from tofuse.engine.alignment import covariance, projective
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.compute import run_chunks
+from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import (
     Measured,
@@ -71,26 +72,20 @@ def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> 
     """
     pairs = _overlapping(views, poses)
     surfaces = [view.view for view in views]
-    T_i_j = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
-
-    def work(start: int, stop: int) -> list[tuple[Float64, Float64, Float64]]:
-        results = []
-        for (i, j), T in zip(pairs[start:stop].tolist(), T_i_j[start:stop], strict=True):
-            target = [projective.Target(surfaces[i], np.eye(4))]
-            aligned = projective.align(surfaces[j], target, T, _ALIGNMENT)
-            C = covariance(surfaces[j], target, aligned, _ALIGNMENT)
-            results.append((aligned.T_world_source, C, aligned.unobservable * projective.UNITS))
-        return results
-
-    results = [result for chunk in run_chunks(work, len(pairs), 64) for result in chunk]
     ids = [view.index for view in views]
-    edges = [
-        Measured(ids[i], ids[j], T, np.asarray(np.linalg.inv(C), np.float64))
-        for (i, j), (T, C, _) in zip(pairs.tolist(), results, strict=True)
-    ]
-    return without_degenerate(
-        build_graph(ids, poses, edges), [degenerate for _, _, degenerate in results]
-    )
+
+    def measured(i: int, j: int) -> tuple[Measured, Float64]:
+        target = [projective.Target(surfaces[i], np.eye(4))]
+        T_i_j = se3.inverse(poses[i]) @ poses[j]
+        aligned = projective.align(surfaces[j], target, T_i_j, _ALIGNMENT)
+        C = covariance(surfaces[j], target, aligned, _ALIGNMENT)
+        information = np.asarray(np.linalg.inv(C), np.float64)
+        edge = Measured(ids[i], ids[j], aligned.T_world_source, information)
+        return edge, aligned.unobservable * projective.UNITS
+
+    edges = run_all([partial(measured, i, j) for i, j in pairs.tolist()])
+    graph = build_graph(ids, poses, [edge for edge, _ in edges])
+    return without_degenerate(graph, [degenerate for _, degenerate in edges])
 
 
 def _overlapping(views: Sequence[PosedView[PreparedView]], poses: Float64) -> Intp:

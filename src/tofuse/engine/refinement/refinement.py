@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Annotated, ClassVar, Literal, Protocol
 
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.compute import Spill
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured, external_sensors
@@ -49,6 +47,10 @@ _ERROR_INDEX: dict[CameraError, int] = {
     "scale": kernels.SCALE,
     "focal": kernels.FOCAL,
 }
+
+
+# Errors of the camera, and (m, rad) of the poses by halves of the images.
+_Evaluation = tuple[CalibrationCheck, tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,8 +247,8 @@ class _Joint(Refiner):
     needs_points: ClassVar[bool] = False
 
     def __init__(self, options: Joint, views: ViewStore[PreparedView]) -> None:
-        self._options = options
-        self._store = views
+        self._options, self._store = options, views
+        self._error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
 
     def finish(
         self,
@@ -262,10 +264,11 @@ class _Joint(Refiner):
         if len(posed) < 2:
             return Refinement(poses, views=len(posed))
         before = poses[positions]
-        refine_views = _refine_jointly if len(posed) <= options.submap else _refine_in_submaps
-        refined, evidence = refine_views(
-            options, posed, before, measured or external_sensors.SensorPriors(), self._store
+        refine_views = self._at_once if len(posed) <= options.submap else self._in_submaps
+        refined, evaluated = refine_views(
+            posed, before, measured or external_sensors.SensorPriors()
         )
+        calibration = combine_checks([check for check, _ in evaluated])
         support = refined.before.of_views(len(posed)), refined.after.of_views(len(posed))
         mean = float(support[0].mean()), float(support[1].mean())
         unchanged = Refinement(poses, False, len(posed), len(refined.pairs), support=mean)
@@ -273,84 +276,69 @@ class _Joint(Refiner):
         if not len(refined.pairs):
             return unchanged
         if support_fell(gain):  # the camera may be the cause
-            return replace(unchanged, calibration_check=evidence.calibration())
+            return replace(unchanged, calibration_check=calibration)
         after = with_unsupported_views_fixed(before, refined.poses, gain < -MAX_LOSS)
         if mean[1] < mean[0]:
             # The poses were already at the optimum; the measurements give their covariances.
             after = before
-        split_m, split_rad = evidence.split()
+        split_m, split_rad = _mean_errors([split for _, split in evaluated])
         return replace(
             unchanged.accepted(positions, after),
-            calibration_check=evidence.calibration(),
+            calibration_check=calibration,
             split_m=split_m,
             split_rad=split_rad,
             errors={name: float(refined.errors[_ERROR_INDEX[name]]) for name in options.calibrate},
             edges=pairwise_measurements([p.index for p in posed], refined),
         )
 
+    def _at_once(
+        self,
+        posed: Sequence[PosedView[PreparedView]],
+        poses: Float64,
+        measured: external_sensors.SensorPriors,
+    ) -> tuple[Refined, list[_Evaluation]]:
+        views = [self._sampled(p) for p in posed]
+        priors = _priors([p.index for p in posed], measured)
+        alignment = self._options.alignment
+        refined = refine(views, poses, alignment, calibrate=self._error_indices, priors=priors)
+        return refined, [self._evaluate(RefinedSubmap(views, refined, priors))]
 
-@dataclass(frozen=True)
-class _Checks:
-    """Evidence of refined views: errors of the camera, and (m, rad) of the poses by halves."""
+    def _in_submaps(
+        self,
+        posed: Sequence[PosedView[PreparedView]],
+        poses: Float64,
+        measured: external_sensors.SensorPriors,
+    ) -> tuple[Refined, list[_Evaluation]]:
+        ids = [p.index for p in posed]
+        return refine_submaps(
+            [self._coarse(p) for p in posed],
+            poses,
+            self._options.alignment,
+            self._options.submap,
+            lambda subset: [self._sampled(posed[k]) for k in subset],
+            lambda subset: _priors(ids if subset is None else [ids[k] for k in subset], measured),
+            self._evaluate,
+            self._error_indices,
+        )
 
-    calibration: Callable[[], CalibrationCheck]
-    split: Callable[[], tuple[float, float]]
+    def _evaluate(self, submap: RefinedSubmap) -> _Evaluation:
+        """Evaluate a submap while its views are in memory."""
+        alignment, refined = self._options.alignment, submap.refined
+        split = split_half_errors(
+            submap.views, refined, alignment, submap.priors, self._error_indices
+        )
+        if not self._error_indices:
+            return check_calibration(submap.views, refined, alignment, submap.priors), split
+        gap = loop_gap(submap.views, refined, refined.poses, refined.errors, alignment)
+        return CalibrationCheck(gap=gap), split
 
+    def _coarse(self, posed: PosedView[PreparedView]) -> SpilledCoarseView:
+        surface = _surface(posed)
+        coarse = CoarseView.of(surface, sampled_points(surface, self._options.alignment.points))
+        return SpilledCoarseView(coarse.centroid, Spilled(coarse, self._store.coarse))
 
-def _refine_jointly(
-    options: Joint,
-    posed: Sequence[PosedView[PreparedView]],
-    poses: Float64,
-    measured: external_sensors.SensorPriors,
-    _: ViewStore[PreparedView],
-) -> tuple[Refined, _Checks]:
-    """Refine all views at once."""
-    views = [_sampled(p, options) for p in posed]
-    priors = _priors([p.index for p in posed], measured)
-    error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
-    refined = refine(views, poses, options.alignment, calibrate=error_indices, priors=priors)
-    all_views = RefinedSubmap(views, np.arange(len(views)), refined, priors)
-    return refined, _Checks(
-        lambda: _calibration_check(all_views, options),
-        lambda: _split_half_errors(all_views, options),
-    )
-
-
-def _refine_in_submaps(
-    options: Joint,
-    posed: Sequence[PosedView[PreparedView]],
-    poses: Float64,
-    measured: external_sensors.SensorPriors,
-    store: ViewStore[PreparedView],
-) -> tuple[Refined, _Checks]:
-    """Refine submap by submap."""
-    ids = [p.index for p in posed]
-    refined, parts = refine_submaps(
-        [_coarse(p, options, store.coarse) for p in posed],
-        poses,
-        options.alignment,
-        options.submap,
-        lambda subset: [_sampled(posed[k], options) for k in subset],
-        lambda subset: _priors(ids if subset is None else [ids[k] for k in subset], measured),
-        partial(_evaluate, options=options),
-        [_ERROR_INDEX[name] for name in options.calibrate],
-    )
-    checks, splits = [check for check, _ in parts], [split for _, split in parts]
-    return refined, _Checks(lambda: combine_checks(checks), lambda: _mean_errors(splits))
-
-
-def _evaluate(
-    submap: RefinedSubmap, options: Joint
-) -> tuple[CalibrationCheck, tuple[float, float]]:
-    """Evaluate a submap while its views are in memory."""
-    return _calibration_check(submap, options), _split_half_errors(submap, options)
-
-
-def _split_half_errors(submap: RefinedSubmap, options: Joint) -> tuple[float, float]:
-    error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
-    return split_half_errors(
-        submap.views, submap.refined, options.alignment, submap.priors, error_indices
-    )
+    def _sampled(self, posed: PosedView[PreparedView]) -> SampledView:
+        return SampledView.of(_surface(posed), self._options.alignment.points)
 
 
 def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
@@ -359,29 +347,8 @@ def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
     return m, rad
 
 
-def _coarse(
-    posed: PosedView[PreparedView], options: Joint, spill: Spill[CoarseView]
-) -> SpilledCoarseView:
-    surface = _surface(posed)
-    coarse = CoarseView.of(surface, sampled_points(surface, options.alignment.points))
-    return SpilledCoarseView(coarse.centroid, Spilled(coarse, spill))
-
-
 def _surface(posed: PosedView[PreparedView]) -> PreparedView:
     return posed.view.with_pixel_variance().without_caches()
-
-
-def _sampled(posed: PosedView[PreparedView], options: Joint) -> SampledView:
-    return SampledView.of(_surface(posed), options.alignment.points)
-
-
-def _calibration_check(submap: RefinedSubmap, options: Joint) -> CalibrationCheck:
-    """Check the calibration by refined views; with estimated errors only the loop's gap."""
-    refined = submap.refined
-    if not options.calibrate:
-        return check_calibration(submap.views, refined, options.alignment, submap.priors)
-    gap = loop_gap(submap.views, refined, refined.poses, refined.errors, options.alignment)
-    return CalibrationCheck(gap=gap)
 
 
 def pairwise_measurements(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:

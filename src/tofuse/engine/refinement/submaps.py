@@ -63,10 +63,9 @@ class Submap:
 
 @dataclass(frozen=True, eq=False)
 class RefinedSubmap:
-    """A refined submap: its views, their positions among all, the result, and the priors."""
+    """A refined submap: its views, the result, and the priors."""
 
     views: Sequence[SampledView]
-    at: Intp
     refined: Refined
     priors: Priors
 
@@ -213,7 +212,7 @@ def _refine_submap(
     local = np.searchsorted(part.views, part.pairs)
     start = se3.inverse(poses[0]) @ poses
     refined = refine(views, start, options, calibrate=calibrate, priors=priors, pairs=local)
-    evaluation = evaluate(RefinedSubmap(views, part.views, refined, priors))
+    evaluation = evaluate(RefinedSubmap(views, refined, priors))
     return _or_unchanged(refined, start), evaluation
 
 
