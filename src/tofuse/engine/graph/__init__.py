@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         external_sensors,
         graph_covariances,
         levenberg,
+        minimisation,
         robust,
         solver,
         sparse,

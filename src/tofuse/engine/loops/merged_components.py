@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -353,10 +353,18 @@ class MergedComponents:
             distances.append(distance_m / self.depth_of(i) + float(se3.angle(T)))
         return max(distances)
 
-    def by_start_time(self, c: int, d: int) -> tuple[TrackedComponent, TrackedComponent]:
-        """Return two components in the order in which they began."""
-        first, second = self.tracked[c], self.tracked[d]
-        return (first, second) if first.frames[0] < second.frames[0] else (second, first)
+    def views_of(self, merged: MergedComponent) -> list[View]:
+        """Return the views of a merged component."""
+        return [view for i, view in self.views.items() if self.component_of[i] in merged.T]
+
+    def of_same_recording(
+        self, a: MergedComponent, b: MergedComponent
+    ) -> Iterator[tuple[TrackedComponent, TrackedComponent]]:
+        """Yield pairs of tracked components of one recording, the earlier one first."""
+        for c, d in itertools.product(a.T, b.T):
+            first, second = self.tracked[c], self.tracked[d]
+            if first.recording == second.recording:
+                yield (first, second) if first.frames[0] < second.frames[0] else (second, first)
 
     def positions(self, a: MergedComponent, b: MergedComponent) -> tuple[int, int]:
         """Return the positions of two merged components, ascending."""

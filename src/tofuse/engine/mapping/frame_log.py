@@ -67,17 +67,7 @@ class FrameSequence:
         previous, self._previous = self._previous, frame
         if previous is None:
             return False
-        # Most images already differ there; the first rows of some cameras are invalid.
-        middle = len(frame.depth) // 2
-        if not np.array_equal(
-            previous.depth[middle : middle + 1], frame.depth[middle : middle + 1]
-        ):
-            return False
         return np.array_equal(previous.depth, frame.depth) and len(frame) > 0
-
-    def end(self) -> None:
-        """Release the last frame."""
-        self._previous = None
 
 
 @dataclass(frozen=True, eq=False)

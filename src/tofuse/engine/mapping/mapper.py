@@ -242,8 +242,7 @@ class Mapper:
         self._live_poses.finish()
         with self.watch.timing("fusion"):
             self._observations.finish()
-        self._sequence.end()
-        del self._tracker  # its keyframes
+        del self._sequence, self._tracker  # the last frame, and keyframes
         trim_memory()
         result = self._assembly().run(self._log)
         diagnostics = replace(
