@@ -22,8 +22,8 @@ import sequences
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.results.types import Reconstruction
 
 Corruption = Callable[[RangeFrame], RangeFrame]

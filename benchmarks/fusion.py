@@ -45,12 +45,12 @@ from tofuse.engine.fusion.layout import Layout
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.model import ModelBuilder
 from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.fusion.range_view import RangeView
-from tofuse.engine.fusion.stored_views import StoredViews
+from tofuse.engine.fusion.range_view import RangeView, StoredViews
 from tofuse.engine.fusion.tsdf import Volume, fitting_voxel, fuse_surface
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import Config, from_method
+from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions

@@ -35,7 +35,7 @@ from tofuse.engine.fusion.range_view import RangeView
 from tofuse.engine.fusion.tsdf import fuse_surface
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.adaptation import adapted
-from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.preparation import Preparation
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import align

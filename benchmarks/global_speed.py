@@ -31,8 +31,8 @@ from tofuse.engine.compute.thread_pool import run_chunks, threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.loops.revisits import Revisits
-from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.progress import Stopwatch
 from tofuse.engine.results.types import Reconstruction
 from tofuse.engine.search.search import Search

@@ -40,8 +40,9 @@ from tofuse.engine.compute.memory import trim_memory
 from tofuse.engine.compute.spill import Spill, SpillFile
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.mapping.adaptation import with_recording_defaults
-from tofuse.engine.mapping.config import Config, changed, from_method
+from tofuse.engine.mapping.config import Config, changed
 from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.record import simulate

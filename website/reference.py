@@ -24,7 +24,8 @@ from tofuse.apps.cli.parser import make_parser
 from tofuse.engine import parts
 from tofuse.engine.bounds import Bounds, NotEmpty
 from tofuse.engine.graph.graph import LoopRecord
-from tofuse.engine.mapping.config import PACKAGES, Config, from_method
+from tofuse.engine.mapping.config import PACKAGES, Config
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.quality.pose_accuracy import Accuracy
 from tofuse.engine.results.types import Component, FrameRecord
 from tofuse.engine.results.verdicts import REASONS

@@ -18,7 +18,8 @@ import tracking
 from boards import Board, Score, default_made
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import TofuseError
-from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.mapping.config import changed
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.parts import name_of
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory

@@ -14,7 +14,7 @@ from tofuse.engine.alignment import step_kernels as steps
 from tofuse.engine.cameras.cameras import BrownConrady
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.measured_graph import Measured
+from tofuse.engine.graph.graph import Measured
 from tofuse.engine.quality.map_agreement import map_consistency
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.lab.experiments.peaks import chain

@@ -22,7 +22,7 @@ from tofuse.apps.jobs import running as run_module
 from tofuse.apps.results.run_json import main_poses
 from tofuse.engine.errors import TofuseError
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.parts import name_of
 from tofuse.engine.results.types import Component, Reason, Reconstruction

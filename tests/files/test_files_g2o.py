@@ -7,8 +7,7 @@ import pytest
 
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.graph.measured_graph import Measured, build_graph
+from tofuse.engine.graph.graph import Measured, PoseGraph, build_graph
 from tofuse.formats.poses.g2o import read_g2o, write_g2o
 
 VERTICES = "VERTEX_SE3:QUAT 3 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 7 1 2 3 0 0 0.6 0.8\n"

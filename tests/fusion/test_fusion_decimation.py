@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.fusion import mesh as mesh_module
-from tofuse.engine.fusion.edge_collapse import collapse_edges
-from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.mesh import Mesh, collapse_edges
 from tofuse.engine.geometry.kdtree import KdTree
 from tofuse.lab.experiments.surface_error import Surface, distances
 

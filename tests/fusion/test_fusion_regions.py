@@ -13,12 +13,10 @@ from tofuse.engine.compute.spill import Spill
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.fusion import tsdf_kernels as tsdf
 from tofuse.engine.fusion.block_kernels import EDGE, block_key, block_of
-from tofuse.engine.fusion.frusta import Frusta
-from tofuse.engine.fusion.layout import Layout
+from tofuse.engine.fusion.layout import Frusta, Layout
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import RangeView
-from tofuse.engine.fusion.stitching import Piece, stitch
-from tofuse.engine.fusion.tsdf import Volume, _free_space_limits, fuse_surface
+from tofuse.engine.fusion.tsdf import Piece, Volume, _free_space_limits, fuse_surface, stitch
 from whole_volume import volume_around
 
 COLUMNS = ("vertices", "faces", "normals", "color", "sigma", "views")

@@ -17,7 +17,7 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion import atlas as atlas_module
 from tofuse.engine.fusion.atlas import MARGIN, plain_atlas, unwrap
 from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
-from tofuse.engine.fusion.colors import NO_COLOR
+from tofuse.engine.fusion.cloud import NO_COLOR
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.texture import TextureView, baked, exposures, textured

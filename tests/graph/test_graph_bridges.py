@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tofuse.engine.graph.bridges import cut_edges
+from tofuse.engine.loops.merged_components import cut_edges
 
 
 @pytest.mark.parametrize(

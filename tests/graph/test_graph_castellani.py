@@ -9,8 +9,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.graph.castellani import Castellani, Problem, free_vertices, normalisation_factors
-from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.graph.measured_graph import Measured, build_graph
+from tofuse.engine.graph.graph import Measured, PoseGraph, build_graph
 from tofuse.formats.poses.g2o import read_g2o
 from tofuse.lab.experiments.peaks import chain
 

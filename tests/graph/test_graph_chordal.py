@@ -7,8 +7,7 @@ import pytest
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.chordal import chordal_poses
-from tofuse.engine.graph.gnc import GraduatedNonConvexity
+from tofuse.engine.graph.gnc import GraduatedNonConvexity, chordal_poses
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
 from tofuse.engine.graph.minimisation import Problem

@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import branches
-from tofuse.engine.graph.branches import Branches
-from tofuse.engine.graph.graph import Optimisation, PoseGraph
+from tofuse.engine.graph import graph_covariances
+from tofuse.engine.graph.graph import Measured, Optimisation, PoseGraph, build_graph
 from tofuse.engine.graph.graph_covariances import (
     MIN_WEIGHT,
+    Branches,
     GraphCovariances,
     accepted_only,
     loop_errors,
     relative_covariance,
 )
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
-from tofuse.engine.graph.measured_graph import Measured, build_graph
 from walks import round_walk, step_of, true_poses
 
 N = 12
@@ -146,7 +145,7 @@ def with_branches(graph: PoseGraph) -> PoseGraph:
 
 @pytest.fixture
 def without_removal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(branches, "_LEVELS", 0)
+    monkeypatch.setattr(graph_covariances, "_LEVELS", 0)
 
 
 def test_covariances_of_branches_are_those_of_the_whole_system(request) -> None:

@@ -18,12 +18,10 @@ from tofuse.engine.graph.external_sensors import (
     measure_all,
     with_sensors,
 )
-from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph.graph import Measured, PoseGraph, build_graph
 from tofuse.engine.graph.graph_covariances import GraphCovariances
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
-from tofuse.engine.graph.measured_graph import Measured, build_graph
-from tofuse.engine.refinement.joint_alignment import refine
-from tofuse.engine.refinement.pose_priors import Priors
+from tofuse.engine.refinement.joint_alignment import Priors, refine
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views.pair_equations import RefineOptions
 from tofuse.engine.stored_views.view_store import SampledView

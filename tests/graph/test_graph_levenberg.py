@@ -11,9 +11,8 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import robust
-from tofuse.engine.graph.graph import Gravity, PoseGraph
+from tofuse.engine.graph.graph import Gravity, Measured, PoseGraph, build_graph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
-from tofuse.engine.graph.measured_graph import Measured, build_graph
 from tofuse.engine.graph.solver import Settings, solve
 from tofuse.engine.graph.sparse import Blocks, PairSystem
 from tofuse.formats.poses.g2o import read_g2o

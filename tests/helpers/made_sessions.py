@@ -14,7 +14,8 @@ from tofuse.apps.results.output import write_result
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.mapping.config import Config, from_method
+from tofuse.engine.mapping.config import Config
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.search.search import SearchOptions
 from tofuse.formats.recordings.native import RecordingWriter

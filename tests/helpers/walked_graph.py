@@ -6,8 +6,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.graph.measured_graph import Measured, build_graph
+from tofuse.engine.graph.graph import Measured, PoseGraph, build_graph
 
 SIGMA = np.array([0.005, 0.01, 0.02, 0.002, 0.004, 0.003])  # of the edges: tx ty tz rx ry rz
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import PoseGraph
-from tofuse.engine.graph.measured_graph import Measured, build_graph
+from tofuse.engine.graph.graph import Measured, PoseGraph, build_graph
 
 SIGMA = np.array([0.004, 0.002, 0.003, 0.001, 0.004, 0.002])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.fusion.layout import Layout
-from tofuse.engine.fusion.stored_views import Views
+from tofuse.engine.fusion.range_view import Views
 from tofuse.engine.fusion.tsdf import Volume
 
 

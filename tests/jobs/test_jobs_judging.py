@@ -19,7 +19,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.quality.pose_accuracy import Accuracy
 from tofuse.engine.quality.pose_deviation import deviation
 from tofuse.engine.quality.trajectory_errors import align, displacement

@@ -24,8 +24,8 @@ from tofuse.engine.fusion.cloud import as_cloud
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.loops.joining import Joining
 from tofuse.engine.mapping import reconstructing as reconstruct
-from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.frame_log import FrameLog
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.results.types import FrameRecord
 from tofuse.engine.search.search import SearchOptions
 from tofuse.engine.tracking.base import Step, Tracker

@@ -7,9 +7,8 @@ import pytest
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph.graph import Measured, PoseGraph, build_graph
 from tofuse.engine.graph.levenberg import minimise
-from tofuse.engine.graph.measured_graph import Measured, build_graph
 from tofuse.engine.graph.robust import Settings
 from tofuse.engine.graph.sparse import PairSystem
 from tofuse.lab.experiments.peaks import chain

@@ -9,9 +9,8 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph.graph import Measured, PoseGraph, build_graph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
-from tofuse.engine.graph.measured_graph import Measured, build_graph
 from tofuse.lab.methods.stochastic import Stochastic
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.measured_graph import Measured
+from tofuse.engine.graph.graph import Measured
 from tofuse.lab.experiments.peaks import PoseErrors, chain, run_peaks, sweep_peaks
 from tofuse.lab.simulation.peaks import peaks, peaks_cameras, peaks_points, peaks_views
 

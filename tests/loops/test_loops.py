@@ -13,7 +13,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.measured_graph import Measured, build_graph
+from tofuse.engine.graph.graph import Measured, build_graph
 from tofuse.engine.icp.icp import algorithm_1
 from tofuse.engine.loops.loops import Confirmation, LoopDetector, PriorLoop, mean_error
 from tofuse.engine.loops.nearby import Nearby, yaw

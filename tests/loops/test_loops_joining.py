@@ -13,10 +13,9 @@ from tofuse.engine.alignment.base import Link, Registration
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import joining
-from tofuse.engine.loops.gaps import TrackedComponent
 from tofuse.engine.loops.join_checks import JoinChecks
 from tofuse.engine.loops.joining import Joining
-from tofuse.engine.loops.merged_components import MergedComponents
+from tofuse.engine.loops.merged_components import MergedComponents, TrackedComponent
 from tofuse.engine.search.search import SearchOptions
 from tofuse.engine.search.verification import MAX_OVERLAP_DISTANCE
 from tofuse.engine.search.view_pair import follow, register_pair

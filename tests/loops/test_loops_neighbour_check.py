@@ -11,9 +11,9 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.graph.external_sensors import SensorPriors
 from tofuse.engine.graph.graph import LoopRecord
 from tofuse.engine.loops.loops import ClosedLoop
-from tofuse.engine.loops.neighbour_check import degraded_neighbours
+from tofuse.engine.loops.revisits import degraded_neighbours
 from tofuse.engine.mapping.backend import BackEnd
-from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.progress import Stopwatch
 from tofuse.engine.tracking.base import Step
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tofuse.engine.loops.pairwise_consistency import maximum_consistent_set
+from tofuse.engine.loops.joining import maximum_consistent_set
 
 
 def is_consistent(consistent, some):

@@ -9,8 +9,8 @@ import pytest
 from tofuse.apps.jobs.run_options import Options, resolve
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.mapping.budget import views_bytes, voxels_mb
-from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.mapping.config import changed, views_bytes, voxels_mb
+from tofuse.engine.mapping.methods import from_method
 
 
 def test_memory_budget_is_divided_consistently() -> None:

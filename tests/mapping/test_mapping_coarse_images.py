@@ -10,7 +10,7 @@ import pytest
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import adapted
-from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.lab.simulation.effects import Effects

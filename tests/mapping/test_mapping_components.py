@@ -11,8 +11,8 @@ from made_rooms import OTHER, at, seen
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.joining import Joining
-from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.search.search import SearchOptions
 
 DEFAULT = from_method("default")

@@ -14,8 +14,8 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.adaptation import adapted
-from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.falloff import estimate_falloff
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.lab.simulation.effects import Effects

@@ -16,10 +16,10 @@ from tofuse.engine.graph.graph import LoopRecord
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
 from tofuse.engine.loops.loops import ClosedLoop
 from tofuse.engine.loops.revisits import Revisits
-from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.live_poses import DELAY, LiveLoops, LivePoses
 from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.refinement.refinement import NoRefinement
 from tofuse.engine.results.types import FrameRecord
 from tofuse.engine.tracking.base import Step

@@ -18,8 +18,9 @@ from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import Optimisation, Optimiser
 from tofuse.engine.loops.loops import PriorLoop
-from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.mapping.config import changed
 from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.parts import part
 from tofuse.lab.methods.filters_temporal import TemporalDeviation

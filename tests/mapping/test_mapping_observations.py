@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from made_rooms import at, seen
-from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.preparation import FilteredFrame
 from tofuse.engine.tracking.base import Step

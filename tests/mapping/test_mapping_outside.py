@@ -11,7 +11,7 @@ import pytest
 
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.external_sensors import GravityEdges, OdometryEdges
-from tofuse.engine.mapping.config import from_method
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.refinement.refinement import Joint
 from tofuse.engine.results.types import Reconstruction

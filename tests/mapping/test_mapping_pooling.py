@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.mapping.pooling import pooled
+from tofuse.engine.mapping.trial import pooled
 
 
 @pytest.mark.slow

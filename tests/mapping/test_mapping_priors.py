@@ -18,8 +18,9 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.external_sensors import GravityEdges, OdometryEdges
-from tofuse.engine.mapping.config import changed, from_method
-from tofuse.engine.mapping.priors import with_prior
+from tofuse.engine.mapping.adaptation import with_prior
+from tofuse.engine.mapping.config import changed
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import device_up, reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.results.types import FrameRecord

@@ -10,8 +10,8 @@ from revisited_path import Drifting, turn  # noqa: F401 - a fixture
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.loops import PriorLoop
 from tofuse.engine.loops.revisits import Revisits
-from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.refinement.refinement import NoRefinement
 from tofuse.engine.stored_views.view_store import Spacing
 

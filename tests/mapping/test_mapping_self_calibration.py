@@ -13,7 +13,8 @@ from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.mapping.config import changed
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.mapping.self_calibration import in_words, self_calibrated
 from tofuse.engine.progress import Silent

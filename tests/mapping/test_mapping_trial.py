@@ -12,7 +12,8 @@ import tofuse
 from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.mapping.adaptation import adapted, with_recording_defaults
-from tofuse.engine.mapping.config import Config, from_method
+from tofuse.engine.mapping.config import Config
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.trial import Trial, trial
 from tofuse.engine.progress import Silent
 from tofuse.engine.sensor.multipath_correction import Multipath

@@ -24,7 +24,8 @@ from tofuse.apps.jobs.pair import register_files
 from tofuse.apps.results.pair import pair_json
 from tofuse.engine import parts
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import Config, ViewKind, changed, from_method
+from tofuse.engine.mapping.config import Config, ViewKind, changed
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.results.verdicts import REASONS
 from tofuse.formats.export.conversion import convert
 from tofuse.formats.poses.trajectory import read_tum

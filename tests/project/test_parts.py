@@ -12,7 +12,8 @@ import pytest
 from tofuse.engine import parts
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
 from tofuse.engine.errors import InputError
-from tofuse.engine.mapping.config import Config, changed, from_method, methods
+from tofuse.engine.mapping.config import Config, changed
+from tofuse.engine.mapping.methods import from_method, methods
 
 
 class Shape(Protocol):

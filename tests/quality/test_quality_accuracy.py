@@ -11,10 +11,9 @@ import tofuse
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import PoseGraph
+from tofuse.engine.graph.graph import Measured, PoseGraph, build_graph
 from tofuse.engine.graph.graph_covariances import GraphCovariances
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
-from tofuse.engine.graph.measured_graph import Measured, build_graph
 from tofuse.engine.quality import pose_accuracy as accuracy
 from tofuse.engine.quality.pose_accuracy import (
     Accuracy,

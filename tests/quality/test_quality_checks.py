@@ -11,9 +11,8 @@ import pytest
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.external_sensors import SensorRecord
-from tofuse.engine.graph.graph import GraphPart, LoopRecord, Optimisation
+from tofuse.engine.graph.graph import GraphPart, LoopRecord, Measured, Optimisation, build_graph
 from tofuse.engine.graph.graph_covariances import GraphCovariances
-from tofuse.engine.graph.measured_graph import Measured, build_graph
 from tofuse.engine.quality.cross_view_agreement import CrossViewConsistency, PairConsistency
 from tofuse.engine.quality.pose_accuracy import Accuracy, ObservedErrors, accuracy_of
 from tofuse.engine.refinement.calibration_check import CalibrationCheck

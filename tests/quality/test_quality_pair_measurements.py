@@ -6,7 +6,7 @@ import numpy as np
 
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.pair_measurements import measured_pairs
+from tofuse.engine.quality.pose_deviation import measured_pairs
 
 
 def test_pairs_measure_true_motion_from_inexact_poses(posed_views) -> None:

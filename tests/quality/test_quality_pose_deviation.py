@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 from scipy.optimize import brentq
 
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.measured_graph import Measured, build_graph
+from tofuse.engine.graph.graph import Measured, build_graph
 from tofuse.engine.quality.pose_deviation import _Corrections, deviation, fitted
 
 SIGMA = np.array([0.003] * 3 + [0.001] * 3)

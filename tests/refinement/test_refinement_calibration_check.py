@@ -18,9 +18,8 @@ from tofuse.engine.refinement.calibration_check import (
     significance_of,
 )
 from tofuse.engine.refinement.camera_response import response
-from tofuse.engine.refinement.joint_alignment import Refined, align_pairs, refine
+from tofuse.engine.refinement.joint_alignment import Priors, Refined, align_pairs, refine
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, longest_loop
-from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views.pair_equations import Round
 from tofuse.engine.stored_views.view_store import SampledView

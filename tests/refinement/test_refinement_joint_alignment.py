@@ -11,8 +11,8 @@ from aligned_surfaces import OPTIONS, away, drifted, path, surfaces
 from corner_views import SHARP, corner
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph.graph import build_graph
 from tofuse.engine.graph.graph_covariances import GraphCovariances
-from tofuse.engine.graph.measured_graph import build_graph
 from tofuse.engine.quality.pose_accuracy import ObservedErrors, accuracy_of
 from tofuse.engine.refinement.joint_alignment import Bodies, refine, spread_evenly
 from tofuse.engine.refinement.refinement import Joint, NoRefinement, propagate_poses, without_errors

@@ -9,8 +9,7 @@ import pytest
 
 from aligned_surfaces import OPTIONS, SHARP, corner, path
 from tofuse.engine.quality.trajectory_errors import displacement
-from tofuse.engine.refinement.joint_alignment import refine
-from tofuse.engine.refinement.pose_priors import Priors
+from tofuse.engine.refinement.joint_alignment import Priors, refine
 from tofuse.engine.refinement.split_half import split_half_errors
 from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.engine.views.prepared_view import prepare_view

@@ -33,8 +33,7 @@ from tofuse.apps.report.subject import Subject
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.fusion.cloud import Cloud, empty_cloud
-from tofuse.engine.fusion.colors import NO_COLOR, display_colors
+from tofuse.engine.fusion.cloud import NO_COLOR, Cloud, display_colors, empty_cloud
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.pose_errors import UNKNOWN_M
 from tofuse.engine.geometry import se3

@@ -17,7 +17,8 @@ from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.mapping.config import changed
+from tofuse.engine.mapping.methods import from_method
 from tofuse.formats.rigs.rig_source import RigSource
 from tofuse.lab.world.paths import look_at, rotation
 

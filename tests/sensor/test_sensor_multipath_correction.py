@@ -10,8 +10,9 @@ import pytest
 from multipath_corner import CAMERA, FLOOR, GAIN, LEFT, PERIOD_M, RIGHT, Seen
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
-from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.mapping.config import changed
 from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.sensor.multipath import (
     GainEstimator,
     MultipathEstimate,

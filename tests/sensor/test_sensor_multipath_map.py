@@ -11,8 +11,8 @@ import pytest
 from multipath_corner import CAMERA, FLOOR, GAIN, LEFT, PERIOD_M, RIGHT, Plane, Seen
 from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import from_method
 from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.sensor.base import Correction, Corrector
 from tofuse.engine.sensor.multipath import MultipathModel, ToFImage
 from tofuse.engine.sensor.multipath_correction import Multipath

@@ -13,7 +13,8 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import with_recording_defaults
-from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.mapping.config import changed
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.noise.model import NOISE, AmplitudeLaw, NoiseModel, RangeLaw
 from tofuse.engine.sensor.noise_correction import Noise
 from tofuse.formats.cameras.noise_file import write_noise

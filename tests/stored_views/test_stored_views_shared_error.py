@@ -14,8 +14,8 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.joint_alignment import refine
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
+from tofuse.engine.stored_views.pair_equation_kernels import marginalise_shared_errors
 from tofuse.engine.stored_views.pair_equations import RefineOptions
-from tofuse.engine.stored_views.shared_error_kernels import marginalise_shared_errors
 from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.engine.views.prepared_view import prepare_view
 

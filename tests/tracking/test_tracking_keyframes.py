@@ -12,7 +12,8 @@ from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import changed, from_method
+from tofuse.engine.mapping.config import changed
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.tracking import hypotheses, keyframe_map
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.formats.recordings.open import open_recording

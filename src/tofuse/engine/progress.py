@@ -33,20 +33,8 @@ class Progress(Protocol):
         ...
 
 
-class Silent:
+class Silent(Progress):
     """Ignores all progress."""
-
-    def stage(self, name: str, total: int | None = None) -> None:
-        """See `Progress`."""
-
-    def advance(self, record: FrameRecord | None = None) -> None:
-        """See `Progress`."""
-
-    def note(self, text: str) -> None:
-        """See `Progress`."""
-
-    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
-        """See `Progress`."""
 
 
 @dataclass(frozen=True)

@@ -29,13 +29,12 @@ from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, Recording, evenly_spaced, frame_ranges
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping import Config, check_views, from_method, priors, reconstructing
+from tofuse.engine.mapping import Config, adaptation, check_views, from_method, reconstructing
 from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import (
     cross_view_agreement,
     map_agreement,
-    measured_pairs,
     pose_accuracy,
     pose_deviation,
     trajectory_errors,
@@ -170,7 +169,7 @@ def judge(
     progress.stage("comparing images")
     initial_support = compared_images.support_at(poses)
     refined, views, refined_support = reconstructed(
-        priors.with_odometry(recording, poses), given_config
+        adaptation.with_odometry(recording, poses), given_config
     )
     from_poses = True
     if not refined_support.is_supported:
@@ -453,7 +452,9 @@ def _deviation(
         return None
     rows = [row_of[view.index] for view in posed]
     depth_m = float(np.median([view.depth for view in posed]))
-    fit = pose_deviation.fitted(measured_pairs(posed, refined.trajectory[rows]), depth_m)
+    fit = pose_deviation.fitted(
+        pose_deviation.measured_pairs(posed, refined.trajectory[rows]), depth_m
+    )
     return pose_deviation.deviation(fit, poses[rows]) if fit.dof > 0 else None
 
 

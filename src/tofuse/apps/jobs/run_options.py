@@ -13,9 +13,9 @@ from tofuse.engine.mapping import (
     MIN_MEMORY_MB,
     Config,
     ViewKind,
+    adaptation,
     changed,
     from_method,
-    priors,
     texturing,
 )
 from tofuse.engine.sensor import range_and_amplitude
@@ -73,7 +73,7 @@ class Options(OpeningOptions, ModelOptions):
     min_depth: float | None = None
     max_depth: float | None = None
     guess: Literal["identity", "previous", "odometry"] | None = None
-    prior: priors.Prior = "auto"
+    prior: adaptation.Prior = "auto"
     loops: Path | None = None
     object: bool = False
     unwrap: bool = False

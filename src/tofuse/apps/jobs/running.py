@@ -25,7 +25,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.engine.fusion import texture
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import Config, adaptation, priors, reconstructing, texturing
+from tofuse.engine.mapping import Config, adaptation, reconstructing, texturing
 from tofuse.engine.progress import Progress, Silent, Stopwatch
 from tofuse.engine.results import Reason, Reconstruction, in_main_model, verdicts
 from tofuse.engine.sensor import Unwrap
@@ -114,7 +114,7 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
     _preview(recording, progress)
     config = resolve(options, reconstructing.view_kind(recording))
     if not options.object:  # no sensor measures the motion relative to a moving object
-        recording, config = priors.with_prior(recording, config, options.prior)
+        recording, config = adaptation.with_prior(recording, config, options.prior)
     check_guess(options, recording)
     if options.unwrap:
         check_unwrap(recording)

@@ -16,7 +16,7 @@ from tofuse.apps.results.run_json import (
     run_json_checked,
 )
 from tofuse.engine.errors import InputError
-from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh, mesh_of
+from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
 from tofuse.engine.graph import GraphPart, LoopRecord, external_sensors
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.results import (
@@ -214,4 +214,4 @@ def read_mesh(path: Path) -> Mesh | None:
 
     Columns that another program left out are 0.
     """
-    return mesh_of(read_ply(path)) if path.is_file() else None
+    return Mesh.of(read_ply(path)) if path.is_file() else None

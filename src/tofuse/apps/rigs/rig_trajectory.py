@@ -18,7 +18,7 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import measured_graph
+from tofuse.engine.graph import Measured
 from tofuse.engine.mapping import reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import joint_alignment, pairwise_measurements, propagate_poses
@@ -61,8 +61,8 @@ class RigTrajectory:
     poses: Float64
     T_rig_frame: Float64
     disagreement: SurfaceDistances
-    measured: tuple[measured_graph.Measured, ...]
-    tracked: tuple[measured_graph.Measured, ...] = ()
+    measured: tuple[Measured, ...]
+    tracked: tuple[Measured, ...] = ()
 
 
 def track_rig(cameras: Sequence[Camera], recording: Recording, progress: Progress) -> RigTrajectory:
@@ -112,7 +112,7 @@ def _tracking_edges(
     poses: Float64,
     instant: Intp,
     used: set[int],
-) -> list[measured_graph.Measured]:
+) -> list[Measured]:
     """Return edges from the first pose to instants that were not refined.
 
     Their information is the sum of that of the cameras' own trajectories.
@@ -129,7 +129,7 @@ def _tracking_edges(
             continue
         T = se3.inverse(poses[instant[posed[0]]]) @ poses[row]
         ends = int(recording.indices[posed[0]]), int(recording.indices[k])
-        edges.append(measured_graph.Measured(*ends, T, np.asarray(information, np.float64)[k]))
+        edges.append(Measured(*ends, T, np.asarray(information, np.float64)[k]))
     return edges
 
 

@@ -21,9 +21,9 @@ from tofuse.engine.compute import threads as using_threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import measured_graph
+from tofuse.engine.graph import Measured
 from tofuse.engine.loops import Nearby
-from tofuse.engine.mapping import Config, priors, reconstructing
+from tofuse.engine.mapping import Config, adaptation, reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import AlreadyRefined, NoRefinement
@@ -144,8 +144,8 @@ def reconstruct_rig(
     poses = np.tile(np.eye(4), (len(instants), 1, 1))
     T_rig_frame = source.T_rig_camera[recording.indices]
     displaced: list[CameraMotion] = []
-    measured: tuple[measured_graph.Measured, ...] = ()
-    tracked: tuple[measured_graph.Measured, ...] = ()
+    measured: tuple[Measured, ...] = ()
+    tracked: tuple[Measured, ...] = ()
     if moves(cameras, motion):
         trajectory = track_rig(cameras, recording, progress)
         poses, T_rig_frame, distances = (
@@ -174,7 +174,10 @@ def reconstruct_rig(
         fusion_config, refinement=AlreadyRefined(measured, (*tracked, *calibration_edges))
     )
     result = reconstructing.reconstruct(
-        priors.with_odometry(recording, frame_poses), refined_config, seed=seed, progress=progress
+        adaptation.with_odometry(recording, frame_poses),
+        refined_config,
+        seed=seed,
+        progress=progress,
     )
     names = [camera.name for camera in rig.cameras]
     rig_fields = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}
@@ -200,7 +203,7 @@ def _calibration_edges(
     T_world_frame: Float64,
     *,
     follow: bool,
-) -> list[measured_graph.Measured]:
+) -> list[Measured]:
     """Return edges from the first camera's frame of each instant to the others, with information.
 
     Calibration errors are the same at all instants: if the rig is static (`follow`), later frames
@@ -214,7 +217,7 @@ def _calibration_edges(
     covariances[0] = np.diag(_MIN_VARIANCES)
     posed = np.flatnonzero(np.isfinite(T_world_frame[:, 0, 0]))
     cameras = source.camera[recording.indices]
-    edges: list[measured_graph.Measured] = []
+    edges: list[Measured] = []
     reference: dict[int, int] = {}
     first_of_camera: dict[int, int] = {}
     for k in posed:
@@ -227,9 +230,7 @@ def _calibration_edges(
         if i != k:
             T = se3.inverse(T_world_frame[i]) @ T_world_frame[k]
             ends = int(recording.indices[i]), int(recording.indices[k])
-            edges.append(
-                measured_graph.Measured(*ends, T, np.asarray(np.linalg.inv(C), np.float64))
-            )
+            edges.append(Measured(*ends, T, np.asarray(np.linalg.inv(C), np.float64)))
     return edges
 
 

@@ -1,20 +1,38 @@
-"""The fused cloud: points of all views in one frame, thinned to one per voxel."""
+"""The fused cloud: points of all views in one frame, thinned to one per voxel.
+
+Colours of a model for display; black marks points without a colour in any image.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Float64, Int32, Int64, UInt8
+from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, UInt8
 from tofuse.engine.compute import thread_count
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
-from tofuse.engine.fusion.exportable import Exportable
-from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.fusion.geometry_record import Exportable, GeometryRecord
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.geometry import se3
+
+# Displayed colour of points without a colour.
+NO_COLOR = (142, 142, 142)
+
+
+def has_color(colors: UInt8) -> Bool:
+    """Return which of the colours (N, 3) are known, (N,)."""
+    return np.asarray(colors.any(1), np.bool_)
+
+
+def display_colors(colors: UInt8) -> UInt8:
+    """Return colours (N, 3) with a neutral grey for unknown ones."""
+    shown = colors.copy()
+    shown[~has_color(colors)] = NO_COLOR
+    return shown
+
 
 _BUFFER_ROWS = 2_000_000
 _NORMAL_NEIGHBOURS = 12  # points in the plane fit of a normal
@@ -53,10 +71,6 @@ class Cloud(Exportable):
 
     def __repr__(self) -> str:
         return f"Cloud: {len(self):,} points over {self.diagonal_m:.3g} m"
-
-    def record(self) -> GeometryRecord:
-        """Return the record for file writers, in the world frame, float64."""
-        return replace(self.local_record(), points=self.points.astype(np.float64) + self.offset)
 
     def local_record(self) -> GeometryRecord:
         """Return the record relative to `offset`, float32."""

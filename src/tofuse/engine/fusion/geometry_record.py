@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Int32, UInt8
+from tofuse.engine.arrays import Float32, Float64, Int32, UInt8
 from tofuse.engine.errors import InputError
 
 _AMPLITUDES = (
@@ -21,14 +22,6 @@ _AMPLITUDES = (
     "scalar_intensity",
     "scalar_Intensity",
 )
-
-
-def stacked(columns: dict[str, NDArray[Any]], names: Sequence[str]) -> NDArray[np.floating]:
-    """Remove named columns (N,), and return them as (N, C) float32 or float64."""
-    removed = [columns.pop(name) for name in names]
-    dtype = np.result_type(np.float32, *(column.dtype for column in removed))
-    with np.errstate(invalid="ignore"):  # damaged data can contain signalling NaNs
-        return np.stack(removed, -1).astype(dtype, copy=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,3 +99,37 @@ class GeometryRecord:
                 where=path,
                 remedy="pass (M, 3) vertex indices",
             )
+
+
+# Imported by name on use: nothing else of the engine knows a file format.
+_WRITERS = "tofuse.formats.export"
+
+
+class Exportable:
+    """Geometry that can be saved, and converted to the types of other packages."""
+
+    offset: Float64
+
+    def local_record(self) -> GeometryRecord:
+        """Return points relative to `offset`, float32, with faces and columns."""
+        raise NotImplementedError
+
+    def record(self) -> GeometryRecord:
+        """Return points in the world frame, float64, with faces and columns."""
+        local = self.local_record()
+        return replace(local, points=local.points.astype(np.float64) + self.offset)
+
+    def save(self, path: str | Path) -> None:
+        """Write a file in the format of its suffix.
+
+        Meshes: .glb, .gltf, .ply, .obj, .stl; clouds: .ply, .pcd, .las, .laz, .e57.
+        """
+        import_module(_WRITERS).save(self.record(), path)
+
+    def to_trimesh(self) -> Any:
+        """Return a `trimesh.Trimesh` or `trimesh.PointCloud` in the world frame."""
+        return import_module(_WRITERS).to_trimesh(self.record())
+
+    def to_open3d(self) -> Any:
+        """Return an Open3D `TriangleMesh` or `PointCloud` in the world frame."""
+        return import_module(_WRITERS).to_open3d(self.record())

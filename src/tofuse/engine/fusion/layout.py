@@ -4,6 +4,8 @@ The blocks of all views are laid out first, so that their order depends on the s
 they exceed the memory, they are bisected recursively into boxes, which are fused one at a time. One
 layer of blocks around a box is fused with it: cells of the surface extend into the adjacent block
 and no farther, so the surface of the box's cells is the same as if all blocks were fused jointly.
+
+View frusta: which views can affect a box of space.
 """
 
 from __future__ import annotations
@@ -12,14 +14,73 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64, Int32, Int64
+from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.fusion.block_kernels import EDGE, EMPTY, HALF, VOXELS, insert_keys
-from tofuse.engine.fusion.range_view import RangeView
-from tofuse.engine.fusion.stored_views import Views, summaries
-from tofuse.engine.fusion.tsdf_kernels import near_cubes
+from tofuse.engine.fusion.range_view import Views, summaries
+from tofuse.engine.fusion.tsdf_kernels import max_informative_depth, near_cubes
+from tofuse.engine.geometry import se3
 
 _CHUNKS = 16
+_ROUNDING = 1.001  # margin for single precision
+
+
+@dataclass(frozen=True, eq=False)
+class Frusta:
+    """The pyramids of space that views affect, up to the truncation behind their surfaces.
+
+    Attributes
+    ----------
+    T_camera_world
+        (N, 4, 4).
+    spans
+        (N, 4) minimum x/z and y/z, and maximum.
+    far
+        (N,) maximum z that a view affects, m; 0 for empty views.
+    """
+
+    T_camera_world: Float64
+    spans: Float64
+    far: Float64
+
+    @classmethod
+    def of(cls, views: Views, poses: Float64, free_space_limits: Float32) -> Frusta:
+        """Return frusta of views at poses (N, 4, 4); limits as for `max_informative_depth`."""
+        spans, far = np.empty((len(views), 4)), np.empty(len(views))
+
+        def measure(a: int, b: int) -> None:
+            for k in range(a, b):
+                view = views[k]
+                projection = view.projection
+                low, size = projection.frame[:2], np.array(projection.lookup.shape[1::-1]) - 1
+                spans[k] = [*low, *(low + size / projection.frame[2:])]
+                far[k] = max_informative_depth(view.stored, free_space_limits)
+
+        run_chunks(measure, len(views), _CHUNKS)
+        T = np.array([se3.inverse(pose) for pose in poses]).reshape(-1, 4, 4)
+        return cls(T, spans, _ROUNDING * far)
+
+    def touching(self, low: Float64, high: Float64) -> Bool:
+        """Return which views (N,) may affect the box from `low` to `high` (3,), m.
+
+        The test is conservative: no such view is missed.
+        """
+        R, t = self.T_camera_world[:, :3, :3], self.T_camera_world[:, :3, 3]
+        centre, half_size = R @ (0.5 * (low + high)) + t, 0.5 * (high - low)
+        min_z = centre[:, 2] - np.abs(R[:, 2]) @ half_size
+        touching = (self.far > 0) & (min_z <= self.far)
+        ones = np.ones(len(touching))
+        for axis in range(2):
+            for side, sign in ((0, -1.0), (2, 1.0)):
+                # Points outside of a side plane have n . p > 0.
+                n = np.zeros((len(touching), 3))
+                n[:, axis], n[:, 2] = sign * ones, -sign * self.spans[:, side + axis]
+                radius = np.abs(np.einsum("ni,nij->nj", n, R)) @ half_size
+                touching &= np.einsum("ni,ni->n", n, centre) <= radius
+        # Nothing behind the camera is visible.
+        return touching & (centre[:, 2] + np.abs(R[:, 2]) @ half_size > 0)
+
+
 # Far from surfaces, free space is integrated of at most every 4th view, with a weight of 4, as
 # hundreds of views through the same free space are redundant. The stride grows by 1 per 32 views.
 _MAX_STRIDE, _VIEWS_PER_STRIDE = 4, 32
@@ -167,11 +228,19 @@ def _surface_blocks(
 ) -> Int64:
     """Return the keys of the blocks near surfaces, ascending."""
 
+    stride = min(free_space_stride, 2)
+
     def touched(start: int, stop: int) -> Int64:
         table, count = np.full(1 << 12, EMPTY, np.int64), 0
         for k in range(start, stop):
-            keys = cubes_near(
-                views[k], poses[k], block_m, reach_m, _BLOCK_SPACING, k, min(free_space_stride, 2)
+            keys = near_cubes(
+                views[k].stored,
+                poses[k],
+                block_m,
+                reach_m,
+                _BLOCK_SPACING,
+                first_pixel(k, stride),
+                stride,
             )
             table, count = insert_keys(table, count, keys)
         return table[table != EMPTY]
@@ -181,36 +250,6 @@ def _surface_blocks(
     return np.unique(np.concatenate(run_chunks(touched, len(views), _CHUNKS)))
 
 
-def cubes_near(
-    view: RangeView,
-    T_world_camera: Float64,
-    cube_m: float,
-    reach_m: float,
-    spacing: float,
-    number: int,
-    stride: int,
-) -> Int64:
-    """Return the keys of the cubes near the surface of a view, by every `stride`-th pixel.
-
-    Parameters
-    ----------
-    view, T_world_camera
-        The view and its (4, 4) pose.
-    cube_m, reach_m
-        Edge of the cubes and truncation distance, m.
-    spacing
-        Of samples along a normal, as a fraction of the edge.
-    number
-        Number of the view, which determines its first pixel.
-    stride
-        Every n-th column and row is used.
-    """
-    return near_cubes(
-        view.stored,
-        T_world_camera,
-        cube_m,
-        reach_m,
-        spacing,
-        (number % stride, number // stride % stride),
-        stride,
-    )
+def first_pixel(number: int, stride: int) -> tuple[int, int]:
+    """Return row and column of the first of every `stride`-th pixel, which depend on the view."""
+    return number % stride, number // stride % stride

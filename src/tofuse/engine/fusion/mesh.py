@@ -1,14 +1,18 @@
-"""A surface of triangles: islands, holes, decimation."""
+"""A surface of triangles: islands, holes, decimation.
+
+Edge collapse by quadric error (Garland and Heckbert 1997), by fast-simplification.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, Intp, UInt8
-from tofuse.engine.fusion.cloud import Cloud
+from tofuse.engine.fusion.cloud import Cloud, has_color
 from tofuse.engine.fusion.clustering_kernels import (
     flatten_groups,
     has_area,
@@ -16,10 +20,81 @@ from tofuse.engine.fusion.clustering_kernels import (
     quadric_sums,
     union_faces,
 )
-from tofuse.engine.fusion.colors import has_color
-from tofuse.engine.fusion.edge_collapse import collapse_edges, with_distinct_corners
-from tofuse.engine.fusion.exportable import Exportable
-from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.fusion.geometry_record import Exportable, GeometryRecord
+
+# The library collapses edges in 100 passes: in pass k those with an error, the sum of squared
+# distances from planes, below 1e-9 (k + 3) ** _GROWTH. So the limit of a distance starts at 1.6e-4
+# and grows 200-fold. With a slow growth edges are collapsed nearly in the order of their errors.
+_AGGRESSIVENESS = 3
+# Unit of length in the library, relative to the spacing of the vertices: the limit starts at 3 % of
+# the spacing, whatever the size of the object.
+_UNITS_PER_SPACING = 200.0
+# If these passes do not suffice, more follow with a larger unit, unless they remove hardly any.
+_UNIT_FACTOR, _MIN_REMOVED = 100.0, 0.1
+
+# The library's state is global.
+_LOCK = Lock()
+
+
+def collapse_edges(
+    vertices: Float32, faces: Int32, count: int, spacing: float
+) -> tuple[Intp, Float64]:
+    """Collapse edges until at most `count` triangles remain, or no more can be removed.
+
+    Parameters
+    ----------
+    vertices
+        (N, 3) m, finite.
+    faces
+        (M, 3) rows of vertices. None is degenerate.
+    count
+        Number of triangles to reach.
+    spacing
+        Distance between neighbouring vertices, m.
+
+    Returns
+    -------
+    group
+        (N,) number of the group of vertices that were merged into one.
+    positions
+        (G, 3) position of each group, m.
+    """
+    from fast_simplification import simplify  # slow to import
+
+    centroid = vertices.mean(0, dtype=float)
+    positions = vertices - centroid
+    merged_into = np.arange(len(vertices))
+    unit = _UNITS_PER_SPACING * spacing
+    while len(faces) > count:
+        with _LOCK:
+            new_positions, remaining, collapses = simplify(
+                positions / unit,
+                faces,
+                target_count=count,
+                agg=_AGGRESSIVENESS,
+                return_collapses=True,
+            )
+        parent = np.arange(len(vertices))
+        parent[collapses[:, 1]] = collapses[:, 0]
+        while (parent[parent] != parent).any():
+            parent = parent[parent]
+        merged_into = parent[merged_into]
+        reduced = len(remaining) <= max(count, (1 - _MIN_REMOVED) * len(faces))
+        # The library numbers the remaining vertices in the order of their old numbers.
+        faces = with_distinct_corners(parent[faces])
+        positions[np.unique(faces)] = new_positions * unit
+        if not reduced:
+            break
+        unit *= _UNIT_FACTOR
+    kept, group = np.unique(merged_into, return_inverse=True)
+    return group, positions[kept] + centroid
+
+
+def with_distinct_corners(faces: Intp) -> Int32:
+    """Return the triangles of three different vertices."""
+    a, b, c = faces.T
+    return faces[(a != b) & (b != c) & (c != a)].astype(np.int32)
+
 
 # Damping of a merged vertex towards the centroid, relative to the planes around it.
 _DAMPING = 0.02
@@ -65,16 +140,26 @@ class Mesh(Exportable):
     views: Int32
     offset: Float64
 
+    @classmethod
+    def of(cls, record: GeometryRecord) -> Mesh:
+        """Return the mesh of a file's record; what it lacks of normals and scalars is zero."""
+        zeros = np.zeros(len(record))
+        faces, normals = record.faces, record.normals
+        return cls(
+            record.points.astype(np.float32),
+            np.zeros((0, 3), np.int32) if faces is None else faces,
+            np.zeros((len(record), 3), np.float32) if normals is None else normals,
+            record.color,
+            record.scalars.get("sigma", zeros).astype(np.float32),
+            record.scalars.get("views", zeros).astype(np.int32),
+            np.zeros(3),
+        )
+
     def __len__(self) -> int:
         return len(self.vertices)
 
     def __repr__(self) -> str:
         return f"Mesh: {len(self):,} vertices, {len(self.faces):,} faces"
-
-    def record(self) -> GeometryRecord:
-        """Return the record for file writers, in the world frame, float64."""
-        points = self.vertices.astype(np.float64) + self.offset
-        return replace(self.local_record(), points=points)
 
     def local_record(self) -> GeometryRecord:
         """Return the record relative to `offset`, float32."""
@@ -214,9 +299,7 @@ class Mesh(Exportable):
             group, count = self._cluster(cell)
             remaining = with_distinct_corners(group[self.faces])
             if len(remaining) <= faces:
-                return self._merge_groups(
-                    group, count, remaining, self._optimal_positions(group, count, cell)
-                )
+                return self._merged(group, count, remaining, cell)
             # A larger step than a flat surface would need.
             cell *= float(np.clip((len(remaining) / faces) ** 0.6, 1.02, 2.0))
 
@@ -236,9 +319,11 @@ class Mesh(Exportable):
             return self
         group, count = self._cluster(cell_m)
         remaining = with_distinct_corners(group[self.faces])
-        return self._merge_groups(
-            group, count, remaining, self._optimal_positions(group, count, cell_m)
-        )
+        return self._merged(group, count, remaining, cell_m)
+
+    def _merged(self, group: Intp, count: Intp, faces: Int32, cell_m: float) -> Mesh:
+        positions = self._optimal_positions(group, count, cell_m)
+        return self._merge_groups(group, count, faces, positions)
 
     def _cluster(self, cell_m: float) -> tuple[Intp, Intp]:
         """Return the group of each vertex (N,), and the size of each group (G,)."""
@@ -302,21 +387,6 @@ class Mesh(Exportable):
             ..., 0
         ]
         return centroids + step.clip(-0.5 * cell_m, 0.5 * cell_m)
-
-
-def mesh_of(record: GeometryRecord) -> Mesh:
-    """Return the mesh of a file's record; what it lacks of normals and scalars is zero."""
-    zeros = np.zeros(len(record))
-    faces, normals = record.faces, record.normals
-    return Mesh(
-        record.points.astype(np.float32),
-        np.zeros((0, 3), np.int32) if faces is None else faces,
-        np.zeros((len(record), 3), np.float32) if normals is None else normals,
-        record.color,
-        record.scalars.get("sigma", zeros).astype(np.float32),
-        record.scalars.get("views", zeros).astype(np.int32),
-        np.zeros(3),
-    )
 
 
 def _means(values: NDArray[np.generic], group: Intp, count: Intp) -> Float64:

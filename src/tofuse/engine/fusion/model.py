@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -15,8 +15,7 @@ from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.fusion.range_view import RangeView
-from tofuse.engine.fusion.stored_views import StoredClouds, StoredViews
+from tofuse.engine.fusion.range_view import RangeView, StoredViews
 from tofuse.engine.fusion.tsdf import fitting_voxel, fuse_surface
 from tofuse.engine.refinement import without_errors
 from tofuse.engine.views import PreparedView
@@ -57,8 +56,8 @@ class ModelBuilder:
         if spill is None:
             spill = Spill(options.memory_mb * 1_000_000 // 10)
         self._ranges = StoredViews(spill)
-        self._clouds = StoredClouds(spill)
-        self._bytes = 0
+        self._spill = spill
+        self._clouds: list[tuple[int, int]] = []  # of the frame, and in the store
         self._voxel_m = 0.01  # of clouds
 
     def add(self, frame: Frame, surface: PreparedView | None, max_points: int) -> None:
@@ -74,23 +73,16 @@ class ModelBuilder:
             Maximum number of points of a cloud.
         """
         if isinstance(frame, CloudFrame):
-            if not len(self._clouds):
+            if not self._clouds:
                 self._voxel_m = self._options.voxel_m or choose_voxel(frame)
-            self._clouds.add(as_cloud(frame, max_points))
+            self._clouds.append((frame.index, self._spill.put(as_cloud(frame, max_points))))
             return
-        view = RangeView.of(frame, surface)
-        self._ranges.add(view)
-        self._bytes += view.nbytes
+        self._ranges.add(RangeView.of(frame, surface))
 
     @property
     def views(self) -> int:
         """Number of stored views."""
         return len(self._ranges) + len(self._clouds)
-
-    @property
-    def nbytes(self) -> int:
-        """Size of the images of these views, in memory or on disk."""
-        return self._bytes
 
     def fuse(
         self,
@@ -112,7 +104,7 @@ class ModelBuilder:
         if len(self._clouds) or not len(self._ranges):
             clouds = (
                 replace(c, points=without_errors(c.points, errors)) if errors else c
-                for c in self._clouds.of(poses)
+                for c in self._clouds_of(poses)
             )
             return Model(self._average(clouds, poses, self._voxel_m, advance), None)
         views = self._ranges.of(poses)
@@ -142,12 +134,15 @@ class ModelBuilder:
         It consists of evenly spaced images, and of evenly spaced pixels of each.
         """
         if len(self._clouds):
-            return self._average(self._clouds.of(poses), poses, self._voxel_m)
+            return self._average(self._clouds_of(poses), poses, self._voxel_m)
         ranges = self._ranges.of(poses)
         sampled = range(0, len(ranges), max(1, -(-len(ranges) // _SKETCH_VIEWS)))
         voxel = self._range_voxel
         clouds = (ranges[k].as_cloud(_SKETCH_PIXELS) for k in sampled)
         return self._average(clouds, poses, voxel, normals=False)
+
+    def _clouds_of(self, frames: Container[int]) -> Iterator[CloudFrame]:
+        return (self._spill.get(number) for index, number in self._clouds if index in frames)
 
     @property
     def _range_voxel(self) -> float:

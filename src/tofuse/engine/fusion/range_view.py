@@ -1,9 +1,13 @@
-"""Compact range images, as stored until they are fused at their final poses."""
+"""Compact range images, as stored until they are fused at their final poses.
+
+The stored views of a recording: in memory up to a limit, the others on disk.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -11,7 +15,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Int8, UInt8, UInt16
 from tofuse.engine.cameras import ray_lengths
-from tofuse.engine.compute import median
+from tofuse.engine.compute import Spill, median
 from tofuse.engine.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.tsdf_kernels import StoredView, mark_jumps, pack_view, shrink_to_planes
 from tofuse.engine.views import (
@@ -269,3 +273,99 @@ def _area_mean(image: Float32, shape: tuple[int, ...]) -> Float32:
     cropped = np.ascontiguousarray(image[: step * shape[0], : step * shape[1]])
     means = cv2.resize(cropped, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
     return np.asarray(means, np.float32)
+
+
+@dataclass(frozen=True)
+class ViewSummary:
+    """Properties of a view that are needed without its images.
+
+    Attributes
+    ----------
+    index, depth, pitch, sigma_m, channels
+        See `RangeView`.
+    """
+
+    index: int
+    depth: float
+    pitch: float
+    sigma_m: float
+    channels: int
+
+    @classmethod
+    def of(cls, view: RangeView) -> ViewSummary:
+        """Return the summary of a view."""
+        return cls(view.index, view.depth, view.pitch, view.sigma_m, view.channels)
+
+
+class Views(Protocol):
+    """A sequence of views: a list, or those of a store."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> RangeView: ...
+
+    def __iter__(self) -> Iterator[RangeView]: ...
+
+
+class StoredViews:
+    """Views in a store, read on demand.
+
+    Attributes
+    ----------
+    summaries
+        Of all views, without reading them.
+    """
+
+    def __init__(self, spill: Spill[RangeView]) -> None:
+        self.summaries: list[ViewSummary] = []
+        self._spill = spill
+        self._numbers: list[int] = []
+
+    def add(self, view: RangeView) -> None:
+        """Store a view.
+
+        Raises
+        ------
+        OutputError
+            If there is no space on the disk.
+        """
+        self._numbers.append(self._spill.put(view))
+        self.summaries.append(ViewSummary.of(view))
+
+    def of(self, indices: Container[int]) -> StoredViews:
+        """Select the views of these frame indices, in the same store."""
+        selected = StoredViews(self._spill)
+        for number, summary in zip(self._numbers, self.summaries, strict=True):
+            if summary.index in indices:
+                selected._numbers.append(number)
+                selected.summaries.append(summary)
+        return selected
+
+    def corrected(self, errors: Mapping[str, float]) -> StoredViews:
+        """Add the views without these errors of the camera to the store."""
+        corrected = StoredViews(self._spill)
+        for view in with_camera_correction(self, errors):
+            corrected.add(view)
+        return corrected
+
+    def drop(self) -> None:
+        """Remove these views from the store."""
+        for number in self._numbers:
+            self._spill.drop(number)
+        self.summaries, self._numbers = [], []
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def __getitem__(self, index: int, /) -> RangeView:
+        return self._spill.get(self._numbers[index])
+
+    def __iter__(self) -> Iterator[RangeView]:
+        return (self._spill.get(number) for number in self._numbers)
+
+
+def summaries(views: Views) -> Sequence[ViewSummary]:
+    """Return the summaries of all views, without reading those that are on disk."""
+    if isinstance(views, StoredViews):
+        return views.summaries
+    return [ViewSummary.of(view) for view in views]

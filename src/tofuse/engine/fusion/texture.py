@@ -21,8 +21,7 @@ from tofuse.engine.fusion.atlas_kernels import (
     add_view,
     draw_triangles,
 )
-from tofuse.engine.fusion.cloud import grey_of
-from tofuse.engine.fusion.colors import NO_COLOR, display_colors, has_color
+from tofuse.engine.fusion.cloud import NO_COLOR, display_colors, grey_of, has_color
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.views import Projection

@@ -1,4 +1,10 @@
-"""."""
+"""Pose graphs: poses, measured motions between them, and their optimisation.
+
+A `PoseGraph` is built of `Measured` motions. An `Optimiser` corrects its poses and rejects wrong
+loops: `levenberg` (the default) or `castellani` (the thesis), by the `solver` of sparse systems
+(`sparse`) with `robust` kernels. `graph_covariances` says how uncertain the poses are;
+`external_sensors` adds gravity and odometry.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -6,17 +12,23 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.graph import (
-        bridges,
         castellani,
         external_sensors,
         graph_covariances,
         levenberg,
-        measured_graph,
         minimisation,
         robust,
         solver,
         sparse,
     )
-    from tofuse.engine.graph.graph import GraphPart, LoopRecord, Optimisation, Optimiser, PoseGraph
+    from tofuse.engine.graph.graph import (
+        GraphPart,
+        LoopRecord,
+        Measured,
+        Optimisation,
+        Optimiser,
+        PoseGraph,
+        build_graph,
+    )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -18,13 +18,13 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.graph.graph import Optimisation, Optimiser, PoseGraph
 from tofuse.engine.graph.levenberg import check_motions
+from tofuse.engine.graph.sparse import first_of_parts
 from tofuse.engine.parts import part
 
 Normalisation = Literal["thesis", "fusiello"]
@@ -181,15 +181,7 @@ class Castellani(Optimiser):
 
 def free_vertices(graph: PoseGraph) -> Bool:
     """Return the (N,) mask of the free vertices: all but the first of each connected part."""
-    n = len(graph.ids)
-    if n == 0:
-        return np.zeros(0, bool)
-    i, j = graph.edges.T
-    adjacency = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
-    _, component = connected_components(adjacency, directed=False)
-    free = np.ones(n, bool)
-    free[np.unique(component, return_index=True)[1]] = False
-    return free
+    return ~first_of_parts(len(graph.ids), graph.edges)
 
 
 class _Step:

@@ -17,9 +17,7 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import Gravity, PoseGraph
-from tofuse.engine.graph.measured_graph import Measured
-from tofuse.engine.graph.minimisation import vertical
+from tofuse.engine.graph.graph import Gravity, Measured, PoseGraph
 from tofuse.engine.parts import part
 
 # With fewer measured frames, a moving accelerometer can't be detected.
@@ -194,7 +192,7 @@ class GravityEdges(Bounded, ExternalSensor):
         inflation = 1 + float((self.shared_rad**2 / measured[:, 3] ** 2).sum())
         observed = (graph.poses[rows, :3, :3] @ measured[:, :3, None])[..., 0]
         gravity = Gravity(rows, measured[:, :3], measured[:, 3], None, self.gate)
-        down = vertical(observed, gravity)
+        down = gravity.vertical(observed)
         chi2 = ((observed - down / np.linalg.norm(down)) ** 2).sum(1) / measured[:, 3] ** 2
         used = int((chi2 <= self.gate).sum())
         measured[:, 3] *= np.sqrt(inflation)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol
 
@@ -11,6 +12,7 @@ from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph import robust
 
 # Squared error of an edge, in units of its information, up to which it may be rounding.
 ROUNDING = 1e-12
@@ -40,6 +42,18 @@ class Gravity:
     sigma: Float64
     world: Float64 | None = None
     gate: float = np.inf
+
+    def vertical(self, observed: Float64) -> Float64:
+        """Return the (3,) robust mean of directions (g, 3) observed in the world."""
+        weight = 1 / self.sigma**2
+        if np.isinf(self.gate):
+            return np.asarray((observed * weight[:, None]).sum(0), np.float64)
+        down = np.median(observed, axis=0)  # robust to outliers
+        for _ in range(10):
+            down = down / max(float(np.linalg.norm(down)), 1e-12)
+            x = ((observed - down) ** 2).sum(1) * weight
+            down = (observed * (weight * robust.weight("huber", x, 1.0))[:, None]).sum(0)
+        return np.asarray(down, np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,3 +293,55 @@ class LoopRecord:
             free_space_violation=registration.violation,
             margin=registration.margin,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """One measurement between frames i and j: T_i_j and its (6, 6) information."""
+
+    i: int
+    j: int
+    T_i_j: Float64
+    information: Float64
+
+
+def build_graph(
+    ids: Sequence[int],
+    poses: Float64,
+    sequence: Sequence[Measured],
+    loops: Sequence[Measured] = (),
+) -> PoseGraph:
+    """Build the graph of posed frames and of the measurements between them.
+
+    Parameters
+    ----------
+    ids
+        Indices of the N frames that have a pose.
+    poses
+        (N, 4, 4) T_world_camera.
+    sequence, loops
+        Odometry edges, and loop edges; both may be empty.
+
+    Raises
+    ------
+    InputError
+        If an edge names a frame that has no pose.
+    """
+    position = {int(index): k for k, index in enumerate(ids)}
+    edges = [*sequence, *loops]
+    for edge in edges:
+        for index in (edge.i, edge.j):
+            if index not in position:
+                raise InputError(
+                    f"the edge {edge.i} {edge.j} names frame {index}, which has no pose",
+                    where="pose graph",
+                )
+    m = len(edges)
+    return PoseGraph(
+        ids=np.array(ids, np.intp),
+        poses=np.asarray(poses, float).reshape(-1, 4, 4),
+        edges=np.array([(position[e.i], position[e.j]) for e in edges], np.intp).reshape(m, 2),
+        measurements=np.array([e.T_i_j for e in edges], float).reshape(m, 4, 4),
+        information=np.array([e.information for e in edges], float).reshape(m, 6, 6),
+        loop=np.arange(m) >= len(sequence),
+    )

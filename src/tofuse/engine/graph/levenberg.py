@@ -11,8 +11,8 @@ from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.branches import Branches
 from tofuse.engine.graph.graph import GraphPart, Optimisation, Optimiser, PoseGraph
+from tofuse.engine.graph.graph_covariances import Branches
 from tofuse.engine.graph.robust import Robust, Settings
 from tofuse.engine.graph.solver import Solution, solve
 from tofuse.engine.graph.sparse import parts_of, sparsify

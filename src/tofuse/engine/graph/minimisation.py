@@ -54,7 +54,7 @@ class Problem:
         if down is None:
             R = poses[self.gravity.vertices, :3, :3]
             observed = (R @ self.gravity.directions[..., None])[..., 0]
-            down = vertical(observed, self.gravity)
+            down = self.gravity.vertical(observed)
         # A rotation with down as its third axis; the other two are arbitrary.
         down = down / np.linalg.norm(down)
         x = np.cross(np.eye(3)[np.argmin(np.abs(down))], down)
@@ -129,19 +129,6 @@ class Problem:
         all_poses = poses if len(poses) == len(self.system.fixed) else self.start(poses)
         matrix, gradient = self.linearised(all_poses, *self.errors(all_poses), weights)
         return self.system.factor(matrix, gradient)
-
-
-def vertical(observed: Float64, gravity: Gravity) -> Float64:
-    """Return the (3,) robust mean of directions (g, 3) `observed` in the world, by their sigmas."""
-    weight = 1 / gravity.sigma**2
-    if np.isinf(gravity.gate):
-        return np.asarray((observed * weight[:, None]).sum(0), np.float64)
-    down = np.median(observed, axis=0)  # robust to outliers
-    for _ in range(10):
-        down = down / max(float(np.linalg.norm(down)), 1e-12)
-        x = ((observed - down) ** 2).sum(1) * weight
-        down = (observed * (weight * robust.weight("huber", x, 1.0))[:, None]).sum(0)
-    return np.asarray(down, np.float64)
 
 
 Cost = Callable[[Float64], Float64]

@@ -95,8 +95,13 @@ def solve(
         selection = truncated_least_squares(problem, poses, loop, settings)
         log = selection.descent.log
         history = tuple(float(np.minimum(x, selection.limit).sum()) + extra for x, extra in log)
-        return _solution(
-            problem, selection.descent, selection.weights, history, selection.converged
+        return Solution(
+            selection.descent.poses[: len(fixed)],
+            selection.descent.chi2,
+            selection.weights,
+            history,
+            selection.converged,
+            problem,
         )
     kernel = settings.robust if settings.robust != "truncated" else "none"
 
@@ -109,15 +114,5 @@ def solve(
     descent = Descent(problem, problem.start(poses))
     converged = descent.run(total, weights, settings.tolerance, settings.max_iterations)
     history = tuple(float(total(x).sum()) + extra for x, extra in descent.log)
-    return _solution(problem, descent, weights(descent.chi2), history, converged)
-
-
-def _solution(
-    problem: Problem,
-    descent: Descent,
-    weights: Float64,
-    history: tuple[float, ...],
-    converged: bool,
-) -> Solution:
-    poses = descent.poses[: len(problem.fixed)]
-    return Solution(poses, descent.chi2, weights, history, converged, problem)
+    solved_poses, chi2 = descent.poses[: len(fixed)], descent.chi2
+    return Solution(solved_poses, chi2, weights(chi2), history, converged, problem)

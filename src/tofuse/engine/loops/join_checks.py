@@ -12,18 +12,16 @@ from tofuse.engine.alignment import Link, Registration, projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.loops.gaps import (
+from tofuse.engine.loops.merged_components import (
     CONVERGENCE,
+    DRIFT,
+    MergedComponent,
+    MergedComponents,
     TrackedComponent,
     View,
     end_speeds,
     largest_motion,
     motion_over,
-)
-from tofuse.engine.loops.merged_components import (
-    DRIFT,
-    MergedComponent,
-    MergedComponents,
     transformed,
 )
 from tofuse.engine.search import (
@@ -111,12 +109,7 @@ class JoinChecks:
     ) -> list[tuple[View, View, Float64, pair_agreement.Agreement]]:
         """View pairs of both sides that overlap most under T_a_b: T_i_j, and their agreement."""
         compare = verification.usual_tolerances(self.fit_statistics)
-        views_a = [
-            self._merged.views[i] for i in self._merged.views if self._merged.component_of[i] in a.T
-        ]
-        views_b = [
-            self._merged.views[i] for i in self._merged.views if self._merged.component_of[i] in b.T
-        ]
+        views_a, views_b = self._merged.views_of(a), self._merged.views_of(b)
         candidates: list[tuple[float, int, int]] = []
         if not views_a or not views_b:
             return []
@@ -185,17 +178,15 @@ class JoinChecks:
         camera is contradicted by the short time, not supported.
         """
         T = {**a.T, **transformed(b.T, T_a_b)}
-        for c in a.T:
-            for d in b.T:
-                before, after = self._merged.by_start_time(c, d)
-                elapsed = float(after.times[0] - before.times[-1])
-                if before.recording != after.recording or elapsed < 0:
-                    continue
-                reach = self.speed * elapsed
-                if reach[0] < max_motion * before.depth and reach[1] < max_motion:
-                    motion = motion_over(before, after, T)
-                    if se3.is_within(motion, max_motion * before.depth, max_motion):
-                        return True
+        for before, after in self._merged.of_same_recording(a, b):
+            elapsed = float(after.times[0] - before.times[-1])
+            if elapsed < 0:
+                continue
+            reach = self.speed * elapsed
+            if reach[0] < max_motion * before.depth and reach[1] < max_motion:
+                motion = motion_over(before, after, T)
+                if se3.is_within(motion, max_motion * before.depth, max_motion):
+                    return True
         return False
 
     def _within_drift(self, T: Float64, other: Float64, depth: float, drift: float) -> bool:
@@ -224,16 +215,12 @@ class JoinChecks:
     def reachable(self, a: MergedComponent, b: MergedComponent, T_a_b: Float64) -> bool:
         """Return whether the camera had the time to move from one side to the other."""
         T = {**a.T, **transformed(b.T, T_a_b)}
-        for c in a.T:
-            for d in b.T:
-                first, second = self._merged.by_start_time(c, d)
-                if first.recording != second.recording:
-                    continue
-                motion = motion_over(first, second, T)
-                max_motion = largest_motion(first, second)
-                max_m = max_motion[0] + _SMALL_MOTION * first.depth
-                if not se3.is_within(motion, max_m, max_motion[1] + _SMALL_MOTION):
-                    return False
+        for first, second in self._merged.of_same_recording(a, b):
+            motion = motion_over(first, second, T)
+            max_motion = largest_motion(first, second)
+            max_m = max_motion[0] + _SMALL_MOTION * first.depth
+            if not se3.is_within(motion, max_m, max_motion[1] + _SMALL_MOTION):
+                return False
         return True
 
 

@@ -8,6 +8,11 @@ free space; it must have no rival, and the camera must have been able to get the
 decided after tracking: best first, each join together with those made before. A join that rests on
 a single link is then undone and searched for again, as more views have been joined to both sides
 since. A component without a join stays separate.
+
+The largest set of pairwise consistent measurements (Mangelson et al., ICRA 2018).
+
+Correct measurements between two maps are all consistent; wrong ones are rarely consistent with each
+other. Each is a vertex, each consistent pair an edge: the maximum clique is accepted.
 """
 
 from __future__ import annotations
@@ -20,14 +25,21 @@ from typing import Annotated, Literal
 import numpy as np
 
 from tofuse.engine.alignment import Link
-from tofuse.engine.arrays import Float64
+from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import bridges
-from tofuse.engine.loops.gaps import TrackedComponent, View, extrapolated, odometry_over
 from tofuse.engine.loops.join_checks import VERIFY, JoinChecks, link_of
-from tofuse.engine.loops.merged_components import Join, JoinKind, MergedComponent, MergedComponents
-from tofuse.engine.loops.pairwise_consistency import maximum_consistent_set
+from tofuse.engine.loops.merged_components import (
+    Join,
+    JoinKind,
+    MergedComponent,
+    MergedComponents,
+    TrackedComponent,
+    View,
+    cut_edges,
+    extrapolated,
+    odometry_over,
+)
 from tofuse.engine.search import (
     DISTINCT_M,
     SearchOptions,
@@ -36,6 +48,42 @@ from tofuse.engine.search import (
     verification,
 )
 from tofuse.engine.views import view_descriptors
+
+
+def maximum_consistent_set(consistent: Bool, weights: Sequence[float] | None = None) -> list[int]:
+    """Return the clique of largest weight, ascending; of equals the one with the lowest indices.
+
+    Exact, by branch and bound: made for tens of measurements, not for thousands.
+
+    Parameters
+    ----------
+    consistent
+        (N, N) symmetric; whether two measurements agree. The diagonal does not matter.
+    weights
+        (N,) above 0; 1 each unless given.
+    """
+    n = len(consistent)
+    weight = np.ones(n) if weights is None else np.asarray(weights, float)
+    # Heavy ones first, so that a good bound is found soon.
+    order = np.lexsort((np.arange(n), -weight))
+    best: list[int] = []
+    best_weight = 0.0
+
+    def grow(chosen: list[int], total: float, candidates: list[int]) -> None:
+        nonlocal best, best_weight
+        if total > best_weight:
+            best, best_weight = list(chosen), total
+        remaining = float(sum(weight[c] for c in candidates))
+        for k, c in enumerate(candidates):
+            if total + remaining <= best_weight:
+                return
+            remaining -= float(weight[c])
+            compatible = [d for d in candidates[k + 1 :] if consistent[c, d]]
+            grow([*chosen, c], total + float(weight[c]), compatible)
+
+    grow([], 0.0, [int(k) for k in order])
+    return sorted(best)
+
 
 # Frames for each additional search, as long recordings have more places.
 _FRAMES_PER_SEARCH = 50
@@ -244,7 +292,7 @@ class _Joiner:
         weak = [
             merged.joins[k]
             for merged in self._merged.all
-            for k in bridges.cut_edges([self._merged.components(join) for join in merged.joins])
+            for k in cut_edges([self._merged.components(join) for join in merged.joins])
         ]
         for join in weak:
             self._merged.cut(join)

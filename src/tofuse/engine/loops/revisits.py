@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, ClassVar
@@ -17,8 +17,13 @@ from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import LoopRecord
-from tofuse.engine.loops.appearance import Appearance
-from tofuse.engine.loops.candidates import MAX_OVERLAP_BETWEEN, CandidateSelector, LoopView, Pair
+from tofuse.engine.loops.candidates import (
+    MAX_OVERLAP_BETWEEN,
+    Appearance,
+    CandidateSelector,
+    LoopView,
+    Pair,
+)
 from tofuse.engine.loops.loops import (
     ClosedLoop,
     LoopDetector,
@@ -28,9 +33,47 @@ from tofuse.engine.loops.loops import (
     in_order,
 )
 from tofuse.engine.parts import part
-from tofuse.engine.search import DISTINCT_M, SearchOptions, follow, register_pair, verification
-from tofuse.engine.stored_views import Spacing, ViewStore
+from tofuse.engine.search import (
+    DISTINCT_M,
+    SearchOptions,
+    follow,
+    pair_agreement,
+    register_pair,
+    verification,
+)
+from tofuse.engine.stored_views import PosedView, Spacing, ViewStore
 from tofuse.engine.views import PreparedView
+
+
+def degraded_neighbours(
+    views: Sequence[PosedView[PreparedView]],
+    before: Float64,
+    after: Float64,
+    suspects: frozenset[int],
+) -> Iterator[tuple[int, int]]:
+    """Yield the frame indices i, j of neighbouring views that agree less after loops were closed.
+
+    Least squares puts the gap of a loop where registrations are least certain. If the images there
+    fit the poses before better, the registration was right, and the error is elsewhere.
+
+    Parameters
+    ----------
+    views
+        N views, ascending.
+    before, after
+        (N, 4, 4) poses before and after.
+    suspects
+        Indices of the frames with uncertain registrations: only neighbours i, j with one of them
+        in (i, j] are compared.
+    """
+    relative = [se3.inverse(poses[:-1]) @ poses[1:] for poses in (before, after)]
+    for a, b, T, T_closed in zip(views[:-1], views[1:], *relative, strict=True):
+        if suspects.isdisjoint(range(a.index + 1, b.index + 1)):
+            continue
+        compared = pair_agreement.Comparison.of(b.view, a.view)
+        if compared.at(T_closed).score < compared.at(T).score - pair_agreement.MIN_LEAD:
+            yield a.index, b.index
+
 
 # The trajectory has drifted when a loop closes. Neighbouring pixels share their noise, so that all
 # of them have hardly more information than every second one.

@@ -10,13 +10,12 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.fusion import Model, with_pose_errors
-from tofuse.engine.graph import LoopRecord, PoseGraph, bridges, external_sensors, graph_covariances
-from tofuse.engine.loops import PriorLoop
+from tofuse.engine.graph import LoopRecord, PoseGraph, external_sensors, graph_covariances
+from tofuse.engine.loops import PriorLoop, cut_edges
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.observations import Observations
-from tofuse.engine.mapping.stage_results import Optimised, Refined
-from tofuse.engine.mapping.tracked_graph import TrackedGraph
+from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph
 from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.parts import name_of
 from tofuse.engine.quality import cross_view_agreement, pose_accuracy, trajectory_errors
@@ -297,7 +296,7 @@ def single_link_frames(tracked: TrackedGraph, loops: Sequence[LoopRecord]) -> tu
     edges = [(component_of[i], component_of[j]) for i, j in pairs]
     first = component_of[tracked.posed[0].record.index]
     weak_components: set[int] = set()
-    for k, sides in bridges.cut_edges(edges).items():
+    for k, sides in cut_edges(edges).items():
         if k < len(tracked.joins) and tracked.joins[k].kind == "links":
             weak_components |= sides[1] if first in sides[0] else sides[0]
     return tuple(index for index, c in component_of.items() if c in weak_components)

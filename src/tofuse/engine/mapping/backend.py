@@ -22,8 +22,7 @@ from tofuse.engine.mapping.assessment import Assessment
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.observations import Observations
-from tofuse.engine.mapping.stage_results import Optimised, Refined, VisualEvidence
-from tofuse.engine.mapping.tracked_graph import TrackedGraph
+from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph, VisualEvidence
 from tofuse.engine.progress import Progress, Stopwatch
 from tofuse.engine.results import Component, Diagnostics, Reconstruction
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -14,11 +14,30 @@ from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.fusion import Fusion
 from tofuse.engine.graph import Optimiser, external_sensors
 from tofuse.engine.loops import Joining, LoopDetector
-from tofuse.engine.mapping.budget import voxels_mb
 from tofuse.engine.refinement import NoRefinement, RefinementMethod
 from tofuse.engine.search import SearchOptions
 from tofuse.engine.sensor import Correction
 from tofuse.engine.tracking import Odometry
+
+# Fractions of the total. The remainder is for the program itself (about 400 MB), frames being
+# processed, data computed from stored views, and the result.
+_VOXELS, _VIEWS, _CHECKED = 0.3, 0.03, 0.005
+
+
+def voxels_mb(memory_mb: int) -> int:
+    """Return the memory of fusion for voxels, MB; see `Fusion.memory_mb`."""
+    return max(1, int(_VOXELS * memory_mb))
+
+
+def checked_bytes(memory_mb: int) -> int:
+    """Return the memory for the images of the final comparison, bytes."""
+    return int(_CHECKED * memory_mb * 1_000_000)
+
+
+def views_bytes(memory_mb: int) -> int:
+    """Return the memory for the prepared views of loops and refinement, bytes."""
+    return int(_VIEWS * memory_mb * 1_000_000)
+
 
 ViewKind = Literal["range", "cloud"]
 
@@ -63,7 +82,7 @@ class Config(Bounded):
         A result is good if the 95 % bound of the poses' rms error is within it, m; None for 0.5 %
         of the model's diagonal, at least 1 cm.
     memory_mb
-        Approximate memory of a run; `pipeline.budget` divides it. Data that does not fit is stored
+        Approximate memory of a run; see `voxels_mb`, `checked_bytes` and `views_bytes`. Data that does not fit is stored
         on disk.
     """
 
@@ -104,21 +123,6 @@ PACKAGES = (
     "tofuse.engine.refinement",
     "tofuse.lab.methods",
 )
-
-
-def methods() -> dict[str, Callable[[ViewKind], Config]]:
-    """Return the named configurations, `default` first."""
-    from tofuse.engine.mapping import methods as named
-
-    return {"default": named.default, "thesis": named.thesis}
-
-
-def from_method(name: str, kind: ViewKind = "range") -> Config:
-    """Return the configuration of that name for a kind of view; InputError if there is none."""
-    available = methods()
-    if name not in available:
-        raise InputError(f"is {name!r}", where="--method", remedy=f"use one of {list(available)}")
-    return available[name](kind)
 
 
 def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config:

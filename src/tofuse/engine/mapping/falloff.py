@@ -28,7 +28,7 @@ from scipy.special import stdtrit
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame, RangeFrame, Recording
-from tofuse.engine.mapping.pooling import pooled
+from tofuse.engine.mapping.trial import pooled
 from tofuse.engine.search import verification, view_points
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view, residual_kernels
 

@@ -67,17 +67,7 @@ class FrameSequence:
         previous, self._previous = self._previous, frame
         if previous is None:
             return False
-        # Most images already differ there; the first rows of some cameras are invalid.
-        middle = len(frame.depth) // 2
-        if not np.array_equal(
-            previous.depth[middle : middle + 1], frame.depth[middle : middle + 1]
-        ):
-            return False
         return np.array_equal(previous.depth, frame.depth) and len(frame) > 0
-
-    def end(self) -> None:
-        """Release the last frame."""
-        self._previous = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +134,6 @@ class FrameLog:
     interruptions: list[int] = field(default_factory=list)
     repeated: list[int] = field(default_factory=list)
     _steps: dict[int, Step] = field(default_factory=dict, init=False, repr=False)
-    _n_indexed: int = field(default=0, init=False, repr=False)
 
     def add(
         self,
@@ -160,6 +149,7 @@ class FrameLog:
             r = step.registration
             r = None if r is None else replace(r, errors=())
             step = replace(step, registration=r, surface=None, moving=None)
+            self._steps[record.index] = step
         number = len(self.interruptions)
         self.entries.append(Entry(record, step, number, T_odometry, gravity, moving))
 
@@ -206,11 +196,6 @@ class FrameLog:
 
     def step_of(self, frame: int) -> Step:
         """Return the tracking result of a frame with a pose."""
-        if self._n_indexed != len(self.entries):
-            for entry in self.entries[self._n_indexed :]:
-                if entry.step is not None:
-                    self._steps[entry.record.index] = entry.step
-            self._n_indexed = len(self.entries)
         return self._steps[frame]
 
     def numbered(self, numbers: Mapping[int, int]) -> FrameLog:

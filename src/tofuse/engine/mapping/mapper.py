@@ -12,9 +12,10 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.assembly import Assembly
-from tofuse.engine.mapping.config import Config, check_views, from_method, kind_of
+from tofuse.engine.mapping.config import Config, check_views, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog, FrameSequence, record_of
 from tofuse.engine.mapping.live_poses import LivePoses
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.preparation import FilteredFrame, Preparation, Prepared
 from tofuse.engine.parts import check_number
@@ -241,8 +242,7 @@ class Mapper:
         self._live_poses.finish()
         with self.watch.timing("fusion"):
             self._observations.finish()
-        self._sequence.end()
-        del self._tracker  # its keyframes
+        del self._sequence, self._tracker  # the last frame, and keyframes
         trim_memory()
         result = self._assembly().run(self._log)
         diagnostics = replace(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from tofuse.engine.clouds import AnyPair
+from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Confidence, NeighbourFraction, NeighbourhoodAngle
 from tofuse.engine.fusion import Fusion
 from tofuse.engine.graph import castellani, external_sensors, levenberg
@@ -78,3 +80,16 @@ def default(kind: ViewKind) -> Config:
         # Odometry only on request: a file next to the images may be of any quality.
         priors=(external_sensors.GravityEdges(),),
     )
+
+
+def methods() -> dict[str, Callable[[ViewKind], Config]]:
+    """Return the named configurations, `default` first."""
+    return {"default": default, "thesis": thesis}
+
+
+def from_method(name: str, kind: ViewKind = "range") -> Config:
+    """Return the configuration of that name for a kind of view; InputError if there is none."""
+    available = methods()
+    if name not in available:
+        raise InputError(f"is {name!r}", where="--method", remedy=f"use one of {list(available)}")
+    return available[name](kind)

@@ -14,8 +14,7 @@ from tofuse.engine.compute import Scratch, Spill, job_pool, thread_count
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.fusion import ModelBuilder, as_cloud
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping.budget import checked_bytes, views_bytes
-from tofuse.engine.mapping.config import Config
+from tofuse.engine.mapping.config import Config, checked_bytes, views_bytes
 from tofuse.engine.mapping.preparation import FilteredFrame
 from tofuse.engine.quality import cross_view_agreement, frame_samples
 from tofuse.engine.stored_views import Spacing, Spilled, ViewStore
@@ -65,7 +64,8 @@ class Observations:
         self.refiner = config.refinement.start(self.views)
         self.model = ModelBuilder(config.fusion)
         self._places = Spacing(views_per_place=_VIEWS_PER_PLACE).places()
-        self._checks = _EvenSample(_CHECKED_IMAGES, Spill(checked_bytes(config.memory_mb)))
+        self._checks = frame_samples.EvenSample[Spilled[RangeFrame]](_CHECKED_IMAGES)
+        self._checks_spill: Spill[RangeFrame] = Spill(checked_bytes(config.memory_mb))
         self.depths: dict[int, float] = {}
         self.ambiguity_m: float | None = None
         self._needs_points = self.loops.needs_points or self.refiner.needs_points
@@ -114,7 +114,11 @@ class Observations:
         if isinstance(frame, RangeFrame):
             self.depths[frame.index] = depth
             if isinstance(clean, RangeFrame):
-                self._checks.add(lambda: cross_view_agreement.restore_thinned(frame, clean))
+                self._checks.offer(
+                    lambda: Spilled(
+                        cross_view_agreement.restore_thinned(frame, clean), self._checks_spill
+                    )
+                )
         assert step.T_component_camera is not None
         if self._places.keeps(depth, step.T_component_camera, step.component):
             self.model.add(clean, step.surface, _MAX_POINTS)
@@ -133,7 +137,7 @@ class Observations:
     @property
     def checks(self) -> Sequence[Spilled[RangeFrame]]:
         """Images that are compared with each other at the final poses."""
-        return self._checks.images
+        return self._checks.items
 
 
 def _reduced(view: PreparedView) -> PreparedView:
@@ -150,23 +154,6 @@ def _typical_range(frame: Frame) -> float:
         ranges = np.linalg.norm(frame.points[::16], axis=1)
     valid = ranges[ranges > 0]
     return float(np.median(valid)) if len(valid) else 0.0
-
-
-class _EvenSample:
-    """Stores at most `size` images of a stream of unknown length, evenly spaced."""
-
-    def __init__(self, size: int, spill: Spill[RangeFrame]) -> None:
-        self.images: list[Spilled[RangeFrame]] = []
-        self._spill = spill
-        self._size, self._step, self._count = size, 1, 0
-
-    def add(self, make: Callable[[], RangeFrame]) -> None:
-        if self._count % self._step == 0:
-            self.images.append(Spilled(make(), self._spill))
-            if len(self.images) > self._size:
-                self.images = self.images[::2]
-                self._step *= 2
-        self._count += 1
 
 
 class _BackgroundQueue:

@@ -16,9 +16,10 @@ from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import POSES_BY, Frame, Recording
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.adaptation import adapted
-from tofuse.engine.mapping.config import Config, ViewKind, from_method, kind_of
+from tofuse.engine.mapping.config import Config, ViewKind, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.self_calibration import self_calibrated
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.graph import PoseGraph, measured_graph
+from tofuse.engine.graph import Measured, Optimisation, PoseGraph, build_graph, external_sensors
 from tofuse.engine.loops import ClosedLoop, Join
 from tofuse.engine.mapping.frame_log import Entry
 from tofuse.engine.quality import pose_accuracy
@@ -105,22 +105,18 @@ class TrackedGraph:
                 information = motion_prediction.with_prediction(
                     information, r.unobservable, predicted_sigma
                 )
-            sequential_edges.append(
-                measured_graph.Measured(step.reference, index, r.T_target_source, information)
-            )
+            sequential_edges.append(Measured(step.reference, index, r.T_target_source, information))
         join_edges = [
-            measured_graph.Measured(j.link.i, j.link.j, j.link.T_i_j, j.link.information)
+            Measured(j.link.i, j.link.j, j.link.T_i_j, j.link.information)
             for j in self.joins
             if j.defines_pose and not {j.link.i, j.link.j} <= refined_frames
         ]
         loop_edges = [
-            measured_graph.Measured(c.record.i, c.record.j, c.T_i_j, c.information)
+            Measured(c.record.i, c.record.j, c.T_i_j, c.information)
             for c in loops
             if c.T_i_j is not None and c.information is not None
         ]
-        return measured_graph.build_graph(
-            ids, poses, [*sequential_edges, *join_edges, *refined_edges], loop_edges
-        )
+        return build_graph(ids, poses, [*sequential_edges, *join_edges, *refined_edges], loop_edges)
 
     def measured(
         self,
@@ -154,3 +150,37 @@ class TrackedGraph:
     def gaps(self) -> set[tuple[int, int]]:
         """The frames before and after the gaps that no registration closes."""
         return {(j.link.i, j.link.j) for j in self.joins if j.kind != "links"}
+
+
+@dataclass(frozen=True, eq=False)
+class VisualEvidence:
+    """The evidence of the images alone: a graph without external sensors.
+
+    `sequential` are the poses before loop closure, with external sensors.
+    """
+
+    sequential: Float64
+    optimisation: Optimisation
+
+
+@dataclass(frozen=True, eq=False)
+class Optimised:
+    """The result of closing loops and optimising.
+
+    `confirmed` are frames whose registrations fit unusually badly, but are confirmed by the loops.
+    """
+
+    loops: list[ClosedLoop]
+    sequential: Float64
+    optimisation: Optimisation
+    sensors: external_sensors.SensorPriors
+    visual: VisualEvidence
+    confirmed: frozenset[int]
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """The result of refining all views."""
+
+    graph: PoseGraph
+    refinement: Refinement

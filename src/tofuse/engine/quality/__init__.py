@@ -1,4 +1,10 @@
-"""."""
+"""Measures of a result's quality, most of them without a ground truth.
+
+`pose_accuracy` bounds the errors of poses by their covariance. `cross_view_agreement` and
+`map_agreement` compare overlapping images at given poses, `pose_deviation` the poses with
+registrations, `trajectory_errors` with a reference. `changes` tells what moved between two
+recordings.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -14,6 +20,5 @@ if TYPE_CHECKING:
         trajectory_errors,
     )
     from tofuse.engine.quality.change_detection import Change, changes
-    from tofuse.engine.quality.pair_measurements import measured_pairs
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -24,7 +25,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
-from tofuse.engine.compute import run_chunks
+from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
@@ -51,7 +52,6 @@ _MIN_COSINE = 0.25
 _VOXEL_PIXELS, _CLUSTER_GAP = 2.5, 3.0
 # Minimum area of a change, as a fraction of the area that a view covers at the typical depth.
 _MIN_AREA_RATIO = 0.004
-_CHUNKS = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,19 +188,16 @@ def _similar_direction(a: _SessionView, b: _SessionView) -> bool:
 def _residuals(pairs: Sequence[tuple[_SessionView, _SessionView]]) -> tuple[Float64, Float64]:
     """Distances of points from the same surface in other views, and their stated sigma, m."""
 
-    def work(start: int, stop: int) -> list[tuple[Float64, Float64]]:
-        residuals = []
-        for source, target in pairs[start:stop]:
-            rows, behind, _, sigma, facing = _compare(source, target)
-            z = source.points.points[rows, 2]
-            same_surface = facing & (np.abs(np.nan_to_num(behind, nan=np.inf)) < _MAX_RESIDUAL * z)
-            residuals.append((np.abs(behind[same_surface]), sigma[same_surface]))
-        return residuals
+    def residuals(source: _SessionView, target: _SessionView) -> tuple[Float64, Float64]:
+        rows, behind, _, sigma, facing = _compare(source, target)
+        z = source.points.points[rows, 2]
+        same_surface = facing & (np.abs(np.nan_to_num(behind, nan=np.inf)) < _MAX_RESIDUAL * z)
+        return np.abs(behind[same_surface]), sigma[same_surface]
 
-    chunks = [item for chunk in run_chunks(work, len(pairs), _CHUNKS) for item in chunk]
-    if not chunks:
+    if not pairs:
         return np.zeros(0), np.ones(0)
-    r, sigma = (np.concatenate(each) for each in zip(*chunks, strict=True))
+    compared = run_all([partial(residuals, *pair) for pair in pairs])
+    r, sigma = (np.concatenate(each) for each in zip(*compared, strict=True))
     return r, sigma
 
 
@@ -238,30 +235,24 @@ def _changed_voxels(
 ) -> Float64:
     """(K, 3) surface centroids of voxels where the other session measured free space."""
 
-    def work(start: int, stop: int) -> list[tuple[Float64, Float64, Intp]]:
-        compared = []
-        for k in range(start, stop):
-            source = views[k]
-            points = source.points.points.astype(np.float64)
-            votes = np.zeros(len(points))
-            for target in other_views:
-                if not _similar_direction(source, target):
-                    continue
-                rows, behind, nearer, sigma, facing = _compare(source, target)
-                sigma = np.hypot(scale * sigma, misalignment)
-                # On slanted surfaces, errors along the ray exceed those along the normal.
-                free_space = (nearer > _FREE_SPACE_SIGMAS * sigma) & ~(
-                    behind > -_FREE_SPACE_SIGMAS * sigma
-                )
-                same_surface = facing & (np.abs(behind) < _SURFACE_SIGMAS * sigma)
-                votes[rows] += free_space.astype(float) - same_surface
-            compared.append(
-                (se3.transform(source.T_world_camera, points), votes, np.full(len(points), k))
-            )
-        return compared
+    def compared(k: int) -> tuple[Float64, Float64, Intp]:
+        source = views[k]
+        points = source.points.points.astype(np.float64)
+        votes = np.zeros(len(points))
+        for target in other_views:
+            if not _similar_direction(source, target):
+                continue
+            rows, behind, nearer, sigma, facing = _compare(source, target)
+            sigma = np.hypot(scale * sigma, misalignment)
+            # On slanted surfaces, errors along the ray exceed those along the normal.
+            limit = _FREE_SPACE_SIGMAS * sigma
+            free_space = (nearer > limit) & ~(behind > -limit)
+            same_surface = facing & (np.abs(behind) < _SURFACE_SIGMAS * sigma)
+            votes[rows] += free_space.astype(float) - same_surface
+        return se3.transform(source.T_world_camera, points), votes, np.full(len(points), k)
 
-    chunks = [item for chunk in run_chunks(work, len(views), _CHUNKS) for item in chunk]
-    points, votes, view_numbers = (np.concatenate(each) for each in zip(*chunks, strict=True))
+    of_views = run_all([partial(compared, k) for k in range(len(views))])
+    points, votes, view_numbers = (np.concatenate(each) for each in zip(*of_views, strict=True))
     if not len(points):
         return np.zeros((0, 3))
     cells, cell = np.unique(np.floor(points / voxel).astype(np.int64), axis=0, return_inverse=True)

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.compute import run_chunks
+from tofuse.engine.compute import run_all
 from tofuse.engine.frames import RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import pair_agreement
@@ -147,21 +148,17 @@ def compare_views(
     facing = axes @ axes.T > 0
     if groups is not None:
         facing &= np.not_equal.outer(groups, groups)
-    pairs = np.argwhere(np.triu(facing, 1))
 
-    def work(start: int, stop: int) -> list[PairConsistency]:
-        overlapping = []
-        for i, j in pairs[start:stop].tolist():
-            a = pair_agreement.agreement(
-                views[j], views[i], se3.inverse(poses[i]) @ poses[j], options
-            )
-            support, contradiction = (a.support + a.clash) * a.points, a.violation * a.points
-            if support + contradiction > _MIN_OVERLAP * a.points:
-                squares = a.rms_m**2 * support if support else 0.0
-                overlapping.append(PairConsistency(i, j, support, contradiction, squares))
-        return overlapping
+    def compared(i: int, j: int) -> PairConsistency | None:
+        T_i_j = se3.inverse(poses[i]) @ poses[j]
+        a = pair_agreement.agreement(views[j], views[i], T_i_j, options)
+        support, contradiction = (a.support + a.clash) * a.points, a.violation * a.points
+        if not support + contradiction > _MIN_OVERLAP * a.points:
+            return None
+        squares = a.rms_m**2 * support if support else 0.0
+        return PairConsistency(i, j, support, contradiction, squares)
 
-    chunks = run_chunks(work, len(pairs), chunks=64)
+    pairs = run_all([partial(compared, i, j) for i, j in np.argwhere(np.triu(facing, 1)).tolist()])
     return CrossViewConsistency(
-        tuple(v.index for v in views), tuple(pair for chunk in chunks for pair in chunk)
+        tuple(v.index for v in views), tuple(pair for pair in pairs if pair is not None)
     )

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, UInt8
 from tofuse.engine.frames import RangeFrame
+
+T = TypeVar("T")
 
 MAX_SAMPLES, MAX_LOST_SAMPLES = 160, 40  # of all frames, and of lost ones in addition
 MAX_WIDTH = 192  # pixels
@@ -70,33 +74,39 @@ class FrameSample:
         )
 
 
+class EvenSample(Generic[T]):
+    """At most `size` items of a stream of unknown length, evenly spaced."""
+
+    def __init__(self, size: int) -> None:
+        self.items: list[T] = []
+        self._size, self._step, self._count = size, 1, 0
+
+    def offer(self, make: Callable[[], T]) -> None:
+        """Offer the next item; `make` is called only if it is taken."""
+        if self._count % self._step == 0:
+            self.items.append(make())
+            if len(self.items) > self._size:
+                del self.items[1::2]
+                self._step *= 2
+        self._count += 1
+
+
 class FrameSamples:
     """At most `MAX_SAMPLES` evenly spaced frames of a stream, and `MAX_LOST_SAMPLES` lost ones."""
 
     def __init__(self) -> None:
-        self._even: list[FrameSample] = []
-        self._lost: list[FrameSample] = []
-        self._steps = [1, 1]
-        self._counts = [0, 0]
+        self._even: EvenSample[FrameSample] = EvenSample(MAX_SAMPLES)
+        self._lost: EvenSample[FrameSample] = EvenSample(MAX_LOST_SAMPLES)
 
     def take(self, *, lost: bool, make: Callable[[], FrameSample]) -> None:
         """Offer the next frame; `make` is called only if it is taken."""
-        sample = None
-        for k, (items, limit) in enumerate(
-            ((self._even, MAX_SAMPLES), (self._lost, MAX_LOST_SAMPLES))
-        ):
-            if k == 1 and not lost:
-                break
-            if self._counts[k] % self._steps[k] == 0:
-                sample = sample or make()
-                items.append(sample)
-                if len(items) > limit:
-                    del items[1::2]
-                    self._steps[k] *= 2
-            self._counts[k] += 1
+        make = cache(make)
+        self._even.offer(make)
+        if lost:
+            self._lost.offer(make)
 
     @property
     def all(self) -> tuple[FrameSample, ...]:
         """All samples, in the order of their frames."""
-        samples = {sample.index: sample for sample in (*self._even, *self._lost)}
+        samples = {sample.index: sample for sample in (*self._even.items, *self._lost.items)}
         return tuple(samples[index] for index in sorted(samples))

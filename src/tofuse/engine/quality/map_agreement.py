@@ -22,18 +22,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import Camera, Fisheye, Pinhole
-from tofuse.engine.compute import run_chunks
+from tofuse.engine.compute import run_all
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory_errors import finite_or_none
+from tofuse.engine.quality.trajectory_errors import associate, finite_or_none
 from tofuse.engine.quality.view_agreement_kernels import (
     agreement_sums,
     project_by_lens,
@@ -253,21 +253,16 @@ def pair_agreement(
 def consistency_of_images(images: Sequence[SurfaceImage], poses: ArrayLike) -> Consistency:
     """Map consistency of prepared views under poses (N, 4, 4) T_world_camera, over all pairs.
 
-    Independent of the number of threads; must not be called inside a chunk of `run_chunks`.
+    Independent of the number of threads.
     """
     T = np.asarray(poses, float)
     pairs = [(i, j) for i in range(len(images)) for j in range(i + 1, len(images))]
 
-    def work(start: int, stop: int) -> list[PairAgreement]:
-        overlapping = []
-        for i, j in pairs[start:stop]:
-            pair = pair_agreement(images[i], images[j], se3.inverse(T[i]) @ T[j], i, j)
-            if pair is not None:
-                overlapping.append(pair)
-        return overlapping
+    def compared(i: int, j: int) -> PairAgreement | None:
+        return pair_agreement(images[i], images[j], se3.inverse(T[i]) @ T[j], i, j)
 
-    agreements = tuple(p for chunk in run_chunks(work, len(pairs), chunks=64) for p in chunk)
-    return Consistency.of(agreements, len(images))
+    agreements = run_all([partial(compared, i, j) for i, j in pairs])
+    return Consistency.of([pair for pair in agreements if pair is not None], len(images))
 
 
 def map_consistency(
@@ -340,16 +335,11 @@ def poses_of_frames(times: ArrayLike, pose_times: ArrayLike, poses: ArrayLike) -
 
     Returns
     -------
-    (M, 4, 4), NaN for frames without a pose. Of several poses for a frame the last one is used.
+    (M, 4, 4), NaN for frames without a pose.
     """
-    times, pose_times = np.asarray(times, float), np.asarray(pose_times, float)
-    frame_poses = np.full((len(times), 4, 4), np.nan)
-    if len(times) == 0:
-        return frame_poses
-    for time, T in zip(pose_times, np.asarray(poses, float), strict=True):
-        k = int(np.abs(times - time).argmin())
-        if abs(times[k] - time) < 0.02:
-            frame_poses[k] = T
+    frame_poses = np.full((np.size(times), 4, 4), np.nan)
+    frames, rows = associate(times, pose_times).T
+    frame_poses[frames] = np.asarray(poses, float)[rows]
     return frame_poses
 
 

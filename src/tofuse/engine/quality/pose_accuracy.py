@@ -13,13 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import bdtrc, gammaincinv
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.compute import run_chunks
+from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import PoseGraph, graph_covariances
@@ -228,20 +229,20 @@ def degenerate_directions(
         result.append(directions)
     to_align += [k for _, k in sorted(spanning)[:_MAX_SPANNING]]
 
-    def work(start: int, stop: int) -> None:
-        for k in to_align[start:stop]:
-            i, j = (views[int(graph.ids[end])].view.without_caches() for end in graph.edges[k])
-            target = [projective.Target(i, np.eye(4))]
-            realigned = (
-                projective.align(j, target, graph.measurements[k], _ALIGNMENT).unobservable
-                * projective.UNITS
-            )
-            # Directions are known to a few degrees only, and the remainder would look measured: a
-            # degenerate pair is taken to be degenerate in all directions of its views.
-            result[k] = np.concatenate([realigned, result[k]]) if len(realigned) else _NO_DIRECTIONS
+    def align_again(k: int) -> None:
+        i, j = (views[int(graph.ids[end])].view.without_caches() for end in graph.edges[k])
+        target = [projective.Target(i, np.eye(4))]
+        realigned = projective.align(j, target, graph.measurements[k], _ALIGNMENT).unobservable
+        # Directions are known to a few degrees only, and the remainder would look measured: a
+        # degenerate pair is taken to be degenerate in all directions of its views.
+        result[k] = (
+            np.concatenate([realigned * projective.UNITS, result[k]])
+            if len(realigned)
+            else _NO_DIRECTIONS
+        )
 
     of_views = list(result)
-    run_chunks(work, len(to_align), -(-len(to_align) // 16))
+    run_all([partial(align_again, k) for k in to_align])
     aligned = np.array(to_align, np.intp)
     constrained = np.array([len(result[k]) == 0 for k in to_align], np.bool_)
     pairs = np.asarray(graph.ids, np.intp)[graph.edges[aligned]]

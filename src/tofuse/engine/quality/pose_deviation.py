@@ -14,23 +14,90 @@ the rotation at the median depth. Gauge freedom and degenerate directions cost n
 
 The norm of the smallest correction is stated for two thresholds: one that correct poses usually
 meet, which estimates the error, and one that 95 % of them meet, which is its lower bound.
+
+Independent measurements of relative poses from pairs of overlapping views.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import fdtri, gammaincinv  # scipy.stats takes long to import
+from scipy.special import fdtri, gammaincinv
 
-from tofuse.engine.alignment import projective
+from tofuse.engine.alignment import covariance, projective
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import PoseGraph, graph_covariances, robust, solver, sparse
-from tofuse.engine.quality.pose_accuracy import ObservedErrors, accuracy_of
+from tofuse.engine.graph import (
+    Measured,
+    PoseGraph,
+    build_graph,
+    graph_covariances,
+    robust,
+    solver,
+    sparse,
+)
+from tofuse.engine.quality.pose_accuracy import ObservedErrors, accuracy_of, without_degenerate
 from tofuse.engine.quality.trajectory_errors import align
+from tofuse.engine.refinement import joint_alignment
+from tofuse.engine.stored_views import PosedView, SampledView, overlaps, pair_equations
+from tofuse.engine.views import PreparedView
+
+_ALIGNMENT = projective.ProjectiveOptions()
+# Pairs are selected as in joint refinement.
+_PAIRS = pair_equations.RefineOptions()
+
+
+def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> PoseGraph:
+    """Align every pair of views that overlap, and each view with the one before it.
+
+    The poses only select the pairs and initialise their alignments.
+
+    Parameters
+    ----------
+    views
+        In the order of their frames.
+    poses
+        (N, 4, 4) T_world_camera.
+
+    Returns
+    -------
+    A graph of the frames with these poses, every edge with the covariance of its alignment
+    (`registration.uncertainty`). Degenerate directions of a pair have almost no information.
+    """
+    pairs = _overlapping(views, poses)
+    surfaces = [view.view for view in views]
+    ids = [view.index for view in views]
+
+    def measured(i: int, j: int) -> tuple[Measured, Float64]:
+        target = [projective.Target(surfaces[i], np.eye(4))]
+        T_i_j = se3.inverse(poses[i]) @ poses[j]
+        aligned = projective.align(surfaces[j], target, T_i_j, _ALIGNMENT)
+        C = covariance(surfaces[j], target, aligned, _ALIGNMENT)
+        information = np.asarray(np.linalg.inv(C), np.float64)
+        edge = Measured(ids[i], ids[j], aligned.T_world_source, information)
+        return edge, aligned.unobservable * projective.UNITS
+
+    edges = run_all([partial(measured, i, j) for i, j in pairs.tolist()])
+    graph = build_graph(ids, poses, [edge for edge, _ in edges])
+    return without_degenerate(graph, [degenerate for _, degenerate in edges])
+
+
+def _overlapping(views: Sequence[PosedView[PreparedView]], poses: Float64) -> Intp:
+    """Return (M, 2) positions i < j of the views that are compared."""
+    sampled = [SampledView.of(view.view, _PAIRS.points) for view in views]
+    pairs = joint_alignment.spread_evenly(
+        overlaps(sampled, poses, _PAIRS.overlap)[0], _PAIRS.neighbours
+    )
+    later = np.arange(1, len(views))
+    consecutive = np.stack([later - 1, later], 1)
+    return np.unique(np.concatenate([pairs, consecutive]), axis=0)
+
 
 _CONFIDENCE = 0.95
 # Of a chi-square variable with six degrees of freedom: its median, and Huber's threshold.

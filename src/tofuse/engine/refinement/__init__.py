@@ -1,4 +1,9 @@
-"""."""
+"""Joint refinement: the poses of all overlapping views are optimised together, after loop closure.
+
+A `RefinementMethod` (`Joint` for images, `plane_refinement` for clouds) starts a `Refiner`, which
+returns a `Refinement`: poses, edges for the pose graph, and evidence of their errors, from a
+`calibration_check` and from halves of the images. `joint_alignment` is its least-squares problem.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -6,7 +11,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.refinement import calibration_check, joint_alignment, plane_refinement
-    from tofuse.engine.refinement.pose_priors import Priors
+    from tofuse.engine.refinement.joint_alignment import Priors
     from tofuse.engine.refinement.refinement import (
         AlreadyRefined,
         Joint,
@@ -14,7 +19,6 @@ if TYPE_CHECKING:
         Refinement,
         RefinementMethod,
         Refiner,
-        accepted_with,
         pairwise_measurements,
         propagate_poses,
         without_errors,

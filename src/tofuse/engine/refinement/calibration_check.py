@@ -15,22 +15,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
-from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.camera_response import response
 from tofuse.engine.refinement.joint_alignment import (
     AlignedViews,
+    Priors,
     Refined,
     align_views,
     refine,
     spread_evenly,
 )
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap
-from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.refinement.split_half import aligned_motion
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
@@ -191,7 +192,7 @@ def check_calibration(
     likely = [name for name in first.determined if first.is_likely(name)]
     if not likely:
         return _check_by_loop(views, refined, first, without_error, options)
-    estimator = _Estimator.of(views, refined, options, priors)
+    estimator = _Estimator(views, refined, options, priors)
     estimates = {name: estimator.alone(name) for name in likely}
     joint: Refined | AlignedViews = estimates[likely[0]]
     if len(likely) > 1:  # errors are correlated: in a joint estimate, the true one remains
@@ -286,62 +287,38 @@ class _FirstEstimates:
         return max(motions, default=(0.0, 0.0))
 
 
-@dataclass(frozen=True, eq=False)
 class _Estimator:
     """Estimates errors from refined views: the overlaps are fixed, the poses are free.
 
-    Attributes
-    ----------
-    views, poses, pairs, options, priors
-        As for `refine`; of many pairs, a part. The poses are aligned without an error.
+    The parameters are those of `check_calibration`; of many pairs, a part is used.
     """
 
-    views: Sequence[SampledView]
-    poses: Float64
-    pairs: Intp
-    options: pair_equations.RefineOptions
-    priors: Priors
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         views: Sequence[SampledView],
         refined: Refined,
         options: pair_equations.RefineOptions,
         priors: Priors,
-    ) -> _Estimator:
-        """Select the pairs. The parameters are those of `check_calibration`."""
+    ) -> None:
         pairs, count = refined.pairs, len(refined.pairs)
         if count > _MAX_PAIRS:
             views = [v.with_points(np.s_[::_POINT_STRIDE]) for v in views]
             pairs = spread_evenly(pairs, -(-options.neighbours * _MAX_PAIRS // count))
         # An estimate of camera errors does not model errors that patches share, so it can't be
         # compared with the refined poses.
-        coarse_to_fine = replace(options, rounds=COARSE_TO_FINE, shared=0.0)
-        poses = align_views(views, refined.poses, coarse_to_fine, priors=priors, pairs=pairs).poses
-        return cls(views, poses, pairs, coarse_to_fine, priors)
+        options = replace(options, rounds=COARSE_TO_FINE, shared=0.0)
+        self._refine = partial(refine, priors=priors, pairs=pairs)
+        self._align = partial(align_views, priors=priors, pairs=pairs)
+        poses = self._align(views, refined.poses, options).poses
+        self._problem = views, poses, options
 
     def alone(self, name: str) -> Refined:
         """Estimate one error."""
-        return refine(
-            self.views,
-            self.poses,
-            self.options,
-            calibrate=[_INDEX[name]],
-            priors=self.priors,
-            pairs=self.pairs,
-        )
+        return self._refine(*self._problem, calibrate=[_INDEX[name]])
 
     def together(self, names: Sequence[str]) -> AlignedViews:
         """Estimate several errors."""
-        return align_views(
-            self.views,
-            self.poses,
-            self.options,
-            calibrate=[_INDEX[name] for name in names],
-            priors=self.priors,
-            pairs=self.pairs,
-        )
+        return self._align(*self._problem, calibrate=[_INDEX[name] for name in names])
 
 
 def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:

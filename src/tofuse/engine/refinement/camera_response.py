@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.refinement.pose_priors import DAMPING, Priors, weak_prior
+from tofuse.engine.refinement.joint_alignment import DAMPING, Priors, weak_prior
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 

@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import external_sensors, measured_graph
+from tofuse.engine.graph import Measured, external_sensors
 from tofuse.engine.parts import part
 from tofuse.engine.refinement.common_planes import (
     SUPPORT_NOISE,
@@ -25,7 +25,6 @@ from tofuse.engine.refinement.refinement import (
     Refinement,
     RefinementMethod,
     Refiner,
-    accepted_with,
     with_unsupported_views_fixed,
 )
 from tofuse.engine.stored_views import Spacing, ViewStore
@@ -105,14 +104,14 @@ class _Planes(Refiner):
         lost = aligned.after < aligned.before - MAX_LOSS
         after = with_unsupported_views_fixed(before, aligned.poses, lost)
         edges = tuple(_edges(aligned, [view.index for view in views], lost))
-        return replace(accepted_with(unchanged, positions, after), edges=edges)
+        return replace(unchanged.accepted(positions, after), edges=edges)
 
 
-def _edges(aligned: Aligned, ids: Sequence[int], lost: Bool) -> list[measured_graph.Measured]:
+def _edges(aligned: Aligned, ids: Sequence[int], lost: Bool) -> list[Measured]:
     """Joint measurements of neighbouring views; those of all pairs would count them repeatedly."""
     out = []
     for (i, j), C in zip(aligned.pairs, aligned.covariance, strict=True):
         if j == i + 1 and not (lost[i] or lost[j]):
             T = se3.inverse(aligned.poses[i]) @ aligned.poses[j]
-            out.append(measured_graph.Measured(ids[i], ids[j], T, np.linalg.inv(C)))
+            out.append(Measured(ids[i], ids[j], T, np.linalg.inv(C)))
     return out

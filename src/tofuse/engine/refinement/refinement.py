@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Annotated, ClassVar, Literal, Protocol
 
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.compute import Spill
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import external_sensors, measured_graph
+from tofuse.engine.graph import Measured, external_sensors
 from tofuse.engine.parts import part
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
     check_calibration,
     combine_checks,
 )
-from tofuse.engine.refinement.joint_alignment import Refined, refine, support_fell
+from tofuse.engine.refinement.joint_alignment import Priors, Refined, refine, support_fell
 from tofuse.engine.refinement.loop_drift import loop_gap
-from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.refinement.split_half import split_half_errors
 from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps
 from tofuse.engine.stored_views import (
@@ -50,6 +47,10 @@ _ERROR_INDEX: dict[CameraError, int] = {
     "scale": kernels.SCALE,
     "focal": kernels.FOCAL,
 }
+
+
+# Errors of the camera, and (m, rad) of the poses by halves of the images.
+_Evaluation = tuple[CalibrationCheck, tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +91,22 @@ class Refinement:
     moved_rad: float = 0.0
     support: tuple[float, float] = (0.0, 0.0)
     errors: dict[str, float] = field(default_factory=dict)
-    edges: tuple[measured_graph.Measured, ...] = ()
+    edges: tuple[Measured, ...] = ()
     calibration_check: CalibrationCheck | None = None
     non_overlap_edges: tuple[tuple[int, int], ...] = ()
     split_m: float = 0.0
     split_rad: float = 0.0
+
+    def accepted(self, positions: Intp, after: Float64) -> Refinement:
+        """Return the refinement that keeps the poses `after` of the frames at `positions`."""
+        motion = se3.log(se3.inverse(self.poses[positions]) @ after)
+        return replace(
+            self,
+            poses=propagate_poses(self.poses, positions, after),
+            kept=True,
+            moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
+            moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
+        )
 
 
 class Refiner(Protocol):
@@ -144,19 +156,14 @@ class RefinementMethod(Protocol):
 
 @part("refinement", "none")
 @dataclass(frozen=True)
-class NoRefinement(RefinementMethod):
-    """Leaves the poses as they are after the optimisation."""
+class NoRefinement(RefinementMethod, Refiner):
+    """Leaves all poses as they are."""
+
+    needs_points: ClassVar[bool] = False
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `RefinementMethod.start`."""
-        return _Idle()
-
-
-class _Idle(Refiner):
-    needs_points: ClassVar[bool] = False
-
-    def push(self, view: Frame, T_component_camera: Float64) -> None:
-        """See `Refiner.push`: views are not needed."""
+        return self
 
     def finish(
         self,
@@ -169,7 +176,7 @@ class _Idle(Refiner):
 
 
 @dataclass(frozen=True, eq=False)
-class AlreadyRefined(RefinementMethod):
+class AlreadyRefined(RefinementMethod, Refiner):
     """Keeps poses that were refined before, with the measurements of that refinement.
 
     Attributes
@@ -178,17 +185,13 @@ class AlreadyRefined(RefinementMethod):
         By frame indices: measurements of pairs of views, and other edges.
     """
 
-    measured: tuple[measured_graph.Measured, ...]
-    non_overlap_edges: tuple[measured_graph.Measured, ...]
+    needs_points: ClassVar[bool] = False
+    measured: tuple[Measured, ...]
+    non_overlap_edges: tuple[Measured, ...]
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `RefinementMethod.start`."""
-        return _AlreadyRefined(self)
-
-
-class _AlreadyRefined(_Idle):
-    def __init__(self, previous: AlreadyRefined) -> None:
-        self._previous = previous
+        return self
 
     def finish(
         self,
@@ -198,12 +201,12 @@ class _AlreadyRefined(_Idle):
     ) -> Refinement:
         """See `Refiner.finish`."""
         posed = set(ids)
-        edges = (*self._previous.measured, *self._previous.non_overlap_edges)
+        edges = (*self.measured, *self.non_overlap_edges)
         return Refinement(
             poses,
             kept=True,
             edges=tuple(e for e in edges if {e.i, e.j} <= posed),
-            non_overlap_edges=tuple((e.i, e.j) for e in self._previous.non_overlap_edges),
+            non_overlap_edges=tuple((e.i, e.j) for e in self.non_overlap_edges),
         )
 
 
@@ -244,11 +247,8 @@ class _Joint(Refiner):
     needs_points: ClassVar[bool] = False
 
     def __init__(self, options: Joint, views: ViewStore[PreparedView]) -> None:
-        self._options = options
-        self._store = views
-
-    def push(self, view: Frame, T_component_camera: Float64) -> None:
-        """See `Refiner.push`. The views are in the store."""
+        self._options, self._store = options, views
+        self._error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
 
     def finish(
         self,
@@ -264,10 +264,11 @@ class _Joint(Refiner):
         if len(posed) < 2:
             return Refinement(poses, views=len(posed))
         before = poses[positions]
-        refine_views = _refine_jointly if len(posed) <= options.submap else _refine_in_submaps
-        refined, evidence = refine_views(
-            options, posed, before, measured or external_sensors.SensorPriors(), self._store
+        refine_views = self._at_once if len(posed) <= options.submap else self._in_submaps
+        refined, evaluated = refine_views(
+            posed, before, measured or external_sensors.SensorPriors()
         )
+        calibration = combine_checks([check for check, _ in evaluated])
         support = refined.before.of_views(len(posed)), refined.after.of_views(len(posed))
         mean = float(support[0].mean()), float(support[1].mean())
         unchanged = Refinement(poses, False, len(posed), len(refined.pairs), support=mean)
@@ -275,84 +276,69 @@ class _Joint(Refiner):
         if not len(refined.pairs):
             return unchanged
         if support_fell(gain):  # the camera may be the cause
-            return replace(unchanged, calibration_check=evidence.calibration())
+            return replace(unchanged, calibration_check=calibration)
         after = with_unsupported_views_fixed(before, refined.poses, gain < -MAX_LOSS)
         if mean[1] < mean[0]:
             # The poses were already at the optimum; the measurements give their covariances.
             after = before
-        split_m, split_rad = evidence.split()
+        split_m, split_rad = _mean_errors([split for _, split in evaluated])
         return replace(
-            accepted_with(unchanged, positions, after),
-            calibration_check=evidence.calibration(),
+            unchanged.accepted(positions, after),
+            calibration_check=calibration,
             split_m=split_m,
             split_rad=split_rad,
             errors={name: float(refined.errors[_ERROR_INDEX[name]]) for name in options.calibrate},
             edges=pairwise_measurements([p.index for p in posed], refined),
         )
 
+    def _at_once(
+        self,
+        posed: Sequence[PosedView[PreparedView]],
+        poses: Float64,
+        measured: external_sensors.SensorPriors,
+    ) -> tuple[Refined, list[_Evaluation]]:
+        views = [self._sampled(p) for p in posed]
+        priors = _priors([p.index for p in posed], measured)
+        alignment = self._options.alignment
+        refined = refine(views, poses, alignment, calibrate=self._error_indices, priors=priors)
+        return refined, [self._evaluate(RefinedSubmap(views, refined, priors))]
 
-@dataclass(frozen=True)
-class _Checks:
-    """Evidence of refined views: errors of the camera, and (m, rad) of the poses by halves."""
+    def _in_submaps(
+        self,
+        posed: Sequence[PosedView[PreparedView]],
+        poses: Float64,
+        measured: external_sensors.SensorPriors,
+    ) -> tuple[Refined, list[_Evaluation]]:
+        ids = [p.index for p in posed]
+        return refine_submaps(
+            [self._coarse(p) for p in posed],
+            poses,
+            self._options.alignment,
+            self._options.submap,
+            lambda subset: [self._sampled(posed[k]) for k in subset],
+            lambda subset: _priors(ids if subset is None else [ids[k] for k in subset], measured),
+            self._evaluate,
+            self._error_indices,
+        )
 
-    calibration: Callable[[], CalibrationCheck]
-    split: Callable[[], tuple[float, float]]
+    def _evaluate(self, submap: RefinedSubmap) -> _Evaluation:
+        """Evaluate a submap while its views are in memory."""
+        alignment, refined = self._options.alignment, submap.refined
+        split = split_half_errors(
+            submap.views, refined, alignment, submap.priors, self._error_indices
+        )
+        if not self._error_indices:
+            return check_calibration(submap.views, refined, alignment, submap.priors), split
+        gap = loop_gap(submap.views, refined, refined.poses, refined.errors, alignment)
+        return CalibrationCheck(gap=gap), split
 
+    def _coarse(self, posed: PosedView[PreparedView]) -> SpilledCoarseView:
+        surface = _surface(posed)
+        coarse = CoarseView.of(surface, sampled_points(surface, self._options.alignment.points))
+        return SpilledCoarseView(coarse.centroid, Spilled(coarse, self._store.coarse))
 
-def _refine_jointly(
-    options: Joint,
-    posed: Sequence[PosedView[PreparedView]],
-    poses: Float64,
-    measured: external_sensors.SensorPriors,
-    _: ViewStore[PreparedView],
-) -> tuple[Refined, _Checks]:
-    """Refine all views at once."""
-    views = [_sampled(p, options) for p in posed]
-    priors = _priors([p.index for p in posed], measured)
-    error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
-    refined = refine(views, poses, options.alignment, calibrate=error_indices, priors=priors)
-    all_views = RefinedSubmap(views, np.arange(len(views)), refined, priors)
-    return refined, _Checks(
-        lambda: _calibration_check(all_views, options),
-        lambda: _split_half_errors(all_views, options),
-    )
-
-
-def _refine_in_submaps(
-    options: Joint,
-    posed: Sequence[PosedView[PreparedView]],
-    poses: Float64,
-    measured: external_sensors.SensorPriors,
-    store: ViewStore[PreparedView],
-) -> tuple[Refined, _Checks]:
-    """Refine submap by submap."""
-    ids = [p.index for p in posed]
-    refined, parts = refine_submaps(
-        [_coarse(p, options, store.coarse) for p in posed],
-        poses,
-        options.alignment,
-        options.submap,
-        lambda subset: [_sampled(posed[k], options) for k in subset],
-        lambda subset: _priors(ids if subset is None else [ids[k] for k in subset], measured),
-        partial(_evaluate, options=options),
-        [_ERROR_INDEX[name] for name in options.calibrate],
-    )
-    checks, splits = [check for check, _ in parts], [split for _, split in parts]
-    return refined, _Checks(lambda: combine_checks(checks), lambda: _mean_errors(splits))
-
-
-def _evaluate(
-    submap: RefinedSubmap, options: Joint
-) -> tuple[CalibrationCheck, tuple[float, float]]:
-    """Evaluate a submap while its views are in memory."""
-    return _calibration_check(submap, options), _split_half_errors(submap, options)
-
-
-def _split_half_errors(submap: RefinedSubmap, options: Joint) -> tuple[float, float]:
-    error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
-    return split_half_errors(
-        submap.views, submap.refined, options.alignment, submap.priors, error_indices
-    )
+    def _sampled(self, posed: PosedView[PreparedView]) -> SampledView:
+        return SampledView.of(_surface(posed), self._options.alignment.points)
 
 
 def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
@@ -361,34 +347,11 @@ def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
     return m, rad
 
 
-def _coarse(
-    posed: PosedView[PreparedView], options: Joint, spill: Spill[CoarseView]
-) -> SpilledCoarseView:
-    surface = _surface(posed)
-    coarse = CoarseView.of(surface, sampled_points(surface, options.alignment.points))
-    return SpilledCoarseView(coarse.centroid, Spilled(coarse, spill))
-
-
 def _surface(posed: PosedView[PreparedView]) -> PreparedView:
     return posed.view.with_pixel_variance().without_caches()
 
 
-def _sampled(posed: PosedView[PreparedView], options: Joint) -> SampledView:
-    return SampledView.of(_surface(posed), options.alignment.points)
-
-
-def _calibration_check(submap: RefinedSubmap, options: Joint) -> CalibrationCheck:
-    """Check the calibration by refined views; with estimated errors only the loop's gap."""
-    refined = submap.refined
-    if not options.calibrate:
-        return check_calibration(submap.views, refined, options.alignment, submap.priors)
-    gap = loop_gap(submap.views, refined, refined.poses, refined.errors, options.alignment)
-    return CalibrationCheck(gap=gap)
-
-
-def pairwise_measurements(
-    ids: Sequence[int], refined: Refined
-) -> tuple[measured_graph.Measured, ...]:
+def pairwise_measurements(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:
     """Return the measurements of single pairs, with reduced information.
 
     All pairs of a view share its errors, so the information is divided by their number.
@@ -404,7 +367,7 @@ def pairwise_measurements(
     partners = np.bincount(pairs.ravel(), minlength=len(ids))
     divisors = _CORRELATED_PIXELS * 0.5 * partners[pairs].sum(1)
     return tuple(
-        measured_graph.Measured(ids[i], ids[j], T, H / divisor)
+        Measured(ids[i], ids[j], T, H / divisor)
         for (i, j), T, H, divisor in zip(
             pairs, refined.measured, refined.information, divisors, strict=True
         )
@@ -466,28 +429,6 @@ def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:
     )
     corrected[:, :2] += errors.get("focal", 0.0) * p[:, :2]
     return corrected.astype(np.float32)
-
-
-def accepted_with(unchanged: Refinement, positions: Intp, after: Float64) -> Refinement:
-    """Return the accepted refinement in which the poses at `positions` become `after`.
-
-    Parameters
-    ----------
-    unchanged
-        The refinement as if it were rejected.
-    positions
-        (M,) ascending positions of the refined views.
-    after
-        (M, 4, 4) T_world_camera.
-    """
-    motion = se3.log(se3.inverse(unchanged.poses[positions]) @ after)
-    return replace(
-        unchanged,
-        poses=propagate_poses(unchanged.poses, positions, after),
-        kept=True,
-        moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
-        moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
-    )
 
 
 def propagate_poses(poses: Float64, positions: Intp, after: Float64) -> Float64:

@@ -21,8 +21,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.refinement.joint_alignment import Refined, align_views
-from tofuse.engine.refinement.pose_priors import Priors
+from tofuse.engine.refinement.joint_alignment import Priors, Refined, align_views
 from tofuse.engine.stored_views import SampledView, pair_equations, shared_error
 
 # The poses are near the solution of each half.

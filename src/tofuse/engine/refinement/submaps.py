@@ -20,6 +20,7 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import PoseGraph, levenberg
 from tofuse.engine.refinement.joint_alignment import (
+    Priors,
     Refined,
     Support,
     refine,
@@ -27,7 +28,6 @@ from tofuse.engine.refinement.joint_alignment import (
     support_fell,
     support_of,
 )
-from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.stored_views import (
     HasCoarseView,
     SampledView,
@@ -63,10 +63,9 @@ class Submap:
 
 @dataclass(frozen=True, eq=False)
 class RefinedSubmap:
-    """A refined submap: its views, their positions among all, the result, and the priors."""
+    """A refined submap: its views, the result, and the priors."""
 
     views: Sequence[SampledView]
-    at: Intp
     refined: Refined
     priors: Priors
 
@@ -213,7 +212,7 @@ def _refine_submap(
     local = np.searchsorted(part.views, part.pairs)
     start = se3.inverse(poses[0]) @ poses
     refined = refine(views, start, options, calibrate=calibrate, priors=priors, pairs=local)
-    evaluation = evaluate(RefinedSubmap(views, part.views, refined, priors))
+    evaluation = evaluate(RefinedSubmap(views, refined, priors))
     return _or_unchanged(refined, start), evaluation
 
 

@@ -1,4 +1,9 @@
-"""."""
+"""What a reconstruction returns, and how it is judged.
+
+A `Reconstruction` consists of a trajectory, a pose graph, a model and `Diagnostics` with a
+`FrameRecord` of each frame. `checks` derive a `Reason` for every weakness, `verdicts` rank them
+to a `Verdict`, and `accuracy_card` sums the result up in one line.
+"""
 
 from typing import TYPE_CHECKING
 

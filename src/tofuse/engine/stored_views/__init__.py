@@ -1,4 +1,10 @@
-"""."""
+"""Views kept while frames stream by, on disk beyond a budget, and their comparison in pairs.
+
+A `ViewStore` keeps evenly spaced `PosedView`s (`Spacing`); `overlaps` finds those that show the
+same surfaces, by a `CoarseView` of each. `pair_equations` linearises how well a `SampledView`
+fits another, over pose and calibration; `shared_error` is the error that the pixels of a patch
+have in common.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -4,6 +4,13 @@ As in `alignment`, source points are compared with plane and log albedo of the t
 they project to. Every pair has its own system, whose unknowns also include errors that all views of
 a camera share. With p a source point, q = T p, m = R^T n the target's normal in the source's frame,
 and b(p) the displacement of p by an error of size 1, the distance changes by m . b(p) - n . b(q).
+
+Correlated errors within image patches, marginalised from the normal equations of a pair.
+
+With D the sums of the weights of the distances in each patch, R the sums of weight times (r, J)
+divided by the root of D, and K the covariance of the patches' errors, the normal equations with one
+error per patch marginalised contain R^T (1 + D^1/2 K D^1/2)^-1 R, where those of independent pixels
+contain R^T R.
 """
 
 from __future__ import annotations
@@ -16,8 +23,7 @@ from tofuse.engine.arrays import Bool, Float32, Float64, Int64
 from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.views import residual_kernels
-from tofuse.engine.views import residual_kernels as pose_sums
+from tofuse.engine.views import residual_kernels as residual
 
 # Camera errors, in the order of the unknowns.
 OFFSET = 0  # to be added to the range, m
@@ -41,7 +47,7 @@ SQUARES_P = WEIGHT_P + 1
 TERMS = SQUARES_P + 1  # number of residuals of both terms
 SUPPORT = TERMS + 1  # sum of (1 - robust cost) of the residuals (Tukey's biweight)
 HISTOGRAM = SUPPORT + 1  # as in `alignment`
-SIZE = HISTOGRAM + residual_kernels.BINS
+SIZE = HISTOGRAM + residual.BINS
 
 _EPSILON = 1e-6  # m or m^2, instead of 0 in a denominator
 
@@ -147,9 +153,9 @@ def displacement(B: Float64, x: float, y: float, z: float, radial: bool) -> None
 @kernel
 def _calibration_equations(
     points: Float32,
-    target: residual_kernels.TargetImage,
+    target: residual.TargetImage,
     T: Float64,
-    residuals: residual_kernels.Residuals,
+    residuals: residual.Residuals,
     camera: CameraErrors,
     out: Float64,
 ) -> None:
@@ -173,9 +179,9 @@ def _calibration_equations(
     r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     for k in range(points.shape[0]):
         point = points[k]
-        px = np.float64(point[residual_kernels.POINT])
-        py = np.float64(point[residual_kernels.POINT + 1])
-        pz = np.float64(point[residual_kernels.POINT + 2])
+        px = np.float64(point[residual.POINT])
+        py = np.float64(point[residual.POINT + 1])
+        pz = np.float64(point[residual.POINT + 2])
         displacement(Bp, px, py, pz, radial_source)
         for p in range(ERRORS):
             px += errors[p] * Bp[p, 0]
@@ -195,37 +201,35 @@ def _calibration_equations(
         if i < 0:
             continue
         pixel = image[i, j]
-        distance = np.float64(pixel[residual_kernels.DISTANCE])
+        distance = np.float64(pixel[residual.DISTANCE])
         if distance == 0:
             continue
         out[COMPARED] += 1
         out[TERMS] += 1
-        n0 = np.float64(pixel[residual_kernels.PLANE])
-        n1 = np.float64(pixel[residual_kernels.PLANE + 1])
-        n2 = np.float64(pixel[residual_kernels.PLANE + 2])
+        n0 = np.float64(pixel[residual.PLANE])
+        n1 = np.float64(pixel[residual.PLANE + 1])
+        n2 = np.float64(pixel[residual.PLANE + 2])
         height = n0 * x + n1 * y + n2 * z
         r = height - distance
         displacement(Bq, x, y, z, radial_target)
         for p in range(ERRORS):
             r -= errors[p] * (n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2])
-        source_sigma = (height - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(
-            point[residual_kernels.SIGMA]
-        )
-        raw_variance = source_sigma * source_sigma + np.float64(pixel[residual_kernels.VARIANCE])
+        source_sigma = (height - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(point[residual.SIGMA])
+        raw_variance = source_sigma * source_sigma + np.float64(pixel[residual.VARIANCE])
         variance = raw_variance * scale_g * scale_g + inflation * inflation
         r2 = r * r
-        out[HISTOGRAM + residual_kernels.histogram_bin(r2 / raw_variance)] += 1
+        out[HISTOGRAM + residual.histogram_bin(r2 / raw_variance)] += 1
         e2 = r2 / variance / limit2
         if e2 >= 1:
-            if r < 0 and e2 > residual_kernels.FREE_SPACE:
+            if r < 0 and e2 > residual.FREE_SPACE:
                 out[IN_FRONT] += 1
             continue
         m0 = r00 * n0 + r10 * n1 + r20 * n2
         m1 = r01 * n0 + r11 * n1 + r21 * n2
         m2 = r02 * n0 + r12 * n1 + r22 * n2
-        s0 = np.float64(point[residual_kernels.NORMAL])
-        s1 = np.float64(point[residual_kernels.NORMAL + 1])
-        s2 = np.float64(point[residual_kernels.NORMAL + 2])
+        s0 = np.float64(point[residual.NORMAL])
+        s1 = np.float64(point[residual.NORMAL + 1])
+        s2 = np.float64(point[residual.NORMAL + 2])
         if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
             continue
         weight = tukey.weight(e2)
@@ -247,18 +251,12 @@ def _calibration_equations(
                 J[7 + p] = 0.0
         _add_residual(A, g, J, r, weight / variance, unknowns)
 
-        tx = np.float64(pixel[residual_kernels.ALBEDO_SLOPE])
-        source_albedo = np.float64(point[residual_kernels.POINT_ALBEDO])
+        tx = np.float64(pixel[residual.ALBEDO_SLOPE])
+        source_albedo = np.float64(point[residual.POINT_ALBEDO])
         if scale_p <= 0 or np.isnan(tx) or np.isnan(source_albedo):
             continue
-        ty = np.float64(pixel[residual_kernels.ALBEDO_SLOPE + 1])
-        r = (
-            np.float64(pixel[residual_kernels.ALBEDO])
-            + tx * xn
-            + ty * yn
-            - source_albedo
-            - exposure
-        )
+        ty = np.float64(pixel[residual.ALBEDO_SLOPE + 1])
+        r = np.float64(pixel[residual.ALBEDO]) + tx * xn + ty * yn - source_albedo - exposure
         out[TERMS] += 1
         r2 = r * r
         e2 = r2 / (scale_p * scale_p) / limit2
@@ -275,9 +273,9 @@ def _calibration_equations(
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2
         m2 = r02 * d0 + r12 * d1 + r22 * d2
-        s0 = np.float64(point[residual_kernels.POINT_ALBEDO_SLOPE])
-        s1 = np.float64(point[residual_kernels.POINT_ALBEDO_SLOPE + 1])
-        s2 = np.float64(point[residual_kernels.POINT_ALBEDO_SLOPE + 2])
+        s0 = np.float64(point[residual.POINT_ALBEDO_SLOPE])
+        s1 = np.float64(point[residual.POINT_ALBEDO_SLOPE + 1])
+        s2 = np.float64(point[residual.POINT_ALBEDO_SLOPE + 2])
         m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
         projection_kernels.jacobian_row(J, m0, m1, m2, px, py, pz)
         J[EXPOSURE] = -1.0
@@ -307,7 +305,7 @@ def _calibration_equations(
 def target_equations(
     sources: SourcePoints,
     views: Int64,
-    target: residual_kernels.TargetImage,
+    target: residual.TargetImage,
     T: Float64,
     residuals: PairResiduals,
     errors: Float64,
@@ -343,7 +341,7 @@ def target_equations(
         view = views[k]
         begin, end = sources.begin[view], sources.end[view]
         points = sources.points[begin:end]
-        pair = residual_kernels.Residuals(
+        pair = residual.Residuals(
             exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine
         )
         camera = CameraErrors(errors, known, sources.measures_range[view], radial_target)
@@ -358,9 +356,9 @@ def target_equations(
 def _pose_equations(
     points: Float32,
     patches: Int64,
-    target: residual_kernels.TargetImage,
+    target: residual.TargetImage,
     T: Float64,
-    residuals: residual_kernels.Residuals,
+    residuals: residual.Residuals,
     camera: CameraErrors,
     out: Float64,
     sums: Float64,
@@ -370,56 +368,49 @@ def _pose_equations(
     has_errors = (errors != 0).any()
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     image, lookup, lookup_frame = target
-    block = np.zeros(residual_kernels.ROWS * residual_kernels.LANES, np.float32)
+    block = np.zeros(residual.ROWS * residual.LANES, np.float32)
     # Products of the rows of J and r, followed by counts and sums over columns.
-    products, support = 36, 36 + pose_sums.SQUARES_G - residual_kernels.INLIERS
-    total = np.zeros(
-        (36 + pose_sums.COUNT_P + 1 - residual_kernels.INLIERS, residual_kernels.LANES)
-    )
-    for first in range(0, len(points), residual_kernels.LANES):
-        count = min(residual_kernels.LANES, len(points) - first)
-        residual_kernels.load_block(block, points[first : first + count])
+    products, support = 36, 36 + residual.SQUARES_G - residual.INLIERS
+    total = np.zeros((36 + residual.COUNT_P + 1 - residual.INLIERS, residual.LANES))
+    for first in range(0, len(points), residual.LANES):
+        count = min(residual.LANES, len(points) - first)
+        residual.load_block(block, points[first : first + count])
         if has_errors:
             _correct_points(block, errors, radial_source)
-        residual_kernels.transform_block(block, T)
+        residual.transform_block(block, T)
         if has_errors:
             _distort_projection(block, errors, radial_target)
-        residual_kernels.project_block(block, count, image, lookup, lookup_frame)
-        residual_kernels.compare_planes(block, T, scale_g, inflation, robust, min_cosine)
+        residual.project_block(block, count, image, lookup, lookup_frame)
+        residual.compare_planes(block, T, scale_g, inflation, robust, min_cosine)
         for k in range(count):
-            if block[residual_kernels.HAS_PLANE * residual_kernels.LANES + k] > 0:
+            if block[residual.HAS_PLANE * residual.LANES + k] > 0:
                 out[COMPARED] += 1
                 out[
-                    HISTOGRAM
-                    + residual_kernels.histogram_bin(
-                        block[residual_kernels.CHI2 * residual_kernels.LANES + k]
-                    )
+                    HISTOGRAM + residual.histogram_bin(block[residual.CHI2 * residual.LANES + k])
                 ] += 1
         if len(sums) > 0:
             _add_patches(sums, block, patches[first : first + count])
-        residual_kernels.add_products(total, block, 8)
-        _add_support(total[support], block, pose_sums.WEIGHT_G)
+        residual.add_products(total, block, 8)
+        _add_support(total[support], block, residual.WEIGHT_G)
         if scale_p > 0:
-            residual_kernels.compare_albedos(block, T, exposure, scale_p, robust)
-            residual_kernels.add_products(total, block, 8)
-            _add_support(total[support], block, pose_sums.WEIGHT_P)
+            residual.compare_albedos(block, T, exposure, scale_p, robust)
+            residual.add_products(total, block, 8)
+            _add_support(total[support], block, residual.WEIGHT_P)
         for statistic in (
-            pose_sums.IN_FRONT,
-            pose_sums.WEIGHT_P,
-            pose_sums.SQUARES_P,
-            pose_sums.COUNT_P,
+            residual.IN_FRONT,
+            residual.WEIGHT_P,
+            residual.SQUARES_P,
+            residual.COUNT_P,
         ):
-            index = statistic - residual_kernels.INLIERS
+            index = statistic - residual.INLIERS
             column = total[products + index]
             row = block[
-                (residual_kernels.STAT + index) * residual_kernels.LANES : (
-                    residual_kernels.STAT + index + 1
-                )
-                * residual_kernels.LANES
+                (residual.STAT + index) * residual.LANES : (residual.STAT + index + 1)
+                * residual.LANES
             ]
-            for k in range(residual_kernels.LANES):
+            for k in range(residual.LANES):
                 column[k] += row[k]
-    width = residual_kernels.LANES
+    width = residual.LANES
     while width > 1:
         width //= 2
         for q in range(len(total)):
@@ -436,29 +427,20 @@ def _pose_equations(
                 out[GRADIENT + p] = total[q, 0]
             q += 1
         index += ERRORS  # products with the camera errors remain 0
-    out[IN_FRONT] = total[products + pose_sums.IN_FRONT - residual_kernels.INLIERS, 0]
-    out[WEIGHT_P] = total[products + pose_sums.WEIGHT_P - residual_kernels.INLIERS, 0]
-    out[SQUARES_P] = total[products + pose_sums.SQUARES_P - residual_kernels.INLIERS, 0]
-    out[TERMS] = out[COMPARED] + total[products + pose_sums.COUNT_P - residual_kernels.INLIERS, 0]
+    out[IN_FRONT] = total[products + residual.IN_FRONT - residual.INLIERS, 0]
+    out[WEIGHT_P] = total[products + residual.WEIGHT_P - residual.INLIERS, 0]
+    out[SQUARES_P] = total[products + residual.SQUARES_P - residual.INLIERS, 0]
+    out[TERMS] = out[COMPARED] + total[products + residual.COUNT_P - residual.INLIERS, 0]
     out[SUPPORT] = total[support, 0]
 
 
 @kernel
 def _correct_points(block: Float32, errors: Float64, radial: bool) -> None:
     """Displace the points of a block by camera errors, see `displacement`."""
-    x = block[
-        residual_kernels.POINT * residual_kernels.LANES : (residual_kernels.POINT + 1)
-        * residual_kernels.LANES
-    ]
-    y = block[
-        (residual_kernels.POINT + 1) * residual_kernels.LANES : (residual_kernels.POINT + 2)
-        * residual_kernels.LANES
-    ]
-    z = block[
-        (residual_kernels.POINT + 2) * residual_kernels.LANES : (residual_kernels.POINT + 3)
-        * residual_kernels.LANES
-    ]
-    for k in range(residual_kernels.LANES):
+    x = block[residual.POINT * residual.LANES : (residual.POINT + 1) * residual.LANES]
+    y = block[(residual.POINT + 1) * residual.LANES : (residual.POINT + 2) * residual.LANES]
+    z = block[(residual.POINT + 2) * residual.LANES : (residual.POINT + 3) * residual.LANES]
+    for k in range(residual.LANES):
         lateral2 = x[k] * x[k] + y[k] * y[k]
         r2 = max(lateral2 + z[k] * z[k], _EPSILON)  # columns without a point may be 0
         ray_scale_error = errors[FOCAL] + errors[DISTORTION] * lateral2 / max(z[k] * z[k], _EPSILON)
@@ -478,19 +460,10 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
 
     To first order in the errors this is the inverse of `_correct_points`.
     """
-    xn = block[
-        residual_kernels.XN * residual_kernels.LANES : (residual_kernels.XN + 1)
-        * residual_kernels.LANES
-    ]
-    yn = block[
-        residual_kernels.YN * residual_kernels.LANES : (residual_kernels.YN + 1)
-        * residual_kernels.LANES
-    ]
-    z = block[
-        residual_kernels.Z * residual_kernels.LANES : (residual_kernels.Z + 1)
-        * residual_kernels.LANES
-    ]
-    for k in range(residual_kernels.LANES):
+    xn = block[residual.XN * residual.LANES : (residual.XN + 1) * residual.LANES]
+    yn = block[residual.YN * residual.LANES : (residual.YN + 1) * residual.LANES]
+    z = block[residual.Z * residual.LANES : (residual.Z + 1) * residual.LANES]
+    for k in range(residual.LANES):
         if not z[k] > projection_kernels.MIN_DEPTH:  # it is not projected
             continue
         lateral2 = xn[k] * xn[k] + yn[k] * yn[k]
@@ -510,28 +483,25 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
 def _add_patches(sums: Float64, block: Float32, patches: Int64) -> None:
     """Add the weighted residuals and Jacobians of the distances of a block to their patches."""
     for k in range(len(patches)):
-        if block[residual_kernels.IS_INLIER * residual_kernels.LANES + k] > 0:
-            sqrt_weight = np.float64(
-                block[residual_kernels.SQRT_WEIGHT * residual_kernels.LANES + k]
-            )
+        if block[residual.IS_INLIER * residual.LANES + k] > 0:
+            sqrt_weight = np.float64(block[residual.SQRT_WEIGHT * residual.LANES + k])
             patch = sums[patches[k]]
             patch[PATCH_WEIGHT] += sqrt_weight * sqrt_weight
             patch[PATCH_RESIDUAL] += (
-                sqrt_weight * block[residual_kernels.WEIGHTED_RESIDUAL * residual_kernels.LANES + k]
+                sqrt_weight * block[residual.WEIGHTED_RESIDUAL * residual.LANES + k]
             )
             for p in range(6):
                 patch[PATCH_RESPONSE + p] += (
-                    sqrt_weight
-                    * block[(residual_kernels.JACOBIAN + p) * residual_kernels.LANES + k]
+                    sqrt_weight * block[(residual.JACOBIAN + p) * residual.LANES + k]
                 )
 
 
 @kernel
 def _add_support(total: Float64, block: Float32, statistic: int) -> None:
     """Add the support of the residuals whose robust weights are in a statistic."""
-    index = residual_kernels.STAT + statistic - residual_kernels.INLIERS
-    row = block[index * residual_kernels.LANES : (index + 1) * residual_kernels.LANES]
-    for k in range(residual_kernels.LANES):
+    index = residual.STAT + statistic - residual.INLIERS
+    row = block[index * residual.LANES : (index + 1) * residual.LANES]
+    for k in range(residual.LANES):
         total[k] += tukey.support(row[k])
 
 
@@ -552,7 +522,7 @@ def overlaps(
     points: Float32,
     starts: Int64,
     sources: Int64,
-    target: residual_kernels.TargetImage,
+    target: residual.TargetImage,
     T_target_world: Float64,
     T_world_source: Float64,
     tolerance: float,
@@ -596,9 +566,9 @@ def overlaps(
             if k - start - shared > max_unseen:
                 break
             px, py, pz = (
-                points[k, residual_kernels.POINT],
-                points[k, residual_kernels.POINT + 1],
-                points[k, residual_kernels.POINT + 2],
+                points[k, residual.POINT],
+                points[k, residual.POINT + 1],
+                points[k, residual.POINT + 2],
             )
             z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
             if z <= projection_kernels.MIN_DEPTH:
@@ -612,17 +582,17 @@ def overlaps(
                 continue
             pixel = image[i, j]
             n0, n1, n2, distance = (
-                pixel[residual_kernels.PLANE],
-                pixel[residual_kernels.PLANE + 1],
-                pixel[residual_kernels.PLANE + 2],
-                pixel[residual_kernels.DISTANCE],
+                pixel[residual.PLANE],
+                pixel[residual.PLANE + 1],
+                pixel[residual.PLANE + 2],
+                pixel[residual.DISTANCE],
             )
             if distance == 0 or abs(n0 * x + n1 * y + n2 * z - distance) > tolerance * z:
                 continue
             nx, ny, nz = (
-                points[k, residual_kernels.NORMAL],
-                points[k, residual_kernels.NORMAL + 1],
-                points[k, residual_kernels.NORMAL + 2],
+                points[k, residual.NORMAL],
+                points[k, residual.NORMAL + 1],
+                points[k, residual.NORMAL + 2],
             )
             cosine = (
                 n0 * (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz)
@@ -633,3 +603,62 @@ def overlaps(
                 shared += 1
         fraction = shared / max(stop - start, 1)
         out[s] = fraction if fraction >= min_overlap else 0.0
+
+
+@kernel
+def marginalise_shared_errors(
+    sums: Float64, correlation: Float64, variance: Float64, pairs: Int64, rows: Float64
+) -> None:
+    """Marginalise the patches' shared errors out of the normal equations of pairs, in place.
+
+    Parameters
+    ----------
+    sums
+        (N, patches, PATCH_SIZE), see `pair_equations.target_equations`.
+    correlation
+        (patches, patches) correlation of the errors of patches.
+    variance
+        (K,) variances of these errors, m^2.
+    pairs
+        (K,) indices of the pairs.
+    rows
+        (N, SIZE) equations of the pairs, see `pair_equations`; updated.
+    """
+    for k in range(len(pairs)):
+        _marginalise(sums[pairs[k]], correlation, variance[k], rows[pairs[k]])
+
+
+@kernel
+def _marginalise(sums: Float64, correlation: Float64, variance: float, row: Float64) -> None:
+    """Do the same for one pair."""
+    count = len(sums)
+    R = np.zeros((count, 7))
+    sqrt_weight = np.sqrt(sums[:, PATCH_WEIGHT])
+    for k in range(count):
+        if sqrt_weight[k] > 0:
+            for p in range(7):
+                R[k, p] = sums[k, PATCH_RESIDUAL + p] / sqrt_weight[k]
+    # Cholesky factor L of 1 + D^1/2 K D^1/2, row by row, and Z with L Z = R.
+    L = np.zeros((count, count))
+    Z = np.zeros((count, 7))
+    for i in range(count):
+        for j in range(i + 1):
+            total = variance * sqrt_weight[i] * sqrt_weight[j] * correlation[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                L[i, i] = np.sqrt(total + 1.0)
+            else:
+                L[i, j] = total / L[j, j]
+        for p in range(7):
+            total = R[i, p]
+            for k in range(i):
+                total -= L[i, k] * Z[k, p]
+            Z[i, p] = total / L[i, i]
+    for p in range(6):
+        for k in range(count):
+            row[GRADIENT + p] -= R[k, 0] * R[k, 1 + p] - Z[k, 0] * Z[k, 1 + p]
+        index = PRODUCTS + p * UNKNOWNS - p * (p - 1) // 2
+        for o in range(p, 6):
+            for k in range(count):
+                row[index + o - p] -= R[k, 1 + p] * R[k, 1 + o] - Z[k, 1 + p] * Z[k, 1 + o]

@@ -18,8 +18,8 @@ from tofuse.engine.compute import run_chunks
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
-from tofuse.engine.stored_views.shared_error_kernels import marginalise_shared_errors
-from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.stored_views.pair_equation_kernels import marginalise_shared_errors
+from tofuse.engine.stored_views.view_store import SampledView, rows_by_target
 from tofuse.engine.views import residual_kernels
 
 _PAIRS_A_CHUNK = 8
@@ -211,14 +211,11 @@ def evaluate(
     sums = np.empty((len(rows), shared_error.PATCHES if by_patch else 0, kernels.PATCH_SIZE))
     cosine = float(np.cos(options.max_angle))
     # All sources of a target in succession, so that it stays in the cache.
-    order = np.argsort(state.target, kind="stable")
-    targets, begin = np.unique(state.target[order], return_index=True)
-    end = np.append(begin[1:], len(order))
+    by_target = rows_by_target(state.target)
 
     def work(a: int, b: int) -> None:
-        for k in range(a, b):
-            pairs = order[begin[k] : end[k]]
-            target = views[targets[k]]
+        for k, pairs in by_target[a:b]:
+            target = views[k]
             pair_rows = np.empty((len(pairs), kernels.SIZE))
             patch_sums = np.empty((len(pairs), *sums.shape[1:]))
             kernels.target_equations(
@@ -242,7 +239,7 @@ def evaluate(
             )
             rows[pairs], sums[pairs] = pair_rows, patch_sums
 
-    run_chunks(work, len(targets), -(-len(rows) // _PAIRS_A_CHUNK))
+    run_chunks(work, len(by_target), -(-len(rows) // _PAIRS_A_CHUNK))
     state.rows, state.sums = rows, sums
 
 

@@ -469,15 +469,12 @@ def _visible_fractions(
     )
     inverse, used_poses = se3.inverse(poses), np.ascontiguousarray(poses[used])
     # All sources of a target in succession, so that it stays in the cache.
-    order = np.argsort(target, kind="stable")
-    targets, begin = np.unique(target[order], return_index=True)
-    end = np.append(begin[1:], len(order))
+    by_target = rows_by_target(target)
     out = np.zeros(len(target))
 
     def work(a: int, b: int) -> None:
-        for k in range(a, b):
-            rows = order[begin[k] : end[k]]
-            view = views[targets[k]].coarse
+        for k, rows in by_target[a:b]:
+            view = views[k].coarse
             fractions = np.empty(len(rows))
             kernels.overlaps(
                 points,
@@ -486,7 +483,7 @@ def _visible_fractions(
                 residual_kernels.TargetImage(
                     view.target, view.projection.lookup, view.projection.frame
                 ),
-                inverse[targets[k]],
+                inverse[k],
                 used_poses,
                 _MAX_DISTANCE,
                 _MIN_COSINE,
@@ -495,5 +492,14 @@ def _visible_fractions(
             )
             out[rows] = fractions
 
-    run_chunks(work, len(targets), 32)
+    run_chunks(work, len(by_target), 32)
     return out
+
+
+def rows_by_target(target: Intp) -> list[tuple[int, Intp]]:
+    """Return each target (M,) of pairs, ascending, with the rows of its pairs."""
+    order = np.argsort(target, kind="stable")
+    targets, begin = np.unique(target[order], return_index=True)
+    return (
+        list(zip(targets.tolist(), np.split(order, begin[1:]), strict=True)) if len(order) else []
+    )

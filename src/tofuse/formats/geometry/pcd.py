@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.errors import InputError
-from tofuse.engine.fusion import GeometryRecord, stacked
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.formats.files import atomic, reading
+from tofuse.formats.geometry.ply import stacked
 
 MAX_POINTS = 1 << 28
 _NORMALS = ("normal_x", "normal_y", "normal_z")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Int32, UInt8
 from tofuse.engine.errors import InputError
-from tofuse.engine.fusion import GeometryRecord, stacked
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.formats.files import atomic, reading
 
 _TYPES = {
@@ -392,3 +392,11 @@ def _stored(dtype: np.dtype) -> str:
     if code in _NAMES:
         return dtype.newbyteorder("<").str
     return {"b": "u1", "i": "<i4", "u": "<u4"}.get(dtype.kind, "<f4")
+
+
+def stacked(columns: dict[str, NDArray[Any]], names: Sequence[str]) -> NDArray[np.floating]:
+    """Remove named columns (N,), and return them as (N, C) float32 or float64."""
+    removed = [columns.pop(name) for name in names]
+    dtype = np.result_type(np.float32, *(column.dtype for column in removed))
+    with np.errstate(invalid="ignore"):  # damaged data can contain signalling NaNs
+        return np.stack(removed, -1).astype(dtype, copy=False)

@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.frames import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Optimiser, PoseGraph, castellani, measured_graph
+from tofuse.engine.graph import Measured, Optimiser, PoseGraph, build_graph, castellani
 from tofuse.engine.icp import CoarseToFine, algorithm_1
 from tofuse.engine.mapping import default, reconstructing
 from tofuse.engine.refinement import plane_refinement
@@ -82,7 +82,7 @@ class PeaksRun:
     truth: Float64
 
 
-def chain(relative: Float64, loops: Sequence[measured_graph.Measured] = ()) -> PoseGraph:
+def chain(relative: Float64, loops: Sequence[Measured] = ()) -> PoseGraph:
     """Build the graph of a sequence of consecutive motions, and loops.
 
     The poses are the products of the motions (eqs 2.9-3.2); ids count from 0, and the information
@@ -99,8 +99,8 @@ def chain(relative: Float64, loops: Sequence[measured_graph.Measured] = ()) -> P
     for T in relative:
         # Rounding errors would accumulate over thousands of products.
         poses.append(se3.orthonormalise(poses[-1] @ T))
-    sequence = [measured_graph.Measured(k, k + 1, T, np.eye(6)) for k, T in enumerate(relative)]
-    return measured_graph.build_graph(range(len(poses)), np.array(poses), sequence, loops)
+    sequence = [Measured(k, k + 1, T, np.eye(6)) for k, T in enumerate(relative)]
+    return build_graph(range(len(poses)), np.array(poses), sequence, loops)
 
 
 def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> PeaksRun:
@@ -116,7 +116,7 @@ def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> Pe
     steps = [tracker.push(view) for view in views]
     relative = np.array([s.registration.T_target_source for s in steps[1:] if s.registration])
     last = len(views) - 1
-    graph = chain(relative, [measured_graph.Measured(0, last, truth[last], np.eye(6))])
+    graph = chain(relative, [Measured(0, last, truth[last], np.eye(6))])
     optimisation = (optimiser or castellani.Castellani()).optimise(graph)
     return PeaksRun(
         sigma,

@@ -23,7 +23,6 @@ from tofuse.engine.refinement import (
     Refinement,
     RefinementMethod,
     Refiner,
-    accepted_with,
     plane_refinement,
 )
 from tofuse.engine.stored_views import Spacing, ViewStore
@@ -158,7 +157,7 @@ class _Relaxation(Refiner):
         )
         unchanged = Refinement(poses, False, len(clouds), len(pairs_after), support=support)
         improved = bool(pairs_after) and support[1] >= support[0]
-        return accepted_with(unchanged, rows, relaxed_poses) if improved else unchanged
+        return unchanged.accepted(rows, relaxed_poses) if improved else unchanged
 
 
 def relax_poses(method: RelaxationMethod, clouds: Sequence[Cloud], poses: Float64) -> Float64:
