@@ -13,21 +13,8 @@ from tofuse.apps.batch.jobs import Job
 from tofuse.formats.files import locked, write_text
 
 COLUMNS = (
-    "name",
-    "recording",
-    "options",
-    "state",
-    "verdict",
-    "position_m",
-    "relative",
-    "frames",
-    "posed",
-    "seconds",
-    "starts",
-    "peak_bytes",
-    "host",
-    "status",
-    "reason",
+    *("name", "recording", "options", "state", "verdict", "position_m", "relative", "frames"),
+    *("posed", "seconds", "starts", "peak_bytes", "host", "status", "reason"),
 )
 _REFRESH_S = 5  # interval at which the page reloads
 
