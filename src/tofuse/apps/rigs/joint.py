@@ -114,9 +114,7 @@ class JointPoses:
     disagreement: dict[tuple[int, int], tuple[float, int]] = field(default_factory=dict)
 
 
-def refine_together(
-    views: Sequence[RigView], poses: Float64, options: JointOptions | None = None
-) -> JointPoses:
+def refine_together(views: Sequence[RigView], poses: Float64) -> JointPoses:
     """Optimise the poses and depth offsets of all cameras jointly.
 
     Parameters
@@ -125,10 +123,8 @@ def refine_together(
         Views of all cameras.
     poses
         (K, 4, 4) initial T_rig_camera; the first is fixed.
-    options
-        Options of the refinement.
     """
-    return _optimised(views, poses, options or JointOptions()).placed()
+    return _optimised(views, poses, JointOptions()).placed()
 
 
 def refined_poses(
