@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.apps.cli.parser import DEMO_SCENES, make_parser
+from tofuse.apps.cli.options import DEMO_SCENES
+from tofuse.apps.cli.parser import make_parser
 from tofuse.apps.cli.program import main
 from tofuse.apps.jobs import running as run_module
 from tofuse.apps.results.run_json import main_poses

@@ -19,7 +19,8 @@ import pytest
 
 import tofuse
 from paths import ROOT
-from tofuse.apps.cli.parser import DEMO_SCENES, make_parser
+from tofuse.apps.cli.options import DEMO_SCENES
+from tofuse.apps.cli.parser import make_parser
 from tofuse.apps.jobs.pair import register_files
 from tofuse.apps.results.pair import pair_json
 from tofuse.engine import parts

@@ -149,13 +149,13 @@ def test_views_of_all_cameras_refine_path_of_rig() -> None:
 def test_split_half_reveals_systematic_errors() -> None:
     times = np.arange(40) / 20.0
     world = np.stack([path(t) for t in times])
-    fit = HandEye(mounted(), np.eye(6), np.eye(4), 0.0, 0.0, len(times), np.ones(6))
+    fit = HandEye(mounted(), np.eye(6), np.eye(4), 0.0, 0.0)
     error = np.array([0.004, -0.001, 0.002, 0.001, 0.0, -0.002])
 
     def tracks(by: np.ndarray) -> dict[int, Track]:
         return {0: Track(times, world), 1: Track(times, world @ mounted() @ se3.exp(by))}
 
-    together = _JointViews({}, {}, {})
+    together = _JointViews({}, {})
     together._halves = [(tracks(error), tracks(-error))]
     found = together.systematic(1, fit)
     np.testing.assert_allclose(found, np.outer(error, error), atol=1e-7)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
-
+from tofuse.apps.cli import options as cli
 from tofuse.apps.cli import print_result, progress_for
 
 
-def demo(arguments: argparse.Namespace) -> int:
+def demo(arguments: cli.Demo) -> int:
     """``tofuse demo``."""
     from tofuse.apps.jobs import exit_status
     from tofuse.engine.compute import threads
@@ -28,7 +27,7 @@ def demo(arguments: argparse.Namespace) -> int:
     return exit_status(result)
 
 
-def simulate(arguments: argparse.Namespace) -> int:
+def simulate(arguments: cli.Simulate) -> int:
     """``tofuse simulate``."""
     from tofuse.engine.compute import threads
     from tofuse.lab.demo import simulate_to
@@ -60,7 +59,7 @@ def simulate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def experiments(arguments: argparse.Namespace) -> int:
+def experiments(arguments: cli.Experiments) -> int:
     """``tofuse experiments``."""
     from tofuse.engine.compute import threads
     from tofuse.lab.experiments import run_experiments

@@ -1,4 +1,8 @@
-"""."""
+"""Many recordings, each reconstructed by a process of its own.
+
+A list gives jobs, workers on this machine or on a Dask cluster do them, and a folder records what
+became of each, so that the same command resumes where an earlier one stopped.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -6,7 +6,6 @@ import csv
 import io
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from urllib.parse import quote
 
 from tofuse.apps.batch.folder import BatchFolder, Record
@@ -14,50 +13,10 @@ from tofuse.apps.batch.jobs import Job
 from tofuse.formats.files import atomic, locked
 
 COLUMNS = (
-    "name",
-    "recording",
-    "options",
-    "state",
-    "verdict",
-    "position_m",
-    "relative",
-    "frames",
-    "posed",
-    "seconds",
-    "starts",
-    "peak_bytes",
-    "host",
-    "status",
-    "reason",
+    *("name", "recording", "options", "state", "verdict", "position_m", "relative", "frames"),
+    *("posed", "seconds", "starts", "peak_bytes", "host", "status", "reason"),
 )
 _REFRESH_S = 5  # interval at which the page reloads
-
-
-@dataclass(frozen=True)
-class Row:
-    """A job that has ended, as text.
-
-    Attributes
-    ----------
-    report, picture
-        Relative addresses of files; empty where there are none.
-    tone
-        Its colour: good, degraded or failed.
-    """
-
-    name: str
-    recording: str
-    options: str
-    report: str
-    picture: str
-    verdict: str
-    tone: str
-    accuracy: str
-    frames: str
-    seconds: str
-    memory: str
-    starts: int
-    reason: str
 
 
 def write_table(jobs: Sequence[Job], folder: BatchFolder) -> None:
@@ -100,7 +59,7 @@ def _html(
     from tofuse.apps.report import page
 
     rows = [_row(job, record, folder) for job, record in ended]
-    counts = Counter(row.tone for row in rows)
+    counts = Counter(row["tone"] for row in rows)
     failed = sum(record.state == "failed" for _, record in ended)
     facts = [
         ("recordings", f"{total}"),
@@ -123,7 +82,8 @@ def _html(
     )
 
 
-def _row(job: Job, record: Record, folder: BatchFolder) -> Row:
+def _row(job: Job, record: Record, folder: BatchFolder) -> dict[str, str | int]:
+    """Return the texts of a job that has ended; `tone` is its colour: good, degraded or failed."""
     from tofuse.engine.results import accuracy_card
 
     done = record.state == "done"
@@ -135,21 +95,23 @@ def _row(job: Job, record: Record, folder: BatchFolder) -> Row:
         accuracy = "not bounded"
     has_report = (folder.result(job) / "report.html").is_file()
     picture = folder.picture(job)
-    return Row(
-        job.name,
-        job.recording,
-        " ".join(job.arguments),
-        f"{quote(job.name)}/report.html" if done and has_report else "",
-        quote(f"{picture.parent.name}/{picture.name}") if done and picture.is_file() else "",
-        record.verdict if done else "no result",
-        record.verdict if done else "failed",
-        accuracy,
-        "" if record.frames is None else f"{record.posed} of {record.frames}",
-        "" if record.seconds is None else duration(record.seconds),
-        "" if record.peak_bytes is None else f"{record.peak_bytes / 1e6:.0f} MB",
-        record.starts,
-        record.reason,
-    )
+    return {
+        "name": job.name,
+        "recording": job.recording,
+        "options": " ".join(job.arguments),
+        "report": f"{quote(job.name)}/report.html" if done and has_report else "",
+        "picture": quote(f"{picture.parent.name}/{picture.name}")
+        if done and picture.is_file()
+        else "",
+        "verdict": record.verdict if done else "no result",
+        "tone": record.verdict if done else "failed",
+        "accuracy": accuracy,
+        "frames": "" if record.frames is None else f"{record.posed} of {record.frames}",
+        "seconds": "" if record.seconds is None else duration(record.seconds),
+        "memory": "" if record.peak_bytes is None else f"{record.peak_bytes / 1e6:.0f} MB",
+        "starts": record.starts,
+        "reason": record.reason,
+    }
 
 
 def duration(seconds: float) -> str:

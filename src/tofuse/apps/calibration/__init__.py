@@ -1,4 +1,8 @@
-"""."""
+"""Calibration of one camera from recordings: its lens, its depth errors and its noise.
+
+A lens and a depth correction come from views of a checkerboard or of planes, noise from a static
+scene; each with its uncertainty, and as a file that readers apply.
+"""
 
 from typing import TYPE_CHECKING
 

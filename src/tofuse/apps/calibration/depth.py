@@ -10,7 +10,7 @@ equivalent to more distant planes: the scale is unobservable, and is fixed by a 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -143,7 +143,7 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
     curve = state.curve + mean
     after = [r - offsets.ravel()[v.pixels] - mean for r, v in zip(residuals, views, strict=True)]
     zero_curve = np.zeros_like(curve)
-    before = _residuals(views, knots, _fit_planes(subsampled, knots, zero_curve))
+    before = _residuals(views, knots, _solve(subsampled, knots, zero_curve))
     constant, scale = state.sigma
     return DepthFit(
         DepthCorrection(knots, curve, offsets.astype(np.float32)),
@@ -191,20 +191,8 @@ def _subsampled(view: PlaneView, shape: tuple[int, int]) -> PlaneView:
     step = max(1, round(float(np.sqrt(shape[0] * shape[1] / _CURVE_PIXELS))))
     row, column = np.divmod(view.pixels, shape[1])
     keep = (row % step == step // 2) & (column % step == step // 2)
-    return PlaneView(
-        view.frame,
-        view.plane,
-        view.information,
-        view.pixels[keep],
-        view.measured_m[keep],
-        view.sigma_m[keep],
-        view.directions[keep],
-    )
-
-
-def _fit_planes(views: Sequence[PlaneView], knots: Float64, curve: Float64) -> _State:
-    """Fit the planes to the measurements, with the curve fixed."""
-    return _solve(views, knots, curve)
+    names = ("pixels", "measured_m", "sigma_m", "directions")
+    return replace(view, **{name: getattr(view, name)[keep] for name in names})
 
 
 def _solve(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import sys
 from collections import Counter
@@ -22,6 +21,8 @@ from tofuse.apps.batch import (
     status_of,
     write_table,
 )
+from tofuse.apps.cli.commands import VERDICT_COLORS, make_console
+from tofuse.apps.cli.options import Batch
 from tofuse.apps.cli.progress import emit, progress_for
 from tofuse.apps.cli.run_arguments import run_arguments
 from tofuse.engine.compute import usable_cores
@@ -31,7 +32,7 @@ _RETRIES = 3
 _MAX_LISTED = 10  # recordings without a result that the summary names
 
 
-def batch(arguments: argparse.Namespace) -> int:
+def batch(arguments: Batch) -> int:
     """Do all pending jobs, and print a summary."""
     jobs = read_jobs(arguments.recordings, run_arguments)
     jobs = tuple(replace(j, memory=j.memory or arguments.memory) for j in jobs)
@@ -62,7 +63,7 @@ def batch(arguments: argparse.Namespace) -> int:
     return _print_summary(selected, folder, as_json=arguments.json)
 
 
-def _selected(jobs: Sequence[Job], arguments: argparse.Namespace) -> list[Job]:
+def _selected(jobs: Sequence[Job], arguments: Batch) -> list[Job]:
     """The jobs of --only, or all."""
     if arguments.only is None:
         return list(jobs)
@@ -78,7 +79,7 @@ def _selected(jobs: Sequence[Job], arguments: argparse.Namespace) -> list[Job]:
     return [job for job in jobs if job.name in arguments.only]
 
 
-def _command_line(arguments: argparse.Namespace, job: Job) -> str:
+def _command_line(arguments: Batch, job: Job) -> str:
     """A command that does a single job, from any folder."""
     command = ["tofuse", "batch", *(str(path.absolute()) for path in arguments.recordings)]
     command += ["--out", str(arguments.out.absolute()), "--only", job.name]
@@ -89,7 +90,7 @@ def _command_line(arguments: argparse.Namespace, job: Job) -> str:
 
 
 def _run(
-    arguments: argparse.Namespace,
+    arguments: Batch,
     jobs: Sequence[Job],
     remaining: Sequence[Job],
     folder: BatchFolder,
@@ -119,7 +120,7 @@ def _run(
         workers.close()
 
 
-def _workers(arguments: argparse.Namespace, jobs: int) -> tuple[Workers, int]:
+def _workers(arguments: Batch, jobs: int) -> tuple[Workers, int]:
     """The workers, and the number of threads of each job."""
     if arguments.scheduler is not None:
         from tofuse.apps.batch import DaskWorkers
@@ -132,8 +133,6 @@ def _workers(arguments: argparse.Namespace, jobs: int) -> tuple[Workers, int]:
 
 def _print_summary(selected: Sequence[Job], folder: BatchFolder, *, as_json: bool) -> int:
     """Print a summary, and return the exit status."""
-    from tofuse.apps.cli.commands import VERDICT_COLORS, make_console
-
     records = {job.name: folder.record(job) for job in selected}
     verdicts = Counter(r.verdict for r in records.values() if r is not None and r.state == "done")
     failed = {n: r.reason for n, r in records.items() if r is not None and r.state == "failed"}

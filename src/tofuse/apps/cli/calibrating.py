@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from tofuse.apps.calibration import (
     scene_planes,
     write_camera_json,
 )
+from tofuse.apps.cli.options import Calibrate
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
@@ -31,7 +31,7 @@ _MAX_LISTED = 8
 _MAX_PLANES = 20
 
 
-def lens(arguments: argparse.Namespace) -> Summary:
+def lens(arguments: Calibrate) -> Summary:
     """``tofuse calibrate lens``."""
     board = _board(arguments)
     recording = Opening.of(arguments.inputs, arguments).open()
@@ -51,7 +51,7 @@ def lens(arguments: argparse.Namespace) -> Summary:
     return fit.to_dict(), lines, list(fit.warnings)
 
 
-def depth(arguments: argparse.Namespace) -> Summary:
+def depth(arguments: Calibrate) -> Summary:
     """``tofuse calibrate depth``."""
     recording = Opening.of(arguments.inputs, arguments).open()
     previous = _previous_correction(arguments, recording)
@@ -88,9 +88,7 @@ def depth(arguments: argparse.Namespace) -> Summary:
     return fit.to_dict(), lines, list(fit.warnings)
 
 
-def _previous_correction(
-    arguments: argparse.Namespace, recording: Recording
-) -> DepthCorrection | None:
+def _previous_correction(arguments: Calibrate, recording: Recording) -> DepthCorrection | None:
     """Return the correction that was applied when the recording was read."""
     if not recording.metadata.get("corrected"):
         return None
@@ -104,7 +102,7 @@ def _previous_correction(
     return read_correction(path)
 
 
-def import_lens(arguments: argparse.Namespace) -> Summary:
+def import_lens(arguments: Calibrate) -> Summary:
     """``tofuse calibrate import``."""
     if len(arguments.inputs) != 1:
         raise InputError("takes one file", where="calibrate import", remedy="pass one INPUT")
@@ -129,7 +127,7 @@ def import_lens(arguments: argparse.Namespace) -> Summary:
     return {"format": lens_file.format, "warnings": warnings} | fields, lines, warnings
 
 
-def _board(arguments: argparse.Namespace) -> Board:
+def _board(arguments: Calibrate) -> Board:
     if arguments.board is None:
         raise InputError(
             "is missing",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import signal
 import sys
 import threading
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rich.console import Console
 from rich.table import Table
 
+from tofuse.apps.cli import options as cli
 from tofuse.apps.cli.progress import (
     JsonProgress,
     QuietProgress,
@@ -35,13 +35,16 @@ if TYPE_CHECKING:
 _Options = TypeVar("_Options", bound="DataclassInstance")
 
 _SEVERITY_COLORS = {"severe": "red", "warning": "yellow", "note": "cyan"}
+_NAME_WIDTH = 14  # width of the column of names
 _STATUS_COLORS = {True: "green", False: "red", None: "yellow"}
+_NOT_WITH_RIG = (
+    *("view", "into", "loops", "guess", "object"),
+    *("average_still", "camera", "topic", "no_report"),
+)
 VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
 
 
-def from_arguments(
-    cls: type[_Options], arguments: argparse.Namespace, **overrides: Any
-) -> _Options:
+def from_arguments(cls: type[_Options], arguments: cli.Command, **overrides: Any) -> _Options:
     """Make a dataclass of options from the arguments with the names of its fields.
 
     Fields without an argument keep their defaults; `overrides` override both.
@@ -56,15 +59,14 @@ def make_console() -> Console:
 
 
 def _progress_unless_json(
-    arguments: argparse.Namespace,
+    arguments: cli.Json,
 ) -> AbstractContextManager[TerminalProgress | JsonProgress | QuietProgress | None]:
     """The progress of a command whose --json prints a single object."""
     return nullcontext() if arguments.json else progress_for(as_json=False)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: cli.Run) -> int:
     """``tofuse run``."""
-    from tofuse.apps.jobs import exit_status
     from tofuse.apps.jobs import run as run_pipeline
     from tofuse.engine.errors import InputError
     from tofuse.formats.rigs import recordings_of, rig_file_in
@@ -85,20 +87,27 @@ def run(arguments: argparse.Namespace) -> int:
             raise InputError("requires --view", where=name, remedy="pass --view as well")
     with progress_for(as_json=arguments.json) as progress:
         result = run_pipeline(arguments.inputs, options, progress)
-    print_result(result, arguments.out, as_json=arguments.json)
+    return _finished(result, arguments.out, arguments)
+
+
+def _finished(result: Reconstruction, out: Path, arguments: cli.JsonLines) -> int:
+    """Print a result, and return the exit status."""
+    from tofuse.apps.jobs import exit_status
+
+    print_result(result, out, as_json=arguments.json)
     return exit_status(result)
 
 
-def run_options(arguments: argparse.Namespace) -> Options:
+def run_options(arguments: cli.Run) -> Options:
     """Return the options of ``tofuse run``."""
     from tofuse.apps.jobs import Options
 
     return from_arguments(Options, arguments)
 
 
-def _run_into(arguments: argparse.Namespace, options: Options) -> int:
+def _run_into(arguments: cli.Run, options: Options) -> int:
     """Run, then merge the result into an earlier one, which stays unchanged if that fails."""
-    from tofuse.apps.jobs import MergeOptions, check_result, exit_status, merge_files
+    from tofuse.apps.jobs import MergeOptions, check_result, merge_files
     from tofuse.apps.jobs import run as run_pipeline
     from tofuse.engine.errors import InputError
 
@@ -113,50 +122,29 @@ def _run_into(arguments: argparse.Namespace, options: Options) -> int:
     with progress_for(as_json=arguments.json) as progress:
         result = run_pipeline(arguments.inputs, options, progress)
     print_result(result, options.out, as_json=arguments.json)
-    map_options = MergeOptions(
-        into,
-        overwrite=True,
-        tolerance=options.tolerance,
-        voxel=options.voxel,
-        faces=options.faces,
-        seed=options.seed or 0,
-        threads=options.threads,
-        texture=options.texture,
-        only_joined=True,
+    map_options = from_arguments(
+        MergeOptions, arguments, out=into, overwrite=True, seed=options.seed or 0, only_joined=True
     )
     with progress_for(as_json=arguments.json) as progress:
         merged = merge_files([into, options.out], map_options, progress)
-    print_result(merged, into, as_json=arguments.json)
-    return exit_status(merged)
+    return _finished(merged, into, arguments)
 
 
-def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
+def _run_rig(arguments: cli.Run, options: Options) -> int:
     """``tofuse run --rig``."""
-    from tofuse.apps.jobs import exit_status
     from tofuse.apps.rigs import run_rig
     from tofuse.engine.errors import InputError
 
-    for name in (
-        "view",
-        "into",
-        "loops",
-        "guess",
-        "object",
-        "average_still",
-        "camera",
-        "topic",
-        "no_report",
-    ):
+    for name in _NOT_WITH_RIG:
         if getattr(arguments, name):
             option = f"--{name.replace('_', '-')}"
             raise InputError("can't be used with a rig", where=option, remedy="leave it out")
     with progress_for(as_json=arguments.json) as progress:
         rig_result = run_rig(arguments.rig, arguments.inputs, options, progress=progress)
-    print_result(rig_result.result, arguments.out, as_json=arguments.json)
-    return exit_status(rig_result.result)
+    return _finished(rig_result.result, arguments.out, arguments)
 
 
-def _run_live(arguments: argparse.Namespace, options: Options) -> int:
+def _run_live(arguments: cli.Run, options: Options) -> int:
     """Run and show the reconstruction live; then show the result until Ctrl-C."""
     from tofuse.apps.jobs import exit_status
     from tofuse.apps.jobs import run as run_pipeline
@@ -179,7 +167,7 @@ def _run_live(arguments: argparse.Namespace, options: Options) -> int:
     return exit_status(result)
 
 
-def view(arguments: argparse.Namespace) -> int:
+def view(arguments: cli.View) -> int:
     """``tofuse view``."""
     with _report_server(arguments.result, arguments.port) as server:
         _show(server.address, arguments)
@@ -200,7 +188,7 @@ def _report_server(folder: Path, port: int | None = None) -> ReportServer:
     return ReportServer(pages, images, port)
 
 
-def _show(address: str, arguments: argparse.Namespace) -> None:
+def _show(address: str, arguments: cli.Page) -> None:
     """Print the address of a page, and open it in the browser."""
     import webbrowser
 
@@ -217,18 +205,10 @@ def _wait() -> None:
             pass
 
 
-def batch(arguments: argparse.Namespace) -> int:
-    """``tofuse batch``."""
-    from tofuse.apps.cli.batching import batch as run_jobs
-
-    return run_jobs(arguments)
-
-
-def register(arguments: argparse.Namespace) -> int:
+def register(arguments: cli.Register) -> int:
     """``tofuse register``."""
-    from tofuse.apps.cli import registering
     from tofuse.apps.jobs import PairOptions, pair_exit_status, register_files
-    from tofuse.apps.report import decision
+    from tofuse.apps.report import decision, lines
     from tofuse.apps.results import pair_json
 
     _check_overwrite(arguments)
@@ -242,15 +222,19 @@ def register(arguments: argparse.Namespace) -> int:
     head, tail = decision(result)
     color = _STATUS_COLORS[result.registration.believed]
     console.print(f"[bold {color}]{head.lower()}[/]" + (f": {escaped(tail)}" if tail else ""))
-    for line in registering.text(result):
-        console.print(line, markup=False)
+    found = lines(result)
+    width = max(_NAME_WIDTH, *(len(name) for name, _ in found))
+    for name, value in found:
+        first, *others = value.split("\n")
+        for title, row in ((name, first), *(("", other) for other in others)):
+            console.print(f"{title:<{width}}  {row}".rstrip(), markup=False)
     _print_warnings(console, pair_json(result)["warnings"])
     if options.out is not None:
         console.print(f"see {options.out / 'report.html'}", markup=False)
     return pair_exit_status(result)
 
 
-def rig_calibrate(arguments: argparse.Namespace) -> int:
+def rig_calibrate(arguments: cli.RigCalibrate) -> int:
     """``tofuse rig calibrate``."""
     from tofuse.apps.calibration import check_new
     from tofuse.apps.cli import rigging
@@ -280,7 +264,7 @@ def rig_calibrate(arguments: argparse.Namespace) -> int:
     return rigging.exit_status(calibration)
 
 
-def rig_check(arguments: argparse.Namespace) -> int:
+def rig_check(arguments: cli.RigCheck) -> int:
     """``tofuse rig check``."""
     from tofuse.apps.cli import rigging
     from tofuse.apps.rigs import check
@@ -306,7 +290,7 @@ def rig_check(arguments: argparse.Namespace) -> int:
     return rigging.check_status(cameras)
 
 
-def judge(arguments: argparse.Namespace) -> int:
+def judge(arguments: cli.Judge) -> int:
     """``tofuse judge``."""
     from tofuse.apps.jobs import JudgeOptions, judge_files, sentence
     from tofuse.apps.results import plain
@@ -338,18 +322,17 @@ def judge(arguments: argparse.Namespace) -> int:
     return status
 
 
-def merge(arguments: argparse.Namespace) -> int:
+def merge(arguments: cli.Merge) -> int:
     """``tofuse merge``."""
-    from tofuse.apps.jobs import MergeOptions, exit_status, merge_files
+    from tofuse.apps.jobs import MergeOptions, merge_files
 
     options = from_arguments(MergeOptions, arguments, seed=arguments.seed or 0)
     with progress_for(as_json=arguments.json) as progress:
         result = merge_files(arguments.results, options, progress)
-    print_result(result, arguments.out, as_json=arguments.json)
-    return exit_status(result)
+    return _finished(result, arguments.out, arguments)
 
 
-def _check_overwrite(arguments: argparse.Namespace) -> None:
+def _check_overwrite(arguments: cli.Register | cli.Judge) -> None:
     """Refuse --overwrite without --out, where that is optional."""
     from tofuse.engine.errors import InputError
 
@@ -432,7 +415,7 @@ def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
             console.print(f"    {verdicts.ADVICE[reason.code]}", markup=False, style="dim")
 
 
-def inspect(arguments: argparse.Namespace) -> int:
+def inspect(arguments: cli.Inspect) -> int:
     """``tofuse inspect``."""
     from tofuse.apps.inspection import inspect_recording
     from tofuse.formats.recordings import Opening
@@ -461,7 +444,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def convert(arguments: argparse.Namespace) -> int:
+def convert(arguments: cli.Convert) -> int:
     """``tofuse convert``."""
     from tofuse.formats.export import convert as convert_recording
     from tofuse.formats.export import convert_to
@@ -478,7 +461,7 @@ def convert(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def record(arguments: argparse.Namespace) -> int:
+def record(arguments: cli.Record) -> int:
     """``tofuse record``."""
     from tofuse.apps.live import device_named, is_installed, known_devices
     from tofuse.apps.live import record as record_stream
@@ -494,7 +477,7 @@ def record(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.out is None:
         raise InputError("is missing", where="--out", remedy="pass a new folder")
-    options = dict(part.partition("=")[::2] for part in arguments.set)
+    options = dict(part.partition("=")[::2] for part in arguments.set or ())
     with (
         device_named(arguments.device, options).open() as stream,
         _stop_on_signal() as stopped,
@@ -537,7 +520,7 @@ def _stop_on_signal() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def calibrate(arguments: argparse.Namespace) -> int:
+def calibrate(arguments: cli.Calibrate) -> int:
     """``tofuse calibrate``."""
     from tofuse.apps.calibration import check_new
     from tofuse.apps.cli import calibrating
@@ -560,7 +543,7 @@ def calibrate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def noise(arguments: argparse.Namespace) -> int:
+def noise(arguments: cli.Noise) -> int:
     """``tofuse noise``."""
     from tofuse.apps.calibration import check_new, estimate_noise
     from tofuse.formats.recordings import Opening
@@ -592,7 +575,7 @@ def noise(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def evaluate(arguments: argparse.Namespace) -> int:
+def evaluate(arguments: cli.Evaluate) -> int:
     """``tofuse evaluate``."""
     from tofuse.apps.jobs import evaluate as evaluate_poses
     from tofuse.engine.quality import trajectory_errors
@@ -607,7 +590,8 @@ def evaluate(arguments: argparse.Namespace) -> int:
     if error.mostly_unmatched:
         print(
             f"note: only {error.associated} of {error.estimated} estimated poses have a reference "
-            f"pose within {1000 * trajectory_errors.MAX_GAP_S:.0f} ms: check that both files have the same clock",
+            f"pose within {1000 * trajectory_errors.MAX_GAP_S:.0f} ms: "
+            "check that both files have the same clock",
             file=sys.stderr,
         )
     if arguments.json:
@@ -635,7 +619,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def optimize(arguments: argparse.Namespace) -> int:
+def optimize(arguments: cli.Optimize) -> int:
     """``tofuse optimize``."""
     from tofuse.apps.calibration import check_new
     from tofuse.engine.mapping import changed, from_method
@@ -672,7 +656,7 @@ def optimize(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def export(arguments: argparse.Namespace) -> int:
+def export(arguments: cli.Export) -> int:
     """``tofuse export``."""
     from tofuse.apps.export import export as export_result
 

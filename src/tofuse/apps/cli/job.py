@@ -45,13 +45,14 @@ def _end_with_parent() -> None:
 
 def _job(picture: str, run_arguments: Sequence[str]) -> int:
     from tofuse.apps.cli.commands import print_result, run_options
+    from tofuse.apps.cli.options import Run
     from tofuse.apps.cli.parser import make_parser
     from tofuse.apps.cli.progress import QuietProgress, emit
     from tofuse.apps.jobs import exit_status, run
     from tofuse.apps.report import encode, make_scene, render_thumbnail
     from tofuse.formats.files import atomic
 
-    arguments = make_parser().parse_args(["run", *run_arguments])
+    arguments = Run(**vars(make_parser().parse_args(["run", *run_arguments])))
     with QuietProgress() as progress:
         result = run(arguments.inputs, run_options(arguments), progress)
     rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}

@@ -90,6 +90,18 @@ class Health:
         return f"[{self._color}]{self._words}[/]{suffix}"
 
 
+class _Context(Silent):
+    """Progress as a context manager, which has nothing to clean up by default."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
+    ) -> None:
+        """Nothing to clean up."""
+
+
 class TerminalProgress(Silent):
     """The stages on a terminal: finished ones with their times, and a bar for the current one.
 
@@ -159,16 +171,8 @@ class TerminalProgress(Silent):
         self._console.print(f"[yellow]note:[/] {escaped(text)}")
 
 
-class JsonProgress(Silent):
+class JsonProgress(_Context):
     """JSON lines on standard output, for programs."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
-    ) -> None:
-        """Nothing to clean up."""
 
     def __init__(self) -> None:
         self._pace = Pace()
@@ -202,7 +206,7 @@ class JsonProgress(Silent):
         emit({"event": "note", "text": text})
 
 
-class QuietProgress(Silent):
+class QuietProgress(_Context):
     """Only notes on standard error, for logs and pipes.
 
     They are printed after a job that succeeded: one that fails prints only its error.
@@ -210,9 +214,6 @@ class QuietProgress(Silent):
 
     def __init__(self) -> None:
         self._notes: list[str] = []
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, value: object, trace: TracebackType | None

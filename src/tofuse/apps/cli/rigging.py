@@ -13,6 +13,12 @@ from tofuse.apps.rigs import Calibration, CameraMotion
 from tofuse.engine.geometry import se3
 from tofuse.formats.rigs import Rig
 
+# Fields of the JSON of a check.
+_CHECKED = (
+    *("moved", "distance_m", "angle_rad", "sigma_m", "sigma_rad"),
+    *("chance", "chance_elsewhere", "reason"),
+)
+
 
 def tables(rig: Rig) -> list[Table]:
     """Return tables of the cameras' poses, and of the distances between overlapping surfaces."""
@@ -85,18 +91,7 @@ def _outcome(camera: CameraMotion) -> str:
 def check_json(cameras: Sequence[CameraMotion]) -> dict[str, Any]:
     """Return the check as plain data."""
     rows = [
-        {
-            "name": c.name,
-            "checked": not c.reason,
-            "moved": c.moved,
-            "distance_m": c.distance_m,
-            "angle_rad": c.angle_rad,
-            "sigma_m": c.sigma_m,
-            "sigma_rad": c.sigma_rad,
-            "chance": c.chance,
-            "chance_elsewhere": c.chance_elsewhere,
-            "reason": c.reason,
-        }
+        {"name": c.name, "checked": not c.reason} | {name: getattr(c, name) for name in _CHECKED}
         for c in cameras
     ]
     data: dict[str, Any] = plain({"cameras": rows})

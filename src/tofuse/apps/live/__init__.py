@@ -1,4 +1,8 @@
-"""."""
+"""Cameras that are connected: streams of frames, and their recording.
+
+A maker's camera is a device in `devices`, a part with options; opened it is a stream of frames that
+can be recorded as a native folder, or pushed into a `Mapper`.
+"""
 
 from typing import TYPE_CHECKING
 

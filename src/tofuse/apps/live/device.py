@@ -12,6 +12,9 @@ from dataclasses import dataclass
 from types import ModuleType, TracebackType
 from typing import Any, ClassVar, Protocol, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import AmplitudeKind, DepthKind, RangeFrame
@@ -76,6 +79,20 @@ class Stream(ABC):
     @abstractmethod
     def close(self) -> None:
         """Stop the camera."""
+
+    def frame(
+        self, index: int, seconds: float, counts: NDArray[Any], infrared: NDArray[Any] | None
+    ) -> RangeFrame:
+        """Return a frame of z depths in counts, and of the infrared image if there is one."""
+        return RangeFrame(
+            index,
+            seconds,
+            self.settings.camera,
+            counts.astype(np.float32) * np.float32(self.settings.depth_unit_m),
+            "z",
+            None if infrared is None else infrared.astype(np.float32),
+            amplitude_kind="ir",
+        )
 
     def __iter__(self) -> Iterator[RangeFrame]:
         """Yield frames endlessly, for example to push them into a `Mapper`."""

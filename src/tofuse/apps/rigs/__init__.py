@@ -1,4 +1,8 @@
-"""."""
+"""Several cameras fixed to each other: where they are, whether one was moved, and their model.
+
+Static cameras are placed by their common surfaces, moving ones by their trajectories; all views are
+then refined jointly. A calibrated rig is reconstructed with one pose per instant.
+"""
 
 from typing import TYPE_CHECKING
 

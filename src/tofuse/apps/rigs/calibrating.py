@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -155,6 +155,16 @@ def moves(cameras: Sequence[Camera], motion: Motion) -> bool:
     return not all(static)
 
 
+def disagreement_rows(
+    names: Sequence[str], distances: Mapping[tuple[int, int], tuple[float, int]]
+) -> tuple[Disagreement, ...]:
+    """Return the distances between the surfaces of pairs of cameras with their names, in order."""
+    return tuple(
+        Disagreement(names[a], names[b], median, pixels)
+        for (a, b), (median, pixels) in sorted(distances.items())
+    )
+
+
 def _from_static(
     cameras: Sequence[Camera], paths: Sequence[str | Path], estimate: StaticRig
 ) -> Calibration:
@@ -172,10 +182,7 @@ def _from_static(
         )
         for k, c in enumerate(estimate.cameras)
     )
-    pairs = tuple(
-        Disagreement(names[estimate.cameras[a]], names[estimate.cameras[b]], median, pixels)
-        for (a, b), (median, pixels) in refined.disagreement.items()
-    )
+    pairs = disagreement_rows([names[c] for c in estimate.cameras], refined.disagreement)
     unplaced = {names[c]: reason for c, reason in sorted(estimate.placement.reasons.items())}
     how = "one instant" if estimate.instants == 1 else f"{estimate.instants} instants"
     return Calibration(Rig(rows, pairs, unplaced), how, estimate.notes)
@@ -190,9 +197,6 @@ def _from_moving(
         RigCamera(names[k], str(paths[k]), fit.T_a_b, fit.covariance, fit.time_offset_s)
         for k, fit in sorted(estimate.fits.items())
     ]
-    pairs = tuple(
-        Disagreement(names[a], names[b], median, pixels)
-        for (a, b), (median, pixels) in estimate.disagreement.items()
-    )
+    pairs = disagreement_rows(names, estimate.disagreement)
     unplaced = {names[k]: reason for k, reason in sorted(estimate.reasons.items())}
     return Calibration(Rig(tuple(rows), pairs, unplaced), "a walk", estimate.notes)

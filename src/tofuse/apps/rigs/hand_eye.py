@@ -86,10 +86,6 @@ class HandEye:
         (4, 4) from b's world to a's.
     time_offset_s, time_sigma_s
         To be added to b's timestamps.
-    poses
-        Number of common poses.
-    sigma
-        (6,) robust standard deviation of the residuals, m and rad.
     """
 
     T_a_b: Float64
@@ -97,8 +93,6 @@ class HandEye:
     T_world_other: Float64
     time_offset_s: float
     time_sigma_s: float
-    poses: int
-    sigma: Float64
 
 
 def clock_of(a: Track, b: Track) -> Lag | None:
@@ -227,10 +221,8 @@ class _Fit:
         sigma = _sigma(e)
         C = _covariance(J, e, times, sigma)
         units = np.outer(projective.UNITS, projective.UNITS)
-        return HandEye(
-            X, C[:6, :6] * units, Y, offset, float(np.sqrt(C[-1, -1])) * _TIME_UNIT, len(e),
-            sigma * projective.UNITS,
-        )  # fmt: skip
+        time_sigma_s = float(np.sqrt(C[-1, -1])) * _TIME_UNIT
+        return HandEye(X, C[:6, :6] * units, Y, offset, time_sigma_s)
 
     def linearised(self, X: Float64, Y: Float64, offset: float) -> tuple[Float64, Float64, Float64]:
         """Return derivatives (N, 6, 13) or (N, 6, 7), residuals (N, 6) in units, and times."""

@@ -53,8 +53,7 @@ class Camera:
 
     def image(self, k: int) -> RangeFrame | None:
         """Read image `k`; None if it can't be read, or is empty."""
-        frame = self.recording.image(k)
-        return frame if frame is not None and len(frame) else None
+        return measured_image(self.recording, k)
 
     def every_image(self) -> Iterator[RangeFrame]:
         """Read all images that can be read."""
@@ -73,6 +72,12 @@ class Camera:
     def surface(self, frame: RangeFrame) -> PreparedView:
         """Return an image prepared for comparison."""
         return prepare_view(self.corrected(frame), SurfaceOptions())
+
+
+def measured_image(recording: Recording, k: int) -> RangeFrame | None:
+    """Read image `k` of a recording; None if it can't be read, or is empty."""
+    frame = recording.image(k)
+    return frame if frame is not None and len(frame) else None
 
 
 def open_cameras(paths: Sequence[str | Path], format: str | None = None) -> list[Camera]:  # noqa: A002

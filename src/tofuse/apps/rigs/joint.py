@@ -102,8 +102,6 @@ class JointPoses:
         (K, 7, 7) marginal covariances of the right perturbation of the pose, and of the offset.
     random_covariance
         (K, 7, 7) the part of it due to random errors: systematic ones recur in the same scene.
-    rms_m
-        Robust root mean square distance between surfaces.
     disagreement
         By pair of cameras (a, b), a < b: median distance between their surfaces in m, and number of
         compared pixels.
@@ -113,13 +111,10 @@ class JointPoses:
     offsets: Float64
     covariance: Float64
     random_covariance: Float64
-    rms_m: float
     disagreement: dict[tuple[int, int], tuple[float, int]] = field(default_factory=dict)
 
 
-def refine_together(
-    views: Sequence[RigView], poses: Float64, options: JointOptions | None = None
-) -> JointPoses:
+def refine_together(views: Sequence[RigView], poses: Float64) -> JointPoses:
     """Optimise the poses and depth offsets of all cameras jointly.
 
     Parameters
@@ -128,10 +123,8 @@ def refine_together(
         Views of all cameras.
     poses
         (K, 4, 4) initial T_rig_camera; the first is fixed.
-    options
-        Options of the refinement.
     """
-    return _optimised(views, poses, options or JointOptions()).placed()
+    return _optimised(views, poses, JointOptions()).placed()
 
 
 def refined_poses(
@@ -174,20 +167,34 @@ def distances_between(
     target: SampledView, source: SampledView, T_target_source: Float64
 ) -> Float64:
     """Return the (N,) distances in m between the surfaces visible in both views."""
+    limit_m = _MAX_DISTANCE * target.depth
+    rows = _residual_rows(target, source, T_target_source, (0.0, 0.0), JointOptions(), limit_m)
+    return np.abs(rows[:, kernels.RESIDUAL])
+
+
+def _residual_rows(
+    target: SampledView,
+    source: SampledView,
+    T_target_source: Float64,
+    offsets: tuple[float, float],
+    options: JointOptions,
+    limit_m: float,
+) -> Float64:
+    """Return the residual rows of corresponding points: larger distances are of other surfaces.
+
+    `offsets` are those of the source and of the target.
+    """
     rows = np.empty((len(source.points), kernels.ROW))
-    options = JointOptions()
     kernels.residuals(
         source.points,
         target.target_image,
         np.ascontiguousarray(T_target_source),
-        0.0,
-        0.0,
+        *offsets,
         float(np.cos(options.max_angle)),
         rows,
     )
-    distance = np.abs(rows[:, kernels.RESIDUAL])
-    valid = (rows[:, kernels.RESIDUAL_VARIANCE] > 0) & (distance < _MAX_DISTANCE * target.depth)
-    return np.asarray(distance[valid], np.float64)
+    near = np.abs(rows[:, kernels.RESIDUAL]) < limit_m
+    return np.asarray(rows[(rows[:, kernels.RESIDUAL_VARIANCE] > 0) & near], np.float64)
 
 
 def _optimised(views: Sequence[RigView], poses: Float64, options: JointOptions) -> _System:
@@ -219,29 +226,21 @@ class _System:
     def compare(self) -> list[Float64]:
         """Return the residual rows of each pair (target, source): close correspondences only."""
         rows: list[Float64] = [np.zeros((0, kernels.ROW))] * len(self.pairs)
-        cosine = float(np.cos(self.options.max_angle))
         inverse = se3.inverse(self.poses)
 
         def work(a: int, b: int) -> None:
             for k in range(a, b):
                 target, source = (self.views[i] for i in self.pairs[k])
-                points = source.sampled.points
-                out = np.empty((len(points), kernels.ROW))
-                kernels.residuals(
-                    points,
-                    target.sampled.target_image,
-                    np.ascontiguousarray(inverse[target.camera] @ self.poses[source.camera]),
-                    self.offsets[source.camera],
-                    self.offsets[target.camera],
-                    cosine,
-                    out,
+                compared = _residual_rows(
+                    target.sampled,
+                    source.sampled,
+                    inverse[target.camera] @ self.poses[source.camera],
+                    (self.offsets[source.camera], self.offsets[target.camera]),
+                    self.options,
+                    _MAX_DISTANCE * self.depth,
                 )
-                # Larger distances are between different surfaces.
-                valid = (out[:, kernels.RESIDUAL_VARIANCE] > 0) & (
-                    np.abs(out[:, kernels.RESIDUAL]) < _MAX_DISTANCE * self.depth
-                )
-                if valid.sum() >= self.options.overlap * len(points):
-                    rows[k] = out[valid]
+                if len(compared) >= self.options.overlap * len(source.sampled.points):
+                    rows[k] = compared
 
         run_chunks(work, len(self.pairs), -(-len(self.pairs) // _PAIRS_PER_CHUNK))
         return rows
@@ -344,7 +343,6 @@ class _System:
         noise = np.zeros((size, size))
         regions, gradients = [], []
         responses = np.zeros((count, shared_error.PATCHES, size))
-        squares = weight = 0.0
         for k, row in enumerate(rows):
             if not len(row):
                 continue
@@ -366,8 +364,6 @@ class _System:
             regions.append(region)
             gradients.append(summed)
             self._add_responses(responses, k, row, J * w[:, None])
-            squares += float((w * r * r).sum())
-            weight += float(w.sum())
         random = systematic = np.full((size - _SIZE, size - _SIZE), np.nan)
         if regions:
             free = slice(_SIZE, None)
@@ -382,13 +378,11 @@ class _System:
             )
             random = bread @ B @ bread + unconstrained
             systematic = bread @ self._systematic(responses[:, :, free]) @ bread
-        rms = float(np.sqrt(squares / weight)) if weight else float("nan")
         return JointPoses(
             self.poses,
             self.offsets,
             self._marginals(random + systematic),
             self._marginals(random),
-            rms,
             self.disagreement(rows),
         )
 

@@ -21,7 +21,6 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import Priors, joint_alignment, propagate_poses, refined_by_halves
-from tofuse.engine.results import Reconstruction
 from tofuse.engine.stored_views import SampledView, pair_equations
 
 # Number of views of each camera that are refined jointly, and of their points.
@@ -39,10 +38,6 @@ class MovingRig:
 
     Attributes
     ----------
-    results
-        The separate reconstruction of each camera.
-    tracks
-        Trajectories by camera, in one world frame; those of cameras not placed are in their own.
     fits
         Calibration of each camera but the first relative to the first, by camera.
     reasons
@@ -54,8 +49,6 @@ class MovingRig:
         Messages for the user.
     """
 
-    results: tuple[Reconstruction, ...]
-    tracks: dict[int, Track]
     fits: dict[int, HandEye]
     reasons: dict[int, str]
     disagreement: dict[tuple[int, int], tuple[float, int]]
@@ -70,11 +63,10 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig
     InputError
         If the first camera has no trajectory.
     """
-    results, tracks = [], []
+    tracks = []
     for camera in cameras:
         progress.stage(f"tracking {camera.name}")
         result = reconstructing.reconstruct(camera.recording, progress=Silent())
-        results.append(result)
         tracks.append(Track.of(result.timestamps, result.trajectory))
     if len(tracks[0].times) < 2:
         raise InputError(
@@ -110,8 +102,6 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig
             del fits[k]
     placed = {0, *fits}
     return MovingRig(
-        tuple(results),
-        {k: refined.get(k, tracks[k]) for k in range(len(cameras))},
         fits,
         reasons,
         {ends: distance for ends, distance in joint.disagreement().items() if set(ends) <= placed},
@@ -180,15 +170,9 @@ class _CameraViews:
 class _JointViews:
     """Views of all cameras in the world of the first one."""
 
-    def __init__(
-        self,
-        tracks: dict[int, Track],
-        camera_views: dict[int, _CameraViews],
-        fits: dict[int, HandEye],
-    ) -> None:
+    def __init__(self, tracks: dict[int, Track], camera_views: dict[int, _CameraViews]) -> None:
         self.tracks, self._views = tracks, camera_views
         self.improved = False
-        self._fits = fits
         views = [v for k in sorted(camera_views) for v in camera_views[k].views]
         self.depth = float(np.median([v.depth for v in views])) if views else 1.0
         self._halves: list[tuple[dict[int, Track], ...]] = []
@@ -213,7 +197,7 @@ class _JointViews:
                     rows.append(p)
                     sampled.append(SampledView.of(cameras[k].surface(frame), _POINTS))
             camera_views[k] = _CameraViews(np.array(rows, np.intp), tuple(sampled))
-        return cls(world, camera_views, fits)
+        return cls(world, camera_views)
 
     def refined(self) -> dict[int, Track]:
         """Return the tracks in one world, after a joint refinement if that improved them."""

@@ -63,14 +63,11 @@ class Placement:
     ----------
     poses
         T_first_camera (4, 4) by camera; the identity for the first one.
-    probability
-        Probability that the pose is correct, by camera except the first, placed or not.
     reasons
         Why a camera is not placed, by camera.
     """
 
     poses: dict[int, Float64]
-    probability: dict[int, float]
     reasons: dict[int, str]
 
 
@@ -262,7 +259,6 @@ class _Placer:
     def placement(self) -> Placement:
         """Search hypotheses, and keep the unambiguous poses of the best one."""
         hypotheses = [_Hypothesis({0: np.eye(4)}, 0.0)] if 0 in self._depth else []
-        probability: dict[int, float] = {}
         reasons: dict[int, str] = {}
         rivals: list[_Hypothesis] = hypotheses
         while hypotheses:
@@ -271,7 +267,6 @@ class _Placer:
         poses = dict(best.poses)
         while len(poses) > 1:
             assessments = {c: self._pose_probability(poses, c, rivals) for c in poses if c}
-            probability.update({c: belief for c, (belief, _) in assessments.items()})
             weakest = min(assessments, key=lambda c: assessments[c][0])
             if not assessments[weakest][1]:
                 break
@@ -280,7 +275,7 @@ class _Placer:
         for c in range(len(self._views)):
             if c not in poses and c not in reasons:
                 reasons[c] = "no other camera sees the same"
-        return Placement(poses, probability, reasons)
+        return Placement(poses, reasons)
 
     def _rivals(
         self, poses: Mapping[int, Float64], camera: int, candidates: Sequence[tuple[float, Float64]]

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.apps.rigs.hand_eye import Track, median_pose
-from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.inputs import Camera, measured_image
 from tofuse.apps.rigs.joint import disagreements_of
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import RangeFrame, Recording
+from tofuse.engine.frames import Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured
 from tofuse.engine.mapping import reconstructing
@@ -227,7 +227,7 @@ def refined(
     selected = _spaced_instants(cameras, recording, poses, instant)
     views, frames = [], []
     for frame in np.flatnonzero(np.isin(instant, selected)):
-        image = _image(recording, int(frame))
+        image = measured_image(recording, int(frame))
         if image is not None:
             camera = cameras[int(source.camera[recording.indices[frame]])]
             views.append(SampledView.of(camera.surface(image), _POINTS))
@@ -262,7 +262,7 @@ def _spaced_instants(
 ) -> Intp:
     """Return instants spaced by the motion of the rig, at most as many as can be refined."""
     posed = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
-    frame = _image(recording, int(np.flatnonzero(instant == posed[0])[0]))
+    frame = measured_image(recording, int(np.flatnonzero(instant == posed[0])[0]))
     depth = 1.0
     if frame is not None:
         depth = float(np.median(frame.z[frame.valid]))
@@ -278,12 +278,6 @@ def _spaced_instants(
         if len(selected) <= max_instants:
             return np.array(selected, np.intp)
         stretch *= 2
-
-
-def _image(recording: Recording, k: int) -> RangeFrame | None:
-    """Return image `k` of the recording; None if it can't be read, or is empty."""
-    frame = recording.image(k)
-    return frame if frame is not None and len(frame) else None
 
 
 def _weighted_means(rig_estimates: Sequence[_RigEstimate]) -> Float64:

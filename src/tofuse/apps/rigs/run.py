@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.apps.jobs import Options, resolve
 from tofuse.apps.results import OutputFolder, write_result
-from tofuse.apps.rigs.calibrating import Motion, cameras_of, moves
+from tofuse.apps.rigs.calibrating import cameras_of, disagreement_rows, moves
 from tofuse.apps.rigs.checking import CameraMotion, compare
 from tofuse.apps.rigs.inputs import Camera
 from tofuse.apps.rigs.joint import RigView, disagreements, refine_together
@@ -119,7 +119,6 @@ def reconstruct_rig(
     recording: Recording,
     config: Config,
     *,
-    motion: Motion = "auto",
     seed: int = 0,
     progress: Progress | None = None,
 ) -> RigResult:
@@ -133,8 +132,6 @@ def reconstruct_rig(
         Of a `RigSource`.
     config, seed
         As in `reconstruct`.
-    motion
-        Whether the rig moves; "auto" detects it.
     """
     progress = progress or Silent()
     source = recording.source
@@ -146,13 +143,10 @@ def reconstruct_rig(
     displaced: list[CameraMotion] = []
     measured: tuple[Measured, ...] = ()
     tracked: tuple[Measured, ...] = ()
-    if moves(cameras, motion):
+    if moves(cameras, "auto"):
         trajectory = track_rig(cameras, recording, progress)
-        poses, T_rig_frame, distances = (
-            trajectory.poses,
-            trajectory.T_rig_frame,
-            trajectory.disagreement,
-        )
+        poses, T_rig_frame = trajectory.poses, trajectory.T_rig_frame
+        distances = trajectory.disagreement
         measured, tracked = trajectory.measured, trajectory.tracked
     else:
         displaced, distances = _check_calibration(rig, cameras, recording)
@@ -186,13 +180,8 @@ def reconstruct_rig(
         config=fusion_config.to_dict(),
         recording={**result.recording, "rig": rig_fields},
     )
-    pairs = tuple(
-        Disagreement(names[a], names[b], median, pixels)
-        for (a, b), (median, pixels) in sorted(distances.items())
-    )
-    return RigResult(
-        _with_rig_reason(result, displaced), times, poses, replace(rig, disagreement=pairs)
-    )
+    measured_rig = replace(rig, disagreement=disagreement_rows(names, distances))
+    return RigResult(_with_rig_reason(result, displaced), times, poses, measured_rig)
 
 
 def _calibration_edges(

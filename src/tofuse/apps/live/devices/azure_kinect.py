@@ -88,15 +88,7 @@ class AzureKinectStream(Stream):
     def read(self, index: int) -> RangeFrame:
         """See `Stream.read`."""
         capture = self._capture()
-        return RangeFrame(
-            index,
-            capture.depth_timestamp_usec / 1e6,
-            self.settings.camera,
-            capture.depth.astype(np.float32) * np.float32(self.settings.depth_unit_m),
-            "z",
-            None if capture.ir is None else capture.ir.astype(np.float32),
-            amplitude_kind="ir",
-        )
+        return self.frame(index, capture.depth_timestamp_usec / 1e6, capture.depth, capture.ir)
 
     def close(self) -> None:
         """See `Stream.close`."""

@@ -79,15 +79,7 @@ class OrbbecStream(Stream):
                 if infrared is None
                 else _image(infrared)
             )
-        return RangeFrame(
-            index,
-            depth.get_timestamp() / 1000.0,
-            self.settings.camera,
-            _image(depth) * np.float32(self.settings.depth_unit_m),
-            "z",
-            amplitude,
-            amplitude_kind="ir",
-        )
+        return self.frame(index, depth.get_timestamp() / 1000.0, _image(depth), amplitude)
 
     def close(self) -> None:
         """See `Stream.close`."""

@@ -80,19 +80,11 @@ class RealSenseStream(Stream):
         except RuntimeError as error:
             raise no_frame(self.settings.sensor) from error
         depth = frames.get_depth_frame()
-        counts = np.asanyarray(depth.get_data()).astype(np.float32)
         amplitude = None
         if self._infrared:
-            amplitude = np.asanyarray(frames.get_infrared_frame().get_data()).astype(np.float32)
-        return RangeFrame(
-            index,
-            depth.get_timestamp() / 1000.0,
-            self.settings.camera,
-            counts * np.float32(self.settings.depth_unit_m),
-            "z",
-            amplitude,
-            amplitude_kind="ir",
-        )
+            amplitude = np.asanyarray(frames.get_infrared_frame().get_data())
+        counts = np.asanyarray(depth.get_data())
+        return self.frame(index, depth.get_timestamp() / 1000.0, counts, amplitude)
 
     def close(self) -> None:
         """See `Stream.close`."""

@@ -1,0 +1,808 @@
+"""The commands and their options, from which the parser and its ``--help`` are made.
+
+A class is a command, and its docstring is its help page: the summary, remarks, options with the
+placeholders of their values, further groups of options, and the exit status. A field without a
+default is an argument, one with `REQUIRED` an option that can't be left out.
+
+Imports nothing heavy, so that ``--help`` is instant.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from tofuse.apps.cli.values import (
+    Count,
+    Depth,
+    Length,
+    Metres,
+    NonNegative,
+    Port,
+    Ratio,
+    Seconds,
+    Size,
+)
+
+REQUIRED: Any = ...
+_LAB = "tofuse.lab.commands"
+
+DemoScene = Literal["room", "empty-room", "rail", "torso", "box", "peaks"]
+DEMO_SCENES = get_args(DemoScene)
+
+
+class Command(argparse.Namespace):
+    """Base of the commands."""
+
+    home = "tofuse.apps.cli.commands"  # module of its function, imported when it runs
+    reconstructs = False  # whether kernels are compiled while it starts
+    exclusive: tuple[str, ...] = ()  # options of which only one may be given
+    subcommands: tuple[type["Command"], ...] = ()
+
+
+class Threads(Command):
+    """Parallelism.
+
+    Attributes
+    ----------
+    threads : N
+        threads (default: all cores)
+    """
+
+    threads: Count | None = None
+
+
+class Seed(Command):
+    """Randomness.
+
+    Attributes
+    ----------
+    seed : N
+        random seed (0)
+    """
+
+    seed: NonNegative | None = None
+
+
+class Json(Command):
+    """Machine-readable output.
+
+    Attributes
+    ----------
+    json
+        print the result as JSON
+    """
+
+    json: bool = False
+
+
+class JsonLines(Command):
+    """Machine-readable output while it is made.
+
+    Attributes
+    ----------
+    json
+        progress and result as JSON lines
+    """
+
+    json: bool = False
+
+
+class Source(Command):
+    """How recordings are opened.
+
+    Input
+    -----
+    format : F
+        input format, if not recognised
+    camera : FILE
+        use this camera.json instead of the recording's own
+    topic : T
+        topic of a ROS bag, if the default is wrong
+    """
+
+    format: str | None = None
+    camera: Path | None = None
+    topic: str | None = None
+
+
+class Selection(Source):
+    """Which frames are read.
+
+    Input
+    -----
+    start : I
+        first frame (0)
+    end : I
+        stop before this frame
+    every : N
+        use every N-th frame
+    """
+
+    start: int = 0
+    end: int | None = None
+    every: Count = 1
+
+
+class Page(Command):
+    """Where a page is shown.
+
+    Browser
+    -------
+    port : N
+        port (8080, or the next free one)
+    no_open
+        do not open the browser
+    """
+
+    port: Port | None = None
+    no_open: bool = False
+
+
+class Run(JsonLines, Seed, Threads, Page, Selection):
+    """Reconstruct a recording.
+
+    Attributes
+    ----------
+    inputs : INPUT
+        recordings, joined in this order
+    out : DIR
+        folder for the result
+    overwrite
+        replace an existing result in --out
+    into : RESULT
+        merge the recording into the map of an existing result, if they overlap
+    no_report
+        don't draw report.html, which takes up to half of a short run
+    texture
+        texture the surface, in mesh.glb and mesh.obj
+    faces : N
+        maximum number of triangles (default: all)
+    voxel : LENGTH
+        resolution of the model, e.g. 5mm (default: from the camera's resolution)
+    memory : SIZE
+        approximate memory limit, e.g. 4GB; the rest goes to disk (2GB)
+    rig : FILE
+        a rig.json; each INPUT is one of its cameras, in the same order
+
+    Reconstruction
+    --------------
+    method : NAME
+        default, thesis (default: default)
+    config : FILE
+        options from a .toml file, or from the run.json of an earlier result
+    guess
+        initial guess of each registration
+    prior
+        priors in addition to the images, as far as they agree: gravity and a phone's own poses
+        (auto, the default), none, or odometry as well (device)
+    loops : FILE
+        known loop closures, one `i j` per line
+    object
+        turntable mode: an object turns in front of a static camera
+    unwrap
+        unwrap phase beyond the camera's ambiguity range
+    tolerance : LENGTH
+        accuracy required of a "good" result, e.g. 30mm (0.5 % of the model, at least 10mm)
+
+    Browser
+    -------
+    view
+        show the reconstruction live, and then the result
+
+    Input
+    -----
+    average_still
+        average static segments into one frame each
+    min_depth : M
+        discard points closer than this
+    max_depth : M
+        discard points farther than this
+
+    Exit status
+    -----------
+    0  a result was written and every readable frame has a pose
+    3  a result was written, but some readable frame has no pose
+    2  nothing was written: one line on stderr states the reason
+    """
+
+    reconstructs = True
+
+    inputs: list[str]
+    out: Path = REQUIRED
+    overwrite: bool = False
+    into: Path | None = None
+    no_report: bool = False
+    texture: bool = False
+    faces: Count | None = None
+    voxel: Length | None = None
+    memory: Size | None = None
+    rig: Path | None = None
+    method: str | None = None
+    config: Path | None = None
+    guess: Literal["identity", "previous", "odometry"] | None = None
+    prior: Literal["auto", "none", "device"] = "auto"
+    loops: Path | None = None
+    object: bool = False
+    unwrap: bool = False
+    tolerance: Length | None = None
+    view: bool = False
+    average_still: bool = False
+    min_depth: Depth | None = None
+    max_depth: Depth | None = None
+
+
+class Batch(Command):
+    """Reconstruct many recordings, each as a separate job.
+
+    A list is a text file with one path or glob per line, or a table (.csv, .toml) with a column
+    `recording` and further columns for options of `tofuse run`; see docs/batch.md. Run the same
+    command again to resume.
+
+    Attributes
+    ----------
+    recordings : LIST
+        a list of recordings, a recording, or a glob
+    out : DIR
+        folder for the results
+    overwrite
+        replace results made with other options; up-to-date results are kept
+    json
+        jobs and outcome as JSON lines
+    only : NAME
+        run only this job; may be repeated
+    print_jobs
+        only print one command per job
+
+    Workers
+    -------
+    workers : N
+        parallel jobs on this machine (1)
+    scheduler : ADDRESS
+        Dask scheduler: tcp://HOST:8786, or its scheduler file
+    threads : N
+        threads per job (default: all cores shared by the jobs; on Dask: 1)
+    memory : SIZE
+        memory per job, e.g. 4GB (not limited)
+    retries : N
+        how often a job whose process was killed is restarted (3)
+
+    Exit status
+    -----------
+    0  every recording has a result, and every readable frame has a pose
+    3  some recording has no result, or some readable frame has no pose
+    2  there is no result: one line on stderr states the reason
+    """
+
+    home = "tofuse.apps.cli.batching"
+    exclusive = ("workers", "scheduler")
+
+    recordings: list[Path]
+    out: Path = REQUIRED
+    overwrite: bool = False
+    json: bool = False
+    only: list[str] | None = None
+    print_jobs: bool = False
+    workers: Count | None = None
+    scheduler: str | None = None
+    threads: Count | None = None
+    memory: Size | None = None
+    retries: NonNegative | None = None
+
+
+class Register(Json, Threads, Source):
+    """Register two files or frames.
+
+    A view is a file with a single view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: frame 12 of
+    a recording, counting from 0.
+
+    Attributes
+    ----------
+    source : SOURCE
+        the view to be transformed
+    target : TARGET
+        the view that stays fixed
+    guess : FILE
+        initial guess of T_target_source (none)
+    out : DIR
+        folder for the result (none)
+    overwrite
+        replace an existing one in --out
+
+    Exit status
+    -----------
+    0  the pose is accepted
+    3  the pose is rejected, or cannot be verified; it is still printed and written
+    2  nothing was written: one line on stderr states the reason
+    """
+
+    source: str
+    target: str
+    guess: Path | None = None
+    out: Path | None = None
+    overwrite: bool = False
+
+
+class Judge(Json, Threads, Selection):
+    """Assess poses from any source, without a reference.
+
+    Attributes
+    ----------
+    recording : RECORDING
+        range images
+    trajectory : TRAJECTORY
+        a trajectory in any supported format, a result, or a recording with poses
+    out : DIR
+        folder for the refined result (none)
+    overwrite
+        replace an existing result in --out
+    tolerance : LENGTH
+        accuracy required of good poses, e.g. 30mm (0.5 % of the model, at least 10mm)
+
+    Exit status
+    -----------
+    0  the poses were assessed
+    3  the depth images contradict the poses
+    2  nothing was assessed: one line on stderr states the reason
+    """
+
+    reconstructs = True
+
+    recording: str
+    trajectory: Path
+    out: Path | None = None
+    overwrite: bool = False
+    tolerance: Length | None = None
+
+
+class Merge(JsonLines, Seed, Threads):
+    """Merge the results of several recordings into one map.
+
+    A RESULT is the --out of `tofuse run` or `tofuse merge`; its recording must still be where it
+    was. The first result defines the world frame. What cannot be joined stays a separate component.
+
+    Attributes
+    ----------
+    results : RESULT
+        two or more results; the first one defines the world frame
+    out : DIR
+        folder for the map
+    overwrite
+        replace an existing result in --out
+    tolerance : LENGTH
+        accuracy required of a "good" map, e.g. 30mm (default: as the first result)
+    texture
+        texture the surface (default: as the first result)
+    faces : N
+        maximum number of triangles (default: as the first result)
+    voxel : LENGTH
+        resolution of the model, e.g. 5mm (default: as the first result)
+
+    Exit status
+    -----------
+    0  a result was written and every readable frame is in one map
+    3  a result was written, but a session or a frame could not be joined
+    2  nothing was written: one line on stderr states the reason
+    """
+
+    reconstructs = True
+
+    results: list[Path]
+    out: Path = REQUIRED
+    overwrite: bool = False
+    tolerance: Length | None = None
+    texture: bool = False
+    faces: Count | None = None
+    voxel: Length | None = None
+
+
+class RigOptions(Json, Threads):
+    """Options of the commands of rigs.
+
+    Attributes
+    ----------
+    motion
+        whether the cameras are static (default: detected from the images)
+    format : F
+        input format, if not recognised
+    """
+
+    motion: Literal["auto", "still", "moving"] = "auto"
+    format: str | None = None
+
+
+class RigCalibrate(RigOptions):
+    """Estimate the extrinsics of a rig.
+
+    Pass one recording per camera, taken at the same time: a single image each, images of a
+    scene in which something moves, or a walk with the rig. The first camera defines the rig
+    frame.
+
+    Attributes
+    ----------
+    inputs : RECORDING
+        one per camera
+    out : FILE
+        the rig.json to write
+    overwrite
+        replace an existing FILE
+
+    Exit status
+    -----------
+    0  the pose of every camera was found
+    3  the file was written, but the pose of some camera could not be found
+    2  nothing was written: one line on stderr states the reason
+    """
+
+    inputs: list[str]
+    out: Path = REQUIRED
+    overwrite: bool = False
+
+
+class RigCheck(RigOptions):
+    """Check whether a camera has moved since the rig was calibrated.
+
+    Attributes
+    ----------
+    rig : RIG
+        a rig.json
+    inputs : RECORDING
+        new recordings of its cameras, in the same order
+
+    Exit status
+    -----------
+    0  no camera has moved
+    3  some camera has moved, or cannot be checked
+    2  nothing could be checked: one line on stderr states the reason
+    """
+
+    rig: Path
+    inputs: list[str]
+
+
+class Rig(Command):
+    """Calibrate or check a rig of several cameras.
+
+    A rig is several rigidly mounted depth cameras.
+    """
+
+    subcommands = (RigCalibrate, RigCheck)
+
+
+class Demo(JsonLines, Seed, Threads):
+    """Simulate a recording and reconstruct it.
+
+    The recording is left in DIR/recording, the result in DIR.
+
+    Attributes
+    ----------
+    scene
+        what to simulate (room)
+    failure
+        simulate a recording that can't be reconstructed, 1.5 m along a bare corridor: report.html
+        shows how the failure is detected and explained
+    out : DIR
+        output folder (tofuse-demo)
+    overwrite
+        replace an existing demo in DIR
+    method : NAME
+        default, thesis (default: default)
+
+    Exit status
+    -----------
+    0  a result was written and every readable frame has a pose
+    3  a result was written, but some readable frame has no pose
+    2  nothing was written: one line on stderr states the reason
+    """
+
+    home = _LAB
+    reconstructs = True
+    exclusive = ("scene", "failure")
+
+    scene: DemoScene = "room"
+    failure: bool = False
+    out: Path = Path("tofuse-demo")
+    overwrite: bool = False
+    method: str | None = None
+
+
+class Simulate(Seed, Threads):
+    """Simulate a recording.
+
+    Attributes
+    ----------
+    scene : SCENE
+        room, empty-room, rail, torso, box, peaks
+    out : DIR
+        output folder
+    camera : NAME
+        camera model (sr4000)
+    every : N
+        stride (default: the thesis's)
+    frames : N
+        stop after this many frames
+    first : K
+        first raw frame (0)
+    uniform
+        uniform albedo, no texture
+    with_person : RATIO
+        a person walks through the view, covering this fraction of it, 0 to 1
+    with_box : RATIO
+        a box slides through the view, covering this fraction of it, 0 to 1
+    without : EFFECTS
+        sensor errors to disable, separated by commas, or `all`
+    no_correction
+        omit the factory depth correction
+    imu
+        simulate an accelerometer as well
+    sigma : M
+        noise of the `peaks` scene (0.05)
+    """
+
+    home = _LAB
+    exclusive = ("with_person", "with_box")
+
+    scene: str
+    out: Path = REQUIRED
+    camera: str = "sr4000"
+    every: Count | None = None
+    frames: Count | None = None
+    first: NonNegative | None = None
+    uniform: bool = False
+    with_person: Ratio | None = None
+    with_box: Ratio | None = None
+    without: str = ""
+    no_correction: bool = False
+    imu: bool = False
+    sigma: Metres | None = None
+
+
+class Inspect(Json, Source):
+    """Show a recording's properties and check it for faults.
+
+    Attributes
+    ----------
+    inputs : INPUT
+        recordings, joined in this order
+    sheet : PNG
+        write a contact sheet of the frames
+    object
+        an object turns in front of a static camera
+    quick
+        only the checks that `tofuse run` makes first
+    """
+
+    inputs: list[str]
+    sheet: Path | None = None
+    object: bool = False
+    quick: bool = False
+
+
+class Convert(Selection):
+    """Write any recording as a native, TUM or Open3D folder.
+
+    Attributes
+    ----------
+    inputs : INPUT
+        recordings, joined in this order
+    out : DIR
+        a new folder
+    to
+        layout of the folder (native; the others cannot store everything)
+    """
+
+    inputs: list[str]
+    out: Path = REQUIRED
+    to: Literal["native", "tum", "open3d"] = "native"
+
+
+class Record(Command):
+    """Record from a connected camera.
+
+    Attributes
+    ----------
+    device : CAMERA
+        camera name; omit to list available cameras
+    out : DIR
+        a new folder for the recording
+    seconds : S
+        stop after this time
+    frames : N
+        stop after this many frames
+    set : NAME=VALUE
+        camera option, e.g. serial=1234; may be repeated
+    """
+
+    device: str | None
+    out: Path | None = None
+    seconds: Seconds | None = None
+    frames: Count | None = None
+    set: list[str] | None = None
+
+
+class Calibrate(Json, Seed, Selection):
+    """Estimate intrinsics or depth errors of a camera, or import intrinsics.
+
+    lens: from views of a checkerboard, writes a camera.json.
+    depth: from views of planes, writes a correction.npz.
+    import: from a file of OpenCV or of ROS (YAML), writes a camera.json.
+
+    Attributes
+    ----------
+    subject
+        what to calibrate
+    inputs : INPUT
+        recordings; import: one file
+    out : FILE
+        write the result
+    overwrite
+        replace an existing FILE
+
+    Lens and depth
+    --------------
+    board : CxR:M
+        inner corners and square size in metres, e.g. 8x6:0.1
+    image
+        image in which to detect the board (amplitude)
+
+    Depth
+    -----
+    wall
+        the board is flat on a wall; use the whole wall
+    planes : N
+        without --board: maximum planes per view (4)
+
+    Lens
+    ----
+    model
+        distortion model (brown)
+
+    Import
+    ------
+    recording : REC
+        take depth unit and kind from this recording
+    """
+
+    subject: Literal["lens", "depth", "import"]
+    inputs: list[str]
+    out: Path | None = None
+    overwrite: bool = False
+    board: str | None = None
+    image: Literal["amplitude", "color"] = "amplitude"
+    wall: bool = False
+    planes: Count = 4
+    model: Literal["pinhole", "brown", "rational", "fisheye"] = "brown"
+    recording: str | None = None
+
+
+class Noise(Json, Source):
+    """Estimate a camera's noise from a static recording.
+
+    Attributes
+    ----------
+    inputs : INPUT
+        recordings, joined in this order
+    out : FILE
+        write the noise model, e.g. noise.json
+    overwrite
+        replace an existing FILE
+    name : NAME
+        name of the camera
+    """
+
+    inputs: list[str]
+    out: Path | None = None
+    overwrite: bool = False
+    name: str | None = None
+
+
+class Evaluate(Json):
+    """Compare a trajectory with a reference.
+
+    Attributes
+    ----------
+    estimate : ESTIMATE
+        a trajectory or a result
+    reference : REFERENCE
+        a trajectory, or a recording that comes with reference poses
+    recording : REC
+        also measure the map consistency of its images
+    reference_error : LENGTH
+        rms error of the reference itself, e.g. 20mm; prints an interval for the ATE
+    """
+
+    estimate: Path
+    reference: Path
+    recording: Path | None = None
+    reference_error: Length | None = None
+
+
+class Optimize(Command):
+    """Optimise a pose graph.
+
+    Attributes
+    ----------
+    input : IN.g2o
+        the pose graph
+    out : OUT.g2o
+        the optimised pose graph
+    optimiser : NAME
+        levenberg-marquardt (the default), castellani, lu-milios, elch or stochastic
+    overwrite
+        replace an existing OUT.g2o
+    """
+
+    input: Path
+    out: Path = REQUIRED
+    optimiser: str | None = None
+    overwrite: bool = False
+
+
+class Export(Command):
+    """Write a result in other formats.
+
+    Attributes
+    ----------
+    result : DIR
+        a result: the --out of `tofuse run`
+    formats : FORMAT
+        pcd, las, laz, e57, glb, gltf, obj, stl, kitti, log, nerfstudio, colmap
+    out : DIR
+        folder for the files (default: that of the result)
+    faces : N
+        maximum number of triangles (60000; STL: all)
+    every : N
+        every N-th image (nerfstudio, colmap)
+    pinhole
+        images without distortion (nerfstudio, colmap)
+    overwrite
+        replace existing files
+    """
+
+    result: Path
+    formats: list[str]
+    out: Path | None = None
+    faces: Count | None = None
+    every: Count = 1
+    pinhole: bool = False
+    overwrite: bool = False
+
+
+class Experiments(Seed, Threads):
+    """Reproduce the experiments of the 2010 thesis.
+
+    Attributes
+    ----------
+    out : DIR
+        folder for the report
+    overwrite
+        replace existing experiments in DIR
+    cases : NAMES
+        run only these, separated by commas
+    seeds : N
+        noise seeds (20)
+    """
+
+    home = _LAB
+
+    out: Path = REQUIRED
+    overwrite: bool = False
+    cases: str = ""
+    seeds: Count = 20
+
+
+class View(Page):
+    """Show a result in the browser.
+
+    Attributes
+    ----------
+    result : DIR
+        a result: the --out of `tofuse run`
+    """
+
+    result: Path
+
+
+COMMANDS: tuple[type[Command], ...] = (
+    *(Run, Batch, Register, Judge, Merge, Rig, Demo, Simulate, Inspect, Convert, Record),
+    *(Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
+)

@@ -1,0 +1,82 @@
+"""Values of options as they are written at the command line; ArgumentTypeError for others."""
+
+import argparse
+import math
+import re
+from collections.abc import Callable
+from typing import Annotated, Any
+
+from tofuse.engine.bounds import Bounds
+
+_UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+
+
+def reader(kind: type, extra: object) -> Callable[[str], Any]:
+    """Return the function that reads a value of an annotated type.
+
+    Parameters
+    ----------
+    kind
+        The type.
+    extra
+        What else is declared: the bounds of a number, a function that reads the value, or None.
+    """
+    if isinstance(extra, Bounds):
+        return lambda text: _within(extra, _number(text, kind), text)
+    if callable(extra):
+        return extra
+    return (lambda text: _number(text, kind)) if kind in (int, float) else kind
+
+
+def _number(text: str, kind: type) -> Any:
+    """Read a number; NaN if the text is none, an error if it should be whole."""
+    try:
+        return kind(text)
+    except ValueError as error:
+        if kind is float:
+            return math.nan
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from error
+
+
+def _within(bounds: Bounds, value: Any, text: str) -> Any:
+    if value not in bounds:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {bounds}")
+    return value
+
+
+def _depth(text: str) -> float:
+    """Read a length of 0 or more in m, given as 30mm, 3cm, 0.03m or 0.03."""
+    match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*(mm|cm|m)?\s*", text)
+    value = _number(match[1], float) * _UNITS_M[match[2] or "m"] if match else math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length, such as 30mm or 0.03")
+    return value
+
+
+def _length(text: str) -> float:
+    """Read a positive length."""
+    value = _depth(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length, such as 30mm or 0.03")
+    return value
+
+
+def _size(text: str) -> int:
+    """Read an amount of memory in bytes, given as 4GB or 2GiB."""
+    from tofuse.apps.batch import parse_bytes
+
+    try:
+        return parse_bytes(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+Count = Annotated[int, Bounds(1)]
+NonNegative = Annotated[int, Bounds(0)]
+Port = Annotated[int, Bounds(1, 65535)]
+Ratio = Annotated[float, Bounds(0, 1, exclusive=True)]
+Seconds = Annotated[float, Bounds(0, exclusive=True)]
+Metres = Annotated[float, Bounds(0)]
+Depth = Annotated[float, _depth]
+Length = Annotated[float, _length]
+Size = Annotated[int, _size]
