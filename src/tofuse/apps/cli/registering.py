@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from tofuse.apps.report import lines
-from tofuse.apps.results import PairResult
+from tofuse.apps.pairs import PairResult, lines
 
 _NAME_WIDTH = 14  # width of the column of names
 

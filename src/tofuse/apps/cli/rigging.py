@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from tofuse.apps.results import plain
+from tofuse.apps.results import run_json
 from tofuse.apps.rigs import Calibration, CameraMotion
 from tofuse.engine.geometry import se3
 from tofuse.formats.recordings import Rig
@@ -99,7 +99,7 @@ def check_json(cameras: Sequence[CameraMotion]) -> dict[str, Any]:
         }
         for c in cameras
     ]
-    data: dict[str, Any] = plain({"cameras": rows})
+    data: dict[str, Any] = run_json.plain({"cameras": rows})
     return data
 
 

@@ -12,18 +12,7 @@ import numpy as np
 
 from tofuse.apps.export.colmap import write_colmap
 from tofuse.apps.export.nerfstudio import write_nerfstudio
-from tofuse.apps.results import (
-    RESULT,
-    claimed,
-    finish_interrupted,
-    is_result,
-    read_cloud,
-    read_mesh,
-    read_run_json,
-    result_folder,
-    rotation_up_world,
-    run_json_checked,
-)
+from tofuse.apps.results import folders, read_cloud, read_mesh, run_json
 from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion import GeometryRecord, Mesh, texture
@@ -78,7 +67,7 @@ class _Result:
     def R_up_world(self) -> Float64:
         """The rotation (3, 3) that makes the mesh upright."""
         path = self.folder / "run.json"
-        return rotation_up_world(read_run_json(path), path)
+        return run_json.rotation_up_world(run_json.read_run_json(path), path)
 
     @cached_property
     def textured(self) -> GeometryRecord:
@@ -102,8 +91,8 @@ class _Result:
     def frame_numbers(self) -> Intp:
         """(N,) frame index of each pose."""
         path = self.folder / "run.json"
-        run = read_run_json(path)
-        with run_json_checked(path):
+        run = run_json.read_run_json(path)
+        with run_json.run_json_checked(path):
             index = np.array([frame["index"] for frame in run["frames"]], np.intp)
             times = np.array([frame["timestamp"] for frame in run["frames"]], float)
         return index[associate(self.trajectory[0], times, limit=1e-6)]
@@ -151,7 +140,7 @@ def _folder(path: Path) -> Iterator[Path]:
     """Yield a new folder that then replaces an earlier export in its place."""
 
     def check(folder: Path) -> None:
-        if unexpected := RESULT.foreign(folder, f"{path.name}/"):
+        if unexpected := folders.RESULT.foreign(folder, f"{path.name}/"):
             raise OutputError(
                 f"contains {unexpected}, which is not part of an export",
                 where=path,
@@ -227,8 +216,8 @@ def export(
         If a file exists already, or can't be written, or another process writes into the folder.
     """
     folder = Path(folder)
-    finish_interrupted(result_folder(folder))
-    if not is_result(folder):
+    folders.finish_interrupted(folders.result_folder(folder))
+    if not folders.is_result(folder):
         raise InputError("is not a result", where=folder, remedy="pass the --out of `tofuse run`")
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
@@ -239,7 +228,7 @@ def export(
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
     make_folder(target)
-    with claimed(target), _unchanged(folder):
+    with folders.claimed(target), _unchanged(folder):
         for path in files.values():
             if path.exists() and not overwrite:
                 raise OutputError(
@@ -258,9 +247,9 @@ def _unchanged(folder: Path) -> Iterator[None]:
 
     The result itself is not locked: it may be read-only.
     """
-    before = stamp(folder / RESULT.marker)
+    before = stamp(folder / folders.RESULT.marker)
     yield
-    if not is_result(folder) or stamp(folder / RESULT.marker) != before:
+    if not folders.is_result(folder) or stamp(folder / folders.RESULT.marker) != before:
         raise InputError(
             "was replaced by another run while it was read",
             where=folder,

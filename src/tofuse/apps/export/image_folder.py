@@ -10,16 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.apps.results import (
-    StoredRecording,
-    frame_covariance,
-    main_poses,
-    read_cloud,
-    read_run_json,
-    reopen,
-    run_json_checked,
-    stored_recordings,
-)
+from tofuse.apps.results import read_cloud, reopening, run_json
 from tofuse.engine.arrays import Float32, Float64, UInt8, UInt16
 from tofuse.engine.cameras import Camera, Pinhole, ray_lengths, scaled
 from tofuse.engine.errors import InputError, UnreadableFrameError
@@ -97,19 +88,21 @@ def posed_images(
         If the recording is missing or has changed, contains clouds, or no image has colour or
         amplitude.
     """
-    run = read_run_json(folder / "run.json")
-    indices, poses = main_poses(folder, run)
+    run = run_json.read_run_json(folder / "run.json")
+    indices, poses = run_json.main_poses(folder, run)
     selected = dict(zip(indices[::every], poses[::every], strict=True))
-    with run_json_checked(folder / "run.json"):
+    with run_json.run_json_checked(folder / "run.json"):
         covariances = {
-            f["index"]: frame_covariance(f) for f in run["frames"] if f["index"] in selected
+            f["index"]: run_json.frame_covariance(f)
+            for f in run["frames"]
+            if f["index"] in selected
         }
-        parts = list(stored_recordings(folder, run))
+        parts = list(reopening.stored_recordings(folder, run))
         correctors = [CameraErrors.made_with(part.config) for part in parts]
     skipped: list[str] = []
     n_images = 0
     for part, frame_correctors in zip(parts, correctors, strict=True):
-        recording = reopen(part, folder)
+        recording = reopening.reopen(part, folder)
         renderer = _ImageRenderer(recording)
         camera: Camera | None = None
         rectifier: Rectifier | None = None
@@ -155,7 +148,7 @@ def posed_images(
 
 
 def _frames(
-    part: StoredRecording,
+    part: reopening.StoredRecording,
     recording: Recording,
     selected: dict[int, Float64],
     correctors: Sequence[Corrector],

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.apps.results import frame_clock, is_result, read_run_json, run_json_checked
+from tofuse.apps.results import folders, run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
@@ -96,7 +96,7 @@ def evaluate(
         str(p) if isinstance(p, str | Path) else n
         for p, n in ((estimate, "estimate"), (reference, "reference"))
     ]
-    clock = frame_clock(Path(estimate)) if isinstance(estimate, str | Path) else None
+    clock = run_json.frame_clock(Path(estimate)) if isinstance(estimate, str | Path) else None
     if recording is not None:
         clock = recording.timestamps, recording.indices
     timed_estimate, timed_reference = (
@@ -140,11 +140,11 @@ def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corr
         return ()
     folder = Path(estimate)
     folder = folder.parent if folder.name == _TRAJECTORY else folder
-    if not is_result(folder):
+    if not folders.is_result(folder):
         return ()
     path = folder / "run.json"
-    run = read_run_json(path)
-    with run_json_checked(path):
+    run = run_json.read_run_json(path)
+    with run_json.run_json_checked(path):
         return CameraErrors.made_with(run["config"])
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.results import OutputFolder, accuracy_json, plain, reasons_json, write_result
+from tofuse.apps.results import folders, run_json, write_result
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
@@ -99,8 +99,8 @@ class Judgement:
         return {
             "schema": 1,
             "verdict": self.verdict,
-            "accuracy": accuracy_json(self.accuracy),
-            "reasons": reasons_json(self.reasons),
+            "accuracy": run_json.accuracy_json(self.accuracy),
+            "reasons": run_json.reasons_json(self.reasons),
             "frames": int(np.isfinite(self.poses[:, 0, 0]).sum()),
             "map_consistency": None if self.consistency is None else self.consistency.to_dict(),
             "deviation": None if self.deviation is None else self.deviation.to_dict(),
@@ -108,7 +108,7 @@ class Judgement:
             "refined": {
                 "from_these_poses": self.started,
                 "verdict": self.refined.diagnostics.verdict,
-                "accuracy": accuracy_json(self.refined.diagnostics.accuracy),
+                "accuracy": run_json.accuracy_json(self.refined.diagnostics.accuracy),
                 "map_consistency": None
                 if self.refined_consistency is None
                 else self.refined_consistency.to_dict(),
@@ -286,7 +286,11 @@ def judge_files(
     opening = Opening.of(inputs, options)
     recording = opening.open()
     out = options.out
-    with nullcontext() if out is None else OutputFolder(out, overwrite=options.overwrite) as folder:
+    with (
+        nullcontext()
+        if out is None
+        else folders.OutputFolder(out, overwrite=options.overwrite) as folder
+    ):
         judgement = judge(
             recording,
             trajectory,
@@ -304,7 +308,7 @@ def judge_files(
 
 
 def _write(
-    judgement: Judgement, trajectory: Path, recording: Recording, folder: OutputFolder
+    judgement: Judgement, trajectory: Path, recording: Recording, folder: folders.OutputFolder
 ) -> None:
     """Write the refined result, with `judge.json` and the judgement as headline of the report."""
     from tofuse.apps.report import ReportExtras, write_report
@@ -314,7 +318,7 @@ def _write(
         title = f"{trajectory.name} on {Path(recording.path).name}"
         write_report(result, path / "report.html", ReportExtras(title, headline=headline))
         if result is judgement.refined:
-            text = json.dumps(plain(judgement.to_dict()), indent=1, allow_nan=False)
+            text = json.dumps(run_json.plain(judgement.to_dict()), indent=1, allow_nan=False)
             (path / "judge.json").write_text(text + "\n", encoding="utf-8")
 
     write_result(judgement.refined, folder, report)

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from tofuse.apps.results import MAX_STATED_PROBABILITY
+from tofuse.apps.report import session_words
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.quality import changes, cross_view_agreement
@@ -66,7 +66,9 @@ class SessionModel:
             and any(first.has(k) for k in (join.link.i, join.link.j))
             and any(second.has(k) for k in (join.link.i, join.link.j))
         ]
-        return min(max(probabilities), MAX_STATED_PROBABILITY) if probabilities else None
+        return (
+            min(max(probabilities), session_words.MAX_STATED_PROBABILITY) if probabilities else None
+        )
 
     def cross_view(
         self, first: Sequence[View], second: Sequence[View]

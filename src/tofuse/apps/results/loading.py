@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.apps.results.folder import component_name, finish_interrupted, is_result
+from tofuse.apps.results.folders import component_name, finish_interrupted, is_result
 from tofuse.apps.results.run_json import (
     frame_covariance,
     main_poses,

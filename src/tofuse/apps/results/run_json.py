@@ -12,7 +12,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from tofuse._version import __version__
-from tofuse.apps.results.folder import is_result
+from tofuse.apps.results.folders import is_result
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3

@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.apps.jobs import Options, resolve
-from tofuse.apps.results import OutputFolder, write_result
+from tofuse.apps.results import folders, write_result
 from tofuse.apps.rigs.calibrating import Motion, cameras_of, moves
 from tofuse.apps.rigs.checking import CameraMotion, compare
 from tofuse.apps.rigs.inputs import Camera
@@ -91,7 +91,7 @@ def run_rig(
         full_recording = Recording.of(source, " ".join(map(str, inputs)), "rig")
         recording = _selected(full_recording, source, options)
         config = resolve(options)
-        with OutputFolder(options.out, overwrite=options.overwrite) as folder:
+        with folders.OutputFolder(options.out, overwrite=options.overwrite) as folder:
             result = reconstruct_rig(
                 rig, cameras, recording, config, seed=options.seed or 0, progress=progress
             )
@@ -309,7 +309,7 @@ def _with_rig_reason(result: Reconstruction, displaced: Sequence[CameraMotion]) 
     return replace(result, diagnostics=replace(d, reasons=reasons, verdict=verdict))
 
 
-def _write(rig_result: RigResult, recording: Recording, folder: OutputFolder) -> None:
+def _write(rig_result: RigResult, recording: Recording, folder: folders.OutputFolder) -> None:
     from tofuse.apps.report import ReportExtras, write_report
 
     def report(result: Reconstruction, target: Path) -> None:

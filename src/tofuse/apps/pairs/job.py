@@ -10,7 +10,8 @@ from time import perf_counter
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.results import LocalView, OutputFolder, PairResult, pair_folder, write_pair
+from tofuse.apps.pairs.result import LocalView, PairResult, pair_folder, write_pair
+from tofuse.apps.results import folders
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds import register
 from tofuse.engine.compute import threads
@@ -164,9 +165,9 @@ def _shifted(view: SingleView, center: Float64) -> LocalView:
     return LocalView(view, frame, center)
 
 
-def _write(result: PairResult, folder: OutputFolder) -> None:
+def _write(result: PairResult, folder: folders.OutputFolder) -> None:
     def page(result: PairResult, path: Path) -> None:
-        from tofuse.apps.report import write_pair_report
+        from tofuse.apps.pairs.page import write_pair_report
 
         write_pair_report(result, path)
 

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from tofuse._version import __version__
-from tofuse.apps.results.folder import Contract, OutputFolder, read_json_object
-from tofuse.apps.results.run_json import plain
+from tofuse.apps.results import folders, run_json
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame
@@ -197,7 +196,7 @@ def pair_json(result: PairResult) -> dict[str, Any]:
     registration = result.registration
     sigma_m, sigma_rad = result.sigma
     covariance = result.covariance
-    data: dict[str, Any] = plain(
+    data: dict[str, Any] = run_json.plain(
         {
             "schema": 1,
             "version": __version__,
@@ -244,20 +243,20 @@ def _view_json(local: LocalView) -> dict[str, Any]:
 
 def is_registration(folder: Path) -> bool:
     """Whether a folder contains an earlier registration."""
-    data = read_json_object(folder / MARKER)
+    data = folders.read_json_object(folder / MARKER)
     return data is not None and {"schema", "version", "T_target_source"} <= set(data)
 
 
-CONTRACT = Contract(re.compile("|".join(map(re.escape, FILES))), MARKER, is_registration)
+CONTRACT = folders.Contract(re.compile("|".join(map(re.escape, FILES))), MARKER, is_registration)
 
 
-def pair_folder(path: Path, *, overwrite: bool = False) -> OutputFolder:
+def pair_folder(path: Path, *, overwrite: bool = False) -> folders.OutputFolder:
     """Check, create and lock the folder for a registration; see `OutputFolder`."""
-    return OutputFolder(path, overwrite=overwrite, contract=CONTRACT)
+    return folders.OutputFolder(path, overwrite=overwrite, contract=CONTRACT)
 
 
 def write_pair(
-    result: PairResult, folder: OutputFolder, report: Callable[[PairResult, Path], None]
+    result: PairResult, folder: folders.OutputFolder, report: Callable[[PairResult, Path], None]
 ) -> None:
     """Write the files of a registration.
 
