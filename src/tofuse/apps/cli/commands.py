@@ -605,7 +605,8 @@ def evaluate(arguments: argparse.Namespace) -> int:
     if error.mostly_unmatched:
         print(
             f"note: only {error.associated} of {error.estimated} estimated poses have a reference "
-            f"pose within {1000 * trajectory_errors.MAX_GAP_S:.0f} ms: check that both files have the same clock",
+            f"pose within {1000 * trajectory_errors.MAX_GAP_S:.0f} ms: check that both files have "
+            "the same clock",
             file=sys.stderr,
         )
     if arguments.json:

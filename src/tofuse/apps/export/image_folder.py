@@ -88,10 +88,9 @@ def posed_images(
         If the recording is missing or has changed, contains clouds, or no image has colour or
         amplitude.
     """
-    run = run_json.read_run_json(folder / "run.json")
-    indices, poses = run_json.main_poses(folder, run)
-    selected = dict(zip(indices[::every], poses[::every], strict=True))
-    with run_json.run_json_checked(folder / "run.json"):
+    with run_json.opened(folder) as run:
+        indices, poses = run_json.main_poses(folder, run)
+        selected = dict(zip(indices[::every], poses[::every], strict=True))
         covariances = {
             f["index"]: run_json.frame_covariance(f)
             for f in run["frames"]

@@ -1,8 +1,8 @@
 """What the commands and the Python functions do, from input files to an output folder.
 
-A job opens recordings, resolves the options, calls the engine and writes the result and its report.
-`run` reconstructs a recording, `merging` joins the results of several runs, `judging` assesses poses
-from another source, and `evaluate` compares poses with a reference.
+A job opens recordings, resolves the options, calls the engine and writes the result and its
+report. `run` reconstructs a recording, `merging` joins the results of several runs, `judging`
+assesses poses from another source, and `evaluate` compares poses with a reference.
 """
 
 from typing import TYPE_CHECKING

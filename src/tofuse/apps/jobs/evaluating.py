@@ -142,9 +142,7 @@ def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corr
     folder = folder.parent if folder.name == _TRAJECTORY else folder
     if not folders.is_result(folder):
         return ()
-    path = folder / "run.json"
-    run = run_json.read_run_json(path)
-    with run_json.run_json_checked(path):
+    with run_json.opened(folder) as run:
         return CameraErrors.made_with(run["config"])
 
 

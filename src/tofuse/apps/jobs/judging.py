@@ -49,6 +49,8 @@ from tofuse.formats.recordings import Opening, OpeningOptions, read_reference
 
 Views = Sequence[PosedView[PreparedView]]
 
+_length = accuracy_card.length
+
 # Number of frames whose images are compared under the poses.
 _CHECKED = 60
 # With a smaller fraction of supporting measurements the recording is tracked again.
@@ -102,18 +104,22 @@ class Judgement:
             "accuracy": run_json.accuracy_json(self.accuracy),
             "reasons": run_json.reasons_json(self.reasons),
             "frames": int(np.isfinite(self.poses[:, 0, 0]).sum()),
-            "map_consistency": None if self.consistency is None else self.consistency.to_dict(),
-            "deviation": None if self.deviation is None else self.deviation.to_dict(),
+            "map_consistency": _dict(self.consistency),
+            "deviation": _dict(self.deviation),
             "displacement_m": self.displacement_m,
             "refined": {
                 "from_these_poses": self.started,
                 "verdict": self.refined.diagnostics.verdict,
                 "accuracy": run_json.accuracy_json(self.refined.diagnostics.accuracy),
-                "map_consistency": None
-                if self.refined_consistency is None
-                else self.refined_consistency.to_dict(),
+                "map_consistency": _dict(self.refined_consistency),
             },
         }
+
+
+def _dict(
+    figures: map_agreement.Consistency | pose_deviation.Deviation | None,
+) -> dict[str, Any] | None:
+    return None if figures is None else figures.to_dict()
 
 
 def judge(
@@ -169,31 +175,20 @@ def judge(
 
     progress.stage("comparing images")
     initial_support = compared_images.support_at(poses)
-    refined, views, refined_support = reconstructed(
-        priors.with_odometry(recording, poses), given_config
-    )
-    from_poses = True
-    if not refined_support.is_supported:
-        independent, independent_views, independent_support = reconstructed(recording, config)
-        if independent_support.support > refined_support.support:
-            refined, views, refined_support, from_poses = (
-                independent,
-                independent_views,
-                independent_support,
-                False,
-            )
+    started = reconstructed(priors.with_odometry(recording, poses), given_config)
+    best = started
+    if not started[2].is_supported:
+        best = max(started, reconstructed(recording, config), key=lambda found: found[2].support)
+    refined, views, refined_support = best
     progress.stage("registering pairs")
     with use_threads(threads), threadpool_limits(1):
         deviation = _deviation(poses, refined, views)
     distances = _distances(poses, refined.trajectory)
     accuracy = _accuracy(distances, poses, refined)
-    reasons = verdicts.ranked(
-        [
-            *_reasons(
-                poses, accuracy, deviation, initial_support, refined_support, refined, tolerance_m
-            ),
-        ]
+    found = _reasons(
+        poses, accuracy, deviation, initial_support, refined_support, refined, tolerance_m
     )
+    reasons = verdicts.ranked([*found])
     return Judgement(
         poses,
         accuracy,
@@ -204,7 +199,7 @@ def judge(
         deviation,
         distances,
         refined,
-        from_poses,
+        best is started,
     )
 
 
@@ -343,15 +338,14 @@ def _agreement(deviation: pose_deviation.Deviation | None) -> str:
     if deviation is None:
         return ""
     if not deviation.consistent:
+        about, at_least = map(_length, (deviation.estimate_m, deviation.at_least_m))
         return (
             " Inconsistent with the depth: surfaces displaced by about "
-            f"{accuracy_card.length(deviation.estimate_m)}, at least {accuracy_card.length(deviation.at_least_m)} (95 %)."
+            f"{about}, at least {at_least} (95 %)."
         )
     if not np.isfinite(deviation.at_most_m):
         return " Consistent with the depth, as far as that constrains them."
-    return (
-        f" Consistent with the depth to within {accuracy_card.length(deviation.at_most_m)} (95 %)."
-    )
+    return f" Consistent with the depth to within {_length(deviation.at_most_m)} (95 %)."
 
 
 def device_sentence(recording: Recording, result: Reconstruction) -> str:
@@ -368,8 +362,8 @@ def device_sentence(recording: Recording, result: Reconstruction) -> str:
         return ""
     rms, bound_m = float(np.sqrt((distances**2).mean())), result.diagnostics.accuracy.position_m
     if not np.isfinite(bound_m):
-        return f"{by}'s poses differ from these by {accuracy_card.length(rms)} rms."
-    return f"{by}'s poses: ±{accuracy_card.length(rms + bound_m)} (95 %); these: ±{accuracy_card.length(bound_m)}."
+        return f"{by}'s poses differ from these by {_length(rms)} rms."
+    return f"{by}'s poses: ±{_length(rms + bound_m)} (95 %); these: ±{_length(bound_m)}."
 
 
 def _read(path: Path) -> TimedPoses:
@@ -501,8 +495,8 @@ def _reasons(
         first = next(iter(jumped))
         ranges = frame_ranges.runs_of(indices, [indices[k] for k in jumped])
         text = (
-            f"The poses of {frame_ranges.in_words(ranges)} jump, and the refined ones don't; that of frame "
-            f"{indices[first]} is {jumped[first]}."
+            f"The poses of {frame_ranges.in_words(ranges)} jump, and the refined ones don't; that "
+            f"of frame {indices[first]} is {jumped[first]}."
         )
         yield Reason("jumped", ranges, text)
 
@@ -517,8 +511,8 @@ def _contradiction(
         return
     text = (
         f"Registrations contradict the poses: surfaces are displaced by about "
-        f"{accuracy_card.length(deviation.estimate_m)} rms, at least {accuracy_card.length(deviation.at_least_m)} (95 %); the "
-        f"tolerance is {accuracy_card.length(allowed_m)}."
+        f"{_length(deviation.estimate_m)} rms, at least {_length(deviation.at_least_m)} (95 %); "
+        f"the tolerance is {_length(allowed_m)}."
     )
     steps = tuple((int(a), int(b)) for a, b in deviation.ids[deviation.steps])
     if steps:

@@ -73,7 +73,13 @@ def run(
                 tracked_frames=tracked_file,
             )
             texture = _texture(job, result, options, progress, watch)
-            result = _with_job(result, job, options, watch)
+            result = with_findings(result, job.findings, turning=options.object)
+            seconds = {**watch.seconds, **result.diagnostics.seconds}
+            result = replace(
+                result,
+                recording={**result.recording, "opening": job.opening.to_dict()},
+                diagnostics=replace(result.diagnostics, seconds=seconds),
+            )
             if device := device_sentence(job.recording, result):
                 progress.note(device)
             progress.stage("writing")
@@ -111,7 +117,8 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
     seed = seed_of(options)
     opening = Opening.of(inputs, options)
     recording = opening.open()
-    _preview(recording, progress)
+    if (frame := recording.first_readable()) is not None:  # shown before any work begins
+        progress.placed(frame, np.eye(4))
     config = resolve(options, reconstructing.view_kind(recording))
     if not options.object:  # no sensor measures the motion relative to a moving object
         recording, config = priors.with_prior(recording, config, options.prior)
@@ -140,26 +147,6 @@ def _texture(
     if texture is None:
         progress.note("no texture: there is no surface, or neither colour nor amplitude")
     return texture
-
-
-def _with_job(
-    result: Reconstruction, job: _Job, options: Options, watch: Stopwatch
-) -> Reconstruction:
-    """Add findings, how the recording was opened, and times to the result."""
-    result = with_findings(result, job.findings, turning=options.object)
-    seconds = {**watch.seconds, **result.diagnostics.seconds}
-    return replace(
-        result,
-        recording={**result.recording, "opening": job.opening.to_dict()},
-        diagnostics=replace(result.diagnostics, seconds=seconds),
-    )
-
-
-def _preview(recording: Recording, progress: Progress) -> None:
-    """Show the first frame before any work begins, at the first pose."""
-    frame = recording.first_readable()
-    if frame is not None:
-        progress.placed(frame, np.eye(4))
 
 
 def _tracked_file(

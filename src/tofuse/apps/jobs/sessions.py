@@ -19,8 +19,6 @@ from tofuse.engine.tracking import Keyframes, Status, given
 from tofuse.formats.files import path_of
 from tofuse.formats.recordings import Opening
 
-_REMEDY = "pass the --out of `tofuse run`"
-
 
 @dataclass(frozen=True, eq=False)
 class Session:
@@ -121,13 +119,8 @@ def _read_parts(
     Also the loop closures between them, see `Session`. Its components are numbered from
     `components`.
     """
-    folders.finish_interrupted(folder)
-    if not folder.exists():
-        raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
-    if not folder.is_dir() or not folders.is_result(folder):
-        raise InputError("contains no result (no run.json)", where=folder, remedy=_REMEDY)
-    run = run_json.read_run_json(folder / "run.json")
-    with run_json.run_json_checked(folder / "run.json"):
+    folders.check_result(folder)
+    with run_json.opened(folder) as run:
         stated = _stated(folder, run, components)
         parts = list(reopening.stored_recordings(folder, run))
         posed = [(p, {k: stated[p.first + k] for k in p.frames}) for p in parts]
@@ -164,15 +157,15 @@ def _session(
     return Session(part.name, folder, opening, recording, config, stated)
 
 
-def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, given.StatedPose]:
+def _stated(folder: Path, run: dict[str, Any], components: int) -> dict[int, given.StatedPose]:
     """Return the pose and status that a result states for each frame, by index."""
-    poses = _poses(folder, dict(run))
+    poses = _poses(folder, run)
     main = {k: (T, components) for k, T in poses.items()}
     separate = [k for k, c in enumerate(run["components"]) if c["T_main_component"] is None]
     for number, k in enumerate(separate, components + 1):
         component_folder = folder / folders.component_name(k)
         if folders.is_result(component_folder):
-            main |= {i: (T, number) for i, T in _poses(component_folder, None).items()}
+            main |= {i: (T, number) for i, T in _poses(component_folder).items()}
     stated = {}
     for frame in run["frames"]:
         index, status = int(frame["index"]), frame["status"]
@@ -188,9 +181,9 @@ def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, 
     return stated
 
 
-def _poses(folder: Path, run: dict[str, Any] | None) -> dict[int, Float64]:
+def _poses(folder: Path, run: dict[str, Any] | None = None) -> dict[int, Float64]:
     """Return (4, 4) T_world_camera by index, of the frames in a folder's main model."""
-    run = run_json.read_run_json(folder / "run.json") if run is None else run
+    run = run or run_json.read_run_json(folder / "run.json")
     indices, poses = run_json.main_poses(folder, run)
     return dict(zip(indices, poses, strict=True))
 

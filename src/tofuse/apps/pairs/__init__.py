@@ -1,8 +1,8 @@
 """Registration of one pair of files: `tofuse register`.
 
 `register_files` opens two views, moves them near the origin, registers them, and writes the pose,
-the aligned cloud and a page that shows both views. A `PairResult` states the pose in the coordinates
-of the files, with its uncertainty.
+the aligned cloud and a page that shows both views. A `PairResult` states the pose in the
+coordinates of the files, with its uncertainty.
 """
 
 from typing import TYPE_CHECKING

@@ -319,16 +319,11 @@ def still(pair: PairScene) -> UInt8:
     points = np.concatenate([pair.points[view] for view in COLORS])
     normals = [n for view in COLORS if (n := pair.normals[view]) is not None]
     counts = [len(pair.points[view]) for view in COLORS]
-    no_poses = np.zeros((0, 4, 4))
     both = scene.Scene(
         points,
         np.repeat(np.array([*COLORS.values()], np.uint8), counts, axis=0),
         np.concatenate(normals) if len(normals) == len(COLORS) else None,
         pair.total,
         max(scene.spacing_of(pair.points[view]) for view in COLORS),
-        no_poses,
-        no_poses,
-        no_poses,
-        np.zeros((0, 2, 3)),
     )
     return scene.render(both, yaw=pair.yaw, pitch=pair.pitch, peel=False, min_radius=2)

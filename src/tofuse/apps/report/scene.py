@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -60,10 +60,10 @@ class Scene:
     normals: Float32 | Float64 | None
     total: int
     spacing: float
-    before: Float64
-    after: Float64
-    reference: Float64
-    loops: Float64
+    before: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    after: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    reference: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    loops: Float64 = field(default_factory=lambda: np.zeros((0, 2, 3)))
     surface: Mesh | None = None
     sigma: Float32 | None = None
     views: Int32 | None = None
@@ -160,17 +160,9 @@ class RigCameras:
     @classmethod
     def of(cls, rig: Any, frames: int) -> RigCameras | None:
         """Read the entry `rig` of `run.json`; None if it does not match the number of frames."""
-        if not isinstance(rig, dict):
+        if not rig or len(rig["of_frames"]) != frames:
             return None
-        names = tuple(str(name) for name in rig.get("cameras", ()))
-        try:
-            of_frames = np.array(rig.get("of_frames", ()), np.intp)
-        except (TypeError, ValueError, OverflowError):
-            return None
-        if of_frames.shape != (frames,) or not frames or not names:
-            return None
-        if of_frames.min() < 0 or of_frames.max() >= len(names):
-            return None
+        names, of_frames = tuple(rig["cameras"]), np.array(rig["of_frames"], np.intp)
         colors = tuple(CAMERA_COLORS[k % len(CAMERA_COLORS)] for k in range(len(names)))
         return cls(names, colors, of_frames)
 
@@ -182,17 +174,13 @@ def finite_poses(poses: Float64 | None) -> Float64:
     return poses[np.isfinite(poses).all((1, 2))]
 
 
-def make_scene(
-    result: Reconstruction, rows: dict[int, int], reference: Float64 | None = None
-) -> Scene:
+def make_scene(result: Reconstruction, reference: Float64 | None = None) -> Scene:
     """Collect and subsample the content of the 3D view.
 
     Parameters
     ----------
     result
         The result.
-    rows
-        Row of the trajectory, by frame index.
     reference
         (N, 4, 4) reference poses, NaN where there is none; or None.
     """
@@ -201,12 +189,9 @@ def make_scene(
     points = cloud.points[sampled].astype(float) + cloud.offset
     finite = np.isfinite(points).all(1)
     points, sampled = points[finite], sampled[finite]
-    ends = [
-        (result.trajectory[rows[p.i], :3, 3], result.trajectory[rows[p.j], :3, 3])
-        for p in result.diagnostics.loops
-        if p.accepted and p.i in rows and p.j in rows
-    ]
-    loops = np.array(ends, float).reshape(-1, 2, 3)
+    rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
+    ends = [(rows[p.i], rows[p.j]) for p in result.diagnostics.loops if p.accepted]
+    loops = result.trajectory[np.array(ends, int).reshape(-1, 2), :3, 3]
     return Scene(
         points,
         _colors(cloud, sampled, points),

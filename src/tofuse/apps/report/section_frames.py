@@ -122,7 +122,7 @@ def _player(s: Subject) -> Values | None:
     if not shown:
         return None
     records = {r.index: r for r in s.result.diagnostics.frames}
-    listed = [records.get(p.index) for p in shown]
+    listed = [records[p.index] for p in shown]
     kinds = {kind: title for kind, title in KINDS.items() if kind in shown[0].images}
     low, high = depth_range(s.result.diagnostics.samples)
     note = f"Range from dark ({words.length(low)}) to bright ({words.length(high)})."
@@ -131,8 +131,8 @@ def _player(s: Subject) -> Values | None:
     return {
         "data": {
             "index": [p.index for p in shown],
-            "descriptions": [frame_text(r, s.result.components) if r else "" for r in listed],
-            "status": [r.status if r else "" for r in listed],
+            "descriptions": [frame_text(r, s.result.components) for r in listed],
+            "status": [r.status for r in listed],
             "images": {kind: [p.uri(kind) for p in shown] for kind in kinds},
         },
         "kinds": kinds,

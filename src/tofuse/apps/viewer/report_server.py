@@ -17,7 +17,6 @@ from typing import Any, Self
 from tofuse.apps.report import thumbnails
 from tofuse.apps.results import folders, reopening, run_json
 from tofuse.apps.viewer.server import HOST, choose_port, is_same_origin
-from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.formats.files import read_bytes
 
@@ -51,9 +50,7 @@ class FrameImages:
         InputError
             If one is missing, can't be opened, or has changed.
         """
-        path = folder / "run.json"
-        run = run_json.read_run_json(path)
-        with run_json.run_json_checked(path):
+        with run_json.opened(folder) as run:
             parts = list(reopening.stored_recordings(folder, run))
         return cls([(part.first, reopening.reopen(part, folder)) for part in parts])
 
@@ -83,13 +80,7 @@ def report_pages(folder: Path) -> dict[str, tuple[str, bytes]]:
     InputError
         If the folder is not a result, or has no report.
     """
-    if not folder.exists():
-        raise InputError("doesn't exist", where=folder, remedy="pass the --out of `tofuse run`")
-    folders.finish_interrupted(folder)
-    if not folder.is_dir() or not folders.is_result(folder):
-        raise InputError(
-            "is not a result (no run.json)", where=folder, remedy="pass the --out of `tofuse run`"
-        )
+    folders.check_result(folder)
     pages = {"/": (_HTML, read_bytes(folder / "report.html"))}
     for path in sorted(folder.glob("component-*/report.html")):
         if folders.component_number(path.parent) is not None:
