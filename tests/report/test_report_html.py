@@ -362,8 +362,8 @@ def test_viewer_mesh_is_simplified():
     mesh = Mesh(
         vertices, faces, normals, color, ones.astype(np.float32), ones.astype(np.int32), np.zeros(3)
     )
-    result = room()[0]
-    scene = make_scene(replace(result, mesh=mesh))
+    result, rows = room()[0], {}
+    scene = make_scene(replace(result, mesh=mesh), rows)
     assert len(scene.mesh.faces) <= MAX_FACES
     assert len(scene.mesh.faces) > MAX_FACES / 4
     data = packed(scene)
@@ -374,11 +374,11 @@ def test_viewer_mesh_is_simplified():
     triangles = unpack(model["faces"], "<u4", 3)
     assert triangles.max() == len(shown) - 1
     assert len(unpack(model["colors"], "u1", 3)) == len(shown) == data["count"]
-    assert packed(make_scene(result))["model"]["faces"] is None
+    assert packed(make_scene(result, rows))["model"]["faces"] is None
 
 
 def test_initial_view_shows_most_of_the_surface():
-    scene = make_scene(room()[0])
+    scene = make_scene(room()[0], {})
     for k in (0, 2, 5):
         yaw = YAW + k * np.pi / 4
         facing = -thumbnails.view_rotation(yaw, PITCH)[2]
@@ -432,7 +432,7 @@ def test_model_can_be_coloured_by_attributes_of_points():
         np.zeros(3),
         np.array([0.001, 0.002, 0.004, UNKNOWN_M], np.float32),
     )
-    found = {f.name: f for f in fields(make_scene(lonely(cloud=cloud)))}
+    found = {f.name: f for f in fields(make_scene(lonely(cloud=cloud), {}))}
     assert list(found) == ["accuracy", "height", "views"]
     of = {
         name: unpack(f.packed()["values"], "u1", 1)[:, 0].astype(int) for name, f in found.items()
@@ -450,7 +450,7 @@ def test_model_can_be_coloured_by_attributes_of_points():
     low, high = accuracy.span
     assert low * (high / low) ** (of["accuracy"][1] / 255) == pytest.approx(0.00392, rel=0.03)
     # Cameras are coloured by the same bar.
-    wider = fields(make_scene(lonely(cloud=cloud)), np.array([0.05, np.nan]))[0]
+    wider = fields(make_scene(lonely(cloud=cloud), {}), np.array([0.05, np.nan]))[0]
     assert wider.high == pytest.approx(0.05)
 
 
@@ -590,6 +590,19 @@ POOR = {
             frames=tuple(FrameRecord(k, k, "tracked", "", 0.0, 0.0, 0.0) for k in range(3)),
         ),
         ReportExtras("x", reference=np.full((3, 4, 4), np.nan)),
+    ),
+    "skipped frames without a row": (
+        lonely(
+            trajectory=np.tile(np.eye(4), (2, 1, 1)),
+            timestamps=np.arange(2.0),
+            sequential=np.tile(np.eye(4), (2, 1, 1)),
+            frames=tuple(
+                FrameRecord(k, k, status)
+                for k, status in enumerate(("tracked", "skipped", "tracked"))
+            ),
+            loops=(LoopRecord(0, 2, True, ""), LoopRecord(0, 7, True, "")),
+        ),
+        ReportExtras("x"),
     ),
 }
 

@@ -201,7 +201,8 @@ class Result(Reconstruction):
     def _repr_html_(self) -> str:
         from tofuse.apps.report import scene, thumbnails
 
-        drawn = scene.make_scene(self)
+        rows = {f.index: k for k, f in enumerate(self.diagnostics.frames)}
+        drawn = scene.make_scene(self, rows)
         accuracy = html.escape(self.accuracy)
         verdict = html.escape(self.diagnostics.verdict.capitalize())
         picture = ""

@@ -54,10 +54,11 @@ def _job(picture: str, run_arguments: Sequence[str]) -> int:
     arguments = make_parser().parse_args(["run", *run_arguments])
     with QuietProgress() as progress:
         result = run(arguments.inputs, run_options(arguments), progress)
+    rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
     write_bytes(
         picture,
         thumbnails.encode(
-            scene.render_thumbnail(scene.make_scene(result), _PICTURE_SIZE), jpeg=True
+            scene.render_thumbnail(scene.make_scene(result, rows), _PICTURE_SIZE), jpeg=True
         ),
     )
     print_result(result, arguments.out, as_json=True)

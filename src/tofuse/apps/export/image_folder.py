@@ -237,8 +237,23 @@ class ImageFolder:
             self.masked = True
             self._png(MASKS, posed.name, np.where(valid, 255, 0).astype(np.uint8))
 
-    def finish(self) -> None:
-        """Write masks for the other frames as well, if any frame has one."""
+    def write_all(
+        self, result: Path, every: int, is_supported: Callable[[Camera], bool]
+    ) -> Iterator[PosedImage]:
+        """Yield the images of a result, see `posed_images`, after writing each.
+
+        Raises
+        ------
+        InputError
+            See `posed_images`; or if no image can be read.
+        """
+        posed = None
+        for posed in posed_images(result, every, is_supported):
+            self.write(posed)
+            yield posed
+        if posed is None:
+            raise InputError("has no readable frame with a pose", where=result)
+        # If any frame has a mask, all get one.
         for name, shape in self._unmasked if self.masked else ():
             self._png(MASKS, name, np.full(shape, 255, np.uint8))
 

@@ -93,26 +93,22 @@ def evaluate(
     if isinstance(recording, str | Path):
         recording = open_recording(recording)
     names = [
-        str(p) if isinstance(p, str | Path) else n
-        for p, n in ((estimate, "estimate"), (reference, "reference"))
+        str(source) if isinstance(source, str | Path) else name
+        for source, name in ((estimate, "estimate"), (reference, "reference"))
     ]
     clock = run_json.frame_clock(Path(estimate)) if isinstance(estimate, str | Path) else None
     if recording is not None:
         clock = recording.timestamps, recording.indices
-    timed_estimate, timed_reference = (
-        _poses(estimate, names[0]),
-        _poses(reference, names[1], is_reference=True),
-    )
-    if clock is None and (timed_estimate.timestamps is None) != (
-        timed_reference.timestamps is None
-    ):
+    timed = _poses(estimate, names[0]), _poses(reference, names[1], is_reference=True)
+    by_frame = [n for n, poses in zip(names, timed, strict=True) if poses.timestamps is None]
+    if clock is None and len(by_frame) == 1:
         raise InputError(
             "has poses by frame, the other file by time",
-            where=names[0] if timed_estimate.timestamps is None else names[1],
+            where=by_frame[0],
             remedy="pass the recording, which has the times, with --recording",
         )
-    times, poses = _timed(timed_estimate, estimate, clock, names[0])
-    reference_times, reference_poses = _timed(timed_reference, reference, clock, names[1])
+    times, poses = _timed(timed[0], estimate, clock, names[0])
+    reference_times, reference_poses = _timed(timed[1], reference, clock, names[1])
     frame_times = None if recording is None else recording.timestamps
     try:
         error = trajectory_errors.evaluate_trajectory(

@@ -174,13 +174,17 @@ def finite_poses(poses: Float64 | None) -> Float64:
     return poses[np.isfinite(poses).all((1, 2))]
 
 
-def make_scene(result: Reconstruction, reference: Float64 | None = None) -> Scene:
+def make_scene(
+    result: Reconstruction, rows: dict[int, int], reference: Float64 | None = None
+) -> Scene:
     """Collect and subsample the content of the 3D view.
 
     Parameters
     ----------
     result
         The result.
+    rows
+        Row of the trajectory, by frame index.
     reference
         (N, 4, 4) reference poses, NaN where there is none; or None.
     """
@@ -189,9 +193,12 @@ def make_scene(result: Reconstruction, reference: Float64 | None = None) -> Scen
     points = cloud.points[sampled].astype(float) + cloud.offset
     finite = np.isfinite(points).all(1)
     points, sampled = points[finite], sampled[finite]
-    rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
-    ends = [(rows[p.i], rows[p.j]) for p in result.diagnostics.loops if p.accepted]
-    loops = result.trajectory[np.array(ends, int).reshape(-1, 2), :3, 3]
+    ends = [
+        (result.trajectory[rows[p.i], :3, 3], result.trajectory[rows[p.j], :3, 3])
+        for p in result.diagnostics.loops
+        if p.accepted and p.i in rows and p.j in rows
+    ]
+    loops = np.array(ends, float).reshape(-1, 2, 3)
     return Scene(
         points,
         _colors(cloud, sampled, points),

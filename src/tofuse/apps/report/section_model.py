@@ -88,7 +88,9 @@ def _packed_cameras(s: Subject, errors: Float64, rig: RigCameras | None) -> dict
     Poses (3, 4) are in the axes of the displayed model, row by row, zeros where there is none;
     errors are bytes on the scale of the accuracy field.
     """
-    numbers = [words.STATUSES.index(r.status) for r in s.result.diagnostics.frames]
+    records = {r.index: r for r in s.result.diagnostics.frames}
+    index = s.index.astype(int)
+    statuses = [records[k].status if k in records else "tracked" for k in index.tolist()]
     error_bytes = np.round(255 * normalized_accuracy(errors)).astype(np.uint8)
 
     def displayed(poses: Float64) -> str:
@@ -97,11 +99,11 @@ def _packed_cameras(s: Subject, errors: Float64, rig: RigCameras | None) -> dict
 
     return {
         "rig": rig and {"colors": rig.colors, "of": pack(rig.of_frames.astype("u1"))},
-        "index": pack(s.index.astype("<u4")),
-        "status": "".join(map(str, numbers)),
+        "index": pack(index.astype("<u4")),
+        "status": "".join(str(words.STATUSES.index(status)) for status in statuses),
         "errors": pack(error_bytes) if np.isfinite(errors).any() else None,
         "after": displayed(s.result.trajectory),
-        "before": displayed(s.result.diagnostics.sequential),
+        "before": displayed(s.sequential),
     }
 
 
@@ -120,11 +122,12 @@ def position_errors(s: Subject) -> Float64:
 
     `UNKNOWN_M` where a pose is not bounded, NaN where there is none or it was not assessed.
     """
+    covariances = {r.index: r.covariance for r in s.result.diagnostics.frames}
     unbounded = set(s.result.diagnostics.accuracy.unbounded)
     errors = np.full(len(s.index), np.nan)
-    for row, record in enumerate(s.result.diagnostics.frames):
-        C = record.covariance
-        if record.index in unbounded:
+    for row, index in enumerate(s.index.astype(int).tolist()):
+        C = covariances.get(index)
+        if index in unbounded:
             errors[row] = OF_95_PERCENT * UNKNOWN_M
         elif C is not None and np.isfinite(C).all():
             errors[row] = OF_95_PERCENT * float(se3.largest_sigmas(C)[0])

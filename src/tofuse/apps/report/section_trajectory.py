@@ -30,9 +30,7 @@ def error(s: Subject) -> Values:
         )
     if int(s.result.has_pose.sum()) < 2:
         return {"figures": [], "title": title}
-    before, after = (
-        _offsets(p, s.reference) for p in (s.result.diagnostics.sequential, s.result.trajectory)
-    )
+    before, after = (_offsets(p, s.reference) for p in (s.sequential, s.result.trajectory))
     bad = s.index[~s.result.has_pose]
     figures = []
     for k, axis in enumerate(_AXES):
@@ -63,9 +61,7 @@ def error(s: Subject) -> Values:
 
 
 def _moved(s: Subject) -> str:
-    displacement = np.linalg.norm(
-        s.result.trajectory[:, :3, 3] - s.result.diagnostics.sequential[:, :3, 3], axis=1
-    )
+    displacement = np.linalg.norm(s.result.trajectory[:, :3, 3] - s.sequential[:, :3, 3], axis=1)
     if not np.isfinite(displacement).any():
         return ""
     k = int(np.nanargmax(displacement))
@@ -124,7 +120,7 @@ def _rows(name: str, offsets: Float64, compared: bool) -> list[list[str]]:
 def _uncertainty(s: Subject) -> list[tuple[str, str]]:
     """Plots of the pose uncertainty over frames: one sigma in the worst direction."""
     C = np.full((len(s.index), 6, 6), np.nan)
-    for k, record in enumerate(s.result.diagnostics.frames):
+    for k, record in enumerate(s.result.diagnostics.frames[: len(C)]):
         if record.covariance is not None:
             C[k] = record.covariance
     bounded = np.isfinite(C).all((1, 2))

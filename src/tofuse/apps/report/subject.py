@@ -30,6 +30,8 @@ class Subject:
     ----------
     index
         (N,) frame index of each row of the trajectory.
+    sequential
+        (N, 4, 4) poses before optimisation, NaN where there is none.
     scene
         Content of the 3D view; plans and sizes are of its points, too.
     truth
@@ -42,6 +44,7 @@ class Subject:
     result: Reconstruction
     extras: ReportExtras
     index: Float64
+    sequential: Float64
     reference: Float64 | None
     scene: Scene
     truth: Float64 | None
@@ -50,11 +53,18 @@ class Subject:
     @classmethod
     def of(cls, result: Reconstruction, extras: ReportExtras) -> Subject:
         """Prepare a result; a reference without any pose in common is ignored."""
-        index = np.array([record.index for record in result.diagnostics.frames], float)
+        index = _row_indices(result)
+        rows = {int(k): row for row, k in enumerate(index)}
+        sequential = result.diagnostics.sequential
+        if sequential.shape != result.trajectory.shape:
+            sequential = np.full_like(result.trajectory, np.nan)
         reference = extras.reference
-        if reference is not None and len(finite_poses(reference[result.has_pose])) == 0:
+        if reference is not None and (
+            reference.shape != result.trajectory.shape
+            or len(finite_poses(reference[result.has_pose])) == 0
+        ):
             reference = None
-        scene = make_scene(result, reference)
+        scene = make_scene(result, rows, reference)
         truth = extras.truth_points
         if truth is not None:
             truth = truth[np.isfinite(truth).all(1)]
@@ -65,7 +75,17 @@ class Subject:
         else:
             R_display_up = _box_axes(truth_points @ R_up_world.T)
         R = R_display_up @ R_up_world
-        return cls(result, extras, index, reference, scene, truth_points, R)
+        return cls(result, extras, index, sequential, reference, scene, truth_points, R)
+
+
+def _row_indices(result: Reconstruction) -> Float64:
+    """Return the frame index of each row of the trajectory."""
+    records = result.diagnostics.frames
+    rows = len(result.trajectory)
+    for candidates in (records, [r for r in records if r.status != "skipped"]):
+        if len(candidates) == rows:
+            return np.array([r.index for r in candidates], float)
+    return np.arange(rows, dtype=float)
 
 
 def _upright_axes(points: Float64, outer: float) -> Float64:
