@@ -110,7 +110,7 @@ def cuts(first: int, count: int, seed: int) -> tuple[int, list[str]]:
     """Power cuts with the seeds from `first`."""
     mutation.subjects()  # adds tests/helpers to the import path
     import made_results
-    from tofuse.apps.results.folder import OutputFolder, finish_interrupted, is_result
+    from tofuse.apps.results.folders import OutputFolder, finish_interrupted, is_result
     from tofuse.apps.results.output import write_result
 
     def write(folder: Path, number: int) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 from tofuse.apps.jobs.merging import MergeOptions, merge_files
 from tofuse.apps.jobs.run_options import Options
 from tofuse.apps.jobs.running import run
-from tofuse.apps.results.session_words import probability_text
+from tofuse.apps.report.session_words import probability_text
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory_errors import align, displacement

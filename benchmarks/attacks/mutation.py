@@ -326,7 +326,7 @@ def _results() -> dict[str, Subject]:
 
 def _result(out: Path) -> None:
     import made_results
-    from tofuse.apps.results.folder import OutputFolder
+    from tofuse.apps.results.folders import OutputFolder
     from tofuse.apps.results.output import write_result
 
     write_result(made_results.torn(), OutputFolder(out))

@@ -299,7 +299,7 @@ def test_container_quotas_limit_cores(name, tmp_path, monkeypatch) -> None:
 
 
 def test_second_run_into_same_folder_is_rejected(clouds: Path, tmp_path: Path, capfd) -> None:
-    from tofuse.apps.results.folder import OutputFolder
+    from tofuse.apps.results.folders import OutputFolder
 
     with OutputFolder(tmp_path / "out"):
         assert main(["run", "no such recording", "--out", str(tmp_path / "out")]) == 2

@@ -13,7 +13,7 @@ import pytest
 from browser import changed, chromium, watched
 from cli_calls import call, listing, refuses
 from registration_scenes import bumpy_ball, stone, turn
-from tofuse.apps.jobs import pair as pair_module
+from tofuse.apps.pairs import job as pair_module
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
@@ -33,7 +33,7 @@ T_SMALL = turn([0.1, 1, 0.2], 4) @ se3.exp([0.02, -0.01, 0.03, 0, 0, 0])
 def light_page(monkeypatch) -> None:
     """Skip the page if the test does not use it."""
     monkeypatch.setattr(
-        "tofuse.apps.report.pair.write_pair_report", lambda _, path: path.write_text("<html>")
+        "tofuse.apps.pairs.page.write_pair_report", lambda _, path: path.write_text("<html>")
     )
 
 
@@ -459,7 +459,7 @@ def test_write_failure_keeps_earlier_result(
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("tofuse.apps.report.pair.write_pair_report", full)
+    monkeypatch.setattr("tofuse.apps.pairs.page.write_pair_report", full)
     refuses(
         capfd, "register", clouds[1], clouds[1], "--out", out, "--overwrite",
         says=(str(out), "No space left"),

@@ -15,7 +15,7 @@ from parsed_glb import parse
 from tofuse.apps.cli.options import Export
 from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import FORMATS, export
-from tofuse.apps.results.folder import OutputFolder
+from tofuse.apps.results.folders import OutputFolder
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3

@@ -17,7 +17,7 @@ from paths import BENCHMARKS
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.table import write_table
-from tofuse.apps.results.folder import OutputFolder, finish_interrupted, is_result
+from tofuse.apps.results.folders import OutputFolder, finish_interrupted, is_result
 from tofuse.apps.results.output import write_result
 from tofuse.formats.files.atomic import write_text
 from tofuse.formats.files.staging import finish_replacing, is_interrupted, new_folder

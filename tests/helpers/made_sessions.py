@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from made_rooms import BOXES, CAMERA, Box, at, seen
-from tofuse.apps.results.folder import OutputFolder
+from tofuse.apps.results.folders import OutputFolder
 from tofuse.apps.results.output import write_result
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames.frames import RangeFrame

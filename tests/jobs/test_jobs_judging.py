@@ -14,7 +14,7 @@ import tofuse
 from made_phones import make_stray
 from tofuse.apps.cli.program import main
 from tofuse.apps.jobs.judging import device_sentence, poses_for, sentence, with_odometry
-from tofuse.apps.results.folder import FILES
+from tofuse.apps.results.folders import FILES
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord

@@ -19,10 +19,10 @@ from tofuse.apps.jobs import running as run_module
 from tofuse.apps.jobs.merging import merge_sessions, merged_config
 from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.jobs.sessions import read_sessions
-from tofuse.apps.results.folder import OutputFolder
+from tofuse.apps.report.session_words import session_sentences
+from tofuse.apps.results.folders import OutputFolder
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import read_run_json
-from tofuse.apps.results.session_words import session_sentences
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame

@@ -17,7 +17,7 @@ from tofuse.apps.cli.program import main
 from tofuse.apps.jobs import running as run
 from tofuse.apps.jobs import tracked_file
 from tofuse.apps.jobs.tracked_file import LoggingTracker, ReplayingTracker, TrackedFile
-from tofuse.apps.results.folder import TRACKED
+from tofuse.apps.results.folders import TRACKED
 from tofuse.engine.errors import Ended, InputError, OutputError
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.fusion.cloud import as_cloud

@@ -21,8 +21,8 @@ import tofuse
 from paths import ROOT
 from tofuse.apps.cli.options import DEMO_SCENES
 from tofuse.apps.cli.parser import make_parser
-from tofuse.apps.jobs.pair import register_files
-from tofuse.apps.results.pair import pair_json
+from tofuse.apps.pairs.job import register_files
+from tofuse.apps.pairs.result import pair_json
 from tofuse.engine import parts
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import Config, ViewKind, changed

@@ -10,7 +10,7 @@ import pytest
 
 from browser import changed, chromium, watched
 from report_results import make_room
-from tofuse.apps.report.html import write_report
+from tofuse.apps.report.sections import write_report
 from tofuse.apps.report.thumbnails import viridis
 
 pytestmark = pytest.mark.nightly

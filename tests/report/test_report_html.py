@@ -17,7 +17,6 @@ from report_results import lonely, make_room
 from tofuse.apps.report import plots, thumbnails
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.fields import fields
-from tofuse.apps.report.html import write_report
 from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import (
     MAX_FACES,
@@ -29,6 +28,7 @@ from tofuse.apps.report.scene import (
     packed,
     render_thumbnail,
 )
+from tofuse.apps.report.sections import write_report
 from tofuse.apps.report.subject import Subject
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import OutputError

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from registration_scenes import relief, view
+from tofuse.apps.pairs.page import MAX_POINTS, PairScene, distance_colors, distances, packed, still
+from tofuse.apps.pairs.result import LocalView, PairResult
 from tofuse.apps.report import thumbnails
-from tofuse.apps.report.pair import MAX_POINTS, PairScene, distance_colors, distances, packed, still
-from tofuse.apps.results.pair import LocalView, PairResult
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.geometry import se3
 from tofuse.formats.recordings.open import SingleView

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from made_results import contents, result, torn
-from tofuse.apps.results.folder import OutputFolder, check_output, finish_interrupted, is_result
+from tofuse.apps.results.folders import OutputFolder, check_output, finish_interrupted, is_result
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import read_run_json
 from tofuse.engine.errors import InputError, OutputError
@@ -41,7 +41,7 @@ def test_links_are_never_followed(tmp_path, what) -> None:
 
 HOLD = """
 import sys
-from tofuse.apps.results.folder import OutputFolder
+from tofuse.apps.results.folders import OutputFolder
 with OutputFolder(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()

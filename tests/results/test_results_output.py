@@ -15,7 +15,7 @@ from made_results import contents, result, torn
 from tofuse.apps.export.exporting import export
 from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.results import output
-from tofuse.apps.results.folder import OutputFolder, component_number, is_result
+from tofuse.apps.results.folders import OutputFolder, component_number, is_result
 from tofuse.apps.results.loading import load_result
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import frames_in_main_model, plain, read_run_json

@@ -18,8 +18,8 @@ import pytest
 from browser import chromium, watched
 from report_results import ROOM, circle, make_room, view
 from tofuse.apps.cli.program import main
-from tofuse.apps.report.html import write_report
-from tofuse.apps.results.folder import OutputFolder
+from tofuse.apps.report.sections import write_report
+from tofuse.apps.results.folders import OutputFolder
 from tofuse.apps.results.output import write_result
 from tofuse.apps.viewer.report_server import FrameImages, ReportServer, report_pages
 from tofuse.engine.cameras.cameras import Pinhole

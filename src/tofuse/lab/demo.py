@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tofuse.apps.jobs import Options, resolve, run
-from tofuse.apps.results import RECORDING, OutputFolder, is_result
+from tofuse.apps.results import folders
 from tofuse.engine.errors import OutputError
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
@@ -55,8 +55,8 @@ def demo(
     )
     # Validate options and folder before the simulation.
     resolve(options)
-    recording = out / RECORDING
-    with OutputFolder(out, overwrite=overwrite) as folder:
+    recording = out / folders.RECORDING
+    with folders.OutputFolder(out, overwrite=overwrite) as folder:
         expect_failure = scene == FAILURE
         with staging.replacing_folder(recording, lambda _: _check_simulated(recording)) as fresh:
             simulate_to(
@@ -76,7 +76,7 @@ def demo(
         try:
             return run([recording], options, progress, folder)
         except BaseException:
-            if not is_result(out):
+            if not folders.is_result(out):
                 shutil.rmtree(recording, ignore_errors=True)
             raise
 
@@ -102,8 +102,8 @@ def _is_simulated(folder: Path) -> bool:
     """Whether a folder contains a simulated recording and nothing else, or is empty."""
     if folder.is_symlink() or not folder.is_dir():
         return False
-    for parent, folders, names in os.walk(folder):
-        if any((Path(parent) / name).is_symlink() for name in (*folders, *names)):
+    for parent, subfolders, names in os.walk(folder):
+        if any((Path(parent) / name).is_symlink() for name in (*subfolders, *names)):
             return False
         relative = Path(parent).relative_to(folder)
         if not all(_SIMULATED.fullmatch((relative / name).as_posix()) for name in names):

@@ -17,9 +17,15 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from tofuse.apps.cli import TerminalProgress
-from tofuse.apps.jobs import Evaluation, evaluate, quick_findings, with_findings, write_report_files
-from tofuse.apps.jobs import merge as merge_results
-from tofuse.apps.results import OutputFolder, load_result, write_result
+from tofuse.apps.jobs import (
+    Evaluation,
+    evaluate,
+    merging,
+    quick_findings,
+    with_findings,
+    write_report_files,
+)
+from tofuse.apps.results import folders, load_result, write_result
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Foreground
 from tofuse.engine.frames import Recording
@@ -94,7 +100,7 @@ class Result(Reconstruction):
             If the folder contains anything but a result, or a result and `overwrite` is not set.
         """
         # BLAS results depend on its number of threads.
-        with OutputFolder(folder, overwrite=overwrite) as out, threadpool_limits(1):
+        with folders.OutputFolder(folder, overwrite=overwrite) as out, threadpool_limits(1):
             write_result(self, out, self._write_report)
         return Path(folder)
 
@@ -193,15 +199,15 @@ class Result(Reconstruction):
         )
 
     def _repr_html_(self) -> str:
-        from tofuse.apps.report import make_scene, render, thumbnails
+        from tofuse.apps.report import scene, thumbnails
 
         rows = {f.index: k for k, f in enumerate(self.diagnostics.frames)}
-        scene = make_scene(self, rows)
+        drawn = scene.make_scene(self, rows)
         accuracy = html.escape(self.accuracy)
         verdict = html.escape(self.diagnostics.verdict.capitalize())
         picture = ""
-        if len(scene.points):
-            source = thumbnails.data_uri(render(scene, _THUMBNAIL))
+        if len(drawn.points):
+            source = thumbnails.data_uri(scene.render(drawn, _THUMBNAIL))
             picture = f'<img src="{source}" alt="The model" style="border-radius:8px"><br>'
         return f"<div>{picture}<b>{verdict}</b>: {accuracy}</div>"
 
@@ -327,7 +333,7 @@ def merge(
         If a folder is not a result, or its recording is missing or has changed.
     """
     with _with_terminal(progress) as display:
-        merged = merge_results(
+        merged = merging.merge(
             results, tolerance_m=tolerance_m, seed=seed, threads=threads, progress=display
         )
     return Result.of(merged)

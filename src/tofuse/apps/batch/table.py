@@ -56,7 +56,7 @@ def _csv(ended: Sequence[tuple[Job, Record]]) -> str:
 def _html(
     ended: Sequence[tuple[Job, Record]], total: int, running: int, folder: BatchFolder
 ) -> str:
-    from tofuse.apps.report import page
+    from tofuse.apps.report import html
 
     rows = [_row(job, record, folder) for job, record in ended]
     counts = Counter(row["tone"] for row in rows)
@@ -72,7 +72,7 @@ def _html(
         facts.append(("pending", f"{total - len(ended)}"))
     seconds = sum(record.seconds or 0 for _, record in ended)
     facts.append(("total time", duration(seconds)))
-    return page(
+    return html.page(
         "batch.html.j2",
         title=folder.path.name,
         facts=facts,

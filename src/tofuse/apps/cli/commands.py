@@ -107,7 +107,7 @@ def run_options(arguments: cli.Run) -> Options:
 
 def _run_into(arguments: cli.Run, options: Options) -> int:
     """Run, then merge the result into an earlier one, which stays unchanged if that fails."""
-    from tofuse.apps.jobs import MergeOptions, check_result, merge_files
+    from tofuse.apps.jobs import merging
     from tofuse.apps.jobs import run as run_pipeline
     from tofuse.engine.errors import InputError
 
@@ -118,15 +118,20 @@ def _run_into(arguments: cli.Run, options: Options) -> int:
         )
     if into.resolve() == options.out.resolve():
         raise InputError("is the same folder as --out", where="--into", remedy="use two folders")
-    check_result(into)  # before hours of work
+    merging.check_result(into)  # before hours of work
     with progress_for(as_json=arguments.json) as progress:
         result = run_pipeline(arguments.inputs, options, progress)
     print_result(result, options.out, as_json=arguments.json)
     map_options = from_arguments(
-        MergeOptions, arguments, out=into, overwrite=True, seed=options.seed or 0, only_joined=True
+        merging.MergeOptions,
+        arguments,
+        out=into,
+        overwrite=True,
+        seed=options.seed or 0,
+        only_joined=True,
     )
     with progress_for(as_json=arguments.json) as progress:
-        merged = merge_files([into, options.out], map_options, progress)
+        merged = merging.merge_files([into, options.out], map_options, progress)
     return _finished(merged, into, arguments)
 
 
@@ -207,9 +212,8 @@ def _wait() -> None:
 
 def register(arguments: cli.Register) -> int:
     """``tofuse register``."""
-    from tofuse.apps.jobs import PairOptions, pair_exit_status, register_files
-    from tofuse.apps.report import decision, lines
-    from tofuse.apps.results import pair_json
+    from tofuse.apps.pairs import PairOptions, decision, pair_exit_status, pair_json, register_files
+    from tofuse.apps.report import lines
 
     _check_overwrite(arguments)
     options = from_arguments(PairOptions, arguments)
@@ -292,23 +296,28 @@ def rig_check(arguments: cli.RigCheck) -> int:
 
 def judge(arguments: cli.Judge) -> int:
     """``tofuse judge``."""
-    from tofuse.apps.jobs import JudgeOptions, judge_files, sentence
-    from tofuse.apps.results import plain
+    from tofuse.apps.jobs import judging
+    from tofuse.apps.results import run_json
 
     _check_overwrite(arguments)
-    options = from_arguments(JudgeOptions, arguments)
+    options = from_arguments(judging.JudgeOptions, arguments)
     with _progress_unless_json(arguments) as progress:
-        judgement = judge_files([arguments.recording], arguments.trajectory, options, progress)
+        judgement = judging.judge_files(
+            [arguments.recording], arguments.trajectory, options, progress
+        )
     status = 3 if judgement.verdict == "failed" else 0
     if arguments.json:
         emit(
-            {**plain(judgement.to_dict()), "out": None if options.out is None else str(options.out)}
+            {
+                **run_json.plain(judgement.to_dict()),
+                "out": None if options.out is None else str(options.out),
+            }
         )
         return status
     console = make_console()
     console.print(f"[bold {VERDICT_COLORS[judgement.verdict]}]{judgement.verdict}[/]")
     _print_reasons(console, judgement.reasons)
-    console.print(sentence(judgement, arguments.trajectory.name), markup=False)
+    console.print(judging.sentence(judgement, arguments.trajectory.name), markup=False)
     consistencies = (("given", judgement.consistency), ("refined", judgement.refined_consistency))
     texts = [
         f"{name} {1e3 * c.rms_m:.1f} mm rms, {c.inlier_ratio:.1%} inliers"
@@ -324,11 +333,11 @@ def judge(arguments: cli.Judge) -> int:
 
 def merge(arguments: cli.Merge) -> int:
     """``tofuse merge``."""
-    from tofuse.apps.jobs import MergeOptions, merge_files
+    from tofuse.apps.jobs import merging
 
-    options = from_arguments(MergeOptions, arguments, seed=arguments.seed or 0)
+    options = from_arguments(merging.MergeOptions, arguments, seed=arguments.seed or 0)
     with progress_for(as_json=arguments.json) as progress:
-        result = merge_files(arguments.results, options, progress)
+        result = merging.merge_files(arguments.results, options, progress)
     return _finished(result, arguments.out, arguments)
 
 
@@ -342,18 +351,13 @@ def _check_overwrite(arguments: cli.Register | cli.Judge) -> None:
 
 def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     """Print a summary of a result, or with `as_json` one JSON line."""
-    from tofuse.apps.results import (
-        accuracy_json,
-        component_name,
-        plain,
-        reasons_json,
-        session_sentences,
-    )
+    from tofuse.apps.report import session_words
+    from tofuse.apps.results import folders, run_json
     from tofuse.engine.frames import frame_ranges
     from tofuse.engine.results import accuracy_card
 
     d = result.diagnostics
-    sessions = session_sentences(result)
+    sessions = session_words.session_sentences(result)
     counts = {s: sum(f.status == s for f in d.frames) for s in ("tracked", "predicted", "lost")}
     skipped = sum(f.status == "skipped" for f in d.frames)
     if as_json:
@@ -362,8 +366,8 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
                 "event": "result",
                 "out": str(out),
                 "verdict": d.verdict,
-                "accuracy": plain(accuracy_json(d.accuracy)),
-                "reasons": reasons_json(d.reasons),
+                "accuracy": run_json.plain(run_json.accuracy_json(d.accuracy)),
+                "reasons": run_json.reasons_json(d.reasons),
                 "frames": {**counts, "skipped": skipped},
                 "loops": sum(p.accepted for p in d.loops),
                 "sessions": sessions,
@@ -388,7 +392,7 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     console.print(f"see {_page_of(out)}", markup=False)
     for number, component in enumerate(result.components):
         if component.result is not None and not component.connected:
-            path = _page_of(out / component_name(number))
+            path = _page_of(out / folders.component_name(number))
             console.print(
                 f"and {path}, for {frame_ranges.in_words(component.frames)}", markup=False
             )

@@ -49,7 +49,7 @@ def _job(picture: str, run_arguments: Sequence[str]) -> int:
     from tofuse.apps.cli.parser import make_parser
     from tofuse.apps.cli.progress import QuietProgress, emit
     from tofuse.apps.jobs import exit_status, run
-    from tofuse.apps.report import encode, make_scene, render_thumbnail
+    from tofuse.apps.report import scene, thumbnails
     from tofuse.formats.files import atomic
 
     arguments = Run(**vars(make_parser().parse_args(["run", *run_arguments])))
@@ -57,7 +57,10 @@ def _job(picture: str, run_arguments: Sequence[str]) -> int:
         result = run(arguments.inputs, run_options(arguments), progress)
     rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
     atomic.write_bytes(
-        picture, encode(render_thumbnail(make_scene(result, rows), _PICTURE_SIZE), jpeg=True)
+        picture,
+        thumbnails.encode(
+            scene.render_thumbnail(scene.make_scene(result, rows), _PICTURE_SIZE), jpeg=True
+        ),
     )
     print_result(result, arguments.out, as_json=True)
     emit({"posed": int(result.has_pose.sum()), "peak_bytes": _peak_bytes()})

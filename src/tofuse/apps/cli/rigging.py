@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from tofuse.apps.results import plain
+from tofuse.apps.results import run_json
 from tofuse.apps.rigs import Calibration, CameraMotion
 from tofuse.engine.geometry import se3
 from tofuse.formats.rigs import Rig
@@ -94,7 +94,7 @@ def check_json(cameras: Sequence[CameraMotion]) -> dict[str, Any]:
         {"name": c.name, "checked": not c.reason} | {name: getattr(c, name) for name in _CHECKED}
         for c in cameras
     ]
-    data: dict[str, Any] = plain({"cameras": rows})
+    data: dict[str, Any] = run_json.plain({"cameras": rows})
     return data
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tofuse.apps.export.image_folder import ImageFolder, posed_images, subsampled_points
+from tofuse.apps.export.image_folder import ImageFolder, subsampled_points
 from tofuse.engine.arrays import Float32, UInt8
 from tofuse.engine.cameras import BrownConrady, Fisheye, Pinhole, Rational
-from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.formats.files import atomic, tables
 
@@ -39,25 +38,20 @@ def write_colmap(result: Path, folder: Path, every: int, pinhole: bool = False) 
     Raises
     ------
     InputError
-        See `posed_images`; or if no image can be read.
+        See `ImageFolder.write_all`.
     """
     images = ImageFolder(folder)
     supported = {Pinhole} if pinhole else set(_MODELS)
     cameras: dict[str, int] = {}
     lines: list[str] = []
-    for number, posed in enumerate(
-        posed_images(result, every, lambda camera: type(camera) in supported), 1
-    ):
-        images.write(posed)
+    written = images.write_all(result, every, lambda camera: type(camera) in supported)
+    for number, posed in enumerate(written, 1):
         camera = cameras.setdefault(lens(posed.camera), len(cameras) + 1)
         T = se3.inverse(posed.T_world_camera)
         x, y, z, w = quaternion.from_matrix(T[:3, :3])
         row = " ".join(tables.exact(value) for value in (w, x, y, z, *T[:3, 3]))
         # The second line of an image, its 2D points, is empty.
         lines += [f"{number} {row} {camera} {posed.name}", ""]
-    images.finish()
-    if not lines:
-        raise InputError("has no readable frame with a pose", where=result)
     sparse = atomic.make_folder(folder / "sparse" / "0")
     table = [f"{number} {camera}" for camera, number in cameras.items()]
     _write(sparse / "cameras.txt", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", table)

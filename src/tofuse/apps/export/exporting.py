@@ -8,22 +8,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from tofuse.apps.export.colmap import write_colmap
 from tofuse.apps.export.nerfstudio import write_nerfstudio
-from tofuse.apps.results import (
-    RESULT,
-    claimed,
-    finish_interrupted,
-    is_result,
-    read_cloud,
-    read_mesh,
-    read_run_json,
-    result_folder,
-    rotation_up_world,
-    run_json_checked,
-)
+from tofuse.apps.results import folders, read_cloud, read_mesh, run_json
 from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion import GeometryRecord, Mesh, texture
@@ -78,15 +65,14 @@ class _Result:
     def R_up_world(self) -> Float64:
         """The rotation (3, 3) that makes the mesh upright."""
         path = self.folder / "run.json"
-        return rotation_up_world(read_run_json(path), path)
+        return run_json.rotation_up_world(run_json.read_run_json(path), path)
 
     @cached_property
     def textured(self) -> GeometryRecord:
         """The simplified mesh, with its colours in a texture unless that takes too long."""
         max_faces = self.faces or FACES
-        if self.mesh.color is None or not len(self.mesh.faces):
-            return self.mesh.decimated(max_faces).record()
-        if min(max_faces, len(self.mesh.faces)) > _MAX_TEXTURED_FACES:
+        n_faces = min(max_faces, len(self.mesh.faces))
+        if self.mesh.color is None or not 0 < n_faces <= _MAX_TEXTURED_FACES:
             return self.mesh.decimated(max_faces).record()
         baked_mesh = texture.baked(self.mesh, max_faces, _TEXTURE_SIZE)
         vertex_rows = baked_mesh.atlas.vertices
@@ -101,11 +87,9 @@ class _Result:
     @cached_property
     def frame_numbers(self) -> Intp:
         """(N,) frame index of each pose."""
-        path = self.folder / "run.json"
-        run = read_run_json(path)
-        with run_json_checked(path):
-            index = np.array([frame["index"] for frame in run["frames"]], np.intp)
-            times = np.array([frame["timestamp"] for frame in run["frames"]], float)
+        clock = run_json.frame_clock(self.folder)
+        assert clock is not None
+        times, index = clock
         return index[associate(self.trajectory[0], times, limit=1e-6)]
 
 
@@ -136,30 +120,20 @@ def _stl(result: _Result, path: Path) -> None:
     exchange.save(mesh.record(), path, result.R_up_world)
 
 
-def _nerfstudio(result: _Result, path: Path) -> None:
-    with _folder(path) as folder:
-        write_nerfstudio(result.folder, folder, result.every, result.pinhole)
-
-
-def _colmap(result: _Result, path: Path) -> None:
-    with _folder(path) as folder:
-        write_colmap(result.folder, folder, result.every, result.pinhole)
-
-
-@contextmanager
-def _folder(path: Path) -> Iterator[Path]:
-    """Yield a new folder that then replaces an earlier export in its place."""
+def _images(result: _Result, path: Path) -> None:
+    """Write a folder with images, which then replaces an earlier export in its place."""
 
     def check(folder: Path) -> None:
-        if unexpected := RESULT.foreign(folder, f"{path.name}/"):
+        if unexpected := folders.RESULT.foreign(folder, f"{path.name}/"):
             raise OutputError(
                 f"contains {unexpected}, which is not part of an export",
                 where=path,
                 remedy="move it away, or pass another --out",
             )
 
+    write = write_colmap if path.name == "colmap" else write_nerfstudio
     with staging.replacing_folder(path, check) as folder:
-        yield folder
+        write(result.folder, folder, result.every, result.pinhole)
 
 
 def _kitti(result: _Result, path: Path) -> None:
@@ -182,8 +156,8 @@ FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
     "stl": ("mesh.stl", _stl),
     "kitti": ("trajectory.kitti.txt", _kitti),
     "log": ("trajectory.log", _log),
-    "nerfstudio": ("nerfstudio", _nerfstudio),
-    "colmap": ("colmap", _colmap),
+    "nerfstudio": ("nerfstudio", _images),
+    "colmap": ("colmap", _images),
 }
 
 
@@ -227,9 +201,7 @@ def export(
         If a file exists already, or can't be written, or another process writes into the folder.
     """
     folder = Path(folder)
-    finish_interrupted(result_folder(folder))
-    if not is_result(folder):
-        raise InputError("is not a result", where=folder, remedy="pass the --out of `tofuse run`")
+    folders.check_result(folder)
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
         available = ", ".join(FORMATS)
@@ -239,7 +211,7 @@ def export(
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
     atomic.make_folder(target)
-    with claimed(target), _unchanged(folder):
+    with folders.claimed(target), _unchanged(folder):
         for path in files.values():
             if path.exists() and not overwrite:
                 raise OutputError(
@@ -247,7 +219,7 @@ def export(
                 )
         result = _Result(folder, faces, every, pinhole)
         # Images first: only they can be missing after a complete run.
-        for name in sorted(files, key=lambda name: name not in ("nerfstudio", "colmap")):
+        for name in sorted(files, key=lambda name: FORMATS[name][1] is not _images):
             FORMATS[name][1](result, files[name])
     return list(files.values())
 
@@ -258,9 +230,9 @@ def _unchanged(folder: Path) -> Iterator[None]:
 
     The result itself is not locked: it may be read-only.
     """
-    before = stamps.stamp(folder / RESULT.marker)
+    before = stamps.stamp(folder / folders.RESULT.marker)
     yield
-    if not is_result(folder) or stamps.stamp(folder / RESULT.marker) != before:
+    if not folders.is_result(folder) or stamps.stamp(folder / folders.RESULT.marker) != before:
         raise InputError(
             "was replaced by another run while it was read",
             where=folder,

@@ -10,16 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.apps.results import (
-    StoredRecording,
-    frame_covariance,
-    main_poses,
-    read_cloud,
-    read_run_json,
-    reopen,
-    run_json_checked,
-    stored_recordings,
-)
+from tofuse.apps.results import read_cloud, reopening, run_json
 from tofuse.engine.arrays import Float32, Float64, UInt8, UInt16
 from tofuse.engine.cameras import Camera, Pinhole, ray_lengths, scaled
 from tofuse.engine.errors import InputError, UnreadableFrameError
@@ -98,19 +89,20 @@ def posed_images(
         If the recording is missing or has changed, contains clouds, or no image has colour or
         amplitude.
     """
-    run = read_run_json(folder / "run.json")
-    indices, poses = main_poses(folder, run)
-    selected = dict(zip(indices[::every], poses[::every], strict=True))
-    with run_json_checked(folder / "run.json"):
+    with run_json.opened(folder) as run:
+        indices, poses = run_json.main_poses(folder, run)
+        selected = dict(zip(indices[::every], poses[::every], strict=True))
         covariances = {
-            f["index"]: frame_covariance(f) for f in run["frames"] if f["index"] in selected
+            f["index"]: run_json.frame_covariance(f)
+            for f in run["frames"]
+            if f["index"] in selected
         }
-        parts = list(stored_recordings(folder, run))
+        parts = list(reopening.stored_recordings(folder, run))
         correctors = [CameraErrors.made_with(part.config) for part in parts]
     skipped: list[str] = []
     n_images = 0
     for part, frame_correctors in zip(parts, correctors, strict=True):
-        recording = reopen(part, folder)
+        recording = reopening.reopen(part, folder)
         renderer = _ImageRenderer(recording)
         camera: Camera | None = None
         rectifier: Rectifier | None = None
@@ -156,7 +148,7 @@ def posed_images(
 
 
 def _frames(
-    part: StoredRecording,
+    part: reopening.StoredRecording,
     recording: Recording,
     selected: dict[int, Float64],
     correctors: Sequence[Corrector],
@@ -246,8 +238,23 @@ class ImageFolder:
             self.masked = True
             self._png(MASKS, posed.name, np.where(valid, 255, 0).astype(np.uint8))
 
-    def finish(self) -> None:
-        """Write masks for the other frames as well, if any frame has one."""
+    def write_all(
+        self, result: Path, every: int, is_supported: Callable[[Camera], bool]
+    ) -> Iterator[PosedImage]:
+        """Yield the images of a result, see `posed_images`, after writing each.
+
+        Raises
+        ------
+        InputError
+            See `posed_images`; or if no image can be read.
+        """
+        posed = None
+        for posed in posed_images(result, every, is_supported):
+            self.write(posed)
+            yield posed
+        if posed is None:
+            raise InputError("has no readable frame with a pose", where=result)
+        # If any frame has a mask, all get one.
         for name, shape in self._unmasked if self.masked else ():
             self._png(MASKS, name, np.full(shape, 255, np.uint8))
 

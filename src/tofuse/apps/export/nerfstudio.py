@@ -16,7 +16,6 @@ from tofuse.apps.export.image_folder import (
     SIGMA,
     SIGMA_UNIT_M,
     ImageFolder,
-    posed_images,
     subsampled_points,
 )
 from tofuse.engine.cameras import DISTORTION_ORDER, BrownConrady, Camera, Fisheye, Pinhole
@@ -46,14 +45,13 @@ def write_nerfstudio(result: Path, folder: Path, every: int, pinhole: bool = Fal
     Raises
     ------
     InputError
-        See `posed_images`; or if no image can be read, or only some have a fisheye lens.
+        See `ImageFolder.write_all`; or if only some have a fisheye lens.
     """
     images = ImageFolder(folder)
     supported = {Pinhole} if pinhole else set(_MODELS)
     frames: list[dict[str, Any]] = []
     lenses: list[dict[str, Any]] = []
-    for posed in posed_images(result, every, lambda camera: type(camera) in supported):
-        images.write(posed)
+    for posed in images.write_all(result, every, lambda camera: type(camera) in supported):
         lenses.append(lens(posed.camera))
         frames.append(
             {key: f"{kind}/{posed.name}" for key, kind in _FILES.items()}
@@ -64,9 +62,6 @@ def write_nerfstudio(result: Path, folder: Path, every: int, pinhole: bool = Fal
         )
         if posed.covariance is not None:
             frames[-1]["pose_covariance"] = posed.covariance.ravel().tolist()
-    images.finish()
-    if not frames:
-        raise InputError("has no readable frame with a pose", where=result)
     header: dict[str, Any] = {"camera_model": lenses[0]["camera_model"]}
     if any(camera["camera_model"] != header["camera_model"] for camera in lenses):
         raise InputError(

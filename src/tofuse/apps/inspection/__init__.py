@@ -1,4 +1,8 @@
-"""."""
+"""Checks of a recording before it is used: `tofuse inspect`, and the start of a run.
+
+A small sample of the frames is read and aligned once; each check looks at it for one kind of fault,
+such as a wrong unit, lens or clock, and yields findings with their evidence and a remedy.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -75,13 +75,7 @@ class Finding:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data."""
-        return {
-            "code": self.code,
-            "severity": self.severity,
-            "text": self.text,
-            "remedy": self.remedy,
-            "evidence": self.evidence,
-        }
+        return {"code": self.code, "severity": self.severity} | vars(self)
 
 
 def is_significant(lead: Float64, minimum: float, sigmas: float) -> bool:

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from tofuse.apps.inspection import channels, geometry, motion_checks, times, values
 from tofuse.apps.inspection.finding import SEVERITIES, Finding
 from tofuse.apps.inspection.sample import Sample
+from tofuse.apps.inspection.sheet import write_sheet
 from tofuse.apps.inspection.values import depths_of
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import Pinhole, RayTable
@@ -102,9 +103,7 @@ class Inspection:
         OutputError
             If it can't be written.
         """
-        from tofuse.apps.inspection.sheet import write_sheet
-
-        return write_sheet(self, Path(path))
+        return write_sheet(Path(path), self.frames, self.facts, self.findings)
 
 
 def inspect_recording(

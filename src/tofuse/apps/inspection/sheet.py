@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.values import flying_pixels
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.errors import OutputError
 from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
-
-if TYPE_CHECKING:
-    from tofuse.apps.inspection.inspect import Inspection
-
 
 _COLUMNS = 5
 # Kinds of pixels in the mask, and their colours.
@@ -29,8 +27,10 @@ _MASK = (
 _LINE_WIDTH = 125
 
 
-def write_sheet(inspection: Inspection, path: Path) -> Path:
-    """Write the contact sheet of an inspection as a PNG.
+def write_sheet(
+    path: Path, frames: Sequence[Frame], facts: Mapping[str, str], findings: Sequence[Finding]
+) -> Path:
+    """Write some of the frames, the facts and the findings of an inspection as a PNG.
 
     Raises
     ------
@@ -40,9 +40,9 @@ def write_sheet(inspection: Inspection, path: Path) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    frames = [f for f in inspection.frames if len(f)]
+    frames = [f for f in frames if len(f)]
     frames = [frames[int(k)] for k in np.linspace(0, len(frames) - 1, min(_COLUMNS, len(frames)))]
-    lines = _lines(inspection)
+    lines = _lines(facts, findings)
     columns = max(len(frames), 2)
     text_height = 0.135 * len(lines) + 0.45
     height = 3 * 1.75 + text_height
@@ -78,13 +78,13 @@ def write_sheet(inspection: Inspection, path: Path) -> Path:
     return path
 
 
-def _lines(inspection: Inspection) -> list[str]:
-    out = [f"{name:<16} {fact}"[:_LINE_WIDTH] for name, fact in inspection.facts.items()]
+def _lines(facts: Mapping[str, str], findings: Sequence[Finding]) -> list[str]:
+    out = [f"{name:<16} {fact}"[:_LINE_WIDTH] for name, fact in facts.items()]
     out.append("")
-    for finding in inspection.findings:
+    for finding in findings:
         text = f"{finding.severity}: {finding.code}: {finding.text}"
         out += textwrap.wrap(text, _LINE_WIDTH, subsequent_indent="    ")
-    if not inspection.findings:
+    if not findings:
         out.append("all checks passed")
     return [line.replace("$", r"\$") for line in out]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.apps.results import frame_clock, is_result, read_run_json, run_json_checked
+from tofuse.apps.results import folders, run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
@@ -93,26 +93,22 @@ def evaluate(
     if isinstance(recording, str | Path):
         recording = open_recording(recording)
     names = [
-        str(p) if isinstance(p, str | Path) else n
-        for p, n in ((estimate, "estimate"), (reference, "reference"))
+        str(source) if isinstance(source, str | Path) else name
+        for source, name in ((estimate, "estimate"), (reference, "reference"))
     ]
-    clock = frame_clock(Path(estimate)) if isinstance(estimate, str | Path) else None
+    clock = run_json.frame_clock(Path(estimate)) if isinstance(estimate, str | Path) else None
     if recording is not None:
         clock = recording.timestamps, recording.indices
-    timed_estimate, timed_reference = (
-        _poses(estimate, names[0]),
-        _poses(reference, names[1], is_reference=True),
-    )
-    if clock is None and (timed_estimate.timestamps is None) != (
-        timed_reference.timestamps is None
-    ):
+    timed = _poses(estimate, names[0]), _poses(reference, names[1], is_reference=True)
+    by_frame = [n for n, poses in zip(names, timed, strict=True) if poses.timestamps is None]
+    if clock is None and len(by_frame) == 1:
         raise InputError(
             "has poses by frame, the other file by time",
-            where=names[0] if timed_estimate.timestamps is None else names[1],
+            where=by_frame[0],
             remedy="pass the recording, which has the times, with --recording",
         )
-    times, poses = _timed(timed_estimate, estimate, clock, names[0])
-    reference_times, reference_poses = _timed(timed_reference, reference, clock, names[1])
+    times, poses = _timed(timed[0], estimate, clock, names[0])
+    reference_times, reference_poses = _timed(timed[1], reference, clock, names[1])
     frame_times = None if recording is None else recording.timestamps
     try:
         error = trajectory_errors.evaluate_trajectory(
@@ -140,11 +136,9 @@ def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corr
         return ()
     folder = Path(estimate)
     folder = folder.parent if folder.name == _TRAJECTORY else folder
-    if not is_result(folder):
+    if not folders.is_result(folder):
         return ()
-    path = folder / "run.json"
-    run = read_run_json(path)
-    with run_json_checked(path):
+    with run_json.opened(folder) as run:
         return CameraErrors.made_with(run["config"])
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.results import OutputFolder, accuracy_json, plain, reasons_json, write_result
+from tofuse.apps.results import folders, run_json, write_result
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
@@ -47,6 +47,8 @@ from tofuse.formats.poses import TimedPoses, read_poses
 from tofuse.formats.recordings import Opening, OpeningOptions, read_reference
 
 Views = Sequence[PosedView[PreparedView]]
+
+_length = accuracy_card.length
 
 # Number of frames whose images are compared under the poses.
 _CHECKED = 60
@@ -98,21 +100,25 @@ class Judgement:
         return {
             "schema": 1,
             "verdict": self.verdict,
-            "accuracy": accuracy_json(self.accuracy),
-            "reasons": reasons_json(self.reasons),
+            "accuracy": run_json.accuracy_json(self.accuracy),
+            "reasons": run_json.reasons_json(self.reasons),
             "frames": int(np.isfinite(self.poses[:, 0, 0]).sum()),
-            "map_consistency": None if self.consistency is None else self.consistency.to_dict(),
-            "deviation": None if self.deviation is None else self.deviation.to_dict(),
+            "map_consistency": _dict(self.consistency),
+            "deviation": _dict(self.deviation),
             "displacement_m": self.displacement_m,
             "refined": {
                 "from_these_poses": self.started,
                 "verdict": self.refined.diagnostics.verdict,
-                "accuracy": accuracy_json(self.refined.diagnostics.accuracy),
-                "map_consistency": None
-                if self.refined_consistency is None
-                else self.refined_consistency.to_dict(),
+                "accuracy": run_json.accuracy_json(self.refined.diagnostics.accuracy),
+                "map_consistency": _dict(self.refined_consistency),
             },
         }
+
+
+def _dict(
+    figures: map_agreement.Consistency | pose_deviation.Deviation | None,
+) -> dict[str, Any] | None:
+    return None if figures is None else figures.to_dict()
 
 
 def judge(
@@ -168,31 +174,20 @@ def judge(
 
     progress.stage("comparing images")
     initial_support = compared_images.support_at(poses)
-    refined, views, refined_support = reconstructed(
-        adaptation.with_odometry(recording, poses), given_config
-    )
-    from_poses = True
-    if not refined_support.is_supported:
-        independent, independent_views, independent_support = reconstructed(recording, config)
-        if independent_support.support > refined_support.support:
-            refined, views, refined_support, from_poses = (
-                independent,
-                independent_views,
-                independent_support,
-                False,
-            )
+    started = reconstructed(adaptation.with_odometry(recording, poses), given_config)
+    best = started
+    if not started[2].is_supported:
+        best = max(started, reconstructed(recording, config), key=lambda found: found[2].support)
+    refined, views, refined_support = best
     progress.stage("registering pairs")
     with use_threads(threads), threadpool_limits(1):
         deviation = _deviation(poses, refined, views)
     distances = _distances(poses, refined.trajectory)
     accuracy = _accuracy(distances, poses, refined)
-    reasons = verdicts.ranked(
-        [
-            *_reasons(
-                poses, accuracy, deviation, initial_support, refined_support, refined, tolerance_m
-            ),
-        ]
+    found = _reasons(
+        poses, accuracy, deviation, initial_support, refined_support, refined, tolerance_m
     )
+    reasons = verdicts.ranked([*found])
     return Judgement(
         poses,
         accuracy,
@@ -203,7 +198,7 @@ def judge(
         deviation,
         distances,
         refined,
-        from_poses,
+        best is started,
     )
 
 
@@ -285,7 +280,11 @@ def judge_files(
     opening = Opening.of(inputs, options)
     recording = opening.open()
     out = options.out
-    with nullcontext() if out is None else OutputFolder(out, overwrite=options.overwrite) as folder:
+    with (
+        nullcontext()
+        if out is None
+        else folders.OutputFolder(out, overwrite=options.overwrite) as folder
+    ):
         judgement = judge(
             recording,
             trajectory,
@@ -303,7 +302,7 @@ def judge_files(
 
 
 def _write(
-    judgement: Judgement, trajectory: Path, recording: Recording, folder: OutputFolder
+    judgement: Judgement, trajectory: Path, recording: Recording, folder: folders.OutputFolder
 ) -> None:
     """Write the refined result, with `judge.json` and the judgement as headline of the report."""
     from tofuse.apps.report import ReportExtras, write_report
@@ -313,7 +312,7 @@ def _write(
         title = f"{trajectory.name} on {Path(recording.path).name}"
         write_report(result, path / "report.html", ReportExtras(title, headline=headline))
         if result is judgement.refined:
-            text = json.dumps(plain(judgement.to_dict()), indent=1, allow_nan=False)
+            text = json.dumps(run_json.plain(judgement.to_dict()), indent=1, allow_nan=False)
             (path / "judge.json").write_text(text + "\n", encoding="utf-8")
 
     write_result(judgement.refined, folder, report)
@@ -338,15 +337,14 @@ def _agreement(deviation: pose_deviation.Deviation | None) -> str:
     if deviation is None:
         return ""
     if not deviation.consistent:
+        about, at_least = map(_length, (deviation.estimate_m, deviation.at_least_m))
         return (
             " Inconsistent with the depth: surfaces displaced by about "
-            f"{accuracy_card.length(deviation.estimate_m)}, at least {accuracy_card.length(deviation.at_least_m)} (95 %)."
+            f"{about}, at least {at_least} (95 %)."
         )
     if not np.isfinite(deviation.at_most_m):
         return " Consistent with the depth, as far as that constrains them."
-    return (
-        f" Consistent with the depth to within {accuracy_card.length(deviation.at_most_m)} (95 %)."
-    )
+    return f" Consistent with the depth to within {_length(deviation.at_most_m)} (95 %)."
 
 
 def device_sentence(recording: Recording, result: Reconstruction) -> str:
@@ -363,8 +361,8 @@ def device_sentence(recording: Recording, result: Reconstruction) -> str:
         return ""
     rms, bound_m = float(np.sqrt((distances**2).mean())), result.diagnostics.accuracy.position_m
     if not np.isfinite(bound_m):
-        return f"{by}'s poses differ from these by {accuracy_card.length(rms)} rms."
-    return f"{by}'s poses: ±{accuracy_card.length(rms + bound_m)} (95 %); these: ±{accuracy_card.length(bound_m)}."
+        return f"{by}'s poses differ from these by {_length(rms)} rms."
+    return f"{by}'s poses: ±{_length(rms + bound_m)} (95 %); these: ±{_length(bound_m)}."
 
 
 def _read(path: Path) -> TimedPoses:
@@ -498,8 +496,8 @@ def _reasons(
         first = next(iter(jumped))
         ranges = frame_ranges.runs_of(indices, [indices[k] for k in jumped])
         text = (
-            f"The poses of {frame_ranges.in_words(ranges)} jump, and the refined ones don't; that of frame "
-            f"{indices[first]} is {jumped[first]}."
+            f"The poses of {frame_ranges.in_words(ranges)} jump, and the refined ones don't; that "
+            f"of frame {indices[first]} is {jumped[first]}."
         )
         yield Reason("jumped", ranges, text)
 
@@ -514,8 +512,8 @@ def _contradiction(
         return
     text = (
         f"Registrations contradict the poses: surfaces are displaced by about "
-        f"{accuracy_card.length(deviation.estimate_m)} rms, at least {accuracy_card.length(deviation.at_least_m)} (95 %); the "
-        f"tolerance is {accuracy_card.length(allowed_m)}."
+        f"{_length(deviation.estimate_m)} rms, at least {_length(deviation.at_least_m)} (95 %); "
+        f"the tolerance is {_length(allowed_m)}."
     )
     steps = tuple((int(a), int(b)) for a, b in deviation.ids[deviation.steps])
     if steps:

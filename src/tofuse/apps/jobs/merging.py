@@ -18,7 +18,8 @@ from threadpoolctl import threadpool_limits
 from tofuse.apps.jobs.run_options import ModelOptions
 from tofuse.apps.jobs.session_pairs import SessionModel, session_changes, session_pairs
 from tofuse.apps.jobs.sessions import Session, read_sessions, sessions_of
-from tofuse.apps.results import OutputFolder, session_sentences, write_result
+from tofuse.apps.report import session_words
+from tofuse.apps.results import folders, write_result
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
@@ -299,12 +300,15 @@ def merge_files(
         If the result can't be written; an existing folder is then unchanged.
     """
     # Claimed before the results are read: it may be one of them.
-    with OutputFolder(options.out, overwrite=options.overwrite) as folder:
+    with folders.OutputFolder(options.out, overwrite=options.overwrite) as folder:
         return _merge_into(folder, results, options, progress or Silent())
 
 
 def _merge_into(
-    folder: OutputFolder, results: Sequence[str | Path], options: MergeOptions, progress: Progress
+    folder: folders.OutputFolder,
+    results: Sequence[str | Path],
+    options: MergeOptions,
+    progress: Progress,
 ) -> Reconstruction:
     progress.stage("opening")
     sessions = read_sessions(results, options.threads, progress)
@@ -333,6 +337,6 @@ def _report(result: Reconstruction, folder: Path) -> None:
     names = ", ".join(session.name for session in result.sessions)
     extras = ReportExtras(
         title=f"{names} merged" if names else f"{folder.name} of a merged result",
-        headline=" ".join(session_sentences(result)),
+        headline=" ".join(session_words.session_sentences(result)),
     )
     write_report(result, folder / "report.html", extras)

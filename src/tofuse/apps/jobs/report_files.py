@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.apps.jobs.judging import device_sentence
-from tofuse.apps.results import RECORDING, component_number
+from tofuse.apps.results import folders
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.filters import apply_filters
@@ -31,7 +31,7 @@ def write_report_files(
 
     title = _title(Path(recording.path)) or recording.path
     truth = truth_points(recording)
-    component = component_number(folder)
+    component = folders.component_number(folder)
     if component is not None:
         title += f", component {component}"
         truth = None  # its pose relative to this component is unknown
@@ -56,7 +56,7 @@ def _frames_of(recording: Recording, result: Reconstruction) -> Recording:
 
 def _title(path: Path) -> str:
     """Return the name of a recording; that of its folder for a native recording in a result."""
-    return (path.parent.name if path.name == RECORDING else "") or path.name
+    return (path.parent.name if path.name == folders.RECORDING else "") or path.name
 
 
 def _final_config(config: Config, result: Reconstruction) -> Config:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tofuse.apps.results import read_run_json
+from tofuse.apps.results import run_json
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.engine.mapping import (
@@ -148,7 +148,7 @@ def seed_of(options: Options) -> int:
     if options.seed is not None:
         return options.seed
     if options.config is not None and options.config.suffix == ".json":
-        seed = read_run_json(options.config).get("seed", 0)
+        seed = run_json.read_run_json(options.config).get("seed", 0)
         if isinstance(seed, int) and seed >= 0:
             return seed
     return 0
@@ -174,7 +174,7 @@ def read_changes(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     if path.suffix == ".json":
-        config = read_run_json(path).get("config")
+        config = run_json.read_run_json(path).get("config")
         if not isinstance(config, dict):
             raise InputError("contains no config", where=path, remedy="pass a run.json of tofuse")
         return config

@@ -19,7 +19,7 @@ from tofuse.apps.jobs.judging import device_sentence
 from tofuse.apps.jobs.report_files import write_report_files
 from tofuse.apps.jobs.run_options import Options, check_guess, check_unwrap, resolve, seed_of
 from tofuse.apps.jobs.tracked_file import TrackedFile
-from tofuse.apps.results import TRACKED, OutputFolder, check_output, plain, write_result
+from tofuse.apps.results import folders, run_json, write_result
 from tofuse.engine.compute import trim_memory
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
@@ -38,7 +38,7 @@ def run(
     inputs: Sequence[str | Path],
     options: Options,
     progress: Progress | None = None,
-    folder: OutputFolder | None = None,
+    folder: folders.OutputFolder | None = None,
 ) -> Reconstruction:
     """Reconstruct recordings and write the output folder.
 
@@ -52,13 +52,13 @@ def run(
     """
     progress = progress or Silent()
     if folder is None:
-        check_output(options.out, overwrite=options.overwrite)
+        folders.check_output(options.out, overwrite=options.overwrite)
     watch = Stopwatch()
     with watch.timing("opening"):
         job = _open(inputs, options, progress)
     tracked_file = _tracked_file(inputs, options, job, progress) if folder is None else None
     with (
-        OutputFolder(options.out, overwrite=options.overwrite)
+        folders.OutputFolder(options.out, overwrite=options.overwrite)
         if folder is None
         else nullcontext(folder)
     ) as out:
@@ -73,7 +73,13 @@ def run(
                 tracked_frames=tracked_file,
             )
             texture = _texture(job, result, options, progress, watch)
-            result = _with_job(result, job, options, watch)
+            result = with_findings(result, job.findings, turning=options.object)
+            seconds = {**watch.seconds, **result.diagnostics.seconds}
+            result = replace(
+                result,
+                recording={**result.recording, "opening": job.opening.to_dict()},
+                diagnostics=replace(result.diagnostics, seconds=seconds),
+            )
             if device := device_sentence(job.recording, result):
                 progress.note(device)
             progress.stage("writing")
@@ -111,7 +117,8 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
     seed = seed_of(options)
     opening = Opening.of(inputs, options)
     recording = opening.open()
-    _preview(recording, progress)
+    if (frame := recording.first_readable()) is not None:  # shown before any work begins
+        progress.placed(frame, np.eye(4))
     config = resolve(options, reconstructing.view_kind(recording))
     if not options.object:  # no sensor measures the motion relative to a moving object
         recording, config = adaptation.with_prior(recording, config, options.prior)
@@ -142,26 +149,6 @@ def _texture(
     return texture
 
 
-def _with_job(
-    result: Reconstruction, job: _Job, options: Options, watch: Stopwatch
-) -> Reconstruction:
-    """Add findings, how the recording was opened, and times to the result."""
-    result = with_findings(result, job.findings, turning=options.object)
-    seconds = {**watch.seconds, **result.diagnostics.seconds}
-    return replace(
-        result,
-        recording={**result.recording, "opening": job.opening.to_dict()},
-        diagnostics=replace(result.diagnostics, seconds=seconds),
-    )
-
-
-def _preview(recording: Recording, progress: Progress) -> None:
-    """Show the first frame before any work begins, at the first pose."""
-    frame = recording.first_readable()
-    if frame is not None:
-        progress.placed(frame, np.eye(4))
-
-
 def _tracked_file(
     inputs: Sequence[str | Path], options: Options, job: _Job, progress: Progress
 ) -> TrackedFile:
@@ -171,12 +158,12 @@ def _tracked_file(
     facts = {
         "version": __version__,
         "options": repr(replace(options, out=Path(), overwrite=False, threads=None)),
-        "config": plain(job.config.to_dict()),
+        "config": run_json.plain(job.config.to_dict()),
         "seed": job.seed,
         "files": [stamps.stamps_of(path.absolute(), out) for path in paths],
     }
     key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
-    return TrackedFile(out / TRACKED, key, progress.note)
+    return TrackedFile(out / folders.TRACKED, key, progress.note)
 
 
 def quick_findings(

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from tofuse.apps.results import MAX_STATED_PROBABILITY
+from tofuse.apps.report import session_words
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.quality import changes, cross_view_agreement
@@ -66,17 +66,21 @@ class SessionModel:
             and any(first.has(k) for k in (join.link.i, join.link.j))
             and any(second.has(k) for k in (join.link.i, join.link.j))
         ]
-        return min(max(probabilities), MAX_STATED_PROBABILITY) if probabilities else None
+        return (
+            min(max(probabilities), session_words.MAX_STATED_PROBABILITY) if probabilities else None
+        )
 
     def cross_view(
         self, first: Sequence[View], second: Sequence[View]
     ) -> cross_view_agreement.CrossViewConsistency:
         """Return the cross-view consistency between views of two sessions."""
-        views = [*first, *second]
+        sessions = [0] * len(first) + [1] * len(second)
+        return cross_view_agreement.compare_views(*self.posed([*first, *second]), sessions)
+
+    def posed(self, views: Sequence[View]) -> tuple[list[PreparedView], Float64]:
+        """Return prepared views and their poses (N, 4, 4)."""
         poses = np.array([self.poses[v.index] for v in views]).reshape(-1, 4, 4)
-        return cross_view_agreement.compare_views(
-            [v.view for v in views], poses, [0] * len(first) + [1] * len(second)
-        )
+        return [v.view for v in views], poses
 
 
 def session_pairs(
@@ -98,47 +102,40 @@ def session_pairs(
     """
     separate = [c.result for c in result.components if c.result is not None and not c.connected]
     models = [SessionModel.of(each) for each in (result, *separate)]
-    pairs = []
-    for a, b in combinations(range(len(records)), 2):
-        first, second = records[a], records[b]
-        for model in models:
-            first_views, second_views = model.views(first, views), model.views(second, views)
-            if first_views and second_views:
-                before = bool(set(components_before[a]) & set(components_before[b]))
-                pairs.append(
-                    _pair(a, b, first, second, model, first_views, second_views, before=before)
-                )
-                break
-        else:
-            pairs.append(SessionPair(a, b, joined=False))
-    return tuple(pairs)
+    return tuple(
+        _pair(a, b, records, models, components_before, views)
+        for a, b in combinations(range(len(records)), 2)
+    )
 
 
 def _pair(
     a: int,
     b: int,
-    first: SessionRecord,
-    second: SessionRecord,
-    model: SessionModel,
-    first_views: Sequence[View],
-    second_views: Sequence[View],
-    *,
-    before: bool,
+    records: Sequence[SessionRecord],
+    models: Sequence[SessionModel],
+    components_before: Sequence[Collection[int]],
+    views: Sequence[View],
 ) -> SessionPair:
-    """Return the links and the overlap of two sessions in one model."""
-    cross_view = model.cross_view(first_views, second_views)
-    overlap = np.isfinite(cross_view.support_of_views())
-    support = cross_view.support()
-    return SessionPair(
-        a,
-        b,
-        True,
-        before,
-        len(model.links(first, second)),
-        model.join_probability(first, second),
-        float(min(overlap[: len(first_views)].mean(), overlap[len(first_views) :].mean())),
-        float(support) if np.isfinite(support) else None,
-    )
+    """Return the links and the overlap of two sessions in the model that has views of both."""
+    first, second = records[a], records[b]
+    for model in models:
+        views_a, views_b = model.views(first, views), model.views(second, views)
+        if not views_a or not views_b:
+            continue
+        cross_view = model.cross_view(views_a, views_b)
+        overlap = np.isfinite(cross_view.support_of_views())
+        support = cross_view.support()
+        return SessionPair(
+            a,
+            b,
+            True,
+            bool(set(components_before[a]) & set(components_before[b])),
+            len(model.links(first, second)),
+            model.join_probability(first, second),
+            float(min(overlap[: len(views_a)].mean(), overlap[len(views_a) :].mean())),
+            float(support) if np.isfinite(support) else None,
+        )
+    return SessionPair(a, b, joined=False)
 
 
 def session_changes(
@@ -155,12 +152,6 @@ def session_changes(
     views_of = [model.views(record, views) for record in records]
     detected = []
     for a, b in combinations(range(len(records)), 2):
-        inputs = [
-            (
-                [v.view for v in session_views],
-                np.array([model.poses[v.index] for v in session_views]),
-            )
-            for session_views in (views_of[a], views_of[b])
-        ]
-        detected += [SessionChange(a, b, change) for change in changes(*inputs[0], *inputs[1])]
+        found = changes(*model.posed(views_of[a]), *model.posed(views_of[b]))
+        detected += [SessionChange(a, b, change) for change in found]
     return tuple(detected)

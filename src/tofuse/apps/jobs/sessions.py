@@ -9,19 +9,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, get_args
 
-from tofuse.apps.results import (
-    StoredRecording,
-    component_name,
-    finish_interrupted,
-    frame_covariance,
-    is_result,
-    locate_recording,
-    main_poses,
-    read_run_json,
-    reopen,
-    run_json_checked,
-    stored_recordings,
-)
+from tofuse.apps.results import folders, reopening, run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
@@ -30,8 +18,6 @@ from tofuse.engine.progress import Progress
 from tofuse.engine.tracking import Keyframes, Status, given
 from tofuse.formats.files import reading
 from tofuse.formats.recordings import Opening
-
-_REMEDY = "pass the --out of `tofuse run`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,26 +113,25 @@ def sessions_of(
 
 def _read_parts(
     folder: Path, components: int
-) -> tuple[list[tuple[StoredRecording, dict[int, given.StatedPose]]], tuple[tuple[int, int], ...]]:
+) -> tuple[
+    list[tuple[reopening.StoredRecording, dict[int, given.StatedPose]]], tuple[tuple[int, int], ...]
+]:
     """Read the recordings of a result and the poses of their frames, by index in the recording.
 
     Also the loop closures between them, see `Session`. Its components are numbered from
     `components`.
     """
-    finish_interrupted(folder)
-    if not folder.exists():
-        raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
-    if not folder.is_dir() or not is_result(folder):
-        raise InputError("contains no result (no run.json)", where=folder, remedy=_REMEDY)
-    run = read_run_json(folder / "run.json")
-    with run_json_checked(folder / "run.json"):
+    folders.check_result(folder)
+    with run_json.opened(folder) as run:
         stated = _stated(folder, run, components)
-        parts = list(stored_recordings(folder, run))
+        parts = list(reopening.stored_recordings(folder, run))
         posed = [(p, {k: stated[p.first + k] for k in p.frames}) for p in parts]
         return posed, _links(run, parts)
 
 
-def _links(run: Mapping[str, Any], parts: Sequence[StoredRecording]) -> tuple[tuple[int, int], ...]:
+def _links(
+    run: Mapping[str, Any], parts: Sequence[reopening.StoredRecording]
+) -> tuple[tuple[int, int], ...]:
     """Return the loop closures (i, j) of a result between its sessions."""
     starts = sorted(p.first for p in parts)
     loops = ((int(p["i"]), int(p["j"])) for p in run.get("loops", ()) if p["accepted"])
@@ -154,14 +139,14 @@ def _links(run: Mapping[str, Any], parts: Sequence[StoredRecording]) -> tuple[tu
 
 
 def _session(
-    part: StoredRecording,
+    part: reopening.StoredRecording,
     stated: dict[int, given.StatedPose],
     folder: Path,
     threads: int | None,
     progress: Progress,
 ) -> Session:
     """Reopen the recording of a part of a result."""
-    recording = reopen(part, folder)
+    recording = reopening.reopen(part, folder)
     frame = recording.first_readable()
     if frame is not None and kind_of(frame) != "range":
         raise InputError(
@@ -170,19 +155,19 @@ def _session(
             remedy="pass their clouds together to one `tofuse run`",
         )
     config = _config(part.config, recording, folder, threads, progress)
-    opening = locate_recording(part.opening, folder)
+    opening = reopening.locate_recording(part.opening, folder)
     return Session(part.name, folder, opening, recording, config, stated)
 
 
-def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, given.StatedPose]:
+def _stated(folder: Path, run: dict[str, Any], components: int) -> dict[int, given.StatedPose]:
     """Return the pose and status that a result states for each frame, by index."""
-    poses = _poses(folder, dict(run))
+    poses = _poses(folder, run)
     main = {k: (T, components) for k, T in poses.items()}
     separate = [k for k, c in enumerate(run["components"]) if c["T_main_component"] is None]
     for number, k in enumerate(separate, components + 1):
-        component_folder = folder / component_name(k)
-        if is_result(component_folder):
-            main |= {i: (T, number) for i, T in _poses(component_folder, None).items()}
+        component_folder = folder / folders.component_name(k)
+        if folders.is_result(component_folder):
+            main |= {i: (T, number) for i, T in _poses(component_folder).items()}
     stated = {}
     for frame in run["frames"]:
         index, status = int(frame["index"]), frame["status"]
@@ -190,7 +175,7 @@ def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, 
             raise ValueError(f"frame {index} is {status!r}")
         if index in main:
             T, component = main[index]
-            C = frame_covariance(frame) if component == components else None
+            C = run_json.frame_covariance(frame) if component == components else None
             stated[index] = given.StatedPose(status, str(frame["reason"]), T, component, C)
         else:
             reason = str(frame["reason"]) if status in ("lost", "skipped") else "was in no model"
@@ -198,10 +183,10 @@ def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, 
     return stated
 
 
-def _poses(folder: Path, run: dict[str, Any] | None) -> dict[int, Float64]:
+def _poses(folder: Path, run: dict[str, Any] | None = None) -> dict[int, Float64]:
     """Return (4, 4) T_world_camera by index, of the frames in a folder's main model."""
-    run = read_run_json(folder / "run.json") if run is None else run
-    indices, poses = main_poses(folder, run)
+    run = run or run_json.read_run_json(folder / "run.json")
+    indices, poses = run_json.main_poses(folder, run)
     return dict(zip(indices, poses, strict=True))
 
 

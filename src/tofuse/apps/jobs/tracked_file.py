@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -30,10 +30,9 @@ from tofuse.formats.files import atomic, npz
 
 # Tracking that took less, in s, is repeated.
 _MIN_TRACKING_S = 10.0
-# Attributes of steps and of registrations that are plain data.
+# Attributes of steps that are plain data, and those of registrations that are arrays.
 _PLAIN_STEP = ("status", "reason", "reference", "component", "doubtful", "inflation")
-_ARRAYS = ("T_target_source", "information", "unobservable", "errors", "runner_up")
-_PLAIN_REGISTRATION = tuple(f.name for f in fields(Registration) if f.name not in _ARRAYS)
+_ARRAYS = ("T_target_source", "information", "unobservable", "runner_up")
 _NOT_TRACKED = Step("lost", "not tracked before", None)
 
 
@@ -113,7 +112,14 @@ class TrackedFile:
                 self._note("goes on after the tracking of an interrupted run")
                 return replaying
             problem = "belong to another input, other options or another version"
-        except (InputError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        except (
+            InputError,
+            AttributeError,
+            LookupError,
+            RuntimeError,
+            TypeError,
+            ValueError,
+        ) as error:
             reason = error.problem if isinstance(error, InputError) else str(error)
             problem = f"are damaged ({reason})"
         self._note(
@@ -200,7 +206,7 @@ class ReplayingTracker(Tracker):
         self.indices = list(self._steps)
         poses = map(_matrix, arrays["predicted"])
         self._predicted = dict(zip(self.indices, poses, strict=True))
-        masks = _split(arrays, "moving")
+        masks = np.split(arrays["moving"], np.cumsum(arrays["n_moving"]))[:-1]
         self._moving = dict(zip(arrays["moving_index"].tolist(), masks, strict=True))
 
     def push(
@@ -233,24 +239,13 @@ class ReplayingTracker(Tracker):
 def _packed(log: FrameLog, tracker: LoggingTracker) -> npz.Arrays:
     """Return the steps of a log as arrays."""
     steps = [(e.record.index, e.step) for e in log.entries if e.step is not None]
-    registrations = [
-        registration
-        for _, step in steps
-        for registration in (step.registration, *(link.registration for link in step.links))
-        if registration is not None
-    ]
-    unobservable = [r.unobservable for r in registrations]
     masks = [np.frombuffer(bits, np.uint8) for bits in tracker.moving.values()]
+    # JSON has all digits of the numbers.
+    text = json.dumps([_plain_step(index, step) for index, step in steps], default=_plain)
     return {
-        "steps": _text([_plain_step(index, step) for index, step in steps]),
-        "poses": _matrices([step.T_component_camera for _, step in steps], 4),
-        "predicted": _matrices([tracker.predicted.get(index) for index, _ in steps], 4),
-        "registrations": _text([_attributes(r, _PLAIN_REGISTRATION) for r in registrations]),
-        "T_target_source": _matrices([r.T_target_source for r in registrations], 4),
-        "information": _matrices([r.information for r in registrations], 6),
-        "runner_up": _matrices([r.runner_up for r in registrations], 4),
-        "unobservable": np.concatenate([np.zeros((0, 6)), *unobservable]),
-        "n_unobservable": np.array([len(u) for u in unobservable], np.int64),
+        "steps": np.frombuffer(text.encode(), np.uint8),
+        "poses": _matrices([step.T_component_camera for _, step in steps]),
+        "predicted": _matrices([tracker.predicted.get(index) for index, _ in steps]),
         "moving": np.concatenate([np.zeros(0, np.uint8), *masks]),
         "n_moving": np.array([len(mask) for mask in masks], np.int64),
         "moving_index": np.array(list(tracker.moving), np.int64),
@@ -258,48 +253,42 @@ def _packed(log: FrameLog, tracker: LoggingTracker) -> npz.Arrays:
 
 
 def _plain_step(index: int, step: Step) -> list[Any]:
-    """Return a frame's index, links, and plain attributes, without matrices."""
-    links = [[link.i, link.j, link.certain, link.how] for link in step.links]
-    return [index, step.registration is not None, links, *_attributes(step, _PLAIN_STEP)]
+    """Return a frame's index, registration, links and plain attributes."""
+    links = [vars(link) for link in step.links]
+    return [index, step.registration, links, *(getattr(step, name) for name in _PLAIN_STEP)]
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON can't represent as plain data: registrations, arrays, NumPy's numbers."""
+    if isinstance(value, Registration):
+        return {name: x for name, x in vars(value).items() if name != "errors"}
+    return value.tolist()
 
 
 def _unpacked_steps(arrays: npz.Arrays) -> Iterator[tuple[int, Step]]:
     """Yield the steps in arrays of `_packed`, by frame index."""
-    registrations = _unpacked_registrations(arrays)
-    for plain, pose in zip(_parsed(arrays["steps"]), arrays["poses"], strict=True):
-        index, is_registered, links, *others = plain
-        step = Step(
-            T_component_camera=_matrix(pose),
-            registration=next(registrations) if is_registered else None,
-            links=tuple(
-                Link(i, j, next(registrations), certain, how) for i, j, certain, how in links
+    steps = json.loads(arrays["steps"].tobytes())
+    for (index, registration, links, *plain), pose in zip(steps, arrays["poses"], strict=True):
+        yield (
+            index,
+            Step(
+                T_component_camera=_matrix(pose),
+                registration=None if registration is None else _registration(registration),
+                links=tuple(
+                    Link(**(link | {"registration": _registration(link["registration"])}))
+                    for link in links
+                ),
+                **dict(zip(_PLAIN_STEP, plain, strict=True)),
             ),
-            **dict(zip(_PLAIN_STEP, others, strict=True)),
-        )
-        yield index, step
-
-
-def _unpacked_registrations(arrays: npz.Arrays) -> Iterator[Registration]:
-    names = ("T_target_source", "information", "runner_up")
-    matrices = zip(*(map(_matrix, arrays[name]) for name in names), strict=True)
-    rows = zip(
-        _parsed(arrays["registrations"]), matrices, _split(arrays, "unobservable"), strict=True
-    )
-    for plain, given, unobservable in rows:
-        yield Registration(
-            unobservable=unobservable.copy(),
-            **dict(zip(names, given, strict=True)),
-            **dict(zip(_PLAIN_REGISTRATION, plain, strict=True)),
         )
 
 
-def _attributes(item: Step | Registration, names: Sequence[str]) -> list[Any]:
-    return [getattr(item, name) for name in names]
-
-
-def _split(arrays: npz.Arrays, name: str) -> list[NDArray[Any]]:
-    """Return the parts of an array whose lengths are in another one."""
-    return np.split(arrays[name], np.cumsum(arrays[f"n_{name}"]))[:-1]
+def _registration(plain: dict[str, Any]) -> Registration:
+    arrays: dict[str, Any] = {
+        name: None if plain[name] is None else np.array(plain[name], float) for name in _ARRAYS
+    }
+    arrays["unobservable"] = arrays["unobservable"].reshape(-1, 6)
+    return Registration(**(plain | arrays))
 
 
 def _unpacked_mask(bits: NDArray[Any], shape: tuple[int, ...]) -> Bool:
@@ -309,24 +298,11 @@ def _unpacked_mask(bits: NDArray[Any], shape: tuple[int, ...]) -> Bool:
     return np.unpackbits(packed, count=rows * columns).astype(np.bool_).reshape(rows, columns)
 
 
-def _matrices(items: Sequence[Float64 | None], size: int) -> Float64:
-    """Return matrices (size, size) as one array (N, size, size); NaN for None."""
-    out = np.full((len(items), size, size), np.nan)
-    for row, item in zip(out, items, strict=True):
-        if item is not None:
-            row[:] = item
-    return out
+def _matrices(items: Sequence[Float64 | None]) -> Float64:
+    """Return matrices (4, 4) as one array (N, 4, 4); NaN for None."""
+    unknown = np.full((4, 4), np.nan)
+    return np.array([unknown if T is None else T for T in items], float).reshape(-1, 4, 4)
 
 
 def _matrix(row: Float64) -> Float64 | None:
     return None if np.isnan(row).all() else row.copy()
-
-
-def _text(data: Any) -> NDArray[np.uint8]:
-    """Return plain data as JSON in an array, with all digits of its numbers."""
-    text = json.dumps(data, separators=(",", ":"), default=np.generic.item)
-    return np.frombuffer(text.encode(), np.uint8)
-
-
-def _parsed(text: NDArray[Any]) -> Any:
-    return json.loads(text.tobytes())

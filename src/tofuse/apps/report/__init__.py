@@ -1,37 +1,18 @@
-"""."""
+"""`report.html`: a result as one page for a human reader, without external resources.
+
+`write_report` collects the values of each section, which a template turns into HTML. Its parts
+serve other pages, too: plots as SVG that follow the page's theme, images as data URIs, the content
+of the 3D view as compressed arrays, and numbers in words.
+"""
 
 from typing import TYPE_CHECKING
 
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.apps.report import plots, thumbnails
+    from tofuse.apps.report import html, packing, plots, scene, session_words, thumbnails, words
     from tofuse.apps.report.extras import ReportExtras
-    from tofuse.apps.report.html import page, write_report
-    from tofuse.apps.report.pair import write_pair_report
-    from tofuse.apps.report.pair_words import decision, lines
-    from tofuse.apps.report.plots import (
-        AFTER,
-        BAD,
-        BEFORE,
-        GRID,
-        INK,
-        MUTED,
-        REFERENCE,
-        make_figure,
-        svg,
-    )
     from tofuse.apps.report.policy import script_hashes
-    from tofuse.apps.report.scene import make_scene, render, render_thumbnail
-    from tofuse.apps.report.thumbnails import (
-        data_uri,
-        depth_image,
-        depth_limits,
-        encode,
-        grey,
-        subsample,
-        viridis,
-    )
-    from tofuse.apps.report.words import length
+    from tofuse.apps.report.sections import write_report
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -60,13 +60,7 @@ class Field:
 
     def normalized(self, values: Float64) -> Float64:
         """Return values as fractions of the span, 0 to 1; 1 where unknown."""
-        return self._fraction(values, *self.span)
-
-    def on_bar(self, values: Float64) -> Float64:
-        """Return values as fractions of the colour bar, 0 to 1; 1 where unknown."""
-        return self._fraction(values, self.low, self.high)
-
-    def _fraction(self, values: Float64, low: float, high: float) -> Float64:
+        low, high = self.span
         if self.logarithmic:
             values, low, high = np.log(np.maximum(values, low)), np.log(low), np.log(high)
         fraction: Float64 = (values - low) / max(high - low, 1e-9)

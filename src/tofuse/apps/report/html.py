@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tofuse._version import __version__
-from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.policy import secured
-from tofuse.engine.results import Reconstruction
 from tofuse.formats.files import atomic
 
 # Files of the pages' script; each uses functions of the previous ones.
@@ -29,19 +27,6 @@ SCRIPTS = (
     "frames.js",
     "main.js",
 )
-
-
-def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> None:
-    """Write `report.html` of a result to `path`, atomically.
-
-    Raises
-    ------
-    OutputError
-        If the file can't be written; an earlier one is unchanged then.
-    """
-    from tofuse.apps.report.sections import sections
-
-    write_page(path, "report.html.j2", script=script(), **sections(result, extras))
 
 
 def write_page(path: Path, template: str, **values: Any) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -60,10 +60,10 @@ class Scene:
     normals: Float32 | Float64 | None
     total: int
     spacing: float
-    before: Float64
-    after: Float64
-    reference: Float64
-    loops: Float64
+    before: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    after: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    reference: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    loops: Float64 = field(default_factory=lambda: np.zeros((0, 2, 3)))
     surface: Mesh | None = None
     sigma: Float32 | None = None
     views: Int32 | None = None
@@ -160,17 +160,9 @@ class RigCameras:
     @classmethod
     def of(cls, rig: Any, frames: int) -> RigCameras | None:
         """Read the entry `rig` of `run.json`; None if it does not match the number of frames."""
-        if not isinstance(rig, dict):
+        if not rig or len(rig["of_frames"]) != frames:
             return None
-        names = tuple(str(name) for name in rig.get("cameras", ()))
-        try:
-            of_frames = np.array(rig.get("of_frames", ()), np.intp)
-        except (TypeError, ValueError, OverflowError):
-            return None
-        if of_frames.shape != (frames,) or not frames or not names:
-            return None
-        if of_frames.min() < 0 or of_frames.max() >= len(names):
-            return None
+        names, of_frames = tuple(rig["cameras"]), np.array(rig["of_frames"], np.intp)
         colors = tuple(CAMERA_COLORS[k % len(CAMERA_COLORS)] for k in range(len(names)))
         return cls(names, colors, of_frames)
 

@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from tofuse.apps.report import plots, thumbnails, words
-from tofuse.apps.report.pictures import FATES, KINDS, depth_range, draw
 from tofuse.apps.report.section_parts import component_color
 from tofuse.apps.report.subject import ROWS, Subject, Values
-from tofuse.engine.compute import trim_memory
+from tofuse.engine.compute import run_all, trim_memory
 from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.quality import frame_samples
 from tofuse.engine.results import Component, FrameRecord, in_main_model
 
 _STRIP = 600  # cells in the strip of frames
 _THUMBNAIL, _FILTER = (220, 165), (320, 240)  # px
 _SEVERITY = {"skipped": 0, "tracked": 1, "predicted": 2, "lost": 3}
+# Kinds of images, in the order in which they are shown, and their titles.
+_KINDS = {"color": "Colour", "range": "Range", "amplitude": "Amplitude", "fate": "Use of pixels"}
+
+# Colour and label of each use of a pixel.
+_FATES = {
+    frame_samples.KEPT: ((38, 150, 140), "in the model"),
+    frame_samples.TRACKED: ((236, 170, 60), "tracking only"),
+    frame_samples.REMOVED: (thumbnails.REMOVED, "removed by a filter"),
+    frame_samples.NOTHING: (thumbnails.NO_MEASUREMENT, "no measurement"),
+}
 
 
 def frames(s: Subject) -> Values:
@@ -117,14 +130,14 @@ def frame_text(record: FrameRecord, components: Sequence[Component] = ()) -> str
 
 def _player(s: Subject) -> Values | None:
     """The images of frames, with the status of each."""
-    shown = draw(s.result.diagnostics.samples)
+    shown = _draw(s.result.diagnostics.samples)
     trim_memory()
     if not shown:
         return None
     records = {r.index: r for r in s.result.diagnostics.frames}
     listed = [records.get(p.index) for p in shown]
-    kinds = {kind: title for kind, title in KINDS.items() if kind in shown[0].images}
-    low, high = depth_range(s.result.diagnostics.samples)
+    kinds = {kind: title for kind, title in _KINDS.items() if kind in shown[0].images}
+    low, high = _depth_range(s.result.diagnostics.samples)
     note = f"Range from dark ({words.length(low)}) to bright ({words.length(high)})."
     if len(shown) < len(records):
         note = f"{len(shown):,} of {len(records):,} frames have images here. " + note
@@ -137,8 +150,51 @@ def _player(s: Subject) -> Values | None:
         },
         "kinds": kinds,
         "note": note,
-        "fates": [(thumbnails.css(color), text) for color, text in FATES.values()],
+        "fates": [(thumbnails.css(color), text) for color, text in _FATES.values()],
     }
+
+
+@dataclass(frozen=True, eq=False)
+class _Pictures:
+    """Images of one frame by kind (`_KINDS`): JPEG, and PNG for the use of pixels."""
+
+    index: int
+    images: dict[str, bytes]
+
+    def uri(self, kind: str) -> str:
+        """Return an image as a data URI, which is empty if there is none of this kind."""
+        data, name = self.images.get(kind), "png" if kind == "fate" else "jpeg"
+        return f"data:image/{name};base64,{base64.b64encode(data).decode()}" if data else "data:,"
+
+
+def _depth_range(frames: Sequence[frame_samples.FrameSample]) -> tuple[float, float]:
+    """Return the depths in m at the ends of the colour map, the same for all frames."""
+    subsampled = [f.depth[::3, ::3] for f in frames]
+    values = (
+        np.concatenate([d[d > 0] for d in subsampled]) if subsampled else np.zeros(0, np.float16)
+    )
+    return thumbnails.percentile_range(values, min_width=1e-3)
+
+
+def _draw(frames: Sequence[frame_samples.FrameSample]) -> tuple[_Pictures, ...]:
+    """Render the samples of frames."""
+    low, high = _depth_range(frames)
+    fate_colors = np.zeros((4, 3), np.uint8)
+    for fate, (color, _) in _FATES.items():
+        fate_colors[fate] = color
+
+    def render(frame: frame_samples.FrameSample) -> _Pictures:
+        depth = frame.depth.astype(float)
+        picture = thumbnails.viridis((depth - low) / (high - low))
+        picture[depth == 0] = thumbnails.NO_MEASUREMENT
+        images = {} if frame.color is None else {"color": thumbnails.encode(frame.color, jpeg=True)}
+        images["range"] = thumbnails.encode(picture, jpeg=True)
+        if frame.amplitude is not None:
+            images["amplitude"] = thumbnails.encode(thumbnails.grey(frame.amplitude), jpeg=True)
+        images["fate"] = thumbnails.encode(fate_colors[frame.fate])
+        return _Pictures(frame.index, images)
+
+    return tuple(run_all([partial(render, frame) for frame in frames]))
 
 
 def loops(s: Subject) -> Values:

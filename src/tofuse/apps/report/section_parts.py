@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.apps.report import plots, words
+from tofuse.apps.report.session_words import probability_text
 from tofuse.apps.report.subject import ROWS, Subject, Values
 from tofuse.apps.report.thumbnails import css
-from tofuse.apps.results import CHANGE_COLORS, component_name, probability_text
+from tofuse.apps.results import CHANGE_COLORS, folders
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import frame_ranges
 from tofuse.engine.geometry import se3
@@ -110,7 +111,7 @@ def _component(number: int, component: Component, count: int) -> Values:
     if component.connected:
         model = "this one"
     elif component.result is not None:
-        model = component_name(number)
+        model = folders.component_name(number)
         link = f"{model}/report.html"
     return {
         "name": f"{number} (main)" if number == 0 else str(number),

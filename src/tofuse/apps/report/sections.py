@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from tofuse._version import __version__
@@ -15,11 +16,23 @@ from tofuse.apps.report import (
     words,
 )
 from tofuse.apps.report.extras import ReportExtras
+from tofuse.apps.report.html import script, write_page
 from tofuse.apps.report.subject import Subject, Values
 from tofuse.engine.compute import job_pool
 from tofuse.engine.results import Reconstruction, accuracy_card
 
 Section = Callable[[Subject], Values | None]
+
+
+def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> None:
+    """Write `report.html` of a result to `path`, atomically.
+
+    Raises
+    ------
+    OutputError
+        If the file can't be written; an earlier one is unchanged then.
+    """
+    write_page(path, "report.html.j2", script=script(), **sections(result, extras))
 
 
 def sections(result: Reconstruction, extras: ReportExtras) -> Values:

@@ -10,14 +10,15 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.apps.report.splat_kernels import nearest_points
-from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
+from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
 from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.engine.geometry import se3
 
 # A grey that differs from both ends of the colour map.
 NO_MEASUREMENT = (128, 128, 132)
 REMOVED = (225, 40, 135)  # removed by the filter shown; not in the colour map
 BACKGROUND = (22, 25, 30)  # of the 3D view
+_MIN_DEPTH = 0.02  # of the eye's distance; nearer points are not drawn
 
 
 def viridis(value: Float64) -> UInt8:
@@ -157,16 +158,46 @@ def splat(
     -------
     (H, W, 4) RGBA, transparent where there is no point.
     """
-    indices = np.full(size[::-1], -1, np.int32)
-    depth = np.full(indices.shape, np.inf)
-    nearest_points(
-        np.ascontiguousarray(points), T_view_world, scale, distance or 0.0, radius, depth, indices
-    )
-    covered = indices >= 0
-    image = np.zeros((*indices.shape, 4), np.uint8)
-    image[covered, :3] = colors[indices[covered]]
+    row = nearest_points(points, T_view_world, size, scale=scale, distance=distance, side=radius)
+    covered = row >= 0
+    image = np.zeros((*row.shape, 4), np.uint8)
+    image[covered, :3] = colors[row[covered]]
     image[covered, 3] = 255
     return image
+
+
+def nearest_points(
+    points: Float64,
+    T_view_world: Float64,
+    size: tuple[int, int],
+    *,
+    scale: float,
+    distance: float | None,
+    side: int,
+) -> Intp:
+    """Return the row (H, W) of the nearest point at each pixel, the last of equally near ones.
+
+    -1 where there is none. Parameters as for `splat`; each point covers a square of `side` pixels,
+    and is in its upper left one.
+    """
+    width, height = size
+    x, y, z = se3.transform(T_view_world, points).T
+    if distance is not None:
+        z = z + distance
+        scale = scale * distance / np.maximum(z, _MIN_DEPTH * distance)
+    u, v = np.rint(0.5 * width + scale * x), np.rint(0.5 * height + scale * y)
+    shown = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    if distance is not None:
+        shown &= z > _MIN_DEPTH * distance
+    rows = np.flatnonzero(shown)
+    rows = rows[np.argsort(-z[rows], kind="stable")]
+    # Squares may reach beyond the image, to the right and below.
+    order = np.full((height + side, width + side), -1)
+    down, right = np.divmod(np.arange(side * side), side)
+    squares = v[rows, None].astype(int) + down, u[rows, None].astype(int) + right
+    np.maximum.at(order, squares, np.arange(len(rows))[:, None])
+    order = order[:height, :width]
+    return np.where(order >= 0, np.append(rows, 0)[order], -1)
 
 
 def view_rotation(yaw: float, pitch: float) -> Float64:

@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.apps.results.folder import component_name, finish_interrupted, is_result
+from tofuse.apps.results.folders import check_result, component_name, is_result
 from tofuse.apps.results.run_json import (
     frame_covariance,
     main_poses,
-    read_run_json,
+    opened,
     rotation_up_world,
-    run_json_checked,
 )
-from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
 from tofuse.engine.graph import GraphPart, LoopRecord, external_sensors
 from tofuse.engine.quality import pose_accuracy
@@ -47,13 +45,8 @@ def load_result(folder: str | Path) -> Reconstruction:
         If it is not an output folder, or its files are damaged or of different runs.
     """
     folder = reading.path_of(folder, "folder", "pass the folder of a result")
-    finish_interrupted(folder)
-    if not folder.is_dir() or not is_result(folder):
-        raise InputError(
-            "is not a result (no run.json)", where=folder, remedy="pass the --out of `tofuse run`"
-        )
-    run = read_run_json(folder / "run.json")
-    with run_json_checked(folder / "run.json"):
+    check_result(folder)
+    with opened(folder) as run:
         return _reconstruction(folder, run)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tofuse._version import __version__
-from tofuse.apps.results.folder import OutputFolder, component_name
+from tofuse.apps.results.folders import OutputFolder, component_name
 from tofuse.apps.results.run_json import write_run_json
 from tofuse.engine.compute import job_pool
 from tofuse.engine.fusion import GeometryRecord, Mesh, display_colors, texture

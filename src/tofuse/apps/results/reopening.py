@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.apps.results.folder import RECORDING
+from tofuse.apps.results.folders import RECORDING
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.formats.recordings import Opening

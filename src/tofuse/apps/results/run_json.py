@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
@@ -12,7 +12,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from tofuse._version import __version__
-from tofuse.apps.results.folder import is_result
+from tofuse.apps.results.folders import is_result
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
@@ -131,11 +131,9 @@ def frame_clock(folder: Path) -> tuple[Float64, Intp] | None:
     """Return (N,) timestamps in s and (N,) indices of a result's frames; None for other folders."""
     if not is_result(folder):
         return None
-    path = folder / "run.json"
-    frames = read_run_json(path).get("frames", [])
-    with run_json_checked(path):
-        times = np.array([frame["timestamp"] for frame in frames], float)
-        return times, np.array([frame["index"] for frame in frames], np.intp)
+    with opened(folder) as run:
+        times = np.array([frame["timestamp"] for frame in run["frames"]], float)
+        return times, np.array([frame["index"] for frame in run["frames"]], np.intp)
 
 
 def accuracy_json(a: pose_accuracy.Accuracy) -> dict[str, Any]:
@@ -231,9 +229,13 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
     return data
 
 
-def run_json_checked(path: Path) -> AbstractContextManager[None]:
-    """Turn errors of a block that reads fields of a `run.json` into InputError."""
-    return reading.damage_reported(path, "a run.json")
+@contextmanager
+def opened(folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield the `run.json` of a result; errors of a block that reads its fields are InputErrors."""
+    path = folder / "run.json"
+    run = read_run_json(path)
+    with reading.damage_reported(path, "a run.json"):
+        yield run
 
 
 def rotation_up_world(data: Mapping[str, Any], path: Path) -> Float64:
@@ -270,7 +272,7 @@ def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
     InputError
         If `run.json` is damaged, or `trajectory.txt` is of another run.
     """
-    with run_json_checked(folder / "run.json"):
+    with reading.damage_reported(folder / "run.json", "a run.json"):
         indices = [int(frame["index"]) for frame in frames_in_main_model(run)]
     _, poses = read_tum(folder / "trajectory.txt")
     if len(indices) != len(poses):

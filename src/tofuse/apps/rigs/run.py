@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.apps.jobs import Options, resolve
-from tofuse.apps.results import OutputFolder, write_result
+from tofuse.apps.results import folders, write_result
 from tofuse.apps.rigs.calibrating import cameras_of, disagreement_rows, moves
 from tofuse.apps.rigs.checking import CameraMotion, compare
 from tofuse.apps.rigs.inputs import Camera
@@ -31,7 +31,7 @@ from tofuse.engine.results import Reason, Reconstruction, verdicts
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.tracking import given
 from tofuse.formats.poses import write_tum
-from tofuse.formats.rigs import Disagreement, Rig, RigSource, read_rig, recordings_of
+from tofuse.formats.rigs import Rig, RigSource, read_rig, recordings_of
 
 # No loops are searched: poses of the rig are final.
 _NO_LOOPS = Nearby(min_gap=1_000_000)
@@ -91,7 +91,7 @@ def run_rig(
         full_recording = Recording.of(source, " ".join(map(str, inputs)), "rig")
         recording = _selected(full_recording, source, options)
         config = resolve(options)
-        with OutputFolder(options.out, overwrite=options.overwrite) as folder:
+        with folders.OutputFolder(options.out, overwrite=options.overwrite) as folder:
             result = reconstruct_rig(
                 rig, cameras, recording, config, seed=options.seed or 0, progress=progress
             )
@@ -299,7 +299,7 @@ def _with_rig_reason(result: Reconstruction, displaced: Sequence[CameraMotion]) 
     return replace(result, diagnostics=replace(d, reasons=reasons, verdict=verdict))
 
 
-def _write(rig_result: RigResult, recording: Recording, folder: OutputFolder) -> None:
+def _write(rig_result: RigResult, recording: Recording, folder: folders.OutputFolder) -> None:
     from tofuse.apps.report import ReportExtras, write_report
 
     def report(result: Reconstruction, target: Path) -> None:

@@ -1,4 +1,8 @@
-"""."""
+"""A run and its result in the browser, served to this machine only.
+
+`LiveView` shows the growing model while a run works; `ReportServer` serves the report of a result,
+with the images of its recording at full resolution.
+"""
 
 from typing import TYPE_CHECKING
 

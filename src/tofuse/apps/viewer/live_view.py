@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tofuse.apps.report import data_uri, depth_image, depth_limits, length, subsample, viridis
+from tofuse.apps.report import thumbnails, words
 from tofuse.apps.viewer.coverage import Coverage
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.frames import Frame, RangeFrame
@@ -135,7 +135,9 @@ class LiveView:
             colors = np.repeat(grey.astype(np.uint8)[:, None], 3, axis=1)
         else:
             low, high = np.percentile(world[:, 1], [2, 98])
-            colors = viridis((high - world[:, 1].astype(float)) / max(float(high - low), 1e-6))
+            colors = thumbnails.viridis(
+                (high - world[:, 1].astype(float)) / max(float(high - low), 1e-6)
+            )
         self._add_coverage(frame, world, sampled)
         handle = self._server.scene.add_point_cloud(
             f"/live/{frame.index}",
@@ -184,8 +186,10 @@ class LiveView:
         for _, handle in self._shown:
             ratio = OF_95_PERCENT * coverage.sigma(self._cloud_data[handle.name][0]) / median
             level = 0.5 + 0.5 * np.log(np.minimum(ratio, _COLOR_RATIO)) / np.log(_COLOR_RATIO)
-            handle.colors = viridis(level)
-        labels = [f"±{length(median * ratio)}" for ratio in (1 / _COLOR_RATIO, 1.0, _COLOR_RATIO)]
+            handle.colors = thumbnails.viridis(level)
+        labels = [
+            f"±{words.length(median * ratio)}" for ratio in (1 / _COLOR_RATIO, 1.0, _COLOR_RATIO)
+        ]
         self._legend.content = _color_bar("Accuracy so far (95 %), noise only", labels) + (
             '<div style="padding:0 0.8em 0.6em;font-size:0.85em">Go to bright places next: they '
             "were seen from too far away or too rarely.</div>"
@@ -197,9 +201,9 @@ class LiveView:
         if isinstance(frame, RangeFrame):
             frame_image = frame.color_image
             if frame_image is None:
-                frame_image = depth_image(frame, depth_limits(frame), None)
-            image = subsample(frame_image, _IMAGE_WIDTH)
-            source = data_uri(image, jpeg=True)
+                frame_image = thumbnails.depth_image(frame, thumbnails.depth_limits(frame), None)
+            image = thumbnails.subsample(frame_image, _IMAGE_WIDTH)
+            source = thumbnails.data_uri(image, jpeg=True)
             self._image.content = (
                 f'<img alt="The frame" src="{source}" style="width:100%;padding:0 0.6em">'
             )
@@ -224,7 +228,7 @@ class LiveView:
 
 def _color_bar(label: str, labels: Sequence[str]) -> str:
     """A colour bar with a title, and labels at its ends and in its middle, as HTML."""
-    stops = ", ".join(f"rgb{tuple(c)}" for c in viridis(np.linspace(0, 1, 9)).tolist())
+    stops = ", ".join(f"rgb{tuple(c)}" for c in thumbnails.viridis(np.linspace(0, 1, 9)).tolist())
     ticks = "".join(f"<span>{text}</span>" for text in labels)
     return (
         f'<div style="padding:0 0.8em 0.5em;font-size:0.85em">{label}'

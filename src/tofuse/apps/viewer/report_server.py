@@ -14,18 +14,9 @@ from pathlib import Path
 from threading import Lock, Thread
 from typing import Any, Self
 
-from tofuse.apps.report import depth_image, depth_limits, encode, grey
-from tofuse.apps.results import (
-    component_number,
-    finish_interrupted,
-    is_result,
-    read_run_json,
-    reopen,
-    run_json_checked,
-    stored_recordings,
-)
+from tofuse.apps.report import thumbnails
+from tofuse.apps.results import folders, reopening, run_json
 from tofuse.apps.viewer.server import HOST, choose_port, is_same_origin
-from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.formats.files import reading
 
@@ -59,11 +50,9 @@ class FrameImages:
         InputError
             If one is missing, can't be opened, or has changed.
         """
-        path = folder / "run.json"
-        run = read_run_json(path)
-        with run_json_checked(path):
-            parts = list(stored_recordings(folder, run))
-        return cls([(part.first, reopen(part, folder)) for part in parts])
+        with run_json.opened(folder) as run:
+            parts = list(reopening.stored_recordings(folder, run))
+        return cls([(part.first, reopening.reopen(part, folder)) for part in parts])
 
     def png(self, index: int) -> bytes | None:
         """Return the colours of a frame, or else amplitudes or ranges; None without an image."""
@@ -75,10 +64,12 @@ class FrameImages:
         if frame is None:
             return None
         if frame.color_image is not None:
-            return encode(frame.color_image)
+            return thumbnails.encode(frame.color_image)
         if frame.amplitude_image is not None:
-            return encode(grey(frame.amplitude_image))
-        return encode(depth_image(frame, depth_limits(frame), None))
+            return thumbnails.encode(thumbnails.grey(frame.amplitude_image))
+        return thumbnails.encode(
+            thumbnails.depth_image(frame, thumbnails.depth_limits(frame), None)
+        )
 
 
 def report_pages(folder: Path) -> dict[str, tuple[str, bytes]]:
@@ -89,16 +80,10 @@ def report_pages(folder: Path) -> dict[str, tuple[str, bytes]]:
     InputError
         If the folder is not a result, or has no report.
     """
-    if not folder.exists():
-        raise InputError("doesn't exist", where=folder, remedy="pass the --out of `tofuse run`")
-    finish_interrupted(folder)
-    if not folder.is_dir() or not is_result(folder):
-        raise InputError(
-            "is not a result (no run.json)", where=folder, remedy="pass the --out of `tofuse run`"
-        )
+    folders.check_result(folder)
     pages = {"/": (_HTML, reading.read_bytes(folder / "report.html"))}
     for path in sorted(folder.glob("component-*/report.html")):
-        if component_number(path.parent) is not None:
+        if folders.component_number(path.parent) is not None:
             pages[f"/{path.parent.name}/report.html"] = _HTML, reading.read_bytes(path)
     if (folder / "changes.ply").is_file():
         pages["/changes.ply"] = _PLY, reading.read_bytes(folder / "changes.ply")

@@ -16,7 +16,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse._version import __version__
-from tofuse.apps.results import Contract, OutputFolder, plain, read_json_object
+from tofuse.apps.results import folders, run_json
 from tofuse.engine.errors import InputError
 from tofuse.engine.progress import Progress, Silent
 from tofuse.lab.experiments import sections
@@ -79,7 +79,7 @@ def run_experiments(
             )
     selected = cases or NAMES
     start = perf_counter()
-    with OutputFolder(out, overwrite=overwrite, contract=_CONTRACT) as folder:
+    with folders.OutputFolder(out, overwrite=overwrite, contract=_CONTRACT) as folder:
         # BLAS sums depend on its number of threads; ours don't.
         with threadpool_limits(1):
             results = _run_all(selected, seeds, seed, progress, limit, draws)
@@ -92,18 +92,20 @@ def run_experiments(
         data = results_json(results, judged, parameters, seconds)
         with folder.staging() as staging:
             (staging / "index.html").write_text(page, encoding="utf-8")
-            text = json.dumps(plain(data), indent=1, allow_nan=False)
+            text = json.dumps(run_json.plain(data), indent=1, allow_nan=False)
             (staging / _MARKER).write_text(text + "\n", encoding="utf-8")
     return out / "index.html"
 
 
 def is_experiments(folder: Path) -> bool:
     """Whether a folder contains the result of earlier experiments."""
-    data = read_json_object(folder / _MARKER)
+    data = folders.read_json_object(folder / _MARKER)
     return data is not None and data.get("kind") == KIND
 
 
-_CONTRACT = Contract(re.compile(rf"index\.html|{re.escape(_MARKER)}"), _MARKER, is_experiments)
+_CONTRACT = folders.Contract(
+    re.compile(rf"index\.html|{re.escape(_MARKER)}"), _MARKER, is_experiments
+)
 
 
 def _run_all(

@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.apps.report import pair_words, thumbnails, words
-from tofuse.apps.report.html import script, write_page
-from tofuse.apps.report.packing import normal_bytes, pack, quantized
-from tofuse.apps.report.scene import Scene, extreme_points, random_subset, render, spacing_of
-from tofuse.apps.results import LocalView, PairResult
+from tofuse.apps.pairs import pair_words
+from tofuse.apps.pairs.result import LocalView, PairResult
+from tofuse.apps.report import html, packing, scene, thumbnails, words
 from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
@@ -41,16 +39,16 @@ def write_pair_report(result: PairResult, path: Path) -> None:
     OutputError
         If the file can't be written; an earlier one is unchanged then.
     """
-    scene = PairScene.of(result)
+    pair = PairScene.of(result)
     source, target = (Path(v.view.name).name or v.view.name for v in (result.source, result.target))
-    write_page(
+    html.write_page(
         path,
         "pair.html.j2",
         title=f"{source} registered to {target}",
-        script=script(),
-        scene=packed(scene),
+        script=html.script(),
+        scene=packed(pair),
         verdict=_verdict(result),
-        model=_model(scene),
+        model=_model(pair),
         transform={
             "lines": pair_words.lines(result),
             "rows": [_row("source", result.source), _row("target", result.target)],
@@ -74,29 +72,29 @@ def _verdict(result: PairResult) -> dict[str, Any]:
     return {"tone": _TONES[registration.believed], "head": head, "tail": tail, "facts": facts}
 
 
-def _model(scene: PairScene) -> dict[str, Any]:
+def _model(pair: PairScene) -> dict[str, Any]:
     """The controls of the 3D view, its colour bar, and an image of it."""
     stops = thumbnails.viridis(np.linspace(_MIN_COLOR, 1, 9))
-    beyond = words.length(scene.max_distance_m)
+    beyond = words.length(pair.max_distance_m)
     distance = f"No point is within {beyond} of the other view."
-    matched = scene.matched
+    matched = pair.matched
     if len(matched):
-        fraction = pair_words.percent(len(matched) / len(scene.all_distances))
+        fraction = pair_words.percent(len(matched) / len(pair.all_distances))
         distance = (
             f"Median distance {_mm(float(np.median(matched)))}, over the {fraction} of the points "
             f"that are within {beyond} of the other view."
         )
-    shown = sum(len(scene.points[view]) for view in COLORS)
+    shown = sum(len(pair.points[view]) for view in COLORS)
     return {
         "modes": MODES,
         "colors": {view: thumbnails.css(color) for view, color in COLORS.items()},
         "none_color": thumbnails.css(thumbnails.NO_MEASUREMENT),
         "bar": f"linear-gradient(to right, {', '.join(map(thumbnails.css, stops.tolist()))})",
-        "ticks": [_mm(scene.cap_m * fraction) for fraction in (0, 0.25, 0.5, 0.75, 1)],
+        "ticks": [_mm(pair.cap_m * fraction) for fraction in (0, 0.25, 0.5, 0.75, 1)],
         "beyond": beyond,
         "distance": distance,
-        "thinned": words.thinned(shown, scene.total, "points"),
-        "still": thumbnails.data_uri(still(scene)),
+        "thinned": words.thinned(shown, pair.total, "points"),
+        "still": thumbnails.data_uri(still(pair)),
     }
 
 
@@ -154,7 +152,7 @@ class PairScene:
             ("source", source, sources, targets, {"start": result.T_start, "source": T}),
             ("target", target, targets, sources, {"target": np.eye(4)}),
         ):
-            chosen = random_subset(len(frame), MAX_POINTS)
+            chosen = scene.random_subset(len(frame), MAX_POINTS)
             distance[name] = distances(own, others, chosen)
             directions = None
             if len(frame) > _NEIGHBOURS:
@@ -190,7 +188,7 @@ class PairScene:
 
 def _search_points(frame: Frame) -> CloudFrame:
     """The points of a view, at most `_MAX_SEARCHED`."""
-    sampled = random_subset(len(frame), _MAX_SEARCHED)
+    sampled = scene.random_subset(len(frame), _MAX_SEARCHED)
     normals = None if frame.normals is None else frame.normals[sampled]
     return CloudFrame(0, 0.0, frame.points[sampled], normals, origin=frame.origin)
 
@@ -255,26 +253,26 @@ def distance_colors(distance: Float64, cap_m: float) -> UInt8:
     return colors
 
 
-def packed(scene: PairScene) -> dict[str, Any]:
+def packed(pair: PairScene) -> dict[str, Any]:
     """Return the scene for the viewer: plain data, arrays as `pack` packs them."""
     arrays: dict[str, str] = {}
     placed: dict[str, dict[str, Any]] = {}
-    for key, points in scene.points.items():
+    for key, points in pair.points.items():
         low, extent = points.min(0), np.maximum(np.ptp(points, axis=0), 1e-6)
-        normals = scene.normals[key]
-        arrays[key] = pack(quantized(points, low, extent))
+        normals = pair.normals[key]
+        arrays[key] = packing.pack(packing.quantized(points, low, extent))
         if normals is not None:
-            arrays[f"{key} normals"] = pack(normal_bytes(normals))
+            arrays[f"{key} normals"] = packing.pack(packing.normal_bytes(normals))
         placed[key] = {
             "count": len(points),
             "low": low.tolist(),
             "extent": extent.tolist(),
-            "spacing": spacing_of(points),
+            "spacing": scene.spacing_of(points),
             "points": key,
             "normals": None if normals is None else f"{key} normals",
         }
-    for view, distance in scene.distance.items():
-        arrays[f"{view} colors"] = pack(distance_colors(distance, scene.cap_m))
+    for view, distance in pair.distance.items():
+        arrays[f"{view} colors"] = packing.pack(distance_colors(distance, pair.cap_m))
     layers = [
         placed["start" if (mode, view) == ("before", "source") else view]
         | {
@@ -286,7 +284,7 @@ def packed(scene: PairScene) -> dict[str, Any]:
         for mode in MODES
         for view, color in COLORS.items()
     ]
-    outlines = framing(scene)
+    outlines = framing(pair)
     low, high = outlines["after"].min(0), outlines["after"].max(0)
     return {
         "count": 0,
@@ -296,8 +294,8 @@ def packed(scene: PairScene) -> dict[str, Any]:
         "size": max(float(np.linalg.norm(high - low)), 1e-3),
         "outlines": {mode: np.round(points, 4).tolist() for mode, points in outlines.items()},
         "spacing": 0.01,
-        "yaw": scene.yaw,
-        "pitch": scene.pitch,
+        "yaw": pair.yaw,
+        "pitch": pair.pitch,
         "model": None,
         "lines": {},
         "arrays": arrays,
@@ -305,9 +303,9 @@ def packed(scene: PairScene) -> dict[str, Any]:
     }
 
 
-def framing(scene: PairScene) -> dict[str, Float64]:
+def framing(pair: PairScene) -> dict[str, Float64]:
     """Return the extreme points (K, 3) of each mode: common ones, unless the start is distant."""
-    start, source, target = (extreme_points(scene.points[k]) for k in ("start", *COLORS))
+    start, source, target = (scene.extreme_points(pair.points[k]) for k in ("start", *COLORS))
     before, after = np.concatenate([start, target]), np.concatenate([source, target])
     combined = np.concatenate([after, before])
     extents = [np.linalg.norm(np.ptp(outline, axis=0)) for outline in (combined, after)]
@@ -316,21 +314,16 @@ def framing(scene: PairScene) -> dict[str, Float64]:
     return {"before": before, "after": after, "distance": after}
 
 
-def still(scene: PairScene) -> UInt8:
+def still(pair: PairScene) -> UInt8:
     """Render both views after registration, for browsers without WebGL."""
-    points = np.concatenate([scene.points[view] for view in COLORS])
-    normals = [n for view in COLORS if (n := scene.normals[view]) is not None]
-    counts = [len(scene.points[view]) for view in COLORS]
-    no_poses = np.zeros((0, 4, 4))
-    both = Scene(
+    points = np.concatenate([pair.points[view] for view in COLORS])
+    normals = [n for view in COLORS if (n := pair.normals[view]) is not None]
+    counts = [len(pair.points[view]) for view in COLORS]
+    both = scene.Scene(
         points,
         np.repeat(np.array([*COLORS.values()], np.uint8), counts, axis=0),
         np.concatenate(normals) if len(normals) == len(COLORS) else None,
-        scene.total,
-        max(spacing_of(scene.points[view]) for view in COLORS),
-        no_poses,
-        no_poses,
-        no_poses,
-        np.zeros((0, 2, 3)),
+        pair.total,
+        max(scene.spacing_of(pair.points[view]) for view in COLORS),
     )
-    return render(both, yaw=scene.yaw, pitch=scene.pitch, peel=False, min_radius=2)
+    return scene.render(both, yaw=pair.yaw, pitch=pair.pitch, peel=False, min_radius=2)

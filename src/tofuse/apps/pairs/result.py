@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,16 +11,13 @@ from typing import Any
 import numpy as np
 
 from tofuse._version import __version__
-from tofuse.apps.results.folder import Contract, OutputFolder, read_json_object
-from tofuse.apps.results.run_json import plain
+from tofuse.apps.results import folders, run_json
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import atomic
 from tofuse.formats.geometry import write_ply
-from tofuse.formats.poses import pose_text
 from tofuse.formats.recordings import SingleView
 from tofuse.formats.sources import cloud_sequence
 
@@ -187,6 +182,12 @@ class PairResult:
 _TRANSLATION, _ROTATION = slice(0, 3), slice(3, 6)
 # A free direction with a smaller fraction of rotation counts as a translation.
 _MAX_ROTATION = 0.4
+# Attributes of a registration in `registration.json`.
+_EVIDENCE = (
+    "believed", "probability", "reason", "converged", "overlap", "support", "contradiction",
+    "margin",
+)  # fmt: skip
+_FIT = ("rms_m", "correspondences", "points", "iterations")
 
 
 def _unit(vectors: Float64) -> Float64:
@@ -195,10 +196,9 @@ def _unit(vectors: Float64) -> Float64:
 
 def pair_json(result: PairResult) -> dict[str, Any]:
     """Return the content of `registration.json`: SI units and radians, null where unknown."""
-    registration = result.registration
+    registration, covariance = result.registration, result.covariance
     sigma_m, sigma_rad = result.sigma
-    covariance = result.covariance
-    data: dict[str, Any] = plain(
+    data: dict[str, Any] = run_json.plain(
         {
             "schema": 1,
             "version": __version__,
@@ -206,14 +206,7 @@ def pair_json(result: PairResult) -> dict[str, Any]:
             "target": _view_json(result.target),
             "guess": result.guess,
             "T_target_source": result.T_target_source,
-            "believed": registration.believed,
-            "probability": registration.probability,
-            "reason": registration.reason,
-            "converged": registration.converged,
-            "overlap": registration.overlap,
-            "support": registration.support,
-            "contradiction": registration.contradiction,
-            "margin": registration.margin,
+            **{name: getattr(registration, name) for name in _EVIDENCE},
             "runner_up": result.runner_up,
             "unobservable": registration.unobservable,
             "covariance": None if covariance is None else covariance.ravel(),
@@ -221,10 +214,7 @@ def pair_json(result: PairResult) -> dict[str, Any]:
             "sigma_rad": sigma_rad,
             "information": np.asarray(registration.information).ravel(),
             "reference_point_m": result.source.center,
-            "rms_m": registration.rms_m,
-            "correspondences": registration.correspondences,
-            "points": registration.points,
-            "iterations": registration.iterations,
+            **{name: getattr(registration, name) for name in _FIT},
             "seconds": round(result.seconds, 4),
             "warnings": [*result.source.view.warnings, *result.target.view.warnings],
         }
@@ -245,43 +235,11 @@ def _view_json(local: LocalView) -> dict[str, Any]:
 
 def is_registration(folder: Path) -> bool:
     """Whether a folder contains an earlier registration."""
-    data = read_json_object(folder / MARKER)
+    data = folders.read_json_object(folder / MARKER)
     return data is not None and {"schema", "version", "T_target_source"} <= set(data)
 
 
-CONTRACT = Contract(re.compile("|".join(map(re.escape, FILES))), MARKER, is_registration)
-
-
-def pair_folder(path: Path, *, overwrite: bool = False) -> OutputFolder:
-    """Check, create and lock the folder for a registration; see `OutputFolder`."""
-    return OutputFolder(path, overwrite=overwrite, contract=CONTRACT)
-
-
-def write_pair(
-    result: PairResult, folder: OutputFolder, report: Callable[[PairResult, Path], None]
-) -> None:
-    """Write the files of a registration.
-
-    Parameters
-    ----------
-    result
-        The registration.
-    folder
-        The output folder.
-    report
-        Writes the report of a registration to a path.
-
-    Raises
-    ------
-    OutputError
-        If a file can't be written; existing files are unchanged then.
-    """
-    with folder.staging() as staging:
-        atomic.write_text(staging / "transform.txt", pose_text(result.T_target_source))
-        write_aligned(result, staging / "aligned.ply")
-        report(result, staging / "report.html")
-        text = json.dumps(pair_json(result), indent=1, allow_nan=False)
-        atomic.write_text(staging / MARKER, text + "\n")
+CONTRACT = folders.Contract(re.compile("|".join(map(re.escape, FILES))), MARKER, is_registration)
 
 
 def write_aligned(result: PairResult, path: Path) -> None:

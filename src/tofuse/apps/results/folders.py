@@ -9,7 +9,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -189,12 +189,10 @@ def claimed(folder: Path) -> Iterator[None]:
         If another process writes into it, or it can't be written.
     """
     result = result_folder(folder)
-    claim = Claim(staging.beside(result, "lock"), target=result) if is_result(result) else None
-    try:
+    with ExitStack() as stack:
+        if is_result(result):
+            stack.callback(Claim(staging.beside(result, "lock"), target=result).release)
         yield
-    finally:
-        if claim is not None:
-            claim.release()
 
 
 def result_folder(folder: Path) -> Path:
@@ -216,11 +214,9 @@ def finish_interrupted(folder: Path) -> None:
     if not staging.is_interrupted(place):
         return
     try:
-        claim = Claim(staging.beside(place, "lock"), target=folder)
-        try:
+        with ExitStack() as stack:
+            stack.callback(Claim(staging.beside(place, "lock"), target=folder).release)
             staging.finish_replacing(place, RECORDING)
-        finally:
-            claim.release()
     except (OutputError, OSError) as error:
         reason = error if isinstance(error, OutputError) else output_error(error, folder)
         raise InputError(
@@ -228,6 +224,23 @@ def finish_interrupted(folder: Path) -> None:
             where=folder,
             remedy="wait until it is done, or make the folder that it is in writable",
         ) from error
+
+
+def check_result(folder: Path) -> None:
+    """Check that a folder contains a result, after finishing its interrupted replacement.
+
+    Raises
+    ------
+    InputError
+        If there is none, or another process is replacing it.
+    """
+    finish_interrupted(result_folder(folder))
+    if not is_result(folder):
+        raise InputError(
+            "is not a result (no run.json)" if folder.exists() else "doesn't exist",
+            where=folder,
+            remedy="pass the --out of `tofuse run`",
+        )
 
 
 def is_result(folder: Path) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -10,7 +10,15 @@ from time import perf_counter
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.results import LocalView, OutputFolder, PairResult, pair_folder, write_pair
+from tofuse.apps.pairs.result import (
+    CONTRACT,
+    MARKER,
+    LocalView,
+    PairResult,
+    pair_json,
+    write_aligned,
+)
+from tofuse.apps.results import folders
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds import register
 from tofuse.engine.compute import threads
@@ -18,7 +26,8 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Progress, Silent
-from tofuse.formats.poses import read_pose
+from tofuse.formats.files import atomic
+from tofuse.formats.poses import pose_text, read_pose
 from tofuse.formats.recordings import SingleView, open_view
 
 # Clouds farther from the origin are centred first: rotation errors would have long lever arms.
@@ -72,7 +81,9 @@ def register_files(
         guess = None if options.guess is None else read_pose(options.guess)
         if options.out is None:
             return _registered(source, target, guess, options, progress)
-        with pair_folder(options.out, overwrite=options.overwrite) as folder:
+        with folders.OutputFolder(
+            options.out, overwrite=options.overwrite, contract=CONTRACT
+        ) as folder:
             result = _registered(source, target, guess, options, progress)
             progress.stage("writing")
             _write(result, folder)
@@ -164,11 +175,12 @@ def _shifted(view: SingleView, center: Float64) -> LocalView:
     return LocalView(view, frame, center)
 
 
-def _write(result: PairResult, folder: OutputFolder) -> None:
-    def page(result: PairResult, path: Path) -> None:
-        from tofuse.apps.report import write_pair_report
+def _write(result: PairResult, folder: folders.OutputFolder) -> None:
+    from tofuse.apps.pairs.page import write_pair_report
 
-        write_pair_report(result, path)
-
-    report: Callable[[PairResult, Path], None] = page
-    write_pair(result, folder, report)
+    with folder.staging() as staging:
+        atomic.write_text(staging / "transform.txt", pose_text(result.T_target_source))
+        write_aligned(result, staging / "aligned.ply")
+        write_pair_report(result, staging / "report.html")
+        text = json.dumps(pair_json(result), indent=1, allow_nan=False)
+        atomic.write_text(staging / MARKER, text + "\n")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofuse.apps.results import PairResult
+from tofuse.apps.pairs.result import PairResult
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 
