@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.engine.filters.angle import NeighbourhoodAngle
+from tofuse.engine.filters.neighbours import NeighbourhoodAngle
 from tofuse.engine.filters.base import Filter, apply_filters
-from tofuse.engine.filters.confidence import Confidence
+from tofuse.engine.filters.distance import Confidence
 from tofuse.engine.filters.distance import Distance
 from tofuse.engine.filters.neighbours import NeighbourFraction
 from tofuse.engine.frames.frames import RangeFrame

@@ -43,7 +43,7 @@ from pair_views import TAKEN, recorded
 from peers import o3d_global
 from sequences import DATA, OUT, kinect_loop
 from tofuse.engine.alignment.base import Registration
-from tofuse.engine.clouds.any_pair import AnyPair
+from tofuse.engine.clouds.pair import AnyPair
 from tofuse.engine.clouds.cloud_pair import register_clouds
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import RangeFrame

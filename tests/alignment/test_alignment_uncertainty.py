@@ -5,7 +5,7 @@ import pytest
 
 from tofuse.engine.alignment import tile_sum_kernels as tile_sums
 from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
-from tofuse.engine.alignment.spurious_information_kernels import spurious_information
+from tofuse.engine.alignment.step_kernels import spurious_information
 from tofuse.engine.alignment.uncertainty import (
     Patches,
     UncertaintyOptions,

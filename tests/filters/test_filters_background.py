@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters.background import Background
+from tofuse.engine.filters.background_model import Background
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.parts import to_dict
-from tofuse.engine.sensor.scattering_correction import LensScattering
+from tofuse.engine.sensor.scattering import LensScattering
 from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan

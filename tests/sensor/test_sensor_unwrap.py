@@ -23,7 +23,7 @@ from tofuse.engine.sensor.unwrap import (
     count_periods,
     on_surface,
 )
-from tofuse.engine.sensor.unwrap_correction import Unwrap
+from tofuse.engine.sensor.unwrap import Unwrap
 from tofuse.engine.sensor.unwrap_kernels import NEIGHBOURS, pass_messages
 from tofuse.formats.images.images import write_png
 from tofuse.lab.simulation.effects import Effects

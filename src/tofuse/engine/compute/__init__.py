@@ -7,19 +7,18 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.compute import tukey_kernels
     from tofuse.engine.compute.ahead import compiling_in_background
-    from tofuse.engine.compute.blas import one_blas_thread
-    from tofuse.engine.compute.cores import usable_cores
     from tofuse.engine.compute.jit import kernel
-    from tofuse.engine.compute.memory import trim_memory
     from tofuse.engine.compute.partition import median
-    from tofuse.engine.compute.spill import Scratch, Spill
+    from tofuse.engine.compute.spill import Scratch, Spill, trim_memory
     from tofuse.engine.compute.thread_pool import (
         job_pool,
+        one_blas_thread,
         run_all,
         run_chunks,
         serial_chunks,
         thread_count,
         threads,
+        usable_cores,
     )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

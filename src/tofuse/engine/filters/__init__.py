@@ -5,18 +5,17 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.filters.angle import NeighbourhoodAngle
     from tofuse.engine.filters.background_model import (
         BackgroundSurface,
         background_surface,
         moving_object,
     )
     from tofuse.engine.filters.base import Filter, Interval, Removal, apply_filters
-    from tofuse.engine.filters.confidence import Confidence
-    from tofuse.engine.filters.foreground import Foreground
+    from tofuse.engine.filters.distance import Confidence, Foreground
     from tofuse.engine.filters.neighbours import (
         MAX_NEIGHBOURS,
         NeighbourFraction,
+        NeighbourhoodAngle,
         mean_neighbour_distance,
     )
 

@@ -14,8 +14,7 @@ if TYPE_CHECKING:
         surface_shape,
     )
     from tofuse.engine.icp.coarse_to_fine import CoarseToFine, spacing
-    from tofuse.engine.icp.icp import Icp, algorithm_1
+    from tofuse.engine.icp.icp import Icp, Remapping, algorithm_1
     from tofuse.engine.icp.reduce import extent, reduced
-    from tofuse.engine.icp.remapping import Remapping
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -13,12 +13,11 @@ from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
-from tofuse.engine.icp.icp import Icp
+from tofuse.engine.icp.icp import Icp, Remapping
 from tofuse.engine.icp.icp_parts import All, MaxDistance, SmallStep, Uniform
 from tofuse.engine.icp.interfaces import Metric
 from tofuse.engine.icp.point_pairs import MIN_PAIRS
 from tofuse.engine.icp.reduce import averaged, extent, reduced
-from tofuse.engine.icp.remapping import Remapping
 from tofuse.engine.icp.surface_metrics import PlaneToPlane
 from tofuse.engine.icp.surface_shape import shape_at
 from tofuse.engine.parts import part

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.noise.choice import family_of, noise_model_for
     from tofuse.engine.noise.model import (
         NOISE,
         AmplitudeLaw,
@@ -13,6 +12,8 @@ if TYPE_CHECKING:
         Law,
         NoiseModel,
         RangeLaw,
+        family_of,
+        noise_model_for,
     )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from tofuse.engine.sensor.multipath_correction import Multipath
     from tofuse.engine.sensor.noise_correction import Noise
     from tofuse.engine.sensor.raw_amplitude import range_and_amplitude
-    from tofuse.engine.sensor.unwrap import on_surface
-    from tofuse.engine.sensor.unwrap_correction import Unwrap
+    from tofuse.engine.sensor.unwrap import Unwrap, on_surface
     from tofuse.engine.sensor.wrapped import Wrapped
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

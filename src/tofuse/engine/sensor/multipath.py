@@ -24,8 +24,9 @@ from tofuse.engine.arrays import Complex128, Float32, Float64
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.sensor import multipath_kernels as kernels
 from tofuse.engine.sensor.multipath_kernels import W, X, Y
-from tofuse.engine.sensor.multipath_map import OffscreenCells, ReflectorMap
 from tofuse.engine.sensor.multipath_surfaces import (
+    OffscreenCells,
+    ReflectorMap,
     Surfaces,
     block_nodes,
     fit_planes,

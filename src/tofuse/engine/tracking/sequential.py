@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 
@@ -16,10 +16,8 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.icp import algorithm_1
 from tofuse.engine.parts import part
 from tofuse.engine.search import SearchOptions
-from tofuse.engine.tracking.base import Odometry, Step, Tracker
+from tofuse.engine.tracking.base import Guess, Odometry, Step, Tracker
 from tofuse.engine.views import PreparedView
-
-Guess = Literal["identity", "previous", "odometry"]
 
 # Seeds the random draws of odometry differently from other stages that register the same pair.
 SEED_STAGE = 1
