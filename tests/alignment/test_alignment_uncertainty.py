@@ -20,7 +20,7 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.residual_kernels import POINT_SIZE, Residuals
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
 GEOMETRY_ONLY = ProjectiveOptions(photometric=False)

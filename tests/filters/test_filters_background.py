@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters.background_model import Background
+from tofuse.engine.filters.background import Background
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.parts import to_dict
 from tofuse.engine.sensor.scattering import LensScattering

@@ -15,7 +15,7 @@ from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import with_recording_defaults
 from tofuse.engine.mapping.config import changed, from_method
 from tofuse.engine.noise.model import NOISE, AmplitudeLaw, NoiseModel, RangeLaw
-from tofuse.engine.sensor.noise_correction import Noise
+from tofuse.engine.sensor.base import Noise
 from tofuse.formats.files.noise_file import write_noise
 
 CAMERA = Pinhole(60, 50, 60.0, 60.0, 29.5, 24.5)

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Annotated, Any, Literal, Protocol, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
-from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.cameras import Camera, ray_lengths
+from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import NOISE_MODEL, RangeFrame, Recording
@@ -42,27 +42,6 @@ _CODES = {
 # Maximum sigma in m; larger values are probably in millimetres.
 _MAX_SIGMA_M = 5.0
 _NO_IMAGE = np.empty((0, 0), np.float32)
-
-
-class NoisyImage(Protocol):
-    """The properties of a range image that determine its noise; a `RangeFrame` has them."""
-
-    @property
-    def camera(self) -> Camera: ...  # noqa: D102
-    @property
-    def depth(self) -> Float32: ...  # noqa: D102
-    @property
-    def depth_kind(self) -> Literal["z", "range"]: ...  # noqa: D102
-    @property
-    def amplitude_image(self) -> Float32 | None: ...  # noqa: D102
-    @property
-    def amplitude_kind(self) -> Literal["raw", "range_compensated", "ir"]: ...  # noqa: D102
-    @property
-    def confidence_image(self) -> UInt8 | None: ...  # noqa: D102
-    @property
-    def sigma_image(self) -> Float32 | None: ...  # noqa: D102
-    @property
-    def normal_image(self) -> Float32 | None: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -159,7 +138,7 @@ class NoiseModel(Bounded):
     ceiling_m: Annotated[float, Bounds(0, 100, exclusive=True)] = 1.0
     footprint: Annotated[float, Bounds(0, 1)] = 0.29
 
-    def law(self, frame: NoisyImage) -> Law:
+    def law(self, frame: RangeFrame) -> Law:
         """Return the law that applies to a frame; "camera" if it states its own sigma."""
         if frame.sigma_image is not None:
             return "camera"
@@ -169,7 +148,7 @@ class NoiseModel(Bounded):
             return "confidence"
         return "range"
 
-    def sigma(self, frame: NoisyImage, incidence: Float32 | None = None) -> Float32:
+    def sigma(self, frame: RangeFrame, incidence: Float32 | None = None) -> Float32:
         """Return the standard deviation (H, W) float32 in m of the radial range; 0 where invalid.
 
         Parameters
@@ -205,7 +184,7 @@ class NoiseModel(Bounded):
         run_chunks(rows, len(out))
         return out
 
-    def sigma_z(self, frame: NoisyImage, incidence: Float32 | None = None) -> Float32:
+    def sigma_z(self, frame: RangeFrame, incidence: Float32 | None = None) -> Float32:
         """Return the standard deviation (H, W) float32 in m of the z depth; 0 where invalid.
 
         The parameters are those of `sigma`.
@@ -253,7 +232,7 @@ class NoiseModel(Bounded):
         return model
 
 
-def incidence_cosine(frame: NoisyImage) -> Float32 | None:
+def incidence_cosine(frame: RangeFrame) -> Float32 | None:
     """Return the cosine (H, W) between ray and normal, NaN where unknown; None without normals."""
     normals = frame.normal_image
     if normals is None:

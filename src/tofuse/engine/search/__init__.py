@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.search import pair_agreement, pose_probability, verification, view_points
+    from tofuse.engine.search import pair_agreement, pose_probability, verification
     from tofuse.engine.search.plane_detection import Plane, detect_planes
     from tofuse.engine.search.search import (
         DISTINCT_M,

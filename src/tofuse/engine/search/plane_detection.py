@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.search import search_kernels as kernels
-from tofuse.engine.search.view_points import sampled_points
+from tofuse.engine.search.pair_agreement import sampled_points
 from tofuse.engine.views import PreparedView
 
 # Points of a view, and hypotheses in each round of RANSAC.

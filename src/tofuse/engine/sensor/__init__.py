@@ -5,12 +5,10 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.sensor.base import Correction, Corrector
-    from tofuse.engine.sensor.camera_errors import FIELDS, CameraErrors
-    from tofuse.engine.sensor.depth_correction import DepthCorrection
+    from tofuse.engine.sensor.base import Correction, Corrector, Noise
+    from tofuse.engine.sensor.camera_errors import FIELDS, CameraErrors, DepthCorrection
     from tofuse.engine.sensor.frequencies import DISAGREEMENT, SPEED_OF_LIGHT, combined
     from tofuse.engine.sensor.multipath_correction import Multipath
-    from tofuse.engine.sensor.noise_correction import Noise
     from tofuse.engine.sensor.raw_amplitude import range_and_amplitude
     from tofuse.engine.sensor.unwrap import Unwrap, on_surface
     from tofuse.engine.sensor.wrapped import Wrapped

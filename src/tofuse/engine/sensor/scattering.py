@@ -28,7 +28,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.filters import moving_object
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
-from tofuse.engine.sensor.base import Correction, Corrector
+from tofuse.engine.sensor.base import FrameCorrection
 from tofuse.engine.sensor.raw_amplitude import frame_phasor, phasor, tof_image
 
 # Columns of the coarse image on which the blur is computed.
@@ -175,7 +175,7 @@ _MIN_STATIC = 0.9
 
 @part("correction", "scattering", label="validated")
 @dataclass(frozen=True)
-class LensScattering(Bounded, Correction):
+class LensScattering(Bounded, FrameCorrection):
     """Compensate lens scattering (Mure-Dubois and Huegli 2007), see above.
 
     Works on cameras with one modulation frequency that record amplitude. Other views are passed
@@ -226,35 +226,15 @@ class LensScattering(Bounded, Correction):
                 fractions = estimate_fractions(np.stack(phasors), moving, static, self.widths)
         return replace(self, fractions=tuple(float(fraction) for fraction in fractions))
 
-    def start(self) -> ScatteringCorrector:
-        """See `Correction.start`."""
-        return ScatteringCorrector(self)
-
-
-class ScatteringCorrector(Corrector):
-    """Corrects the frames of one recording."""
-
-    def __init__(self, options: LensScattering) -> None:
-        self._period_m = options.period_m
-        self._model = (
-            Scattering(options.widths, options.fractions)
-            if options.fractions is not None and any(options.fractions)
-            else None
-        )
-
-    def is_independent(self, frame: Frame) -> bool:
-        """See `Corrector.is_independent`."""
-        return True
-
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`. Scattered light is removed from the amplitude as well."""
-        if self._model is None or not isinstance(frame, RangeFrame):
+        if not self.fractions or not any(self.fractions) or not isinstance(frame, RangeFrame):
             return frame
-        image = tof_image(frame, self._period_m)
+        image = tof_image(frame, self.period_m)
         if image is None:
             return frame
         measured = phasor(image)
-        direct = self._model.without_scatter(measured)
+        direct = Scattering(self.widths, self.fractions).without_scatter(measured)
         valid = (measured != 0) & (np.abs(direct) > _MIN_DIRECT * np.abs(measured))
         ratio = np.where(valid, direct, 1) / np.where(valid, measured, 1)
         r = np.where(valid, frame.radial_range, 1)

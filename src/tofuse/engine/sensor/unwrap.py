@@ -31,7 +31,7 @@ from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
-from tofuse.engine.sensor.base import Correction, Corrector
+from tofuse.engine.sensor.base import FrameCorrection
 from tofuse.engine.sensor.raw_amplitude import pixel_pitch, range_and_amplitude
 from tofuse.engine.sensor.unwrap_kernels import pass_messages
 
@@ -387,7 +387,7 @@ _ROUNDS = 4
 
 @part("correction", "unwrap", label="validated")
 @dataclass(frozen=True)
-class Unwrap(Bounded, Correction):
+class Unwrap(Bounded, FrameCorrection):
     """Unwrap the phase by amplitude and continuity, see `tofuse.engine.sensor.unwrap`.
 
     Works on cameras with one modulation frequency that record amplitude; other views are passed
@@ -428,10 +428,6 @@ class Unwrap(Bounded, Correction):
                 break
         return replace(self, white=white)
 
-    def start(self) -> UnwrapCorrector:
-        """See `Correction.start`."""
-        return UnwrapCorrector(self)
-
     def _white_of(self, frame: Frame, white: float) -> float:
         signal = range_and_amplitude(frame, self.period_m)
         if signal is None:
@@ -443,25 +439,14 @@ class Unwrap(Bounded, Correction):
             amplitude, (radial + periods * period).astype(np.float32), radial > 0
         )
 
-
-class UnwrapCorrector(Corrector):
-    """Adds whole periods to the ranges of each frame."""
-
-    def __init__(self, part: Unwrap) -> None:
-        self.part = part
-
-    def is_independent(self, frame: Frame) -> bool:
-        """See `Corrector.is_independent`."""
-        return True
-
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`. Range-compensated amplitude is scaled to the new range."""
-        signal = range_and_amplitude(frame, self.part.period_m)
+        signal = range_and_amplitude(frame, self.period_m)
         if signal is None or not isinstance(frame, RangeFrame):
             return frame
         radial, measured, period = signal
-        white, pitch = self.part.white or 0.0, pixel_pitch(frame)
-        periods = count_periods(radial, measured, period, white, pitch, self.part.options)
+        white, pitch = self.white or 0.0, pixel_pitch(frame)
+        periods = count_periods(radial, measured, period, white, pitch, self.options)
         if not periods.any():
             return frame
         factor = np.where(periods > 0, 1 + periods * period / np.where(radial > 0, radial, 1), 1)

@@ -12,8 +12,8 @@ from tofuse.engine.arrays import Bool, Float32, Int32
 from tofuse.engine.compute import median
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.views.prepared_view import PreparedView
-from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.engine.views.view_planes import (
+    SurfaceOptions,
     edge_pixels_by_noise,
     fitted_planes,
     inverse,
