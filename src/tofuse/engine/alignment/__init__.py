@@ -1,4 +1,10 @@
-"""."""
+"""Alignment of a view with others from a nearby pose, and how certain the result is.
+
+`projective.align` minimises distances from planes and differences of albedo; `covariance` states
+the uncertainty of its result, including degenerate directions. A `Registration` is the pose of one
+view in the frame of another by any method, a `Registrar` such a method, and a `Link` a registration
+that joins two components.
+"""
 
 from typing import TYPE_CHECKING
 

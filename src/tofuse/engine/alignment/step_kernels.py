@@ -1,4 +1,12 @@
-"""Gauss-Newton iterations of an alignment: from summed normal equations to a converged pose."""
+"""Gauss-Newton iterations of an alignment: from summed normal equations to a converged pose.
+
+Independent noise cancels in the symmetrised cross-information of two views. Errors that distort
+both views alike do not: multipath rounds corners and bends walls, scattering and lens shading
+change the albedo, and the range depends on the amplitude. They tilt normals and add albedo
+gradients in both Jacobians, so that a flat wall seems to constrain directions that it does not
+constrain. The expected spurious information follows from the standard deviations of such tilts and
+gradients, and is subtracted.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +19,13 @@ from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
 from tofuse.engine.geometry import compose, retract, twist_between
 from tofuse.engine.views import residual_kernels as res
+
+# Number of points from which the spurious information is estimated.
+SAMPLE_SIZE = 500
+# Nuisance parameters that are also estimated: log albedo of the targets minus that of the source,
+# scale of the sigmas of distances, and sigma of the log albedo (0 leaves it out).
+EXPOSURE, SCALE_G, SCALE_P = 0, 1, 2
+_MIN_PIVOT = 1e-12
 
 
 @kernel
@@ -81,14 +96,6 @@ def _add_outer(
     for p in range(6):
         for o in range(6):
             out[p, o] += weight * J[p] * J[o]
-
-
-# Number of points from which the spurious information is estimated.
-SAMPLE_SIZE = 500
-# Nuisance parameters that are also estimated: log albedo of the targets minus that of the source,
-# scale of the sigmas of distances, and sigma of the log albedo (0 leaves it out).
-EXPOSURE, SCALE_G, SCALE_P = 0, 1, 2
-_MIN_PIVOT = 1e-12
 
 
 class LevelSettings(NamedTuple):

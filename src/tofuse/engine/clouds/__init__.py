@@ -1,4 +1,9 @@
-"""."""
+"""Registration of any two views, images or clouds, under any rotation.
+
+`register` is what a user calls for one pair; `AnyPair` is the method behind it, and the default of
+configurations. `fpfh` proposes poses by matching local features, and `robust_motion` finds a motion
+among matches that are mostly wrong.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""``tofuse.register``: registration of one pair of views or clouds."""
+"""``tofuse.register``: registration of one pair of views or clouds; and its default method."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number, part
 from tofuse.engine.search import follow, register_pair, verification
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
+
+# Clouds with a larger distance are in different frames.
+_MAX_FRAME_DISTANCE_M = 1e4
 
 MIN_POINTS = 10
 # For recorded views with a wide baseline, which multipath distorts individually.
@@ -137,10 +140,6 @@ def _as_image(view: Frame) -> tuple[PreparedView, Float64] | None:
         return None
     # The optical axis of such an image is not that of a lens.
     return prepare_view(image[0], SurfaceOptions(falloff=0.0)), image[1]
-
-
-# Clouds with a larger distance are in different frames.
-_MAX_FRAME_DISTANCE_M = 1e4
 
 
 def register(

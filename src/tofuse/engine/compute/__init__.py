@@ -1,4 +1,10 @@
-"""."""
+"""Compiled kernels, threads and memory: what makes the engine fast and its results reproducible.
+
+`kernel` compiles a function over arrays; `compiling_in_background` does it ahead of the first call.
+`run_chunks` and `run_all` use one thread pool, and their results are the same for any number of
+`threads`; `one_blas_thread` does the same for BLAS. `Spill` keeps arrays within a budget of memory,
+the rest on disk. `median` and `tukey_kernels` are the statistics that several rooms share.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,7 +1,8 @@
 """The cores of this machine, and one thread pool with results that do not depend on their number.
 
 Work is divided into a number of chunks that depends on the work alone. Each chunk is computed by
-one call of a GIL-free kernel, and results are combined in chunk order. BLAS, whose sums depend on its threads, is limited to one.
+one call of a GIL-free kernel, and results are combined in chunk order. BLAS, whose sums depend on
+its threads, is limited to one.
 """
 
 from __future__ import annotations

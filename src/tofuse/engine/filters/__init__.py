@@ -1,4 +1,9 @@
-"""."""
+"""Which points of a view are to be believed: filters mark the others as invalid.
+
+Each is a `Filter` with a name in configurations, and `apply_filters` applies a list of them. Most
+look at one pixel or its neighbours (`Confidence`, `NeighbourhoodAngle`); `moving_object` separates
+an object from the static background over many frames.
+"""
 
 from typing import TYPE_CHECKING
 

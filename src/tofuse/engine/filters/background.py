@@ -1,4 +1,4 @@
-"""Segmentation of a moving object from the background of a stationary camera."""
+"""Segmentation of a moving object from the background of a stationary camera, and its filter."""
 
 from __future__ import annotations
 
@@ -19,6 +19,38 @@ from tofuse.engine.filters.base import Filter
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.parts import part
+
+# A surface exists where this fraction of the frames, and this number, agree on its depth.
+_MIN_FRACTION, _MIN_AGREEING = 0.15, 3
+# Depths agree within this number of sigmas plus this fraction of the depth.
+_SIGMAS, _RELATIVE = 5.0, 0.01
+_OPTION = "--object"
+_LEAVE = "leave it out if the camera moves; else "
+_CUT = "crop the background with --max-depth, a box or a mask"
+_MIN_FRAMES = 6
+# Neighbouring depths that differ by more than this fraction are on different surfaces.
+_JUMP = 0.04
+# A pixel is static if its background is visible in this fraction of the frames, and swept by the
+# object if it is not visible in this fraction.
+_STATIC, _SWEPT = 0.8, 0.04
+# Fraction of an image border that must be static.
+_STATIC_BORDER = 0.6
+# Smallest fraction of foreground pixels of an object.
+_MIN_OBJECT = 0.002
+# The object's rim has mixed pixels; its depth is taken from the interior within this distance.
+_FILL_PIXELS = 6
+# Smallest fraction of the rim of an object's segment that must continue the passing object.
+_MIN_JOINED = 0.25
+# Foreground components smaller than this fraction of the largest are speckle.
+_SPECKLE = 0.02
+# Fraction of the outline of the foreground at which its surface must end.
+_MIN_OUTLINE = 0.5
+# Fraction of the foreground that must be farther than a pixel from its outline.
+_MIN_INNER = 0.4
+# Percentiles of the depths of the object, and the relative margin around their interval. Mixed
+# pixels of object and background can have any depth, even nearer than both.
+_DEPTH_PERCENTILES = (2, 98)
+_MARGIN = 0.5
 
 
 @part("filter", "background")
@@ -94,40 +126,6 @@ class FittedBackground(Background):
                 remedy="use images of one size",
             )
         return self._found.mask(frame.z)
-
-
-# A surface exists where this fraction of the frames, and this number, agree on its depth.
-_MIN_FRACTION, _MIN_AGREEING = 0.15, 3
-# Depths agree within this number of sigmas plus this fraction of the depth.
-_SIGMAS, _RELATIVE = 5.0, 0.01
-
-_OPTION = "--object"
-_LEAVE = "leave it out if the camera moves; else "
-_CUT = "crop the background with --max-depth, a box or a mask"
-_MIN_FRAMES = 6
-# Neighbouring depths that differ by more than this fraction are on different surfaces.
-_JUMP = 0.04
-# A pixel is static if its background is visible in this fraction of the frames, and swept by the
-# object if it is not visible in this fraction.
-_STATIC, _SWEPT = 0.8, 0.04
-# Fraction of an image border that must be static.
-_STATIC_BORDER = 0.6
-# Smallest fraction of foreground pixels of an object.
-_MIN_OBJECT = 0.002
-# The object's rim has mixed pixels; its depth is taken from the interior within this distance.
-_FILL_PIXELS = 6
-# Smallest fraction of the rim of an object's segment that must continue the passing object.
-_MIN_JOINED = 0.25
-# Foreground components smaller than this fraction of the largest are speckle.
-_SPECKLE = 0.02
-# Fraction of the outline of the foreground at which its surface must end.
-_MIN_OUTLINE = 0.5
-# Fraction of the foreground that must be farther than a pixel from its outline.
-_MIN_INNER = 0.4
-# Percentiles of the depths of the object, and the relative margin around their interval. Mixed
-# pixels of object and background can have any depth, even nearer than both.
-_DEPTH_PERCENTILES = (2, 98)
-_MARGIN = 0.5
 
 
 @dataclass(frozen=True, eq=False)

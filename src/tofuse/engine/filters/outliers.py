@@ -1,4 +1,4 @@
-"""Outlier removal by the distance to the nearest neighbours in space."""
+"""Filters of outliers: points far from their neighbours in space, or at jump edges."""
 
 from __future__ import annotations
 

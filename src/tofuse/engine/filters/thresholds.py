@@ -1,4 +1,4 @@
-"""Filter by the distance to the camera."""
+"""Filters by a threshold: of the distance, of the camera's confidence, or between two surfaces."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.filters.base import Filter, Interval
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
+
+_BINS = 256
 
 
 @part("filter", "distance")
@@ -77,9 +79,6 @@ class Confidence(Bounded, Filter):
         if not isinstance(frame, RangeFrame) or frame.confidence_image is None:
             return np.ones(frame.valid.shape, bool)
         return frame.confidence_image >= self.minimum
-
-
-_BINS = 256
 
 
 @part("filter", "foreground")

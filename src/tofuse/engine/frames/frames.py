@@ -1,7 +1,7 @@
 """The two kinds of view: a depth image of a camera, and a cloud.
 
-Both have N valid points with columns, in a frame of their own, which is all that the registration of
-clouds needs. All arrays are read-only by convention: methods return new frames.
+Both have N valid points with columns, in a frame of their own, which is all that the registration
+of clouds needs. All arrays are read-only by convention: methods return new frames.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Coarse-to-fine registration of two clouds with automatic parameters."""
+"""Coarse-to-fine registration of two clouds, averaged to voxels, with automatic parameters."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ from tofuse.engine.icp.interfaces import Metric
 from tofuse.engine.icp.surface_metrics import MIN_PAIRS, PlaneToPlane
 from tofuse.engine.icp.surface_shape import shape_at
 from tofuse.engine.parts import part
+
+# Maximum number of cubes with a unique index in float64.
+_MAX_CELLS = 2.0**52
 
 _SPACING_SAMPLE = 5000
 _MIN_LEVEL_POINTS = 60
@@ -207,10 +210,6 @@ def spacing(view: Frame) -> float:
     distances: Float64 = np.sqrt(squared[:, 1])
     positive = distances[distances > 0]
     return float(np.median(positive)) if len(positive) else 0.01
-
-
-# Maximum number of cubes with a unique index in float64.
-_MAX_CELLS = 2.0**52
 
 
 def extent(points: Float32 | Float64) -> float:

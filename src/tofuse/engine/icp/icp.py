@@ -1,4 +1,7 @@
-"""The Iterative Closest Point algorithm (Besl and McKay 1992), composed of exchangeable parts."""
+"""The Iterative Closest Point algorithm (Besl and McKay 1992), composed of exchangeable parts.
+
+A `Remapping` keeps degenerate directions at the guess.
+"""
 
 from __future__ import annotations
 
@@ -36,6 +39,8 @@ from tofuse.engine.icp.interfaces import (
 )
 from tofuse.engine.icp.surface_shape import NEIGHBOURS
 from tofuse.engine.parts import part
+
+_MIN_POINTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +85,6 @@ class Remapping:
         xi = se3.log(se3.about(-self.centre, T)) * scale
         component = sum((b * float((b * xi).sum()) for b in basis), np.zeros(6))
         return se3.about(self.centre, se3.exp((component if along else xi - component) / scale))
-
-
-_MIN_POINTS = 3
 
 
 @part("registration", "icp", label="validated")

@@ -1,4 +1,8 @@
-"""Error metrics with normals: point-to-plane, plane-to-plane."""
+"""Error metrics with normals: point-to-plane, plane-to-plane.
+
+`SurfacePairs` are the matches with normals, in coordinates about their centroid. Robust losses,
+the solution of normal equations and the detection of degenerate directions are common to all.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""."""
+"""How accurate a range is: the noise models of depth cameras.
+
+A `NoiseModel` predicts the standard deviation of each pixel from its amplitude, confidence or
+range, by the most informative law that a frame has. `NOISE` holds the models of camera families,
+and `noise_model_for` chooses one for a recording.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -10,6 +10,8 @@ depend on the signal (ambient light, read-out). The ratio of noise and amplitude
 A falls as 1/r^2, so that sigma grows as r^2 in the dark limit. Cameras that don't give their
 amplitude are described by a table over their levels of confidence, or over the range alone,
 ``sigma_r = a + b r^2``, which is also the law of triangulating cameras (Khoshelham 2011).
+
+The model of a recording comes from its folder, its camera family, or its frames.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Agreement of two range images at a pose: support and free-space violations."""
+"""Agreement of two range images at a pose: support and free-space violations.
+
+Sampled points of each are projected into the other.
+"""
 
 from __future__ import annotations
 

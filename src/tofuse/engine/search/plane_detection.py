@@ -11,6 +11,20 @@ from tofuse.engine.search import search_kernels as kernels
 from tofuse.engine.search.pair_agreement import sampled_points
 from tofuse.engine.views import PreparedView
 
+# Number of sampled points, and of hypotheses of the floor.
+_FLOOR_POINTS, _FLOOR_HYPOTHESES = 1200, 200
+# Inlier tolerances: angle between the normals, rad, and distance from the plane, m plus a fraction
+# of the depth. They cover the systematic errors of ToF cameras, which exceed their noise.
+_ANGLE, _BAND_M, _BAND_FRACTION = 0.15, 0.02, 0.01
+# Minimum fraction of the view's points on the floor, and maximum fraction below it.
+_MIN_INLIERS, _MAX_BELOW = 0.04, 0.02
+# Bands below a plane from which on a point counts as below it.
+_BELOW = 3.0
+# Candidates for down in the frame of an unknown camera: +y, or sideways in portrait orientation.
+_DOWN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+# Minimum cosine between the floor's normal and down: any usual attitude of the camera.
+_MIN_COSINE = float(np.cos(0.9))
+
 # Points of a view, and hypotheses in each round of RANSAC.
 _POINTS, _HYPOTHESES = 3000, 150
 # Largest angle between the normals of a plane and of its inliers, rad.
@@ -121,21 +135,6 @@ class Floor:
     normal: Float64
     height: float
     fraction: float
-
-
-# Number of sampled points, and of hypotheses of the floor.
-_FLOOR_POINTS, _FLOOR_HYPOTHESES = 1200, 200
-# Inlier tolerances: angle between the normals, rad, and distance from the plane, m plus a fraction
-# of the depth. They cover the systematic errors of ToF cameras, which exceed their noise.
-_ANGLE, _BAND_M, _BAND_FRACTION = 0.15, 0.02, 0.01
-# Minimum fraction of the view's points on the floor, and maximum fraction below it.
-_MIN_INLIERS, _MAX_BELOW = 0.04, 0.02
-# Bands below a plane from which on a point counts as below it.
-_BELOW = 3.0
-# Candidates for down in the frame of an unknown camera: +y, or sideways in portrait orientation.
-_DOWN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-# Minimum cosine between the floor's normal and down: any usual attitude of the camera.
-_MIN_COSINE = float(np.cos(0.9))
 
 
 def find_floors(source: PreparedView, target: PreparedView) -> tuple[Floor, Floor] | None:

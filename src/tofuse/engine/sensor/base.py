@@ -1,4 +1,7 @@
-"""The interface of corrections, which change measurements before they are filtered."""
+"""The interface of corrections, which change measurements before they are filtered.
+
+And the simplest one: `Noise` changes no measurement, but states its standard deviation.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Correct known errors of a camera: its intrinsics, and an offset of its ranges."""
+"""Known errors of a camera and their correction.
+
+`DepthCorrection` is that of the factory, a curve over the range and an offset per pixel, applied
+when a recording is read. `CameraErrors` corrects intrinsics and range as found by calibration.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +111,7 @@ def _check_numbers(name: str, array: NDArray[np.generic]) -> None:
 
 
 # Options of each error and of its standard deviation, by the names of the calibration check.
-FIELDS = {
+ERROR_OPTIONS = {
     "focal": ("focal", "focal_sigma"),
     "offset": ("offset_m", "offset_sigma_m"),
     "center_x": ("center_x", "center_x_sigma"),
@@ -167,19 +171,19 @@ class CameraErrors(Bounded, Correction):
             self.distortion + other.distortion,
             **{
                 sigma: getattr(other if getattr(other, error) else self, sigma)
-                for error, sigma in FIELDS.values()
+                for error, sigma in ERROR_OPTIONS.values()
             },
         )
 
     @property
     def errors(self) -> dict[str, float]:
-        """The errors by name, as in `FIELDS`."""
-        return {name: getattr(self, error) for name, (error, _) in FIELDS.items()}
+        """The errors by name, as in `ERROR_OPTIONS`."""
+        return {name: getattr(self, error) for name, (error, _) in ERROR_OPTIONS.items()}
 
     @property
     def sigmas(self) -> dict[str, float]:
         """Their standard deviations by name."""
-        return {name: getattr(self, sigma) for name, (_, sigma) in FIELDS.items()}
+        return {name: getattr(self, sigma) for name, (_, sigma) in ERROR_OPTIONS.items()}
 
     @classmethod
     def made_with(cls, config: Mapping[str, Any]) -> tuple[Corrector, ...]:

@@ -1,4 +1,8 @@
-"""Surfaces and their radiometry at the nodes of a coarse grid, for multipath."""
+"""The surfaces that reflect light onto each other, and their radiometry, for multipath.
+
+Those in the image are at the nodes of a coarse grid; illuminated ones outside of it are mapped from
+earlier views, or extrapolated.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,20 @@ from tofuse.engine.arrays import Bool, Complex128, Float32, Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.sensor import multipath_kernels as kernels
 from tofuse.engine.sensor.multipath_kernels import COLUMNS, PATCH, A, W, X, Y
+
+# Upper limit of the illumination angle, rad.
+_MAX_LAMP_ANGLE = np.pi / 3
+# Cells along the image's width of the grid around it.
+_CELLS = 12
+# Rows and columns of nodes at the image's border that are extrapolated.
+_BORDER = 3
+# Limits of the ratio of inverse depths within which a plane is extrapolated.
+_INVERSE_DEPTH_RATIO = np.array([0.3, 3.0])
+# A view is added when the camera has moved by this angle (rad), or distance relative to the depth,
+# since the last one; and the maximum number of views.
+_ANGLE, _DISTANCE, _VIEWS = 0.1, 0.05, 100
+# Smallest cosine of incidence of surfaces that are added.
+_MIN_INCIDENCE = 0.25
 
 # Exponent of the cosine to the optical axis by which amplitude falls off: half of it is due to the
 # lens, half of it due to the lamp.
@@ -146,21 +164,6 @@ def visible_sources(surfaces: Surfaces, radiosity: Complex128) -> Float32:
         surfaces.has_plane, surfaces.points, surfaces.normals, surfaces.area, radiosity, out
     )
     return out[:count]
-
-
-# Upper limit of the illumination angle, rad.
-_MAX_LAMP_ANGLE = np.pi / 3
-# Cells along the image's width of the grid around it.
-_CELLS = 12
-# Rows and columns of nodes at the image's border that are extrapolated.
-_BORDER = 3
-# Limits of the ratio of inverse depths within which a plane is extrapolated.
-_INVERSE_DEPTH_RATIO = np.array([0.3, 3.0])
-# A view is added when the camera has moved by this angle (rad), or distance relative to the depth,
-# since the last one; and the maximum number of views.
-_ANGLE, _DISTANCE, _VIEWS = 0.1, 0.05, 100
-# Smallest cosine of incidence of surfaces that are added.
-_MIN_INCIDENCE = 0.25
 
 
 class ReflectorMap:

@@ -31,6 +31,13 @@ from tofuse.engine.parts import part
 from tofuse.engine.sensor.base import FrameCorrection
 from tofuse.engine.sensor.raw_amplitude import frame_phasor, phasor, tof_image
 
+# Smallest ratio of direct to measured light of a pixel that is corrected.
+_MIN_DIRECT = 0.5
+# Margin in pixels around moving objects that counts neither as moving nor as static.
+_MARGIN = 4
+# Fraction of the frames in which a static pixel must show its background.
+_MIN_STATIC = 0.9
+
 # Columns of the coarse image on which the blur is computed.
 _COLUMNS = 44
 # Fixed-point iterations; each is accurate to one more power of the scattered fraction.
@@ -163,14 +170,6 @@ def estimate_fractions(
     if not explained * len(b) > _MIN_CHI2 * noise or fractions.sum() > _MAX_FRACTION:
         return zero
     return np.asarray(fractions)
-
-
-# Smallest ratio of direct to measured light of a pixel that is corrected.
-_MIN_DIRECT = 0.5
-# Margin in pixels around moving objects that counts neither as moving nor as static.
-_MARGIN = 4
-# Fraction of the frames in which a static pixel must show its background.
-_MIN_STATIC = 0.9
 
 
 @part("correction", "scattering", label="validated")

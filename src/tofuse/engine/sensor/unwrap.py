@@ -35,6 +35,8 @@ from tofuse.engine.sensor.base import FrameCorrection
 from tofuse.engine.sensor.raw_amplitude import pixel_pitch, range_and_amplitude
 from tofuse.engine.sensor.unwrap_kernels import pass_messages
 
+_ROUNDS = 4
+
 # Fraction of pixels that may be brighter than white, due to gloss and noise.
 _GLOSSY_FRACTION = 0.01
 # Slopes are differences between blocks at this distance on either side, of the phase averaged over
@@ -380,9 +382,6 @@ def _upsample(
             out[better] = (best[block] + periods.astype(np.int64))[better]
             nearest[better] = distance[better]
     return np.where(radial_range > 0, np.clip(out, 0, max_periods), 0).astype(np.int32)
-
-
-_ROUNDS = 4
 
 
 @part("correction", "unwrap", label="validated")

@@ -1,4 +1,10 @@
-"""."""
+"""Odometry: the pose of each frame as it arrives.
+
+An `Odometry` method starts a `Tracker`, which returns a `Step` for each frame. `Keyframes` is the
+default; `Pairwise` is for wide baselines and clouds, `Sequential` that of the thesis, and `given`
+adopts known poses. `motion_prediction` says how far a prediction can be trusted, and
+`moving_objects` keeps what moves out of the alignment.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -13,8 +13,8 @@ from tofuse.engine.tracking.motion import FrameTime
 from tofuse.engine.views import PreparedView
 
 Status = Literal["tracked", "predicted", "lost", "skipped"]
-# Where the alignment of a frame starts: at the last pose, at constant velocity, or where an odometry
-# file says.
+# Where the alignment of a frame starts: at the last pose, at constant velocity, or where the
+# motion of an odometry file leads.
 Guess = Literal["identity", "previous", "odometry"]
 
 

@@ -1,4 +1,7 @@
-"""Pose hypotheses: alignments with the last keyframe and the last frame, the likeliest first."""
+"""Pose hypotheses: alignments with the last keyframe and the last frame, the likeliest first.
+
+They start from the state of the tracker between two frames.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +24,14 @@ from tofuse.engine.tracking.moving_objects import (
     without_pixels,
 )
 from tofuse.engine.views import PreparedView
+
+# Minimum score of a rotated start relative to the unrotated one: a flat wall fits under any.
+_MIN_ROTATED_SCORE_RATIO = 1.03
+# A nearly aligned view needs a few more iterations, at the resolution of tracking.
+_CONVERGENCE_LEVELS = (projective.Level(4, 8, 0.005, 0.02), projective.Level(2, 8, 0.0, 0.0))
+# Every n-th frame is segmented, and any with an indication of moving objects: an unusual fit, more
+# than this fraction of points in free space, or objects in the frame before.
+_SEGMENT_EVERY, _MAX_IN_FRONT = 4, 0.005
 
 
 @dataclass(eq=False)
@@ -63,15 +74,6 @@ class TrackerState:
     component: int = -1
     connected: bool = True
     degenerate: int = 0
-
-
-# Minimum score of a rotated start relative to the unrotated one: a flat wall fits under any.
-_MIN_ROTATED_SCORE_RATIO = 1.03
-# A nearly aligned view needs a few more iterations, at the resolution of tracking.
-_CONVERGENCE_LEVELS = (projective.Level(4, 8, 0.005, 0.02), projective.Level(2, 8, 0.0, 0.0))
-# Every n-th frame is segmented, and any with an indication of moving objects: an unusual fit, more
-# than this fraction of points in free space, or objects in the frame before.
-_SEGMENT_EVERY, _MAX_IN_FRONT = 4, 0.005
 
 
 @dataclass(frozen=True, eq=False)

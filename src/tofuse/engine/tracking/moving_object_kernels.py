@@ -382,7 +382,7 @@ def propagate(
                 planes[i, j, 3], plane_variance[i, j], z[i, j], sigma[i, j]
             )
             depths[a, b] = depth
-            k, m, x, y, z_proj = _project_cell(
+            k, m, _, _, z_proj = _project_cell(
                 depth, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), motion,
                 lookup, lookup_frame, prev_shape[0], prev_shape[1],
             )  # fmt: skip
@@ -434,7 +434,7 @@ def predict(
             i, j = a * stride, b * stride
             moving[a, b] = False
             depth = np.float64(z[i, j])
-            k, m, x, y, z_proj = _project_cell(
+            k, m, _, _, z_proj = _project_cell(
                 depth, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), motion,
                 lookup, lookup_frame, prev_shape[0], prev_shape[1],
             )  # fmt: skip

@@ -1,4 +1,8 @@
-"""Odometry with wide baselines: each view is registered to an earlier one, and verified."""
+"""Odometry by registration of each view to an earlier one.
+
+`Sequential` is that of the thesis: to the one before (section 3.3). `Pairwise` is for wide
+baselines: to several earlier ones, and verified.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +25,11 @@ from tofuse.engine.search import SearchOptions, pose_probability
 from tofuse.engine.tracking.base import Guess, Odometry, Step, Tracker
 from tofuse.engine.tracking.motion import FrameTime, MotionModel
 from tofuse.engine.views import PreparedView
+
+# The prediction replaces the search once it has agreed with 2 of the last 3 searches.
+_MIN_CONFIRMED = 2
+# Poses that differ by less than this fraction of the extent are the same.
+_MAX_DIFFERENCE = 0.03
 
 # Seeds the random draws of odometry differently from other stages that register the same pair.
 SEED_STAGE = 1
@@ -133,12 +142,6 @@ def _odometry_motion(last: _Tracked, T_odometry: Float64 | None) -> Float64:
         return np.eye(4)
     motion = se3.inverse(before) @ T_odometry
     return motion if np.isfinite(motion).all() else np.eye(4)
-
-
-# The prediction replaces the search once it has agreed with 2 of the last 3 searches.
-_MIN_CONFIRMED = 2
-# Poses that differ by less than this fraction of the extent are the same.
-_MAX_DIFFERENCE = 0.03
 
 
 @part("odometry", "pairwise")

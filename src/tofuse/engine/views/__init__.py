@@ -1,4 +1,9 @@
-"""."""
+"""Views prepared for alignment: a plane, its uncertainty and an albedo at each pixel.
+
+`prepare_view` makes a `PreparedView` of a range image with `SurfaceOptions`; `with_extended_planes`
+and `with_rough_planes` add planes for fusion and for searches. A `Projection` is the camera at the
+resolution of the view. `residual_kernels` compare two views, `view_descriptors` recognise places.
+"""
 
 from typing import TYPE_CHECKING
 

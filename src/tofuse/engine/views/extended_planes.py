@@ -1,4 +1,8 @@
-"""More planes of a view for fusion: at noisy pixels and at depth edges."""
+"""More planes of a view than tracking uses.
+
+For fusion: at noisy pixels and at depth edges. For the search with views that are too noisy for
+tracking: wide ones with a looser tolerance.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +26,11 @@ from tofuse.engine.views.view_planes import (
     with_shared_error,
 )
 from tofuse.engine.views.view_planes_kernels import extend_planes
+
+_CHUNKS = 4
+# Deviation from a plane as a fraction of the depth, and half width of a plane's window as a
+# fraction of the image.
+_DEVIATION, _WINDOW = 0.01, 0.016
 
 # Pixels whose noise exceeds the typical one by this ratio get planes of their own, if they are at
 # least this fraction of a view.
@@ -121,12 +130,6 @@ def _steps(radius: int) -> tuple[Int32, Float32]:
     order = np.argsort(squares, kind="stable")[1:]
     growth = 1 + squares[order] / (radius * (radius + 1) / 3)
     return offsets[order].astype(np.int32), growth.astype(np.float32)
-
-
-_CHUNKS = 4
-# Deviation from a plane as a fraction of the depth, and half width of a plane's window as a
-# fraction of the image.
-_DEVIATION, _WINDOW = 0.01, 0.016
 
 
 def with_rough_planes(view: PreparedView) -> PreparedView:

@@ -1,4 +1,4 @@
-"""Noise of range images, planes of their pixels, and depth edges, which get no plane.
+"""Noise of range images, planes of their pixels, and depth edges, which get none; their options.
 
 The noise is stated by the frame or by a law of its kind, with a scale that the planes determine.
 
@@ -21,6 +21,15 @@ from tofuse.engine.frames import RangeFrame
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.views.projection import Projection
 from tofuse.engine.views.view_planes_kernels import fit_planes
+
+# Rows of a chunk: many, as chunks cost synchronisation and their windows overlap; fixed, so that
+# the result does not depend on the number of threads.
+_CHUNK_ROWS = 60
+# m. Sigmas beyond are invalid, and their squares exceed the range of float32.
+_MIN_SIGMA, _MAX_SIGMA = 1e-6, 1e3
+# Number of pixels assumed to share a correlated error: an alignment treats pixels as independent,
+# so its variance is multiplied by this.
+_CORRELATED_PIXELS = 100.0
 
 # Tangent of the incidence (80 degrees) up to which neighbouring pixels belong to one surface.
 _STEEPEST = 5.67
@@ -123,16 +132,6 @@ class SurfaceOptions:
             edge_jump=max(options.edge_jump, _STEEPEST * pitch),
             radii=tuple(max(k, round(scale * r)) for k, r in enumerate(options.radii, start=1)),
         )
-
-
-# Rows of a chunk: many, as chunks cost synchronisation and their windows overlap; fixed, so that
-# the result does not depend on the number of threads.
-_CHUNK_ROWS = 60
-# m. Sigmas beyond are invalid, and their squares exceed the range of float32.
-_MIN_SIGMA, _MAX_SIGMA = 1e-6, 1e3
-# Number of pixels assumed to share a correlated error: an alignment treats pixels as independent,
-# so its variance is multiplied by this.
-_CORRELATED_PIXELS = 100.0
 
 
 def fitted_planes(
