@@ -192,13 +192,7 @@ class CameraErrors(Bounded, Correction):
         They are the only corrections that change the rays of pixels.
         """
         return tuple(
-            cls(
-                item["focal"],
-                item["offset_m"],
-                item.get("center_x", 0.0),
-                item.get("center_y", 0.0),
-                item.get("distortion", 0.0),
-            ).start()
+            cls(**{error: item.get(error, 0.0) for error, _ in ERROR_OPTIONS.values()}).start()
             for item in config.get("corrections", ())
             if item["part"] == "camera-errors"
         )

@@ -9,6 +9,7 @@ these; all are 0 where unknown.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -22,6 +23,8 @@ from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.views.projection import Projection
 from tofuse.engine.views.view_planes_kernels import fit_planes
 
+# Neighbours along the rows, and along the columns.
+_NEIGHBOURS = ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1]))
 # Rows of a chunk: many, as chunks cost synchronisation and their windows overlap; fixed, so that
 # the result does not depend on the number of threads.
 _CHUNK_ROWS = 60
@@ -167,28 +170,32 @@ def edge_pixels(w: Float32, jump: float, margin: int) -> Bool:
 
     Due to the blur of the lens they mix light of both sides.
     """
-    edge = np.zeros(w.shape, np.uint8)
-    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
-        is_step = np.abs(w[a] - w[b]) > np.float32(min(jump, 0.9)) * np.maximum(w[a], w[b])
-        edge[a] |= is_step
-        edge[b] |= is_step
-    return dilated(edge, margin)
+    limit = np.float32(min(jump, 0.9))
+    return _edge_pixels(w, [limit] * 2, margin)
 
 
 def edge_pixels_by_noise(w: Float32, noise: Float32, options: SurfaceOptions) -> Bool:
     """Return `edge_pixels` for the noise (H, W) of each pixel, relative to the depth."""
-    edge = np.zeros(w.shape, np.uint8)
-    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+    limits = []
+    for a, b in _NEIGHBOURS:
         n, m = noise[a] ** 2, noise[b] ** 2
         # A large change of the noise is an edge between surfaces.
         noise_step = np.float32(options.edge_sigmas) * np.sqrt(
             np.minimum(n + m, 4 * np.minimum(n, m))
         )
-        limit = np.minimum(np.maximum(noise_step, np.float32(options.edge_jump)), np.float32(0.9))
+        limit = np.maximum(noise_step, np.float32(options.edge_jump))
+        limits.append(np.minimum(limit, np.float32(0.9)))
+    return _edge_pixels(w, limits, options.edge_margin)
+
+
+def _edge_pixels(w: Float32, limits: Sequence[Float32 | np.float32], margin: int) -> Bool:
+    """Return the pixels near relative steps above the limits between columns and between rows."""
+    edge = np.zeros(w.shape, np.uint8)
+    for (a, b), limit in zip(_NEIGHBOURS, limits, strict=True):
         is_step = np.abs(w[a] - w[b]) > limit * np.maximum(w[a], w[b])
         edge[a] |= is_step
         edge[b] |= is_step
-    return dilated(edge, options.edge_margin)
+    return dilated(edge, margin)
 
 
 def dilated(mask: UInt8, margin: int) -> Bool:
