@@ -16,11 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.engine.filters.angle import NeighbourhoodAngle
 from tofuse.engine.filters.base import Filter, apply_filters
-from tofuse.engine.filters.confidence import Confidence
-from tofuse.engine.filters.distance import Distance
-from tofuse.engine.filters.neighbours import NeighbourFraction
+from tofuse.engine.filters.outliers import NeighbourFraction, NeighbourhoodAngle
+from tofuse.engine.filters.thresholds import Confidence, Distance
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.methods.filters_amplitude import Amplitude

@@ -40,7 +40,7 @@ from tofuse.engine.mapping.preparation import Preparation
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import align
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.experiments.surface_error import Surface, distances
 from tofuse.lab.simulation.effects import Effects

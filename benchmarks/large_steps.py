@@ -35,7 +35,7 @@ from tofuse.engine.search.pair_agreement import agreement
 from tofuse.engine.search.search import SearchOptions
 from tofuse.engine.search.view_pair import register_pair
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.lab.methods.features import Features
 from tofuse.lab.methods.fpfh import Fpfh
 from tofuse.lab.methods.plane_sets import PlaneSets

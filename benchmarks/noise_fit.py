@@ -21,7 +21,7 @@ from tofuse.apps.calibration.noise_estimation import NoiseFit, estimate_noise
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.noise.choice import noise_model_for
+from tofuse.engine.noise.model import noise_model_for
 from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.open import open_recording
 from tofuse.formats.recordings.still import average_still

@@ -43,8 +43,8 @@ from pair_views import TAKEN, recorded
 from peers import o3d_global
 from sequences import DATA, OUT, kinect_loop
 from tofuse.engine.alignment.base import Registration
-from tofuse.engine.clouds.any_pair import AnyPair
 from tofuse.engine.clouds.cloud_pair import register_clouds
+from tofuse.engine.clouds.pair import AnyPair
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import Recording
@@ -60,7 +60,7 @@ from tofuse.engine.search.pose_probability import (
 )
 from tofuse.engine.search.view_pair import follow, register_pair
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.record import simulate
 

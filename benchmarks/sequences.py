@@ -18,7 +18,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter, apply_filters
-from tofuse.engine.filters.foreground import Foreground
+from tofuse.engine.filters.thresholds import Foreground
 from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import with_recording_defaults

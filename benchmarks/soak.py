@@ -36,8 +36,7 @@ from tofuse.apps.jobs.run_options import Options
 from tofuse.apps.jobs.running import run
 from tofuse.apps.live.device import DeviceError, Settings, Stream
 from tofuse.apps.live.recorder import record
-from tofuse.engine.compute.memory import trim_memory
-from tofuse.engine.compute.spill import Spill, SpillFile
+from tofuse.engine.compute.spill import Spill, SpillFile, trim_memory
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.mapping.adaptation import with_recording_defaults
 from tofuse.engine.mapping.config import Config, changed

@@ -20,7 +20,7 @@ import numpy as np
 
 from tofuse.engine.cameras.depth_conversion import range_from_z
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.sensor.unwrap_correction import Unwrap
+from tofuse.engine.sensor.unwrap import Unwrap
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 

@@ -11,7 +11,7 @@ from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target,
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render

@@ -5,7 +5,7 @@ import pytest
 
 from tofuse.engine.alignment import tile_sum_kernels as tile_sums
 from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
-from tofuse.engine.alignment.spurious_information_kernels import spurious_information
+from tofuse.engine.alignment.step_kernels import spurious_information
 from tofuse.engine.alignment.uncertainty import (
     Patches,
     UncertaintyOptions,
@@ -20,7 +20,7 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.residual_kernels import POINT_SIZE, Residuals
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
 GEOMETRY_ONLY = ProjectiveOptions(photometric=False)

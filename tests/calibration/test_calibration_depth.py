@@ -17,7 +17,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.engine.sensor.camera_errors import DepthCorrection
 from tofuse.formats.cameras.correction_file import read_correction
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording

@@ -17,8 +17,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.noise.choice import noise_model_for
-from tofuse.engine.noise.model import NOISE, NoiseModel
+from tofuse.engine.noise.model import NOISE, NoiseModel, noise_model_for
 from tofuse.formats.cameras.noise_file import read_noise
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording

@@ -17,7 +17,8 @@ from paths import BENCHMARKS
 from tofuse.apps.cli import program as cli
 from tofuse.apps.cli.program import main, run_command
 from tofuse.apps.cli.streams import SafeStream, safe_streams
-from tofuse.engine.compute import cores, jit
+from tofuse.engine.compute import jit
+from tofuse.engine.compute import thread_pool as cores
 from tofuse.engine.errors import Ended
 from tofuse.lab.simulation.record import simulate
 

@@ -20,7 +20,7 @@ from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.engine.icp.reduce import averaged
+from tofuse.engine.icp.coarse_to_fine import averaged
 from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
 from tofuse.engine.tracking.pairwise import Pairwise
 from tofuse.formats.geometry.ply import write_ply

@@ -19,9 +19,8 @@ from registration_scenes import (
 )
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
-from tofuse.engine.icp.coarse_to_fine import CoarseToFine
-from tofuse.engine.icp.reduce import averaged
-from tofuse.engine.icp.remapping import Remapping
+from tofuse.engine.icp.coarse_to_fine import CoarseToFine, averaged
+from tofuse.engine.icp.icp import Remapping
 from tofuse.engine.icp.surface_metrics import PointToPlane
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.lab.methods.variants import Tricp

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.filters.neighbours import NeighbourFraction
+from tofuse.engine.filters.outliers import NeighbourFraction
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp.icp import algorithm_1

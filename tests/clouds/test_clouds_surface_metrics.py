@@ -17,8 +17,13 @@ from tofuse.engine.icp.icp import Icp
 from tofuse.engine.icp.icp_kernels import transform_points
 from tofuse.engine.icp.icp_parts import All, MaxDistance, PointToPoint, Random, SmallStep
 from tofuse.engine.icp.interfaces import Alignment, Matches, Points
-from tofuse.engine.icp.point_pairs import cross_information, loss_weights, surface_pairs
-from tofuse.engine.icp.surface_metrics import PlaneToPlane, PointToPlane
+from tofuse.engine.icp.surface_metrics import (
+    PlaneToPlane,
+    PointToPlane,
+    cross_information,
+    loss_weights,
+    surface_pairs,
+)
 from tofuse.lab.methods.symmetric import Symmetric
 
 SURFACE_METRICS = [PointToPlane(), Symmetric(), PlaneToPlane()]

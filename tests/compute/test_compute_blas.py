@@ -7,7 +7,7 @@ import pytest
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 import tofuse
-from tofuse.engine.compute.blas import one_blas_thread
+from tofuse.engine.compute.thread_pool import one_blas_thread
 
 
 def counts() -> set[int]:

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from tofuse.engine.views.plane_extension_kernels import extend_planes
+from tofuse.engine.views.view_planes_kernels import extend_planes
 
 STEPS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (2, -1), (-2, 2)], np.int32)
 GROWTH = np.array([1.5, 1.5, 1.5, 1.5, 3.5, 5.0], np.float32)

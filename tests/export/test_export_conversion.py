@@ -19,7 +19,7 @@ from tofuse.engine.cameras.cameras import Pinhole, RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import Recording
-from tofuse.engine.noise.choice import family_of
+from tofuse.engine.noise.model import family_of
 from tofuse.formats.export.conversion import convert
 from tofuse.formats.readers.native import NativeSource
 from tofuse.formats.recordings.open import open_recording

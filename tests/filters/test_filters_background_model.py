@@ -9,7 +9,7 @@ import pytest
 
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters.background_model import background_surface, moving_object
+from tofuse.engine.filters.background import background_surface, moving_object
 from tofuse.engine.frames.frames import RangeFrame
 
 ROWS, COLUMNS = 60, 80

@@ -11,9 +11,7 @@ from tofuse.engine import parts
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter, Removal, apply_filters
-from tofuse.engine.filters.confidence import Confidence
-from tofuse.engine.filters.distance import Distance
-from tofuse.engine.filters.foreground import Foreground, otsu
+from tofuse.engine.filters.thresholds import Confidence, Distance, Foreground, otsu
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 
 NAN = float("nan")

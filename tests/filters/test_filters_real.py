@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.filters.base import Filter, apply_filters
-from tofuse.engine.filters.confidence import Confidence
+from tofuse.engine.filters.thresholds import Confidence
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.methods.filters_temporal import TemporalDeviation, z_deviation

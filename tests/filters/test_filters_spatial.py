@@ -13,9 +13,12 @@ from hypothesis import strategies as st
 from tofuse.engine import parts
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.filters.angle import NeighbourhoodAngle
 from tofuse.engine.filters.base import Filter, apply_filters
-from tofuse.engine.filters.neighbours import NeighbourFraction, mean_neighbour_distance
+from tofuse.engine.filters.outliers import (
+    NeighbourFraction,
+    NeighbourhoodAngle,
+    mean_neighbour_distance,
+)
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.lab.methods.filters_box import Box

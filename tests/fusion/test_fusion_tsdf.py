@@ -31,7 +31,7 @@ from tofuse.engine.fusion.upright import upright
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.refinement import without_errors
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from whole_volume import volume_around
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
-from tofuse.engine.views.surface_options import FineScale, SurfaceOptions
+from tofuse.engine.views.view_planes import FineScale, SurfaceOptions
 
 CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)
 

@@ -14,7 +14,7 @@ from made_recordings import (
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.engine.sensor.camera_errors import DepthCorrection
 from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.recordings.native import RecordingWriter
 

@@ -11,7 +11,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float], float]
 

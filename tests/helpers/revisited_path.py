@@ -14,7 +14,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.engine.tracking.base import Step, Tracker
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import FineScale, SurfaceOptions
+from tofuse.engine.views.view_planes import FineScale, SurfaceOptions
 
 ALL = Spacing(angle=0, distance=0)
 OPTIONS = SurfaceOptions(radii=(4,), fine_scale=FineScale(noise=0))

@@ -15,7 +15,7 @@ from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.lab.methods.features import Features
 from tofuse.lab.methods.keypoints import channel_image, keypoints
 from tofuse.lab.methods.sample_consensus import (

@@ -12,7 +12,7 @@ from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.plane_detection import detect_planes
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.lab.methods.plane_sets import PlaneSets
 
 WORLD = [((0, 1, 0), 1.0), ((0.1, 0, 1), 3.8), ((1, 0, -0.2), 1.7)]

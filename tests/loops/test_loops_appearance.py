@@ -16,8 +16,8 @@ from tofuse.engine.loops.revisits import Revisits
 from tofuse.engine.search.search import SearchOptions
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.engine.views.view_descriptors import mutual_dissimilarity, view_descriptor
+from tofuse.engine.views.view_planes import SurfaceOptions
 
 CAMERA = Pinhole(96, 72, 78.0, 78.0, 47.5, 35.5)
 ALL = Spacing(angle=0, distance=0)

@@ -20,7 +20,7 @@ from tofuse.engine.search.pose_probability import ACCEPTED
 from tofuse.engine.search.verification import FitQuality
 from tofuse.engine.stored_views.view_store import SampledView, ViewStore
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 
 turn = revisited_path.turn  # the fixture
 

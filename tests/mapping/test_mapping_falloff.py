@@ -17,7 +17,7 @@ from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.falloff import estimate_falloff
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render

@@ -7,7 +7,7 @@ import pytest
 import tofuse
 from tofuse.engine.stored_views.view_store import PosedView
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from tofuse.engine.quality.pose_accuracy import (
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.stored_views.view_store import PosedView
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate_recording
 from walks import round_walk, true_poses

@@ -15,7 +15,7 @@ from tofuse.engine.cameras.depth_conversion import points_from_z
 from tofuse.engine.errors import InputError, OutputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.geometry.se3 import exp
-from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.engine.sensor.camera_errors import DepthCorrection
 from tofuse.formats.images.writing import write_png
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.readers.native import NativeSource

@@ -25,7 +25,7 @@ from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry.se3 import exp
-from tofuse.engine.noise.choice import family_of
+from tofuse.engine.noise.model import family_of
 from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.images.writing import write_png
 from tofuse.formats.poses.trajectory import write_tum

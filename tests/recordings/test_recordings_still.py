@@ -14,8 +14,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.noise.choice import noise_model_for
-from tofuse.engine.noise.model import NoiseModel, RangeLaw
+from tofuse.engine.noise.model import NoiseModel, RangeLaw, noise_model_for
 from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording

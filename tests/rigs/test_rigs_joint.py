@@ -17,7 +17,7 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.lab.simulation.rig import camera_ring, relative
 
 

@@ -11,8 +11,8 @@ from searched_pair import CAMERA, TRUE, A, B, camera, error, seen
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
-from tofuse.engine.search.floor import find_floor, find_floors
 from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, agreement
+from tofuse.engine.search.plane_detection import find_floor, find_floors
 from tofuse.engine.search.search import (
     DISTINCT_M,
     Candidate,
@@ -22,9 +22,9 @@ from tofuse.engine.search.search import (
     are_distinct_poses,
 )
 from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.views.extended_planes import with_rough_planes
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.rough import with_rough_planes
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects

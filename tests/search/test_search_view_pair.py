@@ -21,7 +21,7 @@ from tofuse.engine.search.pose_probability import ACCEPTED, PoseEvidence
 from tofuse.engine.search.verification import FitStatistics
 from tofuse.engine.search.view_pair import follow, register_pair
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 
 # 40 degrees and 0.5 m apart.
 A, B = at(-0.4, 0.3, 0.1), at(-0.1, 0.7, 0.8)

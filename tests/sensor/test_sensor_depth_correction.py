@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.errors import InputError
-from tofuse.engine.sensor.depth_correction import DepthCorrection
+from tofuse.engine.sensor.camera_errors import DepthCorrection
 from tofuse.formats.cameras.correction_file import read_correction, write_correction
 
 

@@ -17,8 +17,13 @@ from tofuse.engine.sensor.base import Correction, Corrector
 from tofuse.engine.sensor.multipath import MultipathModel, ToFImage
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.sensor.multipath_kernels import PATCH
-from tofuse.engine.sensor.multipath_map import OffscreenCells, ReflectorMap
-from tofuse.engine.sensor.multipath_surfaces import Surfaces, block_nodes, fit_planes
+from tofuse.engine.sensor.multipath_surfaces import (
+    OffscreenCells,
+    ReflectorMap,
+    Surfaces,
+    block_nodes,
+    fit_planes,
+)
 
 ALBEDO = 0.6
 

@@ -16,7 +16,7 @@ from tofuse.engine.mapping.adaptation import with_recording_defaults
 from tofuse.engine.mapping.config import changed
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.noise.model import NOISE, AmplitudeLaw, NoiseModel, RangeLaw
-from tofuse.engine.sensor.noise_correction import Noise
+from tofuse.engine.sensor.base import Noise
 from tofuse.formats.cameras.noise_file import write_noise
 
 CAMERA = Pinhole(60, 50, 60.0, 60.0, 29.5, 24.5)

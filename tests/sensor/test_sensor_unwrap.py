@@ -17,13 +17,13 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.sensor.frequencies import SPEED_OF_LIGHT, combined
 from tofuse.engine.sensor.unwrap import (
+    Unwrap,
     UnwrapOptions,
     _Blocks,
     _shift_surfaces,
     count_periods,
     on_surface,
 )
-from tofuse.engine.sensor.unwrap_correction import Unwrap
 from tofuse.engine.sensor.unwrap_kernels import NEIGHBOURS, pass_messages
 from tofuse.formats.images.writing import write_png
 from tofuse.lab.simulation.effects import Effects

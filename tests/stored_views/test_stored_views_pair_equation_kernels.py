@@ -14,7 +14,7 @@ from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 
 SETTINGS = (0.05, 1.0, 0.1, 0.01, 4.0, 0.5)  # exposure, scales, slack, robust, cosine
 

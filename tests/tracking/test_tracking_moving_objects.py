@@ -23,7 +23,7 @@ from tofuse.engine.tracking.moving_objects import (
     without_pixels,
 )
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model

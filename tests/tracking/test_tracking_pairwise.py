@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tofuse.engine.alignment.base import Registration
-from tofuse.engine.clouds.any_pair import AnyPair
+from tofuse.engine.clouds.pair import AnyPair
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.tracking.pairwise import Pairwise

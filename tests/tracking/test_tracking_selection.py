@@ -17,7 +17,7 @@ from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.tracking.motion import FrameTime, MotionModel
 from tofuse.engine.tracking.selection import Selection
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
+from tofuse.engine.views.view_planes import SurfaceOptions
 
 SHARP = SurfaceOptions(radii=(2,))
 # A camera that translates and turns slowly.

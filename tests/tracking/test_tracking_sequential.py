@@ -16,7 +16,7 @@ from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp.icp import algorithm_1
 from tofuse.engine.tracking.base import Odometry
-from tofuse.engine.tracking.sequential import SEED_STAGE, Sequential
+from tofuse.engine.tracking.pairwise import SEED_STAGE, Sequential
 from tofuse.lab.simulation.peaks import peaks_views
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.engine.views.view_descriptors import (
     dissimilarity,
     mutual_dissimilarity,
     view_descriptor,
 )
+from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.render import render

@@ -15,7 +15,7 @@ from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.views.extended_planes import with_extended_planes
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.projection import Projection
-from tofuse.engine.views.surface_options import FineScale, SurfaceOptions
+from tofuse.engine.views.view_planes import FineScale, SurfaceOptions
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
 PLANE = np.array([0.1, -0.15, 0.5])  # a X + b Y + c Z = 1

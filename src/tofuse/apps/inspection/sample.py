@@ -15,7 +15,7 @@ from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames import Frame, RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.search import view_points
+from tofuse.engine.search import pair_agreement
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Faults affect the full image; a higher resolution would only take longer.
@@ -267,7 +267,7 @@ def _in_front(source: PreparedView, target: PreparedView, T_target_source: Float
     is_valid = source.z > 0
     points = np.concatenate([source.rays, np.ones_like(source.rays[..., :1])], -1)
     points = se3.transform(T_target_source, (points * source.z[..., None])[is_valid].astype(float))
-    pixels = view_points.landing_pixels(target, points)
+    pixels = pair_agreement.landing_pixels(target, points)
     inside = (
         (points[:, 2] > 0.05)
         & (pixels >= 0).all(-1)

@@ -10,14 +10,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
 from tofuse.engine.alignment import step_kernels as steps
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import median
-from tofuse.engine.views import PreparedView
+from tofuse.engine.views import PreparedView, SurfaceOptions
 from tofuse.engine.views import residual_kernels as kernels
 
 # A direction is constrained if its sigma is at most 1 cm, or 1 degree.
@@ -336,3 +338,40 @@ def _initial_exposure(points: Float32, targets: Sequence[Target], T: Float64) ->
         )
     differences = np.concatenate(per_target) if per_target else np.zeros(0)
     return median(differences) if len(differences) else 0.0
+
+
+@dataclass(frozen=True)
+class ViewOptions(Bounded):
+    """Options of preparation and alignment that depend on the camera and the scene.
+
+    Attributes
+    ----------
+    columns
+        Images are halved until they have at most this many columns: fewer for speed, more for fine
+        structure.
+    photometric
+        Whether the albedo is used in the alignment; switch it off where the light changes.
+    falloff
+        Exponent of the cosine to the optical axis by which amplitude falls off towards the corners;
+        None to estimate it from the recording.
+    range_falloff
+        Exponent of the range by which colour (as if lit by a lamp on the camera) or infrared
+        images of kind "ir" get darker; None to estimate it from the recording.
+    """
+
+    columns: Annotated[int, Bounds(16, 4096)] = 320
+    photometric: bool = True
+    falloff: Annotated[float | None, Bounds(-20, 20)] = None
+    range_falloff: Annotated[float | None, Bounds(0, 10)] = None
+
+    @property
+    def surface(self) -> SurfaceOptions:
+        """Options of `prepare_view`."""
+        return SurfaceOptions(
+            columns=self.columns, falloff=self.falloff, range_falloff=self.range_falloff
+        )
+
+    @property
+    def alignment(self) -> ProjectiveOptions:
+        """Options of `align`."""
+        return ProjectiveOptions(photometric=self.photometric)

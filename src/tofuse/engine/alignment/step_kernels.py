@@ -1,4 +1,12 @@
-"""Gauss-Newton iterations of an alignment: from summed normal equations to a converged pose."""
+"""Gauss-Newton iterations of an alignment: from summed normal equations to a converged pose.
+
+Independent noise cancels in the symmetrised cross-information of two views. Errors that distort
+both views alike do not: multipath rounds corners and bends walls, scattering and lens shading
+change the albedo, and the range depends on the amplitude. They tilt normals and add albedo
+gradients in both Jacobians, so that a flat wall seems to constrain directions that it does not
+constrain. The expected spurious information follows from the standard deviations of such tilts and
+gradients, and is subtracted.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +14,88 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tofuse.engine.alignment.spurious_information_kernels import spurious_information
 from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
 from tofuse.engine.geometry import compose, retract, twist_between
-from tofuse.engine.views import residual_kernels
-from tofuse.engine.views import residual_kernels as sums
+from tofuse.engine.views import residual_kernels as res
 
 # Number of points from which the spurious information is estimated.
 SAMPLE_SIZE = 500
 # Nuisance parameters that are also estimated: log albedo of the targets minus that of the source,
 # scale of the sigmas of distances, and sigma of the log albedo (0 leaves it out).
 EXPOSURE, SCALE_G, SCALE_P = 0, 1, 2
+_MIN_PIVOT = 1e-12
+
+
+@kernel
+def spurious_information(
+    points: Float32,
+    stride: int,
+    scale: float,
+    inflation: float,
+    albedo_variance: float,
+    tilt: float,
+    slope: float,
+) -> Float64:
+    """Return the expected information (6, 6) per point due to tilts and slopes shared by two views.
+
+    Parameters
+    ----------
+    points
+        (N, POINT_SIZE), see `alignment`.
+    stride
+        Every `stride`-th point is used.
+    scale, inflation
+        Factor of the sigmas of distances, and noise inflation added in quadrature, m.
+    albedo_variance
+        Variance of the log albedo residuals; 0 without the photometric term.
+    tilt
+        Standard deviation of the shared error of normals, per tangent direction, rad.
+    slope
+        Standard deviation of the shared error of the log albedo's slope per ray coordinate.
+    """
+    out = np.zeros((6, 6))
+    J = np.empty(6)
+    albedo_weight = slope * slope / albedo_variance if albedo_variance > 0 else 0.0
+    count = 0
+    for k in range(0, points.shape[0], stride):
+        count += 1
+        x = np.float64(points[k, res.POINT])
+        y = np.float64(points[k, res.POINT + 1])
+        z = np.float64(points[k, res.POINT + 2])
+        a = np.float64(points[k, res.NORMAL])
+        b = np.float64(points[k, res.NORMAL + 1])
+        c = np.float64(points[k, res.NORMAL + 2])
+        sigma = (x * a + y * b + z * c) * np.float64(points[k, res.SIGMA]) * scale
+        weight = tilt * tilt / max(2 * sigma * sigma + inflation * inflation, 1e-12)
+        # Sum over both tangent directions: all three axes minus the normal.
+        _add_outer(out, J, weight, 1.0, 0.0, 0.0, x, y, z)
+        _add_outer(out, J, weight, 0.0, 1.0, 0.0, x, y, z)
+        _add_outer(out, J, weight, 0.0, 0.0, 1.0, x, y, z)
+        _add_outer(out, J, -weight, a, b, c, x, y, z)
+        if albedo_weight > 0 and not np.isnan(points[k, res.POINT_ALBEDO]):
+            _add_outer(out, J, albedo_weight, 1 / z, 0.0, -x / (z * z), x, y, z)
+            _add_outer(out, J, albedo_weight, 0.0, 1 / z, -y / (z * z), x, y, z)
+    return out / max(count, 1)
+
+
+@kernel
+def _add_outer(
+    out: Float64,
+    J: Float64,
+    weight: float,
+    m0: float,
+    m1: float,
+    m2: float,
+    x: float,
+    y: float,
+    z: float,
+) -> None:
+    projection_kernels.jacobian_row(J, m0, m1, m2, x, y, z)
+    for p in range(6):
+        for o in range(6):
+            out[p, o] += weight * J[p] * J[o]
 
 
 class LevelSettings(NamedTuple):
@@ -64,7 +142,7 @@ class LevelSettings(NamedTuple):
 @kernel
 def iterate_level(
     points: Float32,
-    targets: tuple[residual_kernels.TargetImage, ...],
+    targets: tuple[res.TargetImage, ...],
     T_targets: Float64,
     T: Float64,
     T_predicted: Float64,
@@ -93,14 +171,14 @@ def iterate_level(
     the returned sums are 0, all directions are degenerate, and T keeps its last value.
     """
     inflation, prior, units = settings.inflation, settings.prior, settings.units
-    total = np.zeros(sums.SIZE)
+    total = np.zeros(res.SIZE)
     degenerate = np.zeros((0, 6))
     spurious = np.zeros((6, 6))
     step_size = np.inf
     iterations = 0
     while iterations < settings.iterations and step_size >= settings.tolerance:
         total[:] = 0.0
-        residuals = residual_kernels.Residuals(
+        residuals = res.Residuals(
             estimates[EXPOSURE],
             estimates[SCALE_G],
             estimates[SCALE_P],
@@ -109,11 +187,9 @@ def iterate_level(
             settings.min_cosine,
         )
         for k in range(len(targets)):
-            total += residual_kernels.accumulate(
-                points, targets[k], compose(T_targets[k], T), residuals
-            )
+            total += res.accumulate(points, targets[k], compose(T_targets[k], T), residuals)
         if settings.remap and iterations == 0:
-            spurious = total[sums.INLIERS] * spurious_information(
+            spurious = total[res.INLIERS] * spurious_information(
                 points,
                 max(1, len(points) // SAMPLE_SIZE),
                 estimates[SCALE_G],
@@ -130,7 +206,7 @@ def iterate_level(
             T_updated, step = solve_step(total, T, T_predicted, degenerate, prior, units)
             finite = np.isfinite(step.sum())
         if not finite:  # planes fitted to mere noise can have unbounded coefficients
-            return np.zeros(sums.SIZE), np.zeros((6, 6)), np.eye(6), np.inf, iterations
+            return np.zeros(res.SIZE), np.zeros((6, 6)), np.eye(6), np.inf, iterations
         T[:] = T_updated
         iterations += 1
         step_size = 0.0
@@ -145,11 +221,11 @@ def iterate_level(
 @kernel
 def _rescale(total: Float64, estimates: Float64, max_scale: float, albedo_inflation: float) -> None:
     """Estimate the sigmas from the residuals, which include both views' noise and bias."""
-    scale = scale_of_distances(total[sums.HISTOGRAM :])
+    scale = scale_of_distances(total[res.HISTOGRAM :])
     if not np.isnan(scale):
         estimates[SCALE_G] = min(max(scale, 0.7), max_scale)
-    if estimates[SCALE_P] > 0 and total[sums.WEIGHT_P] > 0:
-        variance = total[sums.SQUARES_P] / total[sums.WEIGHT_P] / 0.72
+    if estimates[SCALE_P] > 0 and total[res.WEIGHT_P] > 0:
+        variance = total[res.SQUARES_P] / total[res.WEIGHT_P] / 0.72
         estimates[SCALE_P] = min(max(np.sqrt(variance + albedo_inflation**2), 0.005), 0.5)
 
 
@@ -167,13 +243,13 @@ def _without_exposure(A: Float64) -> Float64:
 @kernel
 def information(total: Float64) -> Float64:
     """Return the information (6, 6) of the pose, from the sums of `accumulate`."""
-    return _without_exposure(residual_kernels.normal_equations(total)[0])
+    return _without_exposure(res.normal_equations(total)[0])
 
 
 @kernel
 def cross_information(total: Float64) -> Float64:
     """Return the symmetrised product (6, 6) of the target's and source's pose Jacobians."""
-    return _without_exposure(residual_kernels.normal_equations(total)[2])
+    return _without_exposure(res.normal_equations(total)[2])
 
 
 @kernel
@@ -222,7 +298,7 @@ def solve_step(
     -------
     The updated pose (4, 4) and the step (7,), whose last element is the exposure's.
     """
-    A, g, _ = residual_kernels.normal_equations(total)
+    A, g, _ = res.normal_equations(total)
     deviation = twist_between(T_predicted, T)
     for p in range(6):
         deviation[p] /= units[p]
@@ -248,22 +324,25 @@ def solve_step(
                 g[p] += stiffness * along * degenerate[k, p]
                 for o in range(6):
                     A[p, o] += stiffness * degenerate[k, p] * degenerate[k, o]
-    _solve(A, g)
+    solve_positive(A, g)
     for p in range(7):
         g[p] *= -units[p] if p < 6 else -1.0
     return retract(T, g), g
 
 
 @kernel
-def _solve(A: Float64, b: Float64) -> None:
-    """Solve A x = b in place for a symmetric positive definite A, by Cholesky decomposition."""
+def solve_positive(A: Float64, b: Float64) -> None:
+    """Solve A x = b in place for a symmetric positive definite A, by Cholesky decomposition.
+
+    Only the lower triangle of A is read. Pivots have a lower limit.
+    """
     n = len(b)
     for p in range(n):
         for o in range(p + 1):
             total = A[p, o]
             for k in range(o):
                 total -= A[p, k] * A[o, k]
-            A[p, o] = total / A[o, o] if o < p else np.sqrt(total)
+            A[p, o] = total / A[o, o] if o < p else np.sqrt(max(total, _MIN_PIVOT))
         for k in range(p):
             b[p] -= A[p, k] * b[k]
         b[p] /= A[p, p]
@@ -281,13 +360,13 @@ def scale_of_distances(histogram: Float64) -> float:
     inliers only would confirm itself.
     """
     count = 0.0
-    for k in range(sums.BINS):
+    for k in range(res.BINS):
         count += histogram[k]
     cumulative = 0.0
-    for k in range(sums.BINS):
+    for k in range(res.BINS):
         in_bin = histogram[k]
         if in_bin > 0 and 2 * (cumulative + in_bin) >= count:
-            low, high = residual_kernels.bin_edge(k), residual_kernels.bin_edge(k + 1)
+            low, high = res.bin_edge(k), res.bin_edge(k + 1)
             return 1.48 * np.sqrt(low + (high - low) * (0.5 * count - cumulative) / in_bin)
         cumulative += in_bin
     return np.nan

@@ -12,7 +12,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, Float64, Int64
 from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.views import residual_kernels
+from tofuse.engine.views import residual_kernels as res
 
 # Layout of a tile's sums, over the distances of its pixels.
 RESPONSE = 0  # 7: sum of w J, the response of the gradient to an error shared by the tile
@@ -31,10 +31,10 @@ UPPER = 28
 
 @kernel
 def tile_sums(
-    source: residual_kernels.ViewImages,
-    target: residual_kernels.TargetImage,
+    source: res.ViewImages,
+    target: res.TargetImage,
     T: Float64,
-    residuals: residual_kernels.Residuals,
+    residuals: res.Residuals,
     stride: int,
     tiles_x: int,
     tiles_y: int,
@@ -52,15 +52,15 @@ def tile_sums(
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     rows, columns = planes.shape[0], planes.shape[1]
     tiles = np.zeros((tiles_y * tiles_x, SIZE))
-    points = np.zeros((residual_kernels.LANES, residual_kernels.POINT_SIZE), np.float32)
-    tile_index = np.zeros(residual_kernels.LANES, np.int64)
-    block = np.zeros(residual_kernels.ROWS * residual_kernels.LANES, np.float32)
-    sums = np.zeros((KINDS * UPPER, residual_kernels.LANES))
+    points = np.zeros((res.LANES, res.POINT_SIZE), np.float32)
+    tile_index = np.zeros(res.LANES, np.int64)
+    block = np.zeros(res.ROWS * res.LANES, np.float32)
+    sums = np.zeros((KINDS * UPPER, res.LANES))
     count = 0
     for row in range(stride // 2, rows, stride):
         for column in range(stride // 2, columns, stride):
             if planes[row, column, 3] > 0:
-                residual_kernels.write_point(
+                res.write_point(
                     points[count],
                     rays[row, column],
                     planes[row, column],
@@ -69,98 +69,69 @@ def tile_sums(
                 )
                 tile_index[count] = row * tiles_y // rows * tiles_x + column * tiles_x // columns
                 count += 1
-            if count < residual_kernels.LANES and (
-                row + stride < rows or column + stride < columns
-            ):
+            is_last = row + stride >= rows and column + stride >= columns
+            if count < res.LANES and not is_last:
                 continue
-            residual_kernels.load_block(block, points[:count])
-            residual_kernels.transform_block(block, T)
-            residual_kernels.project_block(block, count, image, lookup, lookup_frame)
-            residual_kernels.compare_planes(block, T, scale_g, inflation, robust, min_cosine)
+            res.load_block(block, points[:count])
+            res.transform_block(block, T)
+            res.project_block(block, count, image, lookup, lookup_frame)
+            res.compare_planes(block, T, scale_g, inflation, robust, min_cosine)
             _add_to_tiles(tiles, tile_index, block, count)
-            _add_products(sums, block, GEOMETRIC, residual_kernels.WEIGHT_G)
+            _add_products(sums, block, GEOMETRIC, res.WEIGHT_G)
             if scale_p > 0:
-                residual_kernels.compare_albedos(block, T, exposure, scale_p, robust)
-                _add_products(sums, block, PHOTOMETRIC, residual_kernels.WEIGHT_P)
+                res.compare_albedos(block, T, exposure, scale_p, robust)
+                _add_products(sums, block, PHOTOMETRIC, res.WEIGHT_P)
             count = 0
     upper = np.zeros((KINDS, UPPER))
     for c in range(KINDS):
         for q in range(UPPER):
-            for k in range(residual_kernels.LANES):
+            for k in range(res.LANES):
                 upper[c, q] += sums[c * UPPER + q, k]
     return tiles, upper
 
 
 @kernel
 def _add_to_tiles(tiles: Float64, tile_index: Int64, block: Float32, count: int) -> None:
+    is_inlier, sqrt_weights = _row(block, res.IS_INLIER), _row(block, res.SQRT_WEIGHT)
+    residuals = _row(block, res.WEIGHTED_RESIDUAL)
     for k in range(count):
-        if block[residual_kernels.IS_INLIER * residual_kernels.LANES + k] > 0:
-            tile, sqrt_weight = (
-                tiles[tile_index[k]],
-                np.float64(block[residual_kernels.SQRT_WEIGHT * residual_kernels.LANES + k]),
-            )
+        if is_inlier[k] > 0:
+            tile, sqrt_weight = tiles[tile_index[k]], np.float64(sqrt_weights[k])
             for p in range(7):
-                tile[RESPONSE + p] += (
-                    sqrt_weight
-                    * block[(residual_kernels.JACOBIAN + p) * residual_kernels.LANES + k]
-                )
+                tile[RESPONSE + p] += sqrt_weight * block[(res.JACOBIAN + p) * res.LANES + k]
             tile[WEIGHT] += sqrt_weight * sqrt_weight
-            tile[RESIDUAL] += (
-                sqrt_weight * block[residual_kernels.WEIGHTED_RESIDUAL * residual_kernels.LANES + k]
-            )
+            tile[RESIDUAL] += sqrt_weight * residuals[k]
             tile[COUNT] += 1
 
 
 @kernel
 def _add_products(sums: Float64, block: Float32, kind: int, statistic: int) -> None:
     """Add the products of the rows of J to those of a kind, and to the weighted and cross sums."""
-    slope = np.empty(residual_kernels.LANES, np.float32)
-    weights = block[
-        (residual_kernels.STAT + statistic - residual_kernels.INLIERS) * residual_kernels.LANES : (
-            residual_kernels.STAT + statistic - residual_kernels.INLIERS + 1
-        )
-        * residual_kernels.LANES
-    ]
-    for k in range(residual_kernels.LANES):
+    slope = np.empty(res.LANES, np.float32)
+    weights = _row(block, res.STAT + statistic - res.INLIERS)
+    for k in range(res.LANES):
         slope[k] = tukey.relative_slope(weights[k])
     q = 0
     for p in range(7):
-        a = block[
-            (residual_kernels.JACOBIAN + p) * residual_kernels.LANES : (
-                residual_kernels.JACOBIAN + p + 1
-            )
-            * residual_kernels.LANES
-        ]
-        c = block[
-            (residual_kernels.DIFFERENCE + p) * residual_kernels.LANES : (
-                residual_kernels.DIFFERENCE + p + 1
-            )
-            * residual_kernels.LANES
-        ]
+        a, c = _row(block, res.JACOBIAN + p), _row(block, res.DIFFERENCE + p)
         for o in range(p, 7):
-            b = block[
-                (residual_kernels.JACOBIAN + o) * residual_kernels.LANES : (
-                    residual_kernels.JACOBIAN + o + 1
-                )
-                * residual_kernels.LANES
-            ]
-            d = block[
-                (residual_kernels.DIFFERENCE + o) * residual_kernels.LANES : (
-                    residual_kernels.DIFFERENCE + o + 1
-                )
-                * residual_kernels.LANES
-            ]
+            b, d = _row(block, res.JACOBIAN + o), _row(block, res.DIFFERENCE + o)
             products = sums[kind * UPPER + q]
             weighted, cross = sums[WEIGHTED * UPPER + q], sums[CROSS * UPPER + q]
-            for k in range(residual_kernels.LANES):
+            for k in range(res.LANES):
                 products[k] += a[k] * b[k]
             if o < 6:
-                for k in range(residual_kernels.LANES):
+                for k in range(res.LANES):
                     symmetrised = a[k] * b[k] - c[k] * d[k]
                     weighted[k] += symmetrised
                     cross[k] += slope[k] * symmetrised
             else:  # the exposure has the same derivative in both Jacobians
-                for k in range(residual_kernels.LANES):
+                for k in range(res.LANES):
                     weighted[k] += a[k] * b[k]
                     cross[k] += slope[k] * a[k] * b[k]
             q += 1
+
+
+@kernel
+def _row(block: Float32, row: int) -> Float32:
+    return block[row * res.LANES : (row + 1) * res.LANES]

@@ -1,4 +1,9 @@
-"""."""
+"""Camera models: the ray of each pixel, and the pixel of each ray.
+
+A `Camera` is anything with `rays()` and `project()`; `MODELS` are the lenses that `camera.json`
+names, and a `RayTable` is any other. `depth_conversion` turns radial range into depth and points;
+`projection_kernels` project into a view inside kernels.
+"""
 
 from typing import TYPE_CHECKING
 

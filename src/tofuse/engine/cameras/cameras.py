@@ -199,10 +199,12 @@ class Fisheye(Pinhole):
 
     def _distort(self, xy: Float64) -> Float64:
         r = np.sqrt((xy * xy).sum(-1))
-        theta = np.arctan(r)
-        t2 = theta * theta
-        distorted = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+        distorted = self._distorted_angle(np.arctan(r))
         return xy * np.where(r > 1e-9, distorted / np.where(r > 1e-9, r, 1), 1.0)[..., None]
+
+    def _distorted_angle(self, theta: Float64) -> Float64:
+        t2 = theta * theta
+        return theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
 
     def _undistort(self, xy: Float64) -> Float64:
         # Solve for the angle, which has no pole, rather than for its tangent.
@@ -210,14 +212,13 @@ class Fisheye(Pinhole):
         theta = np.minimum(distorted, 1.5)
         for _ in range(50):
             t2 = theta * theta
-            estimate = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+            estimate = self._distorted_angle(theta)
             slope = 1 + t2 * (
                 3 * self.k1 + t2 * (5 * self.k2 + t2 * (7 * self.k3 + t2 * 9 * self.k4))
             )
             with np.errstate(all="ignore"):
                 theta = theta - np.clip((estimate - distorted) / slope, -0.3, 0.3)
-        t2 = theta * theta
-        estimate = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+        estimate = self._distorted_angle(theta)
         converged = (
             (np.abs(estimate - distorted) < 1e-7) & (theta >= 0) & (theta < np.pi / 2 - 1e-3)
         )

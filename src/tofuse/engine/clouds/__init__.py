@@ -1,4 +1,9 @@
-"""."""
+"""Registration of any two views, images or clouds, under any rotation.
+
+`register` is what a user calls for one pair; `AnyPair` is the method behind it, and the default of
+configurations. `fpfh` proposes poses by matching local features, and `robust_motion` finds a motion
+among matches that are mostly wrong.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -6,7 +11,6 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.clouds import fpfh, robust_motion
-    from tofuse.engine.clouds.any_pair import AnyPair
-    from tofuse.engine.clouds.pair import register
+    from tofuse.engine.clouds.pair import AnyPair, register
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

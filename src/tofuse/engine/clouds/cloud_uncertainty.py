@@ -22,7 +22,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap
 from tofuse.engine.geometry import se3
-from tofuse.engine.icp import point_pairs
+from tofuse.engine.icp import surface_metrics
 from tofuse.engine.normal import robust_sigma
 
 # Maximum distance of corresponding points, in resolutions, and minimum cosine between their
@@ -73,7 +73,7 @@ def cloud_unobservable(source: CloudMap, target: CloudMap, T_target_source: Floa
     pairs = _Pairs.of(source, target, T_target_source)
     if pairs is None:
         return np.eye(6)
-    surface = point_pairs.SurfacePairs(
+    surface = surface_metrics.SurfacePairs(
         T_target_source,
         pairs.centre,
         pairs.points,
@@ -83,7 +83,7 @@ def cloud_unobservable(source: CloudMap, target: CloudMap, T_target_source: Floa
         pairs.weight,
         pairs.resolution,
     )
-    return point_pairs.unobservable_directions(surface, pairs.noise**2)
+    return surface_metrics.unobservable_directions(surface, pairs.noise**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ class _Pairs:
         q = se3.transform(se3.inverse(T), target.view.points[j].astype(np.float64))
         cosine = (a * b).sum(1)
         matched = (nearest >= 0) & (np.abs(cosine) > _MIN_NORMAL_COSINE)  # false for NaN
-        if np.count_nonzero(matched) < point_pairs.MIN_PAIRS:
+        if np.count_nonzero(matched) < surface_metrics.MIN_PAIRS:
             return None
         p, q, a = p[matched], q[matched], a[matched]
         b = b[matched] * np.sign(cosine[matched])[:, None]
@@ -140,7 +140,9 @@ class _Pairs:
         centre = p.mean(0)
         p = p - centre
         spread = max(float(np.sqrt((p**2).sum(1).mean())), size)
-        return cls(centre, spread, p, r, n, a, b, point_pairs.loss_weights("tukey", r, size), size)
+        return cls(
+            centre, spread, p, r, n, a, b, surface_metrics.loss_weights("tukey", r, size), size
+        )
 
     @property
     def noise(self) -> float:

@@ -1,4 +1,10 @@
-"""."""
+"""Compiled kernels, threads and memory: what makes the engine fast and its results reproducible.
+
+`kernel` compiles a function over arrays; `compiling_in_background` does it ahead of the first call.
+`run_chunks` and `run_all` use one thread pool, and their results are the same for any number of
+`threads`; `one_blas_thread` does the same for BLAS. `Spill` keeps arrays within a budget of memory,
+the rest on disk. `median` and `tukey_kernels` are the statistics that several rooms share.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -7,19 +13,18 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.compute import tukey_kernels
     from tofuse.engine.compute.ahead import compiling_in_background
-    from tofuse.engine.compute.blas import one_blas_thread
-    from tofuse.engine.compute.cores import usable_cores
     from tofuse.engine.compute.jit import kernel
-    from tofuse.engine.compute.memory import trim_memory
     from tofuse.engine.compute.partition import median
-    from tofuse.engine.compute.spill import Scratch, Spill
+    from tofuse.engine.compute.spill import Scratch, Spill, trim_memory
     from tofuse.engine.compute.thread_pool import (
         job_pool,
+        one_blas_thread,
         run_all,
         run_chunks,
         serial_chunks,
         thread_count,
         threads,
+        usable_cores,
     )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -22,7 +22,7 @@ from typing import Any
 import numba
 
 from tofuse.engine.compute import jit
-from tofuse.engine.compute.cores import usable_cores
+from tofuse.engine.compute.thread_pool import usable_cores
 
 # Helper processes, each of which takes about 0.5 GB of memory; at most half of the cores.
 _MAX_HELPERS = 3

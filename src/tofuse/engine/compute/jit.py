@@ -1,8 +1,8 @@
 """Compilation of kernels, with a cache that can neither become stale nor abort a run.
 
 Numba's on-disk cache does not notice a changed callee in another file, and fails where it can't
-write. The cache folder is therefore named by a hash of all kernel sources, the `*_kernels.py` of all
-rooms, and a private temporary folder is used where the home folder is read-only.
+write. The cache folder is therefore named by a hash of all kernel sources, the `*_kernels.py` of
+all rooms, and a private temporary folder is used where the home folder is read-only.
 """
 
 from __future__ import annotations

@@ -8,11 +8,14 @@ result depends on the budget.
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
+import sys
 import tempfile
 import weakref
 from collections import OrderedDict
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from threading import RLock
 from typing import IO, Any, Generic, TypeVar
@@ -21,8 +24,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import UInt8
-from tofuse.engine.compute.memory import trim_memory
 from tofuse.engine.errors import OutputError, output_error
+
+
+def trim_memory() -> None:
+    """Return freed memory to the operating system, where the C library (glibc) retains it.
+
+    The memory that a stage frees is fragmented, so that the next one would allocate more.
+    """
+    trim = _trim()
+    if trim is not None:
+        trim(0)
+
+
+@cache
+def _trim() -> Any:
+    if sys.platform != "linux":
+        return None
+    try:
+        return ctypes.CDLL(None).malloc_trim
+    except (AttributeError, OSError):  # another C library
+        return None
+
 
 _TRIM_BYTES = 128 << 20  # evicted between two returns of free memory to the system
 

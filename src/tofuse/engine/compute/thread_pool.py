@@ -1,23 +1,94 @@
-"""One thread pool, used so that results do not depend on the number of threads.
+"""The cores of this machine, and one thread pool with results that do not depend on their number.
 
 Work is divided into a number of chunks that depends on the work alone. Each chunk is computed by
-one call of a GIL-free kernel, and results are combined in chunk order.
+one call of a GIL-free kernel, and results are combined in chunk order. BLAS, whose sums depend on
+its threads, is limited to one.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
+import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TypeVar
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from threadpoolctl import ThreadpoolController
 
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.compute.cores import usable_cores
 from tofuse.engine.parts import check_number
 
 R = TypeVar("R")
+
+
+@cache
+def usable_cores() -> int:
+    """Return the number of threads that can run at once, by affinity and quota."""
+    allowed = quota()
+    return max(1, _affinity() if allowed is None else min(_affinity(), math.ceil(allowed)))
+
+
+def _affinity() -> int:
+    """Return the number of cores that this process may be scheduled on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def quota(root: Path = Path("/")) -> float | None:
+    """Return the CPU quota of this process's control groups, in cores; None without a limit.
+
+    Parameters
+    ----------
+    root
+        Root of the file system.
+    """
+    limits = [limit for folder in _groups(root) if (limit := _cpu_limit(folder)) is not None]
+    return min(limits, default=None)
+
+
+def _groups(root: Path) -> list[Path]:
+    """Return the folders of this process's control groups (v1 and v2) and of their parents."""
+    mount = root / "sys/fs/cgroup"
+    found: list[Path] = []
+    for line in _read(root / "proc/self/cgroup").splitlines():
+        hierarchy, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if hierarchy == "0" and not controllers:
+            top = mount
+        elif "cpu" in controllers.split(","):
+            top = mount / "cpu"
+        else:
+            continue
+        parts = [part for part in path.split("/") if part not in ("", ".", "..")]
+        # In a container the path may be the host's, while the mount is the container's.
+        found += [top.joinpath(*parts[:k]) for k in range(len(parts) + 1)]
+    return found
+
+
+def _cpu_limit(folder: Path) -> float | None:
+    words = _read(folder / "cpu.max").split() or [
+        *_read(folder / "cpu.cfs_quota_us").split(),
+        *_read(folder / "cpu.cfs_period_us").split(),
+    ]
+    try:
+        time, period = (float(word) for word in words)
+    except ValueError:  # "max", or nothing
+        return None
+    return time / period if time > 0 and period > 0 else None
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="ascii")
+    except (OSError, ValueError):
+        return ""
+
 
 _thread_count = usable_cores()
 # A pool for each number of threads. Pools are never shut down, as other threads may be using them.
@@ -103,3 +174,36 @@ def serial_chunks(serial: bool = True) -> Iterator[None]:
 def run_all(tasks: Sequence[Callable[[], R]]) -> list[R]:
     """Run independent tasks on the pool and return their results in the order given."""
     return run_chunks(lambda a, _b: tasks[a](), len(tasks), chunks=max(1, len(tasks)))
+
+
+# How many blocks limit BLAS now, and the limit to lift after the last of them.
+_blas_lock = threading.Lock()
+_active_blocks = 0
+_blas_limit: Any = None
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Limit BLAS to one thread inside the block.
+
+    The limit applies to the whole process, and is lifted at the end of the last of several
+    overlapping blocks.
+    """
+    global _active_blocks, _blas_limit
+    with _blas_lock:
+        if not _active_blocks:
+            _blas_limit = _controller().limit(limits=1, user_api="blas")
+        _active_blocks += 1
+    try:
+        yield
+    finally:
+        with _blas_lock:
+            _active_blocks -= 1
+            if not _active_blocks:
+                _blas_limit.restore_original_limits()
+
+
+@cache
+def _controller() -> ThreadpoolController:
+    """Return the controller of the loaded libraries, whose detection takes milliseconds."""
+    return ThreadpoolController()

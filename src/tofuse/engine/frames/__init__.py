@@ -1,4 +1,9 @@
-"""."""
+"""The two kinds of view, and recordings, which are sequences of them.
+
+A `RangeFrame` is a depth image with a camera, a `CloudFrame` has points only; each is a `Frame`. A
+`Recording` reads frames lazily from a `Source`, which formats implement. `frame_ranges` names
+frames in reports, and `depth_counts` reads depth stored as integers.
+"""
 
 from typing import TYPE_CHECKING
 

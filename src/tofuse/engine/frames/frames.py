@@ -1,14 +1,14 @@
 """The two kinds of view: a depth image of a camera, and a cloud.
 
-Both implement the `View` protocol, which is all that cloud registration needs. All arrays are
-read-only by convention: methods return new frames.
+Both have N valid points with columns, in a frame of their own, which is all that the registration
+of clouds needs. All arrays are read-only by convention: methods return new frames.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Literal, Protocol, Self, get_args
+from typing import Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,54 +24,6 @@ DepthKind = Literal["z", "range"]
 AmplitudeKind = Literal["raw", "range_compensated", "ir"]
 
 SATURATED_AMPLITUDE = 65535.0
-
-
-class View(Protocol):
-    """The common interface of both kinds of view: N points with columns, in the view's frame."""
-
-    @property
-    def index(self) -> int:
-        """Index of the frame in its recording, before any selection."""
-        ...
-
-    @property
-    def timestamp(self) -> float:
-        """Timestamp in s."""
-        ...
-
-    @property
-    def points(self) -> Float32:
-        """(N, 3) valid points in m, camera (or cloud) frame."""
-        ...
-
-    @property
-    def normals(self) -> Float32 | None:
-        """(N, 3) unit normals towards the sensor, NaN where unknown; None if not computed."""
-        ...
-
-    @property
-    def sigma(self) -> Float32 | None:
-        """(N,) standard deviation of the range in m; None if not known."""
-        ...
-
-    @property
-    def amplitude(self) -> Float32 | None:
-        """(N,) amplitude in the recording's counts; None if not recorded."""
-        ...
-
-    @property
-    def color(self) -> UInt8 | None:
-        """(N, 3) uint8 RGB; None if not recorded."""
-        ...
-
-    @property
-    def origin(self) -> Float64:
-        """(3,) position of the sensor in the view's own frame."""
-        ...
-
-    def __len__(self) -> int:
-        """Return the number of valid points."""
-        ...
 
 
 # Names of all images of a `RangeFrame`, which have one size.
@@ -225,32 +177,32 @@ class RangeFrame:
 
     @cached_property
     def points(self) -> Float32:
-        """See `View.points`; in row-major order of the valid pixels."""
+        """(N, 3) valid points in m, in row-major order of their pixels."""
         return self.point_image[self.valid]
 
     @property
     def normals(self) -> Float32 | None:
-        """See `View.normals`."""
+        """(N, 3) unit normals towards the sensor, NaN where unknown; None if not computed."""
         return None if self.normal_image is None else self.normal_image[self.valid]
 
     @property
     def sigma(self) -> Float32 | None:
-        """See `View.sigma`."""
+        """(N,) standard deviation of the range in m; None if not known."""
         return None if self.sigma_image is None else self.sigma_image[self.valid]
 
     @property
     def amplitude(self) -> Float32 | None:
-        """See `View.amplitude`."""
+        """(N,) amplitude in the recording's counts; None if not recorded."""
         return None if self.amplitude_image is None else self.amplitude_image[self.valid]
 
     @property
     def color(self) -> UInt8 | None:
-        """See `View.color`."""
+        """(N, 3) uint8 RGB; None if not recorded."""
         return None if self.color_image is None else self.color_image[self.valid]
 
     @property
     def origin(self) -> Float64:
-        """See `View.origin`: the optical centre."""
+        """(3,) position of the sensor in the frame's own coordinates: the optical centre."""
         return np.zeros(3)
 
     def __len__(self) -> int:

@@ -241,13 +241,13 @@ class Recording:
                 continue
         return None
 
-    def read_all(self, ahead: int = 8, *, first: int = 0) -> Iterator[Frame | UnreadableFrameError]:
-        """Iterate over the frames from position `first`, with errors in place of unreadable ones.
+    def read_all(self, ahead: int = 8) -> Iterator[Frame | UnreadableFrameError]:
+        """Iterate over the frames, with errors in place of unreadable ones.
 
         Reads up to `ahead` frames in advance: on two other threads if the source allows it, else
         on one.
         """
-        return (item for item, _ in self.read_with(lambda frame: None, ahead, first=first))
+        return (item for item, _ in self.read_with(lambda frame: None, ahead))
 
     def read_with(
         self, process: Callable[[Frame], R], ahead: int = 8, *, first: int = 0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
@@ -80,13 +78,10 @@ class KdTree:
             index[finite[row[near]], rank[near]] = found[near]
             distance2[finite[row[near]], rank[near]] = squared[near]
 
-        run_queries(work, len(array))
+        size = len(array)
+        chunks = min(16, 2 * size // _MIN_PARALLEL) if size > _MIN_PARALLEL else 1
+        run_chunks(work, size, chunks)
         return index, distance2
-
-
-def run_queries(work: Callable[[int, int], None], size: int) -> None:
-    """Call `work(start, stop)` for chunks of `size` queries, in parallel if they are many."""
-    run_chunks(work, size, chunks=min(16, 2 * size // _MIN_PARALLEL) if size > _MIN_PARALLEL else 1)
 
 
 def checked_points(points: ArrayLike, name: str) -> Float64:

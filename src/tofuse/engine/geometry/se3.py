@@ -116,21 +116,20 @@ def jacobian_inverse(xi: ArrayLike) -> Float64:
     """
     xi = -np.asarray(xi, float)
     J = left_jacobian_inverse(xi[..., 3:])
-    out = np.zeros((*xi.shape[:-1], 6, 6))
-    out[..., :3, :3] = J
-    out[..., 3:, 3:] = J
-    out[..., :3, 3:] = -J @ _coupling(xi) @ J
-    return out
+    return _block_triangular(J, -J @ _coupling(xi) @ J)
 
 
 def jacobian(xi: ArrayLike) -> Float64:
     """Right Jacobian J (..., 6, 6): ``exp(xi + d) = exp(xi) exp(J d + O(d^2))``."""
     xi = -np.asarray(xi, float)
-    J = left_jacobian(xi[..., 3:])
-    out = np.zeros((*xi.shape[:-1], 6, 6))
-    out[..., :3, :3] = J
-    out[..., 3:, 3:] = J
-    out[..., :3, 3:] = _coupling(xi)
+    return _block_triangular(left_jacobian(xi[..., 3:]), _coupling(xi))
+
+
+def _block_triangular(diagonal: Float64, upper: Float64) -> Float64:
+    """Return (..., 6, 6) matrices with two equal blocks (..., 3, 3) on the diagonal, 0 below."""
+    out = np.zeros((*diagonal.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = diagonal
+    out[..., :3, 3:] = upper
     return out
 
 
@@ -178,11 +177,7 @@ def adjoint(T: ArrayLike) -> Float64:
     """Adjoint (..., 6, 6): ``T exp(xi) T^-1 == exp(adjoint(T) @ xi)`` in the (t, r) order."""
     T = np.asarray(T, float)
     R = T[..., :3, :3]
-    out = np.zeros((*T.shape[:-2], 6, 6))
-    out[..., :3, :3] = R
-    out[..., 3:, 3:] = R
-    out[..., :3, 3:] = hat(T[..., :3, 3]) @ R
-    return out
+    return _block_triangular(R, hat(T[..., :3, 3]) @ R)
 
 
 def transform(T: ArrayLike, points: ArrayLike) -> Float64:

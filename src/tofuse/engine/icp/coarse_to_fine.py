@@ -1,27 +1,28 @@
-"""Coarse-to-fine registration of two clouds with automatic parameters."""
+"""Coarse-to-fine registration of two clouds, averaged to voxels, with automatic parameters."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
 
 from tofuse.engine.alignment import Registrar, Registration
-from tofuse.engine.arrays import Float64
+from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
-from tofuse.engine.icp.icp import Icp
+from tofuse.engine.icp.icp import Icp, Remapping
 from tofuse.engine.icp.icp_parts import All, MaxDistance, SmallStep, Uniform
 from tofuse.engine.icp.interfaces import Metric
-from tofuse.engine.icp.point_pairs import MIN_PAIRS
-from tofuse.engine.icp.reduce import averaged, extent, reduced
-from tofuse.engine.icp.remapping import Remapping
-from tofuse.engine.icp.surface_metrics import PlaneToPlane
+from tofuse.engine.icp.surface_metrics import MIN_PAIRS, PlaneToPlane
 from tofuse.engine.icp.surface_shape import shape_at
 from tofuse.engine.parts import part
+
+# Maximum number of cubes with a unique index in float64.
+_MAX_CELLS = 2.0**52
 
 _SPACING_SAMPLE = 5000
 _MIN_LEVEL_POINTS = 60
@@ -209,3 +210,59 @@ def spacing(view: Frame) -> float:
     distances: Float64 = np.sqrt(squared[:, 1])
     positive = distances[distances > 0]
     return float(np.median(positive)) if len(positive) else 0.01
+
+
+def extent(points: Float32 | Float64) -> float:
+    """Return the diagonal in m of the middle 90 % of points (n, 3) along each axis; 0 of none."""
+    if not len(points):
+        return 0.0
+    low, high = np.percentile(points, [5, 95], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def averaged(view: Frame, size: float) -> CloudFrame:
+    """Return a cloud with the mean of the points in each cube with edges of `size` m.
+
+    Its points are in the order of the cubes; amplitude and colour are not kept.
+    """
+    points = view.points.astype(np.float64)
+    if len(points) == 0:
+        return CloudFrame(view.index, view.timestamp, view.points, origin=view.origin)
+    order, starts = _cells(points, size)
+    counts = np.diff(np.r_[starts, len(points)])
+    means = np.add.reduceat(points[order], starts, axis=0) / counts[:, None]
+    return CloudFrame(
+        view.index, view.timestamp, means.astype(np.float32), origin=np.asarray(view.origin)
+    )
+
+
+def _cells(points: Float64, size: float) -> tuple[Intp, Intp]:
+    """Order of points (n, 3) by cubes, x before y before z, and where each cube starts in it."""
+    columns = np.ascontiguousarray(points.T)
+    cell = np.floor((columns - columns.min(1)[:, None]) / size)
+    count = cell.max(1) + 1
+    if count.prod() < _MAX_CELLS:
+        # A single key sorts faster than three.
+        key = ((cell[0] * count[1] + cell[1]) * count[2] + cell[2]).astype(np.int64)
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+        return order, np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+    order = np.lexsort(cell[::-1])
+    cell = cell[:, order]
+    return order, np.flatnonzero(np.r_[True, (cell[:, 1:] != cell[:, :-1]).any(0)])
+
+
+def reduced(
+    source: Frame, target: Frame, size: float, max_points: int
+) -> tuple[float, CloudFrame, CloudFrame]:
+    """Return the voxel size in m and both averaged views, with at most `max_points` points each.
+
+    The voxel size is `size` m, or larger if that leaves too many points.
+    """
+    while True:
+        data, model = averaged(source, size), averaged(target, size)
+        count = max(len(data), len(model))
+        if count <= max_points:
+            return size, data, model
+        # Points lie on surfaces: their number falls with the square of the edge.
+        size *= 1.02 * max(1.05, math.sqrt(count / max_points))

@@ -112,6 +112,16 @@ def point_information(points: Float64, i: Int64, weight: Float64) -> Float64:
 
 
 @kernel
+def _write_jacobian(J: Float64, p: Float64, a: Float64) -> None:
+    """Write the derivative (6,) of the distance of the point p along the unit vector a."""
+    for c in range(3):
+        d = (c + 1) % 3
+        e = (c + 2) % 3
+        J[c] = a[c]
+        J[3 + c] = p[d] * a[e] - p[e] * a[d]
+
+
+@kernel
 def plane_sums(
     p: Float64, a: Float64, b: Float64, residual: Float64, weight: Float64
 ) -> tuple[Float64, Float64, float]:
@@ -127,13 +137,8 @@ def plane_sums(
     Jb = np.empty(6)
     for k in range(len(p)):
         w = weight[k]
-        for c in range(3):
-            d = (c + 1) % 3
-            e = (c + 2) % 3
-            Ja[c] = a[k, c]
-            Jb[c] = b[k, c]
-            Ja[3 + c] = p[k, d] * a[k, e] - p[k, e] * a[k, d]
-            Jb[3 + c] = p[k, d] * b[k, e] - p[k, e] * b[k, d]
+        _write_jacobian(Ja, p[k], a[k])
+        _write_jacobian(Jb, p[k], b[k])
         r = residual[k]
         for c in range(6):
             x = w * Ja[c]
@@ -225,13 +230,8 @@ def direction_products(
     Ja = np.empty(6)
     Jb = np.empty(6)
     for k in range(len(p)):
-        for c in range(3):
-            d = (c + 1) % 3
-            e = (c + 2) % 3
-            Ja[c] = a[k, c]
-            Jb[c] = b[k, c]
-            Ja[3 + c] = p[k, d] * a[k, e] - p[k, e] * a[k, d]
-            Jb[3 + c] = p[k, d] * b[k, e] - p[k, e] * b[k, d]
+        _write_jacobian(Ja, p[k], a[k])
+        _write_jacobian(Jb, p[k], b[k])
         for u in range(len(directions)):
             x = 0.0
             y = 0.0

@@ -1,4 +1,9 @@
-"""Selection of a view's points (section 2.9.2)."""
+"""The common parts of ICP, in the order in which an iteration uses them.
+
+Selectors choose the points of a view (section 2.9.2), a matcher pairs them by a kd-tree (2.9.3),
+rejectors drop pairs (2.9.4), the point-to-point metric gives the motion, and a stopping rule ends
+the iterations. Metrics with normals are in `surface_metrics`, rarer parts in the laboratory.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +19,14 @@ from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import KdTree
 from tofuse.engine.icp import icp_kernels, interfaces, surface_shape
 from tofuse.engine.parts import part
+
+# Relative second singular values below this are rounding errors: the points are collinear.
+_RANK_TOLERANCE = 1e-12
+_ROUNDING = 1e-14
+# Lower limit of the residuals' sigma, as a fraction of the resolution.
+_MIN_SIGMA_RATIO = 1e-3
+# Relative difference of E up to which iterations repeat.
+_REPETITION_TOLERANCE = 1e-6
 
 
 @part("selector", "all", label="validated")
@@ -140,13 +153,6 @@ class Unique(interfaces.Rejector):
         return matches.keep(keep)
 
 
-# Relative second singular values below this are rounding errors: the points are collinear.
-_RANK_TOLERANCE = 1e-12
-_ROUNDING = 1e-14
-# Lower limit of the residuals' sigma, as a fraction of the resolution.
-_MIN_SIGMA_RATIO = 1e-3
-
-
 @part("metric", "point-to-point", label="validated")
 @dataclass(frozen=True)
 class PointToPoint(interfaces.Metric):
@@ -210,9 +216,6 @@ class PointToPoint(interfaces.Metric):
             icp_kernels.point_information(alignment.source.points, matches.source, weight)
             / variance
         )
-
-
-_REPETITION_TOLERANCE = 1e-6
 
 
 @part("stopping", "two-loops", label="validated")

@@ -14,7 +14,7 @@ from typing import ClassVar, Protocol, Self
 
 import numpy as np
 
-from tofuse.engine.arrays import Bool, Float64, Int64
+from tofuse.engine.arrays import Bool, Float32, Float64, Int64, UInt8
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
 from tofuse.engine.icp.surface_shape import NEIGHBOURS, Shape, normals_at, shape_at
@@ -59,22 +59,20 @@ class Points:
     @cached_property
     def amplitude(self) -> Float64:
         """(n,) amplitude in counts; RegistrationError if the view has none."""
-        if self.view.amplitude is None:
-            raise RegistrationError(
-                "has no amplitude, which this registration compares",
-                where=f"frame {self.view.index}",
-            )
-        return self.view.amplitude[self.index].astype(np.float64)
+        return self._column(self.view.amplitude, "amplitude")
 
     @cached_property
     def color(self) -> Float64:
         """(n, 3) RGB, 0 to 1; RegistrationError if the view has none."""
-        if self.view.color is None:
+        return self._column(self.view.color, "colour") / 255
+
+    def _column(self, values: Float32 | UInt8 | None, name: str) -> Float64:
+        if values is None:
             raise RegistrationError(
-                "has no colour, which this registration compares",
+                f"has no {name}, which this registration compares",
                 where=f"frame {self.view.index}",
             )
-        return self.view.color[self.index].astype(np.float64) / 255
+        return values[self.index].astype(np.float64)
 
     @cached_property
     def variance(self) -> Float64 | None:

@@ -1,27 +1,256 @@
-"""Error metrics with normals: point-to-plane, plane-to-plane."""
+"""Error metrics with normals: point-to-plane, plane-to-plane.
+
+`SurfacePairs` are the matches with normals, in coordinates about their centroid. Robust losses,
+the solution of normal equations and the detection of degenerate directions are common to all.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
+from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.icp.icp_kernels import matrix_sums, plane_sums, plane_to_plane_weights
-from tofuse.engine.icp.interfaces import Alignment, Matches, Metric
-from tofuse.engine.icp.point_pairs import (
-    Loss,
-    SurfacePairs,
-    loss_weights,
-    shared_weights,
-    solve,
-    surface_pairs,
-    unobservable_directions,
-    variance_of,
+from tofuse.engine.compute import tukey_kernels as tukey
+from tofuse.engine.errors import RegistrationError
+from tofuse.engine.geometry import se3
+from tofuse.engine.icp.icp_kernels import (
+    direction_products,
+    matrix_sums,
+    plane_sums,
+    plane_to_plane_weights,
+    transform_points,
 )
+from tofuse.engine.icp.interfaces import Alignment, Matches, Metric
+from tofuse.engine.normal import robust_sigma
 from tofuse.engine.parts import part
+
+Loss = Literal["square", "huber", "cauchy", "tukey"]
+
+MIN_PAIRS = 6
+# Lower limit of the residuals' sigma, as a fraction of the resolution.
+_MIN_SIGMA_RATIO = 1e-3
+# Tuning constants for 95 % efficiency on normal errors, in standard deviations.
+_HUBER, _CAUCHY, _TUKEY = 1.345, 2.385, 4.685
+# Relative eigenvalues below this are rounding errors.
+_RANK_TOLERANCE = 1e-10
+# Normals that differ by more than 60 degrees are of different surfaces.
+_MIN_NORMAL_COSINE = 0.5
+# Minimum fraction of a direction's information that is not noise. Degenerate directions have less
+# than 0.15, directions constrained by a few percent of the points more than 0.5.
+_MIN_SIGNAL_FRACTION = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePairs:
+    """m pairs in the source's frame, about `centre`.
+
+    Attributes
+    ----------
+    T_target_source
+        (4, 4) the estimate.
+    centre
+        (3,) centroid of the paired source points, m, source frame.
+    points
+        (m, 3) source points relative to it, m.
+    residual
+        (m, 3) from target point to transformed source point, m, rotated into the source's frame.
+    target_normals, source_normals
+        (m, 3) unit normals of both surfaces, rotated into the source's frame.
+    weight
+        (m,) weights of the pairs by their noise.
+    resolution
+        Point spacing or voxel size of the views, m.
+    """
+
+    T_target_source: Float64
+    centre: Float64
+    points: Float64
+    residual: Float64
+    target_normals: Float64
+    source_normals: Float64
+    weight: Float64
+    resolution: float
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def size(self) -> float:
+        """Root mean square distance of the points from their centroid, m."""
+        return max(float(np.sqrt((self.points**2).sum(1).mean())), self.resolution)
+
+    def motion(self, xi: Float64) -> Float64:
+        """Return the motion (4, 4) in the target's frame of a perturbation about the centre."""
+        T_source_centre, T_centre_source = np.eye(4), np.eye(4)
+        T_source_centre[:3, 3], T_centre_source[:3, 3] = self.centre, -self.centre
+        T = self.T_target_source
+        return T @ T_source_centre @ se3.exp(xi) @ T_centre_source @ se3.inverse(T)
+
+    def to_origin(self, H: Float64) -> Float64:
+        """Transform information (6, 6) about the centre to the source's origin."""
+        T_centre_source = np.eye(4)
+        T_centre_source[:3, 3] = -self.centre
+        adjoint = se3.adjoint(T_centre_source)
+        H = adjoint.T @ H @ adjoint
+        return (H + H.T) / 2
+
+    def keep(self, mask: Bool) -> SurfacePairs:
+        """Return the pairs of the mask, about the same centre."""
+        return SurfacePairs(
+            self.T_target_source,
+            self.centre,
+            self.points[mask],
+            self.residual[mask],
+            self.target_normals[mask],
+            self.source_normals[mask],
+            self.weight[mask],
+            self.resolution,
+        )
+
+
+def surface_pairs(matches: Matches, alignment: Alignment, *, source: bool = False) -> SurfacePairs:
+    """Convert matches to pairs with normals of the target and, if `source`, of the source.
+
+    Pairs without normals are excluded.
+
+    Raises
+    ------
+    RegistrationError
+        If fewer than six pairs remain.
+    """
+    i, j = matches.source, matches.target
+    T = alignment.T_target_source
+    rotation = np.eye(4)
+    rotation[:3, :3] = T[:3, :3].T
+    p = alignment.source.points[i]
+    residual = transform_points(rotation, alignment.transformed[i] - alignment.target.points[j])
+    target_normals = transform_points(rotation, alignment.target.normals[j])
+    source_normals = alignment.source.normals[i] if source else np.zeros((len(i), 3))
+    weight = matches.weights() * _noise_weights(matches, alignment)
+    valid = np.isfinite(target_normals).all(1) & np.isfinite(source_normals).all(1) & (weight > 0)
+    if np.count_nonzero(valid) < MIN_PAIRS:
+        raise RegistrationError(
+            f"only {np.count_nonzero(valid)} points of the views correspond and have normals, "
+            f"{MIN_PAIRS} are needed"
+        )
+    centre = p[valid].mean(0)
+    pairs = SurfacePairs(
+        T,
+        centre,
+        p - centre,
+        residual,
+        target_normals,
+        source_normals,
+        weight,
+        alignment.resolution,
+    )
+    return pairs.keep(valid)
+
+
+def _noise_weights(matches: Matches, alignment: Alignment) -> Float64:
+    """Return inverse variances (m,) relative to their mean; ones if sigma is unknown."""
+    source_variance, target_variance = alignment.source.variance, alignment.target.variance
+    if source_variance is None or target_variance is None or len(matches) == 0:
+        return np.ones(len(matches))
+    floor = (_MIN_SIGMA_RATIO * alignment.resolution) ** 2
+    inverse = 1 / np.maximum(
+        source_variance[matches.source] + target_variance[matches.target], floor
+    )
+    return inverse / inverse.mean()
+
+
+def shared_weights(matches: Matches, alignment: Alignment) -> Float64:
+    """Return the information weights (m,) of pairs, reduced where many share one target point.
+
+    With equal noise in both views, m pairs with one target point have the information of
+    ``2 m / (1 + m)`` pairs with distinct target points.
+    """
+    count = np.bincount(matches.target, minlength=len(alignment.target))
+    return 2 / (1 + count[matches.target])
+
+
+def in_scales(residual: Float64, resolution: float) -> Float64:
+    """Return absolute residuals (m,), in m, relative to their robust scale.
+
+    The scale is 1.4826 times their median, at least a thousandth of the resolution.
+    """
+    magnitude = np.abs(residual)
+    return np.asarray(magnitude / max(robust_sigma(magnitude), _MIN_SIGMA_RATIO * resolution))
+
+
+def loss_weights(loss: Loss, residual: Float64, resolution: float) -> Float64:
+    """Weights (m,), 0 to 1, of a robust loss for residuals (m,) in m; see `in_scales`."""
+    if loss == "square":
+        return np.ones(len(residual))
+    x = in_scales(residual, resolution)
+    if loss == "huber":
+        return np.minimum(1.0, _HUBER / np.maximum(x, _HUBER))
+    if loss == "cauchy":
+        return 1 / (1 + (x / _CAUCHY) ** 2)
+    return tukey.weights((x / _TUKEY) ** 2)
+
+
+def variance_of(square: float, weight: Float64, resolution: float) -> float:
+    """Variance in m^2 of residuals with the weighted sum of squares `square`."""
+    variance = square / max(float(weight.sum()) - 6, 1.0)
+    return max(variance, (_MIN_SIGMA_RATIO * resolution) ** 2)
+
+
+def solve(H: Float64, g: Float64, size: float) -> Float64:
+    """Solve ``H xi = -g`` by the pseudo-inverse, without motion along null directions of H.
+
+    `size` (m) makes rotations comparable with translations.
+    """
+    scale = np.array([1, 1, 1, 1 / size, 1 / size, 1 / size])
+    values, vectors = np.linalg.eigh(H * scale[:, None] * scale)
+    nonsingular = values > _RANK_TOLERANCE * values[-1]
+    step = np.zeros(6)
+    for value, vector in zip(values[nonsingular], vectors.T[nonsingular], strict=True):
+        step -= vector * float((vector * scale * g).sum()) / value
+    return scale * step
+
+
+def cross_information(pairs: SurfacePairs, variance: float) -> Float64:
+    """Return ``sum w (Jt^T Js + Js^T Jt) / (2 variance)`` (6, 6), about the pairs' centre.
+
+    Jt and Js are the derivatives of the distance along the target's and along the source's
+    normal. The noise of the two views is independent and cancels in the product. In the plain
+    information ``Jt^T Jt`` it accumulates, and seems to constrain a flat wall in every direction.
+    """
+    a, b = pairs.target_normals, pairs.source_normals
+    H, _, _ = plane_sums(pairs.points, a, b, np.zeros(len(pairs)), pairs.weight)
+    return (H + H.T) / (2 * variance)
+
+
+def unobservable_directions(pairs: SurfacePairs, variance: float) -> Float64:
+    """Return the degenerate directions (k, 6) of the right perturbation.
+
+    Candidates are the eigenvectors of the cross-information, with lengths in resolutions and
+    angles scaled by the rms distance from the centroid. One is degenerate if its sigma exceeds one,
+    or if most of its plain information is noise, and absent from the cross-information.
+    """
+    # The orientation of the normals is irrelevant here.
+    cosine = (pairs.target_normals * pairs.source_normals).sum(1)
+    oriented = pairs.source_normals * np.sign(cosine)[:, None]
+    pairs = replace(pairs, source_normals=oriented).keep(np.abs(cosine) > _MIN_NORMAL_COSINE)
+    if not len(pairs):
+        return np.eye(6)
+    unit = pairs.resolution
+    scale = unit * np.array([1, 1, 1, 1 / pairs.size, 1 / pairs.size, 1 / pairs.size])
+    C = cross_information(pairs, variance) * scale[:, None] * scale
+    values, vectors = np.linalg.eigh(C)
+    directions = np.ascontiguousarray((vectors * scale[:, None]).T)
+    cross, plain = direction_products(
+        pairs.points, pairs.target_normals, pairs.source_normals, pairs.weight, directions
+    )
+    constrained = (values > 1) & (cross > _MIN_SIGNAL_FRACTION * plain)
+    T_source_centre = np.eye(4)
+    T_source_centre[:3, 3] = pairs.centre
+    unobservable = directions[~constrained] @ se3.adjoint(T_source_centre).T
+    return unobservable / np.linalg.norm(unobservable, axis=1, keepdims=True)
 
 
 class SurfaceMetric(Metric, Protocol):

@@ -29,7 +29,7 @@ from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.mapping.trial import pooled
-from tofuse.engine.search import verification, view_points
+from tofuse.engine.search import pair_agreement, verification
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view, residual_kernels
 
 Prepare = Callable[[Frame], Frame]
@@ -231,7 +231,7 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64, law: Law) -> 
     packed = projective.points_of(source, 2).astype(np.float64)
     p = packed[:, residual_kernels.POINT : residual_kernels.POINT + 3]
     q = p @ T[:3, :3].T + T[:3, 3]
-    u, v = view_points.landing_pixels(target, q).T
+    u, v = pair_agreement.landing_pixels(target, q).T
     rows, columns = target.z.shape
     inside = (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
     p, q, u, v = p[inside], q[inside], u[inside], v[inside]

@@ -27,7 +27,7 @@ from tofuse.engine.results import (
     accuracy_card,
     verdicts,
 )
-from tofuse.engine.sensor import FIELDS, CameraErrors
+from tofuse.engine.sensor import ERROR_OPTIONS, CameraErrors
 
 # The first estimate uses poses that the error has distorted, the second one does not.
 _ROUNDS = 2
@@ -71,7 +71,7 @@ def self_calibrated(
             correction.center_x,
             correction.center_y,
             correction.distortion,
-            {FIELDS[check.best][0]: check.sigmas[check.best]},
+            {ERROR_OPTIONS[check.best][0]: check.sigmas[check.best]},
             (_bound(initial), _bound(candidate)),
         )
         diagnostics = _with_calibration(candidate, correction, calibration)
@@ -101,7 +101,7 @@ def _estimated_error(
     remaining = check.improves and best in check.unconfirmed and applied.errors[best]
     if not (check.alarm or remaining):
         return None
-    error, sigma = FIELDS[best]
+    error, sigma = ERROR_OPTIONS[best]
     try:
         return check, CameraErrors(**{error: check.errors[best], sigma: check.sigmas[best]})
     except ValueError:

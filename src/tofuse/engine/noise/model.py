@@ -10,22 +10,26 @@ depend on the signal (ambient light, read-out). The ratio of noise and amplitude
 A falls as 1/r^2, so that sigma grows as r^2 in the dark limit. Cameras that don't give their
 amplitude are described by a table over their levels of confidence, or over the range alone,
 ``sigma_r = a + b r^2``, which is also the law of triangulating cameras (Khoshelham 2011).
+
+The model of a recording comes from its folder, its camera family, or its frames.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Annotated, Any, Literal, Protocol, Self
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
-from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.cameras import Camera, ray_lengths
+from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import InputError
+from tofuse.engine.frames import NOISE_MODEL, RangeFrame, Recording
 from tofuse.engine.noise import noise_kernels as kernels
+from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.parts import from_dict, to_dict
 
 Law = Literal["range", "amplitude", "confidence", "camera"]
@@ -40,27 +44,6 @@ _CODES = {
 # Maximum sigma in m; larger values are probably in millimetres.
 _MAX_SIGMA_M = 5.0
 _NO_IMAGE = np.empty((0, 0), np.float32)
-
-
-class NoisyImage(Protocol):
-    """The properties of a range image that determine its noise; a `RangeFrame` has them."""
-
-    @property
-    def camera(self) -> Camera: ...  # noqa: D102
-    @property
-    def depth(self) -> Float32: ...  # noqa: D102
-    @property
-    def depth_kind(self) -> Literal["z", "range"]: ...  # noqa: D102
-    @property
-    def amplitude_image(self) -> Float32 | None: ...  # noqa: D102
-    @property
-    def amplitude_kind(self) -> Literal["raw", "range_compensated", "ir"]: ...  # noqa: D102
-    @property
-    def confidence_image(self) -> UInt8 | None: ...  # noqa: D102
-    @property
-    def sigma_image(self) -> Float32 | None: ...  # noqa: D102
-    @property
-    def normal_image(self) -> Float32 | None: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -157,7 +140,7 @@ class NoiseModel(Bounded):
     ceiling_m: Annotated[float, Bounds(0, 100, exclusive=True)] = 1.0
     footprint: Annotated[float, Bounds(0, 1)] = 0.29
 
-    def law(self, frame: NoisyImage) -> Law:
+    def law(self, frame: RangeFrame) -> Law:
         """Return the law that applies to a frame; "camera" if it states its own sigma."""
         if frame.sigma_image is not None:
             return "camera"
@@ -167,7 +150,7 @@ class NoiseModel(Bounded):
             return "confidence"
         return "range"
 
-    def sigma(self, frame: NoisyImage, incidence: Float32 | None = None) -> Float32:
+    def sigma(self, frame: RangeFrame, incidence: Float32 | None = None) -> Float32:
         """Return the standard deviation (H, W) float32 in m of the radial range; 0 where invalid.
 
         Parameters
@@ -203,7 +186,7 @@ class NoiseModel(Bounded):
         run_chunks(rows, len(out))
         return out
 
-    def sigma_z(self, frame: NoisyImage, incidence: Float32 | None = None) -> Float32:
+    def sigma_z(self, frame: RangeFrame, incidence: Float32 | None = None) -> Float32:
         """Return the standard deviation (H, W) float32 in m of the z depth; 0 where invalid.
 
         The parameters are those of `sigma`.
@@ -251,7 +234,7 @@ class NoiseModel(Bounded):
         return model
 
 
-def incidence_cosine(frame: NoisyImage) -> Float32 | None:
+def incidence_cosine(frame: RangeFrame) -> Float32 | None:
     """Return the cosine (H, W) between ray and normal, NaN where unknown; None without normals."""
     normals = frame.normal_image
     if normals is None:
@@ -329,3 +312,101 @@ NOISE: dict[str, NoiseModel] = {
         NoiseModel("unknown", RangeLaw(0.003, 0.003)),
     )
 }
+
+
+# Keywords in a sensor's name, in lower case, the more specific ones first.
+_SENSOR_KEYWORDS = (
+    (("sr4000", "swissranger"), "sr4000"),
+    (("kinect v2", "kinect2", "kinectv2"), "kinect2"),
+    (("azure",), "azure-nfov"),
+    (("pico flexx", "pico-flexx", "picoflexx"), "pico-flexx"),
+    (("zense",), "pico-zense"),
+    (("o3r", "ifm"), "ifm-o3r"),
+    (("iphone", "ipad", "arkit", "lidar"), "iphone"),
+    (("kinect v1", "xtion", "primesense", "structured light", "kinect"), "kinect1"),
+)
+_SIZES = {
+    (176, 144): "sr4000",
+    (512, 424): "kinect2",
+    (640, 576): "azure-nfov",
+    (320, 288): "azure-nfov",
+    (224, 171): "pico-flexx",
+    (224, 172): "ifm-o3r",
+    (256, 192): "iphone",
+    (192, 256): "iphone",
+}
+_SAMPLED_FRAMES = 3
+_MAX_RATIO = 3.0  # of observed to predicted noise
+
+
+def noise_model_for(recording: Recording) -> NoiseModel:
+    """Choose the noise model of a recording.
+
+    One that came with the recording comes first, then the sensor's name, then the size of the
+    images. Amplitude counts have no common unit: where the noise predicted from amplitude differs
+    by more than a factor of three from that between neighbouring pixels, the amplitude law is
+    rescaled by an unknown gain.
+    """
+    stored = recording.metadata.get(NOISE_MODEL)
+    if isinstance(stored, NoiseModel):
+        return stored
+    frames = _sampled_frames(recording)
+    model = NOISE[family_of(recording, frames[0] if frames else None)]
+    if model.amplitude is None:
+        return model
+    frames = [f for f in frames if model.law(f) == "amplitude"]
+    return _rescaled(model, model.amplitude, frames) if frames else model
+
+
+def family_of(recording: Recording, frame: RangeFrame | None) -> str:
+    """Return the name of the camera family in `NOISE`; "unknown" if it can't be determined."""
+    sensor = str(recording.metadata.get("sensor", "")).lower()
+    for keywords, family in _SENSOR_KEYWORDS:
+        if any(keyword in sensor for keyword in keywords):
+            return family
+    if frame is None:
+        return "unknown"
+    family = _SIZES.get((frame.camera.width, frame.camera.height), "unknown")
+    if family == "iphone" and frame.amplitude_image is not None:
+        return "unknown"  # iPhones have no amplitude
+    return family
+
+
+def _sampled_frames(recording: Recording) -> list[RangeFrame]:
+    positions = np.unique(np.linspace(0, len(recording) - 1, _SAMPLED_FRAMES).astype(int))
+    images = (recording.image(int(k)) for k in positions)
+    return [image for image in images if image is not None and len(image)]
+
+
+def _rescaled(model: NoiseModel, law: AmplitudeLaw, frames: list[RangeFrame]) -> NoiseModel:
+    """The model with the gain of its amplitude law adjusted to the noise of the frames."""
+
+    def excess(gain: float) -> float:
+        """Log ratio of observed to predicted noise, if counts are `gain` times those of the law."""
+        scaled = replace(law, shot=law.shot * gain**0.5, dark=law.dark * gain)
+        return _log_excess(replace(model, amplitude=scaled), frames)
+
+    mismatch = excess(1.0)
+    if not np.isfinite(mismatch) or abs(mismatch) <= np.log(_MAX_RATIO):
+        return model
+    low, high = 1e-4, 1e4
+    for _ in range(30):
+        gain = float(np.sqrt(low * high))
+        low, high = (gain, high) if excess(gain) > 0 else (low, gain)
+    return replace(model, amplitude=replace(law, shot=law.shot * gain**0.5, dark=law.dark * gain))
+
+
+def _log_excess(model: NoiseModel, frames: list[RangeFrame]) -> float:
+    """Median log ratio of the noise in second differences along rows to that of the model."""
+    ratios_by_frame = []
+    for frame in frames:
+        values, valid = frame.radial_range.astype(float), frame.valid
+        second = values[:, :-2] - 2 * values[:, 1:-1] + values[:, 2:]
+        # Variance of the second difference: 1 + 4 + 1.
+        expected = model.sigma(frame).astype(float)[:, 1:-1] * np.sqrt(6.0)
+        usable = valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:] & (expected > 0)
+        ratios_by_frame.append(np.abs(second[usable]) / expected[usable])
+    ratios: Float64 = np.concatenate(ratios_by_frame) if ratios_by_frame else np.empty(0)
+    if len(ratios) < 200 or not (median := float(np.median(ratios))) > 0:
+        return float("nan")
+    return float(np.log(median / MEDIAN_OF_NORMAL))

@@ -29,7 +29,7 @@ from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
-from tofuse.engine.search import ViewPoints, pair_agreement, view_points
+from tofuse.engine.search import ViewPoints, pair_agreement
 from tofuse.engine.views import PreparedView
 
 Kind = Literal["appeared", "vanished"]
@@ -140,7 +140,10 @@ def changes(
 def _prepare(views: Sequence[PreparedView], poses: Float64) -> list[_SessionView]:
     return [
         _SessionView(
-            view, view_points.sampled_points(view, _POINTS), pair_agreement.nearest_depth(view), T
+            view,
+            pair_agreement.sampled_points(view, _POINTS),
+            pair_agreement.nearest_depth(view),
+            T,
         )
         for view, T in zip(views, poses, strict=True)
     ]
@@ -161,7 +164,7 @@ def _compare(
     T = se3.inverse(target.T_world_camera) @ source.T_world_camera
     points = se3.transform(T, source.points.points.astype(np.float64))
     view = target.view
-    pixel = view_points.landing_pixels(view, points)
+    pixel = pair_agreement.landing_pixels(view, points)
     rows, columns = view.z.shape
     inside = (pixel >= 0).all(1) & (pixel[:, 0] < columns) & (pixel[:, 1] < rows)
     inside[inside] = target.nearest[pixel[inside, 1], pixel[inside, 0]] > 0

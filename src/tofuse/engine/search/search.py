@@ -20,8 +20,8 @@ from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
-from tofuse.engine.search.floor import find_floors
 from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, Comparison
+from tofuse.engine.search.plane_detection import find_floors
 from tofuse.engine.search.search_grid import (
     MIN_POINTS,
     ResampledView,

@@ -13,9 +13,8 @@ from tofuse.engine.compute import run_chunks
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
-from tofuse.engine.search.floor import Floor
-from tofuse.engine.search.pair_agreement import nearest_depth
-from tofuse.engine.search.view_points import sampled_points
+from tofuse.engine.search.pair_agreement import nearest_depth, sampled_points
+from tofuse.engine.search.plane_detection import Floor
 from tofuse.engine.views import PreparedView
 
 # Steps of the two grids: rad, and as a fraction of the depth. Projective ICP converges from

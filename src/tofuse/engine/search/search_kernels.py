@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tofuse.engine.alignment import step_kernels
 from tofuse.engine.arrays import Float32, Float64, Int32, Int64
 from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
@@ -124,25 +125,16 @@ class Tolerance(NamedTuple):
 
 @kernel
 def _score_points(
-    points: Float32,
-    normals: Float32,
-    log_albedo: Float32,
-    grid: Float32,
-    frame: Float64,
-    reach: float,
-    block: Float32,
-    node: Int32,
+    view: Resampled, other: Resampled, reach: float, block: Float32, node: Int32
 ) -> None:
-    """Add the scores of one image's points, projected into the other image, for a block of poses.
+    """Add the scores of one view's points, projected into the other image, for a block of poses.
 
     A point supports a pose by up to 1, and counts -2 if it lies in the other camera's free space.
 
     Parameters
     ----------
-    points, normals, log_albedo
-        (N, 3) m, (N, 3) unit, and (N,) log albedo.
-    grid, frame
-        The other image.
+    view, other
+        The view of the points, and the other one.
     reach
         See `score_grid`.
     block
@@ -150,6 +142,8 @@ def _score_points(
     node
         (_LANES,) scratch: flat index of the node that the point projects to.
     """
+    points, normals, log_albedo, _, _ = view
+    grid, frame = other.grid, other.frame
     rows, columns = np.int32(grid.shape[0]), np.int32(grid.shape[1])
     planes = grid.reshape(grid.size)
     su, sv = np.float32(frame[2]), np.float32(frame[3])
@@ -195,27 +189,16 @@ def _score_points(
             m0, m1 = block[_PIXEL * _LANES + b], block[(_PIXEL + 1) * _LANES + b]
             m2, d = block[(_PIXEL + 2) * _LANES + b], block[(_PIXEL + 3) * _LANES + b]
             z = block[(_POSITION + 2) * _LANES + b]
-            r = (
-                m0 * block[_POSITION * _LANES + b]
-                + m1 * block[(_POSITION + 1) * _LANES + b]
-                + m2 * z
-                - d
+            x, y = block[_POSITION * _LANES + b], block[(_POSITION + 1) * _LANES + b]
+            r = m0 * x + m1 * y + m2 * z - d
+            n0 = block[b] * nx + block[_LANES + b] * ny + block[2 * _LANES + b] * nz
+            n1 = (
+                block[3 * _LANES + b] * nx + block[4 * _LANES + b] * ny + block[5 * _LANES + b] * nz
             )
-            c = (
-                m0 * (block[b] * nx + block[_LANES + b] * ny + block[2 * _LANES + b] * nz)
-                + m1
-                * (
-                    block[3 * _LANES + b] * nx
-                    + block[4 * _LANES + b] * ny
-                    + block[5 * _LANES + b] * nz
-                )
-                + m2
-                * (
-                    block[6 * _LANES + b] * nx
-                    + block[7 * _LANES + b] * ny
-                    + block[8 * _LANES + b] * nz
-                )
+            n2 = (
+                block[6 * _LANES + b] * nx + block[7 * _LANES + b] * ny + block[8 * _LANES + b] * nz
             )
+            c = m0 * n0 + m1 * n1 + m2 * n2
             violation = ((d > zero) & (r < -reach32)) | ((d < zero) & (z < -d - reach32))
             inlier = (d > zero) & (r >= -reach32) & (r < reach32) & (c > zero)
             w = c * (one - r * r * inv_reach2) if inlier else zero
@@ -297,9 +280,7 @@ def score_grid(
         (A, B), written: support minus twice the violations minus the albedo penalty, divided by
         the number of points.
     """
-    source_points, source_normals, source_log_albedo, source_grid, source_frame = source
-    target_points, target_normals, target_log_albedo, target_grid, target_frame = target
-    inv_count = 1.0 / max(len(source_points) + len(target_points), 1)
+    inv_count = 1.0 / max(len(source.points) + len(target.points), 1)
     inv_sigma2 = 1.0 / (albedo_sigma * albedo_sigma)
     poses_per_rotation = translations.shape[1]
     forward, backward = np.zeros(_ROWS * _LANES, np.float32), np.zeros(_ROWS * _LANES, np.float32)
@@ -319,41 +300,27 @@ def score_grid(
                 backward[(_TRANSLATION + i) * _LANES + b] = inverse_translation
         forward[_TOTAL * _LANES :] = np.float32(0)
         backward[_TOTAL * _LANES :] = np.float32(0)
-        _score_points(
-            source_points, source_normals, source_log_albedo, target_grid, target_frame, reach,
-            forward, node,
-        )  # fmt: skip
-        _score_points(
-            target_points, target_normals, target_log_albedo, source_grid, source_frame, reach,
-            backward, node,
-        )  # fmt: skip
+        _score_points(source, target, reach, forward, node)
+        _score_points(target, source, reach, backward, node)
         for b in range(count):
             total = np.float64(forward[_TOTAL * _LANES + b]) + backward[_TOTAL * _LANES + b]
-            weight = np.float64(forward[_ALBEDO * _LANES + b]) + backward[_ALBEDO * _LANES + b]
+            k = _ALBEDO * _LANES + b
+            weight = np.float64(forward[k]) + backward[k]
             if weight > 0:
                 # The mean difference is the exposure, which has opposite signs in the two
                 # directions.
-                mean = (
-                    np.float64(forward[(_ALBEDO + 1) * _LANES + b])
-                    - backward[(_ALBEDO + 1) * _LANES + b]
-                )
-                square = (
-                    np.float64(forward[(_ALBEDO + 2) * _LANES + b])
-                    + backward[(_ALBEDO + 2) * _LANES + b]
-                )
-                total -= min(
-                    (square - mean * mean / weight) * inv_sigma2, _MAX_ALBEDO_PENALTY * weight
-                )
+                mean = np.float64(forward[k + _LANES]) - backward[k + _LANES]
+                square = np.float64(forward[k + 2 * _LANES]) + backward[k + 2 * _LANES]
+                penalty = (square - mean * mean / weight) * inv_sigma2
+                total -= min(penalty, _MAX_ALBEDO_PENALTY * weight)
             a, c = divmod(first + b, poses_per_rotation)
             scores[a, c] = total * inv_count
 
 
 @kernel
 def _add_equations(
-    points: Float32,
-    normals: Float32,
-    grid: Float32,
-    frame: Float64,
+    view: Resampled,
+    other: Resampled,
     T: Float64,
     forward: bool,
     reach: float,
@@ -361,11 +328,12 @@ def _add_equations(
     H: Float64,
     g: Float64,
 ) -> None:
-    """Add the point-to-plane equations of one direction to H (6, 6) and g (6,).
+    """Add the equations of a view's points and the other's planes to H (6, 6) and g (6,).
 
     They are those of the right perturbation of T = T_target_source in either case: if `forward`,
-    the points are the source's and the grid is the target's, else the other way round.
+    the view is the source, else the target. Only the lower triangle of H is written.
     """
+    points, normals, grid, frame = view.points, view.normals, other.grid, other.frame
     rows, columns = grid.shape[0], grid.shape[1]
     x0, y0, sx, sy = frame[0], frame[1], frame[2], frame[3]
     J = np.empty(6)
@@ -420,35 +388,8 @@ def _add_equations(
             projection_kernels.jacobian_row(J, -n0, -n1, -n2, x, y, z)
         for p in range(6):
             g[p] += w * J[p] * r
-            for o in range(p, 6):
-                H[p, o] += w * J[p] * J[o]
-
-
-@kernel
-def _solve(H: Float64, g: Float64) -> Float64:
-    """Solve the symmetric H x = -g, (6, 6), from its upper triangle, by Cholesky."""
-    L = np.zeros((6, 6))
-    for i in range(6):
-        for j in range(i + 1):
-            s = H[j, i]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                L[i, i] = np.sqrt(max(s, 1e-12))
-            else:
-                L[i, j] = s / L[j, j]
-    x = np.empty(6)
-    for i in range(6):
-        s = -g[i]
-        for k in range(i):
-            s -= L[i, k] * x[k]
-        x[i] = s / L[i, i]
-    for i in range(5, -1, -1):
-        s = x[i]
-        for k in range(i + 1, 6):
-            s -= L[k, i] * x[k]
-        x[i] = s / L[i, i]
-    return x
+            for o in range(p + 1):
+                H[p, o] += w * J[o] * J[p]
 
 
 @kernel
@@ -477,45 +418,22 @@ def refine_poses(
     poses
         (N, 4, 4) T_target_source.
     """
-    source_points, source_normals, _, source_grid, source_frame = source
-    target_points, target_normals, _, target_grid, target_frame = target
     H = np.empty((6, 6))
-    g = np.empty(6)
+    step = np.empty(6)
     for c in range(start, stop):
         T = poses[c].copy()
         for k in range(len(reaches)):
             reach = reaches[k]
             H[:] = 0
-            g[:] = 0
-            _add_equations(
-                source_points,
-                source_normals,
-                target_grid,
-                target_frame,
-                T,
-                True,
-                reach,
-                min_cosine,
-                H,
-                g,
-            )
-            _add_equations(
-                target_points,
-                target_normals,
-                source_grid,
-                source_frame,
-                T,
-                False,
-                reach,
-                min_cosine,
-                H,
-                g,
-            )
+            step[:] = 0
+            _add_equations(source, target, T, True, reach, min_cosine, H, step)
+            _add_equations(target, source, T, False, reach, min_cosine, H, step)
             damping = 1e-3 * (H[0, 0] + H[1, 1] + H[2, 2]) + 1e-9
             for p in range(3):
                 H[p, p] += damping
                 H[p + 3, p + 3] += damping * unit_m * unit_m
-            step = _solve(H, g)
+            step_kernels.solve_positive(H, step)
+            step *= -1
             T = retract(T, step)
             translation2 = step[0] ** 2 + step[1] ** 2 + step[2] ** 2
             rotation2 = step[3] ** 2 + step[4] ** 2 + step[5] ** 2

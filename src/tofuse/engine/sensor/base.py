@@ -1,12 +1,18 @@
-"""The interface of corrections, which change measurements before they are filtered."""
+"""The interface of corrections, which change measurements before they are filtered.
+
+And the simplest one: `Noise` changes no measurement, but states its standard deviation.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Protocol
+from dataclasses import dataclass, replace
+from typing import ClassVar, Protocol, Self
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames import Frame
+from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.noise import NoiseModel
+from tofuse.engine.parts import part
 
 
 class Corrector(Protocol):
@@ -112,3 +118,43 @@ class Correction(Protocol):
     def start(self) -> Corrector:
         """Return a corrector for one recording, to be applied to its frames in order."""
         ...
+
+
+class FrameCorrection(Correction, Corrector, Protocol):
+    """A correction of each frame by itself: it is its own corrector, without a state."""
+
+    def start(self) -> Self:
+        """See `Correction.start`."""
+        return self
+
+    def is_independent(self, frame: Frame) -> bool:
+        """See `Corrector.is_independent`."""
+        return True
+
+
+@part("correction", "noise")
+@dataclass(frozen=True)
+class Noise(FrameCorrection):
+    """Assign the standard deviation of the range to each pixel, for all later weighting.
+
+    Depths are not changed. Frames with a sigma stated by the camera keep it; clouds are passed
+    through.
+
+    Attributes
+    ----------
+    model
+        Noise of the camera. None: that of the recording's `noise.json`, else that of the camera's
+        family; without either, frames are passed through.
+    """
+
+    model: NoiseModel | None = None
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
+        """See `Corrector.apply`."""
+        if self.model is None or not isinstance(frame, RangeFrame):
+            return frame
+        if frame.sigma_image is not None:
+            return frame
+        return replace(frame, sigma_image=self.model.sigma(frame))

@@ -15,7 +15,7 @@ given, or estimated by `GainEstimator`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -24,8 +24,9 @@ from tofuse.engine.arrays import Complex128, Float32, Float64
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.sensor import multipath_kernels as kernels
 from tofuse.engine.sensor.multipath_kernels import W, X, Y
-from tofuse.engine.sensor.multipath_map import OffscreenCells, ReflectorMap
 from tofuse.engine.sensor.multipath_surfaces import (
+    OffscreenCells,
+    ReflectorMap,
     Surfaces,
     block_nodes,
     fit_planes,
@@ -289,12 +290,7 @@ class GainEstimator:
         self._frames += 1
         if len(self._bright) >= self.MAX_IMAGES or (index >= self.FIRST and index % self.EVERY):
             return
-        coarse = MultipathModel(
-            max(8, self.model.columns // 2),
-            self.model.iterations,
-            self.model.lamp,
-            self.model.bounces,
-        )
+        coarse = replace(self.model, columns=max(8, self.model.columns // 2))
         bright = coarse.bright_albedo(image)
         if not bright > 0:
             return

@@ -19,7 +19,7 @@ from tofuse.engine.sensor.multipath import (
     MultipathModel,
     ToFImage,
 )
-from tofuse.engine.sensor.multipath_map import ReflectorMap
+from tofuse.engine.sensor.multipath_surfaces import ReflectorMap
 from tofuse.engine.sensor.raw_amplitude import modulation_period, tof_image
 
 

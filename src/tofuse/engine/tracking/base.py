@@ -13,6 +13,9 @@ from tofuse.engine.tracking.motion import FrameTime
 from tofuse.engine.views import PreparedView
 
 Status = Literal["tracked", "predicted", "lost", "skipped"]
+# Where the alignment of a frame starts: at the last pose, at constant velocity, or where the
+# motion of an odometry file leads.
+Guess = Literal["identity", "previous", "odometry"]
 
 
 @dataclass(frozen=True, eq=False)

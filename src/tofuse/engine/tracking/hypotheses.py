@@ -1,9 +1,12 @@
-"""Pose hypotheses: alignments with the last keyframe and the last frame, the likeliest first."""
+"""Pose hypotheses: alignments with the last keyframe and the last frame, the likeliest first.
+
+They start from the state of the tracker between two frames.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,11 +14,15 @@ from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import verification
-from tofuse.engine.tracking.keyframe_map import Keyframe
-from tofuse.engine.tracking.keyframes import Keyframes
-from tofuse.engine.tracking.motion import FrameTime
-from tofuse.engine.tracking.moving_objects import MIN_MOVING_FRACTION, Moving, without_pixels
-from tofuse.engine.tracking.tracker_state import TrackerState
+from tofuse.engine.tracking.base import Guess
+from tofuse.engine.tracking.keyframe_map import Keyframe, KeyframeMap, Relocalizer
+from tofuse.engine.tracking.motion import FrameTime, MotionModel
+from tofuse.engine.tracking.moving_objects import (
+    MIN_MOVING_FRACTION,
+    Moving,
+    MovingObjects,
+    without_pixels,
+)
 from tofuse.engine.views import PreparedView
 
 # Minimum score of a rotated start relative to the unrotated one: a flat wall fits under any.
@@ -25,6 +32,48 @@ _CONVERGENCE_LEVELS = (projective.Level(4, 8, 0.005, 0.02), projective.Level(2, 
 # Every n-th frame is segmented, and any with an indication of moving objects: an unusual fit, more
 # than this fraction of points in free space, or objects in the frame before.
 _SEGMENT_EVERY, _MAX_IN_FRONT = 4, 0.005
+
+
+@dataclass(eq=False)
+class TrackerState:
+    """What the tracker knows of the frames so far.
+
+    `Hypotheses` and `Selection` read it for one frame; `KeyframeTracker` updates it.
+
+    Attributes
+    ----------
+    keyframes
+        Those of all components.
+    relocalizer
+        Searches for poses, and their budget.
+    fit_statistics
+        Usual fit of views of this camera.
+    motion
+        Velocity of the camera.
+    objects
+        Moving objects in the last view and in the keyframes.
+    last
+        The last frame of the component; None after an interruption.
+    in_sequence
+        Whether the frame just before has a pose in the component.
+    component
+        Number of the component; -1 before the first.
+    connected
+        Whether a certain link joins the component to an earlier one.
+    degenerate
+        Number of degenerate directions of the last selected alignment.
+    """
+
+    keyframes: KeyframeMap
+    relocalizer: Relocalizer
+    fit_statistics: verification.FitStatistics
+    motion: MotionModel = field(default_factory=MotionModel)
+    objects: MovingObjects = field(default_factory=MovingObjects)
+    last: Keyframe | None = None
+    in_sequence: bool = False
+    component: int = -1
+    connected: bool = True
+    degenerate: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +133,10 @@ class Hypotheses:
         The view, and when it was taken.
     state
         Of the tracker; only `segment` changes it.
+    guess
+        Where alignments start, see `Keyframes`.
     options
-        Where alignments start, and how views are aligned.
+        How views are aligned.
 
     Attributes
     ----------
@@ -100,19 +151,24 @@ class Hypotheses:
     """
 
     def __init__(
-        self, view: PreparedView, now: FrameTime, state: TrackerState, options: Keyframes
+        self,
+        view: PreparedView,
+        now: FrameTime,
+        state: TrackerState,
+        guess: Guess,
+        options: projective.ProjectiveOptions,
     ) -> None:
         self.view, self.now, self.state = view, now, state
-        self._options = options.views.alignment
+        self._options = options
         self.T_last = np.eye(4) if state.last is None else state.last.T_component_camera
         self.references = self._make_references()
         # The pose that degenerate directions keep.
         self._T_smoothed: Float64 | None = None
         self.T_predicted: Float64 | None = None
-        if options.guess == "previous":
+        if guess == "previous":
             self.T_predicted = state.motion.predicted_pose(now)
             self._T_smoothed = state.motion.smoothed_pose(now)
-        elif options.guess == "odometry":
+        elif guess == "odometry":
             self.T_predicted = state.motion.odometry_pose()
         self.static_view = view
         if state.objects.in_last_view:

@@ -109,6 +109,8 @@ class Limits(NamedTuple):
 @kernel
 def cell_depth(w: float, plane_variance: float, z: float, sigma: float) -> tuple[float, float]:
     """Return depth (m) and variance of a pixel: of its plane (w = 1/z), else measured; else 0."""
+    w, plane_variance = np.float64(w), np.float64(plane_variance)
+    z, sigma = np.float64(z), np.float64(sigma)
     if w > 0:
         depth = 1.0 / w
         square = depth * depth
@@ -155,6 +157,31 @@ def transform_point(motion: Rows, x: float, y: float, depth: float) -> tuple[flo
 
 
 @kernel
+def _project_cell(
+    depth: float,
+    x_ray: float,
+    y_ray: float,
+    motion: Rows,
+    lookup: Float32,
+    lookup_frame: Float64,
+    rows: int,
+    columns: int,
+) -> tuple[int, int, float, float, float]:
+    """Return row and column of the pixel that a point is seen at, and its (x/z, y/z, z) there.
+
+    The point is at `depth` on the ray (x_ray, y_ray). The row is -1 if it has no depth, is too near
+    to the camera, or outside of the image of `rows` x `columns`.
+    """
+    if not depth > 0:
+        return -1, -1, 0.0, 0.0, 0.0
+    x, y, z = transform_point(motion, x_ray, y_ray, depth)
+    if z == 0:
+        return -1, -1, 0.0, 0.0, 0.0
+    k, m = projection_kernels.nearest_pixel(x, y, lookup, lookup_frame, rows, columns)
+    return k, m, x, y, z
+
+
+@kernel
 def residual_ratios(
     view: View, moving: Bool, step: int, other: View, T: Float64, model_error: float
 ) -> Float32:
@@ -186,28 +213,20 @@ def residual_ratios(
             if moving[a, b]:
                 continue
             depth, variance = cell_depth(
-                np.float64(planes[i, j, 3]),
-                np.float64(plane_variance[i, j]),
-                np.float64(z[i, j]),
-                np.float64(sigma[i, j]),
+                planes[i, j, 3], plane_variance[i, j], z[i, j], sigma[i, j]
             )
-            if not depth > 0:
+            k, m, x, y, z_proj = _project_cell(
+                depth, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), motion,
+                lookup, lookup_frame, other_z.shape[0], other_z.shape[1],
+            )  # fmt: skip
+            if k < 0:
                 continue
-            x, y, z_proj = transform_point(
-                motion, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), depth
-            )
-            if z_proj == 0:
-                continue
-            u, v, node, _ = projection_kernels.project_ray(x, y, lookup, lookup_frame)
-            if not projection_kernels.in_image(u, v, node, other_z.shape[0], other_z.shape[1]):
-                continue
-            k, m = int(v + 0.5), int(u + 0.5)
             w_ray = other_planes[k, m, 0] * x + other_planes[k, m, 1] * y + other_planes[k, m, 2]
             z_obs, observed_variance = cell_depth(
                 _plane_inverse_depth(np.float64(other_planes[k, m, 3]), w_ray),
-                np.float64(other_variance[k, m]),
-                np.float64(other_z[k, m]),
-                np.float64(other_sigma[k, m]),
+                other_variance[k, m],
+                other_z[k, m],
+                other_sigma[k, m],
             )
             if not z_obs > 0:
                 continue
@@ -265,28 +284,20 @@ def compare(
             outcome[a, b], llr[a, b] = NONE, 0.0
             i, j = a * stride, b * stride
             depth, variance = cell_depth(
-                np.float64(planes[i, j, 3]),
-                np.float64(plane_variance[i, j]),
-                np.float64(z[i, j]),
-                np.float64(sigma[i, j]),
+                planes[i, j, 3], plane_variance[i, j], z[i, j], sigma[i, j]
             )
-            if not depth > 0:
+            k, m, x, y, z_proj = _project_cell(
+                depth, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), motion,
+                lookup, lookup_frame, rows, columns,
+            )  # fmt: skip
+            if k < 0:
                 continue
-            x, y, z_proj = transform_point(
-                motion, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), depth
-            )
-            if z_proj == 0:
-                continue
-            u, v, node, _ = projection_kernels.project_ray(x, y, lookup, lookup_frame)
-            if not projection_kernels.in_image(u, v, node, rows, columns):
-                continue
-            k, m = int(v + 0.5), int(u + 0.5)
             w_ray = other_planes[k, m, 0] * x + other_planes[k, m, 1] * y + other_planes[k, m, 2]
             z_obs, observed_variance = cell_depth(
                 _plane_inverse_depth(np.float64(other_planes[k, m, 3]), w_ray),
-                np.float64(other_variance[k, m]),
-                np.float64(other_z[k, m]),
-                np.float64(other_sigma[k, m]),
+                other_variance[k, m],
+                other_z[k, m],
+                other_sigma[k, m],
             )
             if not z_obs > 0:
                 continue
@@ -368,23 +379,15 @@ def propagate(
             i, j = a * stride, b * stride
             odds[a, b], tracked[a, b], in_free_space[a, b] = prior, 0, False
             depth, variance = cell_depth(
-                np.float64(planes[i, j, 3]),
-                np.float64(plane_variance[i, j]),
-                np.float64(z[i, j]),
-                np.float64(sigma[i, j]),
+                planes[i, j, 3], plane_variance[i, j], z[i, j], sigma[i, j]
             )
             depths[a, b] = depth
-            if not depth > 0:
+            k, m, _, _, z_proj = _project_cell(
+                depth, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), motion,
+                lookup, lookup_frame, prev_shape[0], prev_shape[1],
+            )  # fmt: skip
+            if k < 0:
                 continue
-            x, y, z_proj = transform_point(
-                motion, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), depth
-            )
-            if z_proj == 0:
-                continue
-            u, v, node, _ = projection_kernels.project_ray(x, y, lookup, lookup_frame)
-            if not projection_kernels.in_image(u, v, node, prev_shape[0], prev_shape[1]):
-                continue
-            k, m = int(v + 0.5), int(u + 0.5)
             k, m = k // prev_stride, m // prev_stride
             z_prev = np.float64(prev_depth[k, m])
             max_difference = max(tolerance * z_proj, _EDGE_SIGMAS * np.sqrt(variance))
@@ -431,17 +434,12 @@ def predict(
             i, j = a * stride, b * stride
             moving[a, b] = False
             depth = np.float64(z[i, j])
-            if not depth > 0:
+            k, m, _, _, z_proj = _project_cell(
+                depth, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), motion,
+                lookup, lookup_frame, prev_shape[0], prev_shape[1],
+            )  # fmt: skip
+            if k < 0:
                 continue
-            x, y, z_proj = transform_point(
-                motion, np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1]), depth
-            )
-            if z_proj == 0:
-                continue
-            u, v, node, _ = projection_kernels.project_ray(x, y, lookup, lookup_frame)
-            if not projection_kernels.in_image(u, v, node, prev_shape[0], prev_shape[1]):
-                continue
-            k, m = int(v + 0.5), int(u + 0.5)
             k, m = k // prev_stride, m // prev_stride
             moving[a, b] = _is_near_moving(k, m, z_proj, prev_depth, prev_moving, tolerance, radius)
             if not moving[a, b]:  # an object may move with the camera
@@ -460,12 +458,10 @@ def _cell_on_ray(
     lookup_frame: Float64,
 ) -> tuple[int, int]:
     """Return row and column of the cell that a ray projects to; -1 outside the image."""
-    u, v, node, _ = projection_kernels.project_ray(
-        np.float64(ray[0]), np.float64(ray[1]), lookup, lookup_frame
+    k, m = projection_kernels.nearest_pixel(
+        np.float64(ray[0]), np.float64(ray[1]), lookup, lookup_frame, shape[0], shape[1]
     )
-    if not projection_kernels.in_image(u, v, node, shape[0], shape[1]):
-        return -1, -1
-    return int(v + 0.5) // stride, int(u + 0.5) // stride
+    return (k // stride, m // stride) if k >= 0 else (-1, -1)
 
 
 @kernel

@@ -2,8 +2,8 @@
 
 A point that lies in the free space of another view has moved there; a surface that lies in the
 free space of a later view has moved away. Either contradicts a static scene by a likelihood ratio,
-see `tofuse.engine.tracking.moving_object_kernels`. The log-odds of each pixel accumulate over frames and are
-propagated with the motion of the camera, and connected pixels are segmented with hysteresis.
+see `moving_object_kernels`. The log-odds of each pixel accumulate over frames and are propagated
+with the motion of the camera, and connected pixels are segmented with hysteresis.
 Occlusion and disocclusion by the foreground are no evidence: no free space was observed there.
 
 The static scene is consistent with the given poses. A wrong pose makes views disagree as well:

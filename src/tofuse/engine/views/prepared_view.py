@@ -13,8 +13,8 @@ from tofuse.engine.compute import median, run_chunks
 from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.views.projection import Projection, projection_of
 from tofuse.engine.views.residual_kernels import TargetImage, ViewImages, make_target
-from tofuse.engine.views.surface_options import SurfaceOptions
 from tofuse.engine.views.view_planes import (
+    SurfaceOptions,
     edge_pixels,
     fitted_planes,
     inverse,
@@ -157,31 +157,16 @@ class PreparedView:
             return self._subsampled[step]
         first = step // 2
         pixels = (slice(first, None, step),) * 2
-        z, sigma, planes, variance = (
-            np.ascontiguousarray(image[pixels])
-            for image in (self.z, self.sigma, self.planes, self.plane_variance)
-        )
-        albedo = (
-            np.ascontiguousarray(self.albedo[pixels]) if self.has_albedo else _no_albedo(*z.shape)
-        )
+        images = {
+            name: np.ascontiguousarray(image[pixels])
+            for name in ("z", "sigma", "planes", "plane_variance", "albedo", "pixel_variance")
+            if (image := getattr(self, name)) is not None
+        }
+        if not self.has_albedo:
+            images["albedo"] = _no_albedo(*images["z"].shape)
         projection = self.projection.subsampled(step)
-        rays = projection.rays
-        pixel_variance = self.pixel_variance
-        self._subsampled[step] = PreparedView(
-            self.index,
-            rays,
-            z,
-            sigma,
-            planes,
-            variance,
-            albedo,
-            projection,
-            self.has_albedo,
-            pixel_variance=None
-            if pixel_variance is None
-            else np.ascontiguousarray(pixel_variance[pixels]),
-            unknown_falloff=self.unknown_falloff,
-            measures_range=self.measures_range,
+        self._subsampled[step] = replace(
+            self, rays=projection.rays, projection=projection, **images
         )
         return self._subsampled[step]
 

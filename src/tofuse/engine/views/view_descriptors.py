@@ -72,12 +72,8 @@ def mutual_dissimilarity(descriptors: Sequence[Float32] | Float32, shift: float)
     """Return the pairwise distances (N, N) of descriptors (N, 2, 9, 12), see `dissimilarity`."""
     stack = np.asarray(descriptors)
     distances = np.ones((len(stack), len(stack)))
-
-    def rows(a: int, b: int) -> None:
-        for k in range(a, b):
-            distances[k, k:] = dissimilarity(stack[k], stack[k:], shift)
-
-    run_chunks(rows, len(stack), _CHUNKS)
+    i, j = np.triu_indices(len(stack))
+    distances[i, j] = pairwise_dissimilarity(stack, i, j, shift)
     return np.minimum(distances, distances.T)
 
 

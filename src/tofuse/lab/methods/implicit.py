@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.icp import icp_kernels, interfaces, point_pairs, surface_metrics
+from tofuse.engine.icp import icp_kernels, interfaces, surface_metrics
 from tofuse.engine.parts import part
 from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
 
@@ -37,13 +37,13 @@ class Implicit(Bounded, surface_metrics.SurfaceMetric):
 
     def motion(self, matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
         """See `Metric.motion`."""
-        pairs = point_pairs.surface_pairs(matches, alignment)
+        pairs = surface_metrics.surface_pairs(matches, alignment)
         usable = with_normals(matches, alignment)
         distance = self.distance(alignment.transformed[usable.source], alignment)
         n = pairs.target_normals
         weight = np.where(np.isfinite(distance), pairs.weight, 0.0)
         H, g, _ = icp_kernels.plane_sums(pairs.points, n, n, np.nan_to_num(distance), weight)
-        return pairs.motion(point_pairs.solve(H, g, pairs.size))
+        return pairs.motion(surface_metrics.solve(H, g, pairs.size))
 
     def distance(self, x: Float64, alignment: interfaces.Alignment) -> Float64:
         """I(x), (m,) in m, of points (m, 3) in the target's frame; NaN without neighbours."""
@@ -58,6 +58,6 @@ class Implicit(Bounded, surface_metrics.SurfaceMetric):
         sums = (W * np.nan_to_num(height)).sum(1)
         return np.divide(sums, total, out=np.full(len(x), np.nan), where=total > 0)
 
-    def fit(self, pairs: point_pairs.SurfacePairs) -> tuple[Float64, float]:
+    def fit(self, pairs: surface_metrics.SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: that of point-to-plane."""
         return surface_metrics.PointToPlane().fit(pairs)

@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.icp import icp_kernels, icp_parts, interfaces, point_pairs, surface_metrics
+from tofuse.engine.icp import icp_kernels, icp_parts, interfaces, surface_metrics
 from tofuse.engine.parts import part
 
 # Factor of mu per round (Yang et al. 2020, remark 5).
@@ -97,7 +97,7 @@ class Adaptive(surface_metrics.TangentPlanes):
 
     def weights(self, residual: Float64, resolution: float) -> Float64:
         """See `TangentPlanes.weights`."""
-        x = point_pairs.in_scales(residual, resolution)
+        x = surface_metrics.in_scales(residual, resolution)
         a = estimate_shape(x)
         return np.asarray((x * x / abs(a - 2) + 1) ** (a / 2 - 1)) if a < 2 else np.ones(len(x))
 

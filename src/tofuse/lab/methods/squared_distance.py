@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.icp import icp_kernels, interfaces, point_pairs, surface_metrics
+from tofuse.engine.icp import icp_kernels, interfaces, surface_metrics
 from tofuse.engine.parts import part
 from tofuse.lab.methods.neighbourhoods import neighbourhood, with_normals
 
@@ -31,18 +31,18 @@ class SquaredDistance(surface_metrics.SurfaceMetric):
 
     def motion(self, matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
         """See `Metric.motion`."""
-        pairs = point_pairs.surface_pairs(matches, alignment)
+        pairs = surface_metrics.surface_pairs(matches, alignment)
         usable = with_normals(matches, alignment)
         W = approximant(usable, alignment)
         R = alignment.T_target_source[:3, :3]
         H, g, _ = icp_kernels.matrix_sums(
             pairs.points, pairs.residual, np.einsum("ji,njk,kl->nil", R, W, R), pairs.weight
         )
-        velocity = point_pairs.solve(H, g, pairs.size)
+        velocity = surface_metrics.solve(H, g, pairs.size)
         speed = float(np.linalg.norm(velocity[3:]))
         return pairs.motion(velocity * (math.atan(speed) / speed) if speed > 0 else velocity)
 
-    def fit(self, pairs: point_pairs.SurfacePairs) -> tuple[Float64, float]:
+    def fit(self, pairs: surface_metrics.SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: at convergence the sum is that of point-to-plane."""
         return surface_metrics.PointToPlane().fit(pairs)
 

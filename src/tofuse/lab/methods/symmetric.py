@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.icp import icp_kernels, interfaces, point_pairs, surface_metrics
+from tofuse.engine.icp import icp_kernels, interfaces, surface_metrics
 from tofuse.engine.parts import part
 from tofuse.lab.methods.symmetric_kernels import symmetric_sums
 
@@ -29,20 +29,20 @@ class Symmetric(surface_metrics.SurfaceMetric):
         "square" as in the paper; "huber", "cauchy" or "tukey" downweight large residuals.
     """
 
-    loss: point_pairs.Loss = "square"
+    loss: surface_metrics.Loss = "square"
 
     def motion(self, matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
         """See `Metric.motion`; no motion along unconstrained directions."""
-        pairs = point_pairs.surface_pairs(matches, alignment, source=True)
+        pairs = surface_metrics.surface_pairs(matches, alignment, source=True)
         n = pairs.source_normals + pairs.target_normals
         r = (pairs.residual * n).sum(1)
-        weight = pairs.weight * point_pairs.loss_weights(self.loss, r, pairs.resolution)
+        weight = pairs.weight * surface_metrics.loss_weights(self.loss, r, pairs.resolution)
         # p and q in the source's frame, centred between both.
         p = pairs.points
         q = p - pairs.residual
         centre = (p.mean(0) + q.mean(0)) / 2
         H, g = symmetric_sums(p - centre, q - centre, n, weight)
-        x = point_pairs.solve(H, g, 2 * pairs.size)
+        x = surface_metrics.solve(H, g, 2 * pairs.size)
         tangent = float(np.linalg.norm(x[3:]))
         angle = math.atan(tangent)
         half = np.eye(4)
@@ -55,12 +55,12 @@ class Symmetric(surface_metrics.SurfaceMetric):
         T = pairs.T_target_source
         return T @ T_centre @ half @ translation @ half @ T_uncentre @ se3.inverse(T)
 
-    def fit(self, pairs: point_pairs.SurfacePairs) -> tuple[Float64, float]:
+    def fit(self, pairs: surface_metrics.SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: along the mean normal."""
         n = pairs.source_normals + pairs.target_normals
         n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
         r = (pairs.residual * n).sum(1)
-        weight = pairs.weight * point_pairs.loss_weights(self.loss, r, pairs.resolution)
+        weight = pairs.weight * surface_metrics.loss_weights(self.loss, r, pairs.resolution)
         H, _, square = icp_kernels.plane_sums(pairs.points, n, n, r, weight)
-        variance = point_pairs.variance_of(square, weight, pairs.resolution)
+        variance = surface_metrics.variance_of(square, weight, pairs.resolution)
         return H / variance, variance
