@@ -228,16 +228,6 @@ def test_view_with_infinite_planes_stays_at_prediction(room):
     assert len(found.unobservable) == 6
 
 
-def test_points_are_on_fitted_surface(room):
-    view = room.views[0]
-    some = points_of(view, 4)
-    every = points_of(view, 1)
-    assert len(every) == np.count_nonzero(view.planes[..., 3])
-    assert len(some) == pytest.approx(len(every) / 16, rel=0.1)
-    z = np.float32(1) / view.planes[view.planes[..., 3] > 0][:, 3]
-    np.testing.assert_allclose(every[:, 2], z, rtol=1e-6)
-
-
 def test_all_pixels_of_a_small_image_are_sampled(room):
     small = SurfaceOptions(columns=22)
     target, source = (prepare_view(frame, small) for frame in room.frames[:2])

@@ -21,7 +21,6 @@ from tofuse.engine.sensor.scattering_correction import LensScattering
 from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
-from tofuse.lab.simulation.scenes import box
 
 OF_OBJECT = {"torso": ("skin", "hair", "shirt", "trousers", "seat"), "box": ("box",)}
 
@@ -83,19 +82,6 @@ def test_person_is_segmented() -> None:
 @pytest.mark.slow
 def test_box_is_segmented() -> None:
     check(shown("box"), 0.85)
-
-
-@pytest.mark.slow
-def test_smaller_box_farther_away_is_segmented(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(box, "DISTANCE", 1.3)
-    for name, value in zip(("WIDTH", "DEPTH", "HEIGHT"), (0.16, 0.2, 0.25), strict=True):
-        monkeypatch.setattr(box, name, value)
-    check(shown.__wrapped__("box", off=SLOW), 0.82)
-
-
-@pytest.mark.slow
-def test_box_is_segmented_with_other_camera() -> None:
-    check(shown("box", camera="ifm-o3r", off=SLOW), 0.85)
 
 
 def test_moving_camera_is_rejected() -> None:

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.fusion import mesh as mesh_module
 from tofuse.engine.fusion.edge_collapse import collapse_edges
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.geometry.kdtree import KdTree
@@ -171,32 +170,6 @@ def test_meshes_of_several_pieces_are_decimated() -> None:
         None, np.ones(n, np.float32), np.ones(n, np.int32), np.zeros(3),
     )  # fmt: skip
     assert len(scraps.decimated(100).faces) <= 100
-
-
-def test_failed_collapse_falls_back_to_clustering(monkeypatch) -> None:
-    whole = hills(30)
-    monkeypatch.setattr(
-        mesh_module,
-        "collapse_edges",
-        lambda vertices, *_: (np.arange(len(vertices)), vertices.astype(float)),
-    )
-    assert digest(whole.decimated(200)) == digest(whole.clustered(200))
-
-
-def test_large_meshes_are_clustered_first(monkeypatch) -> None:
-    whole = hills()
-    seen = []
-
-    def recorded(vertices, faces, count, spacing):
-        seen.append(len(faces))
-        return collapse_edges(vertices, faces, count, spacing)
-
-    monkeypatch.setattr(mesh_module, "collapse_edges", recorded)
-    monkeypatch.setattr(mesh_module, "_MAX_COLLAPSED", 10_000)
-    assert len(whole.decimated(1500).faces) <= 1500
-    assert digest(whole.decimated(12_000)) == digest(whole.clustered(12_000))
-    assert len(seen) == 1
-    assert 5000 < seen[0] <= 10_000
 
 
 @pytest.mark.parametrize("seed", range(6))

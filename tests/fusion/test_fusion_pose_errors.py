@@ -60,16 +60,6 @@ def test_pose_errors_add_to_noise(offset) -> None:
     np.testing.assert_allclose(found, np.hypot(SIGMA, 0.02), rtol=1e-4)
 
 
-def test_rotation_error_scales_with_distance() -> None:
-    points = wall().points
-    found = with_pose_errors(
-        model_of(points), [wall()], np.eye(4)[None], covariance(0, 0.01)[None]
-    ).cloud.sigma
-    middle = np.argmin(np.linalg.norm(points[:, :2], axis=1))
-    expected = np.hypot(SIGMA, 0.01 * 2.0 * np.sqrt(2 / 3))
-    assert found[middle] == pytest.approx(expected, rel=0.02)
-
-
 def test_most_accurate_view_determines_sigma() -> None:
     poses = np.stack([np.eye(4), np.eye(4)])
     both = np.stack([covariance(0.05), covariance(0.01)])

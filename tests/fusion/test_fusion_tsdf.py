@@ -11,7 +11,6 @@ import pytest
 from ball_views import CAMERA, EYE, around_a_ball, frame_of, look, plane_range, sphere_range
 from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
 from tofuse.engine.compute.spill import Spill
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion import layout
 from tofuse.engine.fusion import tsdf_kernels as tsdf
@@ -27,7 +26,6 @@ from tofuse.engine.fusion.model import ModelBuilder
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import DECODED, RangeView, with_camera_correction
 from tofuse.engine.fusion.tsdf import fitting_voxel, fuse_surface
-from tofuse.engine.fusion.upright import upright
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.refinement import without_errors
 from tofuse.engine.views.prepared_view import prepare_view
@@ -91,15 +89,6 @@ def test_noisy_ball_has_correct_radius_and_normals(ball) -> None:
     assert area == pytest.approx(4 * np.pi * 0.09, rel=0.03)
     assert mesh.views.max() > 2
     assert 0.0005 < np.median(mesh.sigma) < 0.005
-
-
-def test_surface_is_independent_of_threads(ball) -> None:
-    views, poses, mesh = ball
-    for count in (1, 3):
-        with threads(count):
-            again = fuse_surface(views, poses, Fusion(voxel_m=0.012))
-        for name in ("vertices", "faces", "normals", "color", "sigma", "views"):
-            assert getattr(again, name).tobytes() == getattr(mesh, name).tobytes(), name
 
 
 def pixels_of(view):
@@ -457,40 +446,6 @@ def test_clouds_give_no_mesh_and_sparse_images_give_cloud() -> None:
     model = builder.fuse({0: EYE})
     assert len(model.mesh) == 0
     assert len(model.cloud) == 1
-
-
-def test_simplified_mesh_keeps_shape(ball) -> None:
-    _, _, mesh = ball
-    small = mesh.simplified(0.036)
-    assert len(small.faces) < len(mesh.faces) / 5
-    r = np.linalg.norm(small.vertices, axis=1)
-    assert np.abs(r - 0.3).mean() < 0.004
-    a, b, c = (small.vertices[small.faces[:, k]] for k in range(3))
-    assert (np.einsum("ni,ni->n", np.cross(b - a, c - a), a) > 0).mean() > 0.99
-
-
-@pytest.mark.parametrize("tilt", [0.0, 0.5])
-def test_up_follows_floor_or_walls(tilt) -> None:
-    # The camera looks down by `tilt`, at a floor 1 m below and a wall 3 m ahead.
-    T = se3.exp(np.array([0, 0, 0, -tilt, 0, 0]))
-    floor = plane_range(T, np.array([0, 1.0, 0]), 1.0)
-    wall = plane_range(T, np.array([0, 0, 1.0]), 3.0)
-    view = RangeView.of(frame_of(np.minimum(floor, wall)))
-    # In the world, which is the first camera.
-    mesh = fuse_surface([view], EYE[None], Fusion(voxel_m=0.03))
-    R = upright(mesh, EYE[None])
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(R) == pytest.approx(1)
-    down = T[:3, :3].T @ [0, 1.0, 0]
-    if (np.minimum(floor, wall) == floor).mean() > 0.15:
-        np.testing.assert_allclose(R @ down, [0, -1, 0], atol=0.03)
-    wall_only = fuse_surface([RangeView.of(frame_of(wall))], EYE[None], Fusion(voxel_m=0.03))
-    # A wall is vertical, however the camera is tilted.
-    np.testing.assert_allclose(upright(wall_only, EYE[None]) @ down, [0, -1, 0], atol=0.03)
-    # Without a floor, measured gravity takes precedence over the cameras' up direction.
-    against_gravity = np.array([0.6, -0.8, 0.0])
-    R = upright(wall_only, EYE[None], against_gravity)
-    np.testing.assert_allclose(R @ against_gravity, [0, 1, 0], atol=1e-12)
 
 
 def test_plane_shrinkage_and_jumps_match_slow_twins() -> None:

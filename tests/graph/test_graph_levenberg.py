@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import robust
 from tofuse.engine.graph.graph import Gravity, PoseGraph
@@ -263,59 +262,6 @@ def test_gravity_stabilises_tilt_of_chain():
         np.testing.assert_array_equal(done.graph.poses[0], graph.poses[0])
 
 
-def test_parts_are_solved_and_reported_separately():
-    a, _, _ = walk(20, 8)
-    b, _, _ = walk(12, 5, seed=1)
-    n, m = len(a.ids), len(a.edges)
-    both = PoseGraph(
-        np.concatenate([a.ids, 100 + b.ids, [500]]),
-        np.concatenate([a.poses, b.poses, np.eye(4)[None]]),
-        np.concatenate([a.edges, b.edges + n]),
-        np.concatenate([a.measurements, b.measurements]),
-        np.concatenate([a.information, b.information]),
-        np.concatenate([a.loop, b.loop]),
-    )
-    optimiser = LevenbergMarquardt()
-    done = optimiser.optimise(both)
-    np.testing.assert_array_equal(done.graph.poses[:n], optimiser.optimise(a).graph.poses)
-    np.testing.assert_array_equal(done.graph.poses[n:-1], optimiser.optimise(b).graph.poses)
-    assert [(p.first, p.vertices, p.edges) for p in done.parts] == [
-        (0, 20, m),
-        (100, 12, len(b.edges)),
-        (500, 1, 0),
-    ]
-    assert [p.improved for p in done.parts] == [True, True, False]
-    assert done.objective[-1] == pytest.approx(sum(p.after for p in done.parts))
-
-
-def test_optimal_input_is_unchanged():
-    graph, truth, _ = walk(10, 4)
-    i, j = graph.edges.T
-    exact = replace(graph, poses=truth, measurements=se3.inverse(truth[i]) @ truth[j])
-    best = minimise(exact, Settings(tolerance=1e-15))
-    again = minimise(best.graph, Settings(tolerance=1e-15))
-    assert not again.parts[0].improved
-    np.testing.assert_array_equal(again.graph.poses, best.graph.poses)
-    empty = LevenbergMarquardt().optimise(PoseGraph.empty())
-    assert (len(empty.graph.ids), empty.converged) == (0, True)
-
-
-def test_invalid_graphs_and_options_are_refused():
-    graph, _, _ = walk(8, 2)
-    poses = graph.poses.copy()
-    poses[2, 0, 3] = np.nan
-    with pytest.raises(InputError, match="pose 2 is not finite"):
-        LevenbergMarquardt().optimise(graph.with_poses(poses))
-    information = graph.information.copy()
-    information[3, 1, 1] *= -1
-    with pytest.raises(InputError, match="edge 3 4: the information matrix is not positive"):
-        LevenbergMarquardt().optimise(replace(graph, information=information))
-    with pytest.raises(ValueError, match="gate must be above 0"):
-        LevenbergMarquardt(gate=0.0)
-    with pytest.raises(InputError, match="names no vertex"):
-        replace(graph, gravity=Gravity(np.array([8]), np.array([[0.0, 1, 0]]), np.ones(1)))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least"), [("sphere", 63789.07892761), ("parking-garage", 0.63419240)]
@@ -327,9 +273,3 @@ def test_benchmark_graphs_match_gtsam(shared_data, name, least):
     assert done.converged
     assert done.graph.chi2() / 2 < 1.00001 * least
     assert (done.weights == 1).all()
-
-
-def test_options_match_settings():
-    part, function = LevenbergMarquardt(), Settings()
-    for name in ("robust", "gate"):
-        assert getattr(part, name) == getattr(function, name)

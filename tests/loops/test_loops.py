@@ -7,15 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from tofuse.engine import parts
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.measured_graph import Measured, build_graph
 from tofuse.engine.icp.icp import algorithm_1
-from tofuse.engine.loops.loops import Confirmation, LoopDetector, PriorLoop, mean_error
+from tofuse.engine.loops.loops import Confirmation, PriorLoop, mean_error
 from tofuse.engine.loops.nearby import Nearby, yaw
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.formats.poses.given_loops import read_loops
@@ -207,16 +205,6 @@ def test_real_registrations_distinguish_loop_from_other_place():
     assert not other.record.accepted
 
 
-def test_detector_is_configurable():
-    data = parts.to_dict(Nearby(min_gap=30))
-    assert data["part"] == "nearby"
-    parts.discover("tofuse.engine.clouds")
-    assert parts.from_dict(LoopDetector, data, where="x") == Nearby(min_gap=30)
-    for bad in ({"min_gap": 0}, {"max_distance_m": 0.0}, {"confirmation": {"min_fraction": 2.0}}):
-        with pytest.raises(InputError, match="x"):
-            parts.from_dict(LoopDetector, {"part": "nearby", **bad}, where="x")
-
-
 def test_loops_from_file(tmp_path):
     file = tmp_path / "loops.txt"
     file.write_text(
@@ -264,15 +252,3 @@ def test_invalid_line_is_named(tmp_path, line, problem):
 def test_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
         read_loops(tmp_path / "nowhere.txt")
-
-
-def test_edges_refer_to_frames_with_pose():
-    poses = np.array([np.eye(4), pose(1.0), pose(2.0)])
-    edges = [Measured(4, 7, pose(1.0), np.eye(6)), Measured(7, 9, pose(1.0), np.eye(6))]
-    graph = build_graph([4, 7, 9], poses, edges, [Measured(4, 9, pose(2.0), np.eye(6))])
-    assert graph.ids.tolist() == [4, 7, 9]
-    assert graph.edges.tolist() == [[0, 1], [1, 2], [0, 2]]
-    assert graph.chi2() == pytest.approx(0)
-    with pytest.raises(InputError, match="names frame 8, which has no pose"):
-        build_graph([4, 7, 9], poses, edges, [Measured(4, 8, pose(2.0), np.eye(6))])
-    assert len(build_graph([4], np.eye(4)[None], []).edges) == 0

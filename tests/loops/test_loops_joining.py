@@ -17,7 +17,6 @@ from tofuse.engine.loops.gaps import TrackedComponent
 from tofuse.engine.loops.join_checks import JoinChecks
 from tofuse.engine.loops.joining import Joining
 from tofuse.engine.loops.merged_components import MergedComponents
-from tofuse.engine.search.search import SearchOptions
 from tofuse.engine.search.verification import MAX_OVERLAP_DISTANCE
 from tofuse.engine.search.view_pair import follow, register_pair
 from tofuse.engine.stored_views.view_store import PosedView
@@ -412,42 +411,8 @@ def test_independent_links_raise_probability(three, min_probability) -> None:
     assert other > same
 
 
-def test_failed_tries_lower_probability(three, monkeypatch) -> None:
-    monkeypatch.setattr(JoinChecks, "confirming", lambda *_: [])
-    a, b = three[0].views, three[1].views
-    right = probable(a[-1], b[0], 0.96)
-    joiner = joining._Joiner(replace(SPARSELY, min_probability=0.9), three[:2], SearchOptions())
-    joiner.add(right)
-    assert joiner._probability(*joiner._merged.all, [right]) == pytest.approx(0.96)
-    joiner._tried |= {(a[k].index, b[k].index) for k in range(3)}  # and nothing was found
-    assert joiner._probability(*joiner._merged.all, [right]) == pytest.approx(24 / 28)
-    joiner.decide(single=True)
-    assert len(joiner.groups()) == 2
-
-
-def test_single_link_is_never_certain(three, min_probability) -> None:
-    a, b = three[0].views, three[1].views
-    assert min_probability([probable(a[-1], b[0], 1.0)]) == pytest.approx(joining._MAX_PROBABILITY)
-    assert min_probability([probable(a[-1], b[0], 1.0)], at_least=0.999) is None
-
-
 @pytest.mark.slow
 def test_first_group_is_main_on_request(elsewhere, three) -> None:
     strange = stretch(0, range(4), **STRANGE)
     groups = replace(SPARSELY, main="first").join([strange, three[1], three[2]], [])
     assert members(groups) == [[0], [1, 2]]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"searches": -1},
-        {"tries": -1},
-        {"min_probability": 1.0},
-        {"min_probability": np.nan},
-        {"main": "last"},
-    ],
-)
-def test_options_are_checked(options) -> None:
-    with pytest.raises(ValueError, match=next(iter(options))):
-        Joining(**options)

@@ -156,14 +156,6 @@ def test_falloff_of_infrared_images_is_estimated(forward, exponent):
     assert np.nanstd(alone.albedo[..., 0] - expected.albedo[..., 0]) < 0.02
 
 
-def test_infrared_image_alone_is_assumed_raw(forward):
-    raw = infrared(forward[:1], 2.0)[0]
-    assert isinstance(raw, RangeFrame)
-    alone = prepare_view(raw, SurfaceOptions(falloff=0.0))
-    expected = prepare_view(raw, SurfaceOptions(falloff=0.0, range_falloff=2.0))
-    np.testing.assert_array_equal(alone.albedo, expected.albedo)
-
-
 def test_colour_falloff_is_compensated(forward):
     lit, ambient = colored(forward[:1], 4.4)[0], colored(forward[:1], 0.0)[0]
     view = prepare_view(lit, SurfaceOptions(range_falloff=2.0))

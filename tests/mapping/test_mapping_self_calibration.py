@@ -10,7 +10,7 @@ import pytest
 
 from boxes_in_room import views_in_room
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import changed, from_method
@@ -59,12 +59,6 @@ def test_corrected_points_are_correct(camera, kind, distortion) -> None:
     np.testing.assert_allclose(after.points, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_lens_distortion_is_kept() -> None:
-    lens = BrownConrady(8, 6, 10.0, 11.0, 3.5, 2.5, k1=-0.1)
-    true = CameraErrors(focal=0.25).camera(lens)
-    assert true == replace(lens, fx=8.0, fy=8.8)
-
-
 def test_errors_are_composed() -> None:
     first = CameraErrors(0.1, 0.02, 0.01, focal_sigma=0.004, center_x_sigma=0.002)
     second = CameraErrors(0.1, 0.01, 0.0, -0.02, 0.0, focal_sigma=0.003, offset_sigma_m=0.005)
@@ -87,17 +81,6 @@ def test_errors_are_composed() -> None:
     again = second.camera(first.camera(CAMERA))
     for name in ("fx", "fy", "cx", "cy"):
         assert getattr(camera, name) == pytest.approx(getattr(again, name))
-
-
-def test_clouds_are_unchanged() -> None:
-    cloud = CloudFrame.of(np.ones((5, 3)))
-    assert CameraErrors(0.1, 0.1).start().apply(cloud) is cloud
-
-
-@pytest.mark.parametrize("wrong", [{"focal": 0.6}, {"offset_m": -2.0}, {"focal": np.nan}])
-def test_implausible_errors_are_refused(wrong) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        CameraErrors(**wrong)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import pytest
 import tofuse
 from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.frames.recording import Recording
-from tofuse.engine.mapping.adaptation import adapted, with_recording_defaults
+from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config, from_method
 from tofuse.engine.mapping.trial import Trial, trial
 from tofuse.engine.progress import Silent
@@ -151,24 +151,3 @@ def test_single_run_of_bad_poses_does_not_decide() -> None:
     strengths = np.array([0.2, 0.3, 0.25, 0.35, 0.2, 0.3, 0.25, -0.4])
     predicted = np.array([*[1.0] * 7, 12.0])
     assert Trial(tuple(strengths * predicted), tuple(predicted)).is_significant
-
-
-def test_views_without_amplitude_are_not_tried(straight: Recording) -> None:
-    source = straight.source
-
-    class Dark:
-        metadata = source.metadata
-        timestamps = source.timestamps
-
-        def __len__(self) -> int:
-            return len(source)
-
-        def read(self, index: int) -> Frame:
-            assert index == 0, "one frame tells that there is nothing to compensate"
-            frame = source.read(index)
-            assert isinstance(frame, RangeFrame)
-            return replace(frame, amplitude_image=None)
-
-    known = with_recording_defaults(from_method("default"), straight)
-    config = adapted(known, replace(straight, source=Dark()), 1)
-    assert multipath_of(config) == Multipath(trial=False)

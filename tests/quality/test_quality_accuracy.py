@@ -68,15 +68,6 @@ def test_coverage_of_error_bounds(loops, monkeypatch) -> None:
     assert bound.unbounded == ()
 
 
-def test_uncertainty_is_largest_at_ends_without_loops() -> None:
-    a = accuracy_of(GraphCovariances(walk(loops=())), ObservedErrors(), 1.0)
-    assert a.worst is not None
-    assert a.worst.frame in (0, N - 1)
-    assert (
-        a.position_m > 1.5 * accuracy_of(GraphCovariances(walk()), ObservedErrors(), 1.0).position_m
-    )
-
-
 def test_errors_shown_by_recording_are_added() -> None:
     plain = accuracy_of(GraphCovariances(walk()), ObservedErrors(), 1.0)
     more = accuracy_of(GraphCovariances(walk()), ObservedErrors(0.03, 0.02, 0.04), 1.0)
@@ -111,20 +102,6 @@ def test_split_half_errors_replace_too_small_covariance() -> None:
     ]
     assert np.trace(C[1][:3, :3]) > np.trace(C[0][:3, :3]) + stated**2
     np.testing.assert_array_equal(C[1][3:, 3:], C[0][3:, 3:])
-
-
-def test_larger_of_refinement_and_split_half_errors_counts() -> None:
-    """Both stand for errors that pairs of views share."""
-    moved = accuracy_of(GraphCovariances(walk()), ObservedErrors(moved_m=0.5), 1.0)
-    assert (
-        accuracy_of(GraphCovariances(walk()), ObservedErrors(moved_m=0.5, split_m=0.1), 1.0)
-        == moved
-    )
-    split = accuracy_of(GraphCovariances(walk()), ObservedErrors(split_m=0.5), 1.0)
-    assert (
-        accuracy_of(GraphCovariances(walk()), ObservedErrors(moved_m=0.1, split_m=0.5), 1.0)
-        == split
-    )
 
 
 @pytest.mark.parametrize("direction", [X, TURN])

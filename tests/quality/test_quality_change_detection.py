@@ -78,10 +78,6 @@ def test_occluded_regions_give_no_changes(earlier) -> None:
     assert compared(earlier, boxes=(*BOXES, ((0.1, 0.95, 1.65), (0.08, 0.1, 0.05), 0.0))) == []
 
 
-def test_no_views_give_no_changes(earlier) -> None:
-    assert changes([], np.zeros((0, 4, 4)), earlier, np.array(FIRST)) == []
-
-
 def test_changes_are_independent_of_threads(earlier) -> None:
     moved = with_moved(CHAIR, (0.25, 0.0, 0.0))
     found = []

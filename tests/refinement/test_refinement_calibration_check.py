@@ -14,11 +14,10 @@ from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
     check_calibration,
-    proposal,
     significance_of,
 )
 from tofuse.engine.refinement.camera_response import response
-from tofuse.engine.refinement.joint_alignment import Refined, align_pairs, refine
+from tofuse.engine.refinement.joint_alignment import Refined, refine
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, longest_loop
 from tofuse.engine.refinement.pose_priors import Priors
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
@@ -162,32 +161,6 @@ def test_unclosed_gap_contradicts_errors() -> None:
     assert not Gap(0, 9, (0.009, 0.008), (0.009, 0.008), 1.5, changed).contradicts  # no gap
 
 
-@pytest.mark.slow
-def test_error_that_only_closes_a_loop_is_rejected(monkeypatch):
-    """Drift of odometry leaves a gap, too: views of a correct camera do not keep the error."""
-    truth = path(24)[:8]
-    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
-    refined = refine(views, truth, OPTIONS)
-    drift = np.zeros(kernels.ERRORS)
-    drift[kernels.FOCAL] = -0.06
-
-    def drifting(views, pairs, T_i_j, options, errors):
-        # The last one closes the loop. It is measured by views that hardly differ, so an error of
-        # the camera does not matter there.
-        right = align_pairs(views, pairs, T_i_j, options, np.zeros_like(errors))
-        drifted = align_pairs(views, pairs, T_i_j, options, errors - drift)
-        return np.concatenate([drifted[:-1], right[-1:]])
-
-    monkeypatch.setattr("tofuse.engine.refinement.loop_drift.align_pairs", drifting)
-    assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm
-    monkeypatch.setattr(Loop, "error_by_views", lambda *args: -0.5 * args[-1])
-    assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm  # the opposite one
-    monkeypatch.setattr(Loop, "error_by_views", lambda *args: args[-1])
-    found = check_calibration(views, refined, OPTIONS, Priors.none())
-    assert found.alarm
-    assert found.best == "focal"
-
-
 @pytest.mark.parametrize("true", [0.0, 0.06])
 def test_views_keep_only_true_error_of_loop(true):
     views, refined = kept(true)
@@ -238,15 +211,3 @@ def test_kinect_loop_raises_alarm(shared_data):
     assert calibrated.calibrated is not None
     assert calibrated.calibrated.focal == pytest.approx(-0.05, abs=0.015)
     assert calibrated.accuracy.position_m < 0.1 * result.diagnostics.accuracy.position_m
-
-
-def test_proposal_names_two_alternatives_or_the_best() -> None:
-    errors = {"focal": -0.05, "distortion": -0.02}
-    assert proposal(errors, "focal") == (
-        "a focal length 5.3% larger or 2.0% more pincushion distortion at 45 degrees"
-    )
-    errors |= {"center_y": 0.03}
-    assert proposal(errors, "center_y") == (
-        "a principal point 3.0% of the focal length further up (or other calibration errors with a "
-        "similar effect)"
-    )

@@ -253,15 +253,3 @@ def test_bound_of_single_recordings_varies_with_first_view():
     # Two views: half the distance of the second one.
     C = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
     assert mean_distances(C).mean() == pytest.approx(np.sqrt(8 / np.pi) / 2, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("cls", "options"),
-    [
-        (Planes, {"points": 10}),
-        (Planes, {"max_views": 1}),
-    ],
-)
-def test_options_are_checked(cls, options):
-    with pytest.raises(ValueError, match=next(iter(options))):
-        cls(**options)

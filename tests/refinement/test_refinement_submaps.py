@@ -16,11 +16,9 @@ from tofuse.engine.refinement.refinement import Joint
 from tofuse.engine.refinement.submaps import partition, submaps
 from tofuse.engine.stored_views import view_store as of_views
 from tofuse.engine.stored_views.view_store import (
-    SampledView,
     Spacing,
     ViewStore,
     candidate_pairs,
-    overlaps,
 )
 from tofuse.engine.views.view_descriptors import (
     mutual_dissimilarity,
@@ -137,18 +135,6 @@ def test_views_of_nearby_places_are_compared(monkeypatch) -> None:
     assert set(b.tolist()) == {399}
     assert {(0, 399), (398, 399), (394, 399)} <= set(zip(a.tolist(), b.tolist(), strict=True))
     assert len(candidate_pairs(middles[:50])[0]) == 50 * 49 // 2
-
-
-def test_nearest_views_are_overlapping_views(swing, monkeypatch) -> None:
-    views, truth = swing
-    kept = [SampledView.of(view, 600) for view in views]
-    every, shares = overlaps(kept, truth, 0.6)
-    for name, number in (("_MAX_EXHAUSTIVE", 10), ("_NEAREST", 20), ("_PREVIOUS", 5)):
-        monkeypatch.setattr(of_views, name, number)
-    some, of_some = overlaps(kept, truth, 0.6)
-    known = {(int(i), int(j)): s for (i, j), s in zip(every, shares, strict=True)}
-    assert all(known[int(i), int(j)] == s for (i, j), s in zip(some, of_some, strict=True))
-    assert len(some) > 0.6 * len(every)
 
 
 @pytest.mark.slow

@@ -12,14 +12,10 @@ from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
 from tofuse.engine.search.floor import find_floor, find_floors
-from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, agreement
+from tofuse.engine.search.pair_agreement import AgreementOptions, agreement
 from tofuse.engine.search.search import (
-    DISTINCT_M,
-    Candidate,
     Search,
     SearchOptions,
-    _distinct,
-    are_distinct_poses,
 )
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.views.prepared_view import prepare_view
@@ -252,13 +248,6 @@ def test_agreement_matches_loop_over_pixels(pair):
 # Agreement of two images
 
 
-def test_images_agree_on_true_pose(pair):
-    found = agreement(*pair, TRUE)
-    assert found.support > 0.9 * found.overlap > 0.4
-    assert found.violation < 0.005
-    assert found.rms_m < 0.01
-
-
 @pytest.mark.parametrize("aside", [0.15, -0.15])
 def test_wrong_pose_violates_free_space(pair, aside):
     """Too near, source points are in front of the target's surfaces; too far, vice versa."""
@@ -316,22 +305,6 @@ def test_lowest_plane_has_most_points_and_few_below():
         on = ((np.abs(r) < band[:, None]) & (n @ n[tried].T > cosine)).sum(0)
         on[(r > 3 * band[:, None]).sum(0) > most] = 0
         assert kernels.lowest_plane(p, n, band, tried, cosine, most, 3.0) == tried[on.argmax()]
-
-
-def test_best_of_distinct_poses_are_kept():
-    rng = np.random.default_rng(1)
-    found = Agreement(1.0, 1.0, 0.0, 0.0, 0.0, 1, 0.0)
-    poses = [se3.exp(rng.normal(size=6) * ([0.07] * 3 + [0.06] * 3)) for _ in range(60)]
-    found = [
-        Candidate(T, replace(found, score=s)) for T, s in zip(poses, rng.random(60), strict=True)
-    ]
-    kept = []
-    for one in sorted(found, key=lambda c: -c.score):
-        if all(are_distinct_poses(one.T_target_source, c.T_target_source) for c in kept):
-            kept.append(one)
-    assert 3 < len(kept) < 50
-    assert _distinct(found, DISTINCT_M) == tuple(kept)
-    assert _distinct([], DISTINCT_M) == ()
 
 
 def test_no_floor_is_found_in_view_of_wall():
@@ -460,15 +433,6 @@ def test_tracker_connects_view_after_large_step_by_search():
     metres, degrees = error(found, TRUE)
     assert metres < 0.02
     assert degrees < 0.5
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"mode": "none"}, {"reach": -1.0}, {"full_candidates": 0}, {"turn": 4.0}],
-)
-def test_options_out_of_range_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        SearchOptions(**wrong)
 
 
 def test_recorded_views_are_found_without_guess(shared_data):

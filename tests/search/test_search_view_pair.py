@@ -15,7 +15,6 @@ from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.icp.coarse_to_fine import CoarseToFine
 from tofuse.engine.search.pair_agreement import Agreement, agreement
 from tofuse.engine.search.pose_probability import ACCEPTED, PoseEvidence
 from tofuse.engine.search.verification import FitStatistics
@@ -232,27 +231,6 @@ def test_constant_depths_are_rejected(pair):
         assert found.reason
 
 
-def test_invalid_guess_is_refused(pair):
-    for guess in (np.zeros((4, 4)), np.eye(3), np.full((4, 4), np.nan)):
-        with pytest.raises(tofuse.InputError, match="guess"):
-            tofuse.register(*pair, guess=guess)
-
-
-def test_few_pixels_are_registered_but_rejected(pair):
-    depth = np.where(np.arange(pair[0].depth.size) % 97 == 0, pair[0].depth.ravel(), 0)
-    sparse = replace(pair[0], depth=depth.reshape(pair[0].depth.shape))
-    found = tofuse.register(sparse, pair[1], guess=TRUE)
-    assert found.believed is False
-    assert "1 direction is degenerate" in found.reason
-
-
-def test_other_methods_state_no_acceptance(pair):
-    found = tofuse.register(*pair, guess=TRUE, method=CoarseToFine())
-    assert found.believed is None
-    assert found.probability is None
-    assert found.reason == ""
-
-
 def agreement_of(support, contradiction, overlap=0.6):
     return Agreement(overlap, support, contradiction * overlap, 0.0, 0.01, 1000, support)
 
@@ -279,13 +257,6 @@ def test_probability_follows_evidence():
         PoseEvidence.of(agreement_of(0.9, 0.1)).probability
         < PoseEvidence.of(agreement_of(0.9, 0.0)).probability
     )
-
-
-def test_reason_names_contrary_evidence():
-    words = PoseEvidence.of(agreement_of(0.1, 0.2), 0.01, 2).rejection_reason()
-    for part in ("only 10% of the points", "another pose", "20% of the overlap", "2 directions"):
-        assert part in words
-    assert PoseEvidence.of(agreement_of(0.6, 0.0), 0.3).rejection_reason() == ""
 
 
 def test_usual_fit_of_camera_decides_acceptance(pair):
@@ -340,13 +311,6 @@ def test_largest_overlap_along_wall_is_no_evidence():
     found = register_pair(views[1], views[0])
     assert found.probability < PROBABLE
     assert "degenerate" in found.reason
-
-
-def test_prepared_views_of_different_scale_are_not_compared(pair):
-    small = surface(replace(pair[0], depth=pair[0].depth * np.float32(0.1)))
-    target = surface(pair[1])
-    assert register_pair(small, target) is None
-    assert follow(small, target, np.eye(4)) is None
 
 
 def test_consistent_search_and_alignment_stand_alone(pair):

@@ -133,32 +133,6 @@ def test_known_errors_are_corrected_as_if_they_were_unknowns(pair, kind, error):
     assert np.abs(found[:6]).max() < 0.2 * np.abs(effect[:6]).max()
 
 
-@pytest.mark.parametrize("kind", ["z", "range"])
-def test_few_points_with_known_errors_have_finite_equations(pair, kind):
-    source, target, T = pair
-    points = points_of(prepare_view(source, SHARP), 1)[::97]
-    surface = prepare_view(as_measured(target, kind), SHARP)
-    row, _ = pair_equations(points, surface, T, SETTINGS, np.full(kernels.ERRORS, 0.01))
-    assert 0 < row[kernels.COMPARED] <= len(points) < 128
-    assert np.isfinite(row).all()
-
-
-def test_points_behind_target_are_not_compared_with_known_errors(pair):
-    source, target, T = pair
-    errors = np.zeros(kernels.ERRORS)
-    errors[kernels.OFFSET] = 0.1
-    behind = T @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
-    assert evaluate(source, target, behind, errors)[kernels.COMPARED] == 0
-
-
-def test_fixed_unknowns_have_no_equations(pair):
-    source, target, T = pair
-    H, g = unpack(evaluate(source, target, T))
-    assert not H[7:].any()
-    assert not g[7:].any()
-    assert np.linalg.eigvalsh(H[:7, :7]).min() > 0
-
-
 def test_free_space_and_support_are_counted(pair):
     source, target, T = pair
     agree = evaluate(source, target, T)

@@ -19,7 +19,6 @@ from tofuse.engine.tracking import moving_object_kernels as kernels
 from tofuse.engine.tracking.moving_objects import (
     Moving,
     MovingObjects,
-    _robust_scale,
     without_pixels,
 )
 from tofuse.engine.views.prepared_view import prepare_view
@@ -335,15 +334,6 @@ def test_masked_pixels_keep_free_space_but_no_surface(room):
     assert agreement(rest, other, T).violation <= agreement(view, other, T).violation + 0.01
     with pytest.raises(ValueError, match="the mask is"):
         without_pixels(view, mask[1:])
-
-
-def test_robust_scale_ignores_outliers():
-    rng = np.random.default_rng(0)
-    ratios = np.abs(rng.normal(0, 1.7, 4000))
-    assert _robust_scale(ratios.astype(np.float32)) == pytest.approx(1.7, rel=0.05)
-    ratios[:1600] += rng.uniform(10, 300, 1600)
-    assert _robust_scale(ratios.astype(np.float32)) == pytest.approx(1.7, rel=0.1)
-    assert _robust_scale(np.zeros(3, np.float32)) == 1
 
 
 def pair(seed=3):

@@ -66,15 +66,6 @@ def test_motions_are_chained_by_equations_3_1_and_3_2():
         np.testing.assert_array_equal(step.registration.T_target_source, new)
 
 
-def test_identity_guess():
-    registrar = Scripted(list(MOTIONS))
-    tracker = Sequential(registrar, "identity").start(0)
-    for k in range(5):
-        tracker.push(cloud(k))
-    for _, _, guess, _ in registrar.asked:
-        np.testing.assert_array_equal(guess, np.eye(4))
-
-
 def test_previous_guess_is_last_motion_even_across_lost_frame():
     lost = RegistrationError("too bad")
     registrar = Scripted([MOTIONS[0], MOTIONS[1], lost, found(MOTIONS[2], 0.0), MOTIONS[3]])

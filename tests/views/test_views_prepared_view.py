@@ -159,13 +159,6 @@ def test_albedo_is_independent_of_range_and_incidence(amplitude):
     assert np.nanmax(level) - np.nanmin(level) < 0.02
 
 
-def test_view_without_amplitude_has_no_albedo():
-    view = prepare_view(wall(amplitude=None), OPTIONS)
-    assert not view.has_albedo
-    assert np.isnan(view.albedo).all()
-    assert view.planar_fraction > 0.9
-
-
 def test_saturated_pixels_have_no_albedo():
     frame = wall()
     light = frame.amplitude_image.copy()
@@ -460,24 +453,6 @@ def test_shared_error_is_downsampled_with_image() -> None:
     np.testing.assert_allclose(added[seen], wanted[seen], rtol=0.15)
 
 
-def test_subsampled_view_is_cached():
-    view = prepare_view(wall(sigma=0.01), OPTIONS)
-    thin = view.subsampled(50)
-    assert thin is view.subsampled(44)
-    assert view.subsampled(88) is view
-    np.testing.assert_array_equal(thin.z, view.z[1::2, 1::2])
-
-
-def test_views_without_amplitude_share_one_albedo_image():
-    dark = [prepare_view(replace(wall(), amplitude_image=None), OPTIONS) for _ in range(2)]
-    assert dark[0].albedo is dark[1].albedo
-    assert dark[0].subsampled(50).albedo is dark[1].subsampled(50).albedo
-    assert not dark[0].has_albedo
-    assert np.isnan(dark[0].albedo).all()
-    assert np.isnan(dark[0].subsampled(50).albedo).all()
-    assert prepare_view(wall(), OPTIONS).albedo is not dark[0].albedo
-
-
 def test_planes_are_extended_to_edges_but_not_to_flying_pixels():
     """A slanted wall with a bar in front, whose left border has flying pixels."""
     frame = wall(sigma=0.004, seed=5)
@@ -501,14 +476,3 @@ def test_planes_are_extended_to_edges_but_not_to_flying_pixels():
     sigma = np.sqrt(more.plane_variance[6:-6][new]) * truth[6:-6][new] ** 2
     assert 0.5 < np.std(off / sigma) < 1.6
     assert np.median(sigma) > 1.2 * np.median(np.sqrt(view.plane_variance[before.nonzero()]) * 4)
-
-
-def test_windows_are_smaller_in_coarse_images():
-    fine, coarse = OPTIONS.for_image(0.005), OPTIONS.for_image(0.02)
-    assert fine == OPTIONS
-    assert coarse.radii == (1, 2)
-
-
-def test_windows_are_small_where_few_pixels_determine_a_slope():
-    assert OPTIONS.for_image(0.005, noise=0.002).radii == OPTIONS.radii
-    assert OPTIONS.for_image(0.01, noise=0.002).radii == OPTIONS.fine_scale.radii

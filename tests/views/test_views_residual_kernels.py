@@ -225,21 +225,6 @@ def test_points_with_deviating_normals_are_no_inliers():
     assert sums[kernels.INLIERS] == 30
 
 
-def test_outliers_have_no_weight():
-    view, of = list(source()), target()
-    before = accumulate(view, of, stop=40)
-    view[0][40:, 2] *= 1.5
-    after = accumulate(view, of)
-    np.testing.assert_array_equal(before[: kernels.PROJECTED], after[: kernels.PROJECTED])
-
-
-def test_partial_block_adds_only_its_points():
-    view, of = source(), target()
-    sums = accumulate(view, of, T=np.eye(4), stop=7)
-    assert np.isfinite(sums).all()
-    assert sums[kernels.COUNT_P] > 0
-
-
 def test_sums_are_additive():
     view, of = source(), target()
     whole = accumulate(view, of)
