@@ -13,7 +13,6 @@ from tofuse.engine.alignment.uncertainty import (
     covariance,
     covariance_of_patches,
     patches,
-    with_prior,
 )
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
@@ -123,19 +122,6 @@ def test_degenerate_directions_of_wall_have_prior_uncertainty():
     assert (np.linalg.eigvalsh(C) > 0).all()
 
 
-def test_covariance_is_independent_of_threads():
-    from tofuse.engine.compute.thread_pool import threads
-
-    T = se3.exp([0.01, 0, 0.01, 0, 0.01, 0])
-    target, source = _view(0, CORNER), _view(1, CORNER, T)
-    found = []
-    for count in (1, 2):
-        with threads(count):
-            targets, aligned = _aligned(source, target, T)
-            found.append(covariance(source, targets, aligned, GEOMETRY_ONLY))
-    assert found[0].tobytes() == found[1].tobytes()
-
-
 def _made_patches(means, weights, change=0.0):
     rng = np.random.default_rng(3)
     n = len(means)
@@ -184,14 +170,6 @@ def test_less_information_never_reduces_sigma(information):
     sigma = _sigmas(covariance_of_patches(found, options))
     assert 0.9 * options.max_sigma < sigma[2] < 1.1 * options.max_sigma
     np.testing.assert_allclose(sigma[[0, 1, 3, 4, 5]], 0.1, rtol=1e-3)
-
-
-def test_prior_applies_to_unobservable_directions_only():
-    C = np.diag([1e-6] * 3 + [1e-7] * 3)
-    directions = np.eye(6)[[0]]
-    out = with_prior(C, directions, np.full(6, 0.3))
-    np.testing.assert_allclose(out[0, 0], 0.09)
-    np.testing.assert_allclose(out[1:, 1:], C[1:, 1:], atol=1e-18)
 
 
 def test_uncertainty_is_bounded_by_prediction():

@@ -8,21 +8,16 @@ import pytest
 import tofuse
 from registration_scenes import (
     box_walls,
-    bumpy_ball,
     error,
     relief,
-    relief_image,
     rng,
     stone,
     turn,
     view,
 )
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
-from tofuse.engine.icp.coarse_to_fine import CoarseToFine
 from tofuse.engine.icp.reduce import averaged
 from tofuse.engine.icp.remapping import Remapping
-from tofuse.engine.icp.surface_metrics import PointToPlane
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.lab.methods.variants import Tricp
 
@@ -57,13 +52,6 @@ def test_half_of_each_view_may_be_outside_overlap():
         assert error(found, T)[0] < 0.005
         assert error(found, T)[1] < 0.5
         assert 0.4 < found.inlier_ratio < 0.65
-
-
-def test_images_of_camera_are_registered():
-    T = se3.exp([0.05, -0.04, 0.06, 0.05, -0.04, 0.06])
-    found = tofuse.register(relief_image(T, 1, 0.003), relief_image(np.eye(4), 0, 0.003))
-    assert error(found, T)[0] < 0.002
-    assert error(found, T)[1] < 0.1
 
 
 @pytest.mark.slow
@@ -160,16 +148,6 @@ def test_other_method_may_be_given():
     assert found.T_target_source.tobytes() != other.T_target_source.tobytes()
 
 
-def test_result_is_independent_of_threads():
-    target, source = bumpy_ball(12000, 0, 0.002), bumpy_ball(12000, 1, 0.002)
-    results = []
-    for count in (1, 2, 5):
-        with threads(count):
-            results.append(tofuse.register(source, target))
-    assert len({r.T_target_source.tobytes() for r in results}) == 1
-    assert len({r.information.tobytes() for r in results}) == 1
-
-
 def test_averaged_is_mean_of_each_cube():
     points = rng(2).uniform(-1, 1, (1000, 3))
     reduced = averaged(view(points), 0.5)
@@ -238,15 +216,3 @@ def test_non_finite_points_are_dropped():
     source[::7] = np.nan
     target[5] = np.inf
     assert error(tofuse.register(source, target), T)[0] < 0.003
-
-
-def test_finest_level_depends_on_noise():
-    plane = rng(0).uniform(-1, 1, (20000, 3)) * [1, 1, 0] + np.array([0, 0, 2])
-    sizes = []
-    for noise in (0.0, 0.02):
-        noisy = plane + rng(1).normal(0, noise, plane.shape) * [0, 0, 1]
-        sizes.append(CoarseToFine().finest(view(noisy), view(noisy), 0.01)[0])
-    assert sizes[1] > 2 * sizes[0]
-    given = CoarseToFine(resolution=0.1, metric=PointToPlane())
-    found = given.register(view(plane), view(plane), np.eye(4), rng(2))
-    assert found.points == len(averaged(view(plane), 0.1))

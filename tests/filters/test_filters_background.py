@@ -16,7 +16,6 @@ import pytest
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.background import Background
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.parts import to_dict
 from tofuse.engine.sensor.scattering_correction import LensScattering
 from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.simulation.effects import Effects
@@ -89,31 +88,6 @@ def test_moving_camera_is_rejected() -> None:
     frames = [rendered.frame for rendered in made.frames(None)]
     with pytest.raises(InputError, match="leave it out if the camera moves"):
         Background().fit(frames)
-
-
-def test_filter_needs_fit_and_keeps_options() -> None:
-    filter_ = Background(sigmas=5.0)
-    case = shown("box")
-    with pytest.raises(InputError, match="is not fitted"):
-        filter_.mask(case.frames[0], ())
-    found = filter_.fit(case.frames)
-    assert filter_.needs_fit
-    assert not found.needs_fit
-    assert (
-        to_dict(found)
-        == to_dict(filter_)
-        == {"part": "background", "sigmas": 5.0, "fraction": 0.02}
-    )
-    small = case.frames[0]
-    small = replace(
-        small,
-        camera=replace(small.camera, width=20, height=10),
-        depth=small.depth[:10, :20],
-        amplitude_image=None,
-        confidence_image=None,
-    )
-    with pytest.raises(InputError, match="20 x 10"):
-        found.mask(small, ())
 
 
 @pytest.mark.slow

@@ -117,16 +117,6 @@ def test_neighbour_fraction_removes_most_distant() -> None:
     assert NeighbourFraction(0.29).mask(CloudFrame.of(cloud_of(1, 100)), ()).sum() == 71
 
 
-def test_image_masks_follow_pixels() -> None:
-    z = np.full((12, 12), 1.0)
-    z[0, :] = 0
-    z[6, 6] = 2.0
-    keep = NeighbourFraction(0.01, 3).mask(frame(z), ())
-    assert keep.shape == (12, 12)
-    assert not keep[6, 6]
-    assert keep[1:].sum() == 11 * 12 - 1
-
-
 def test_neighbour_fraction_breaks_ties_by_order() -> None:
     # On a regular grid all inner points have the same distance.
     x, y = np.meshgrid(np.arange(8.0), np.arange(8.0))

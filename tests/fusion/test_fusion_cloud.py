@@ -94,13 +94,6 @@ def test_cloud_is_independent_of_threads() -> None:
     assert len(set(found)) == 1
 
 
-def test_points_of_few_views_are_removed() -> None:
-    both, once = [0.05, 0.05, 1.05], [0.55, 0.05, 1.05]
-    views = [view([both, once]), view([both], 1)]
-    np.testing.assert_allclose(fuse(views, min_views=2).points, [both], atol=1e-6)
-    assert len(fuse(views, min_views=3)) == 0
-
-
 def test_no_points_give_empty_cloud() -> None:
     for found in (fuse([]), fuse([view(np.zeros((0, 3)))])):
         assert len(found) == 0
@@ -173,19 +166,3 @@ def test_voxel_size_follows_point_spacing() -> None:
     assert choose_voxel(view(square / 1000)) == 0.002
     assert choose_voxel(view(square * 1000)) == 0.1
     assert choose_voxel(view(np.zeros((0, 3)))) > 0
-
-
-def test_thinning_keeps_channels_aligned() -> None:
-    n = 1003
-    item = view(
-        np.arange(3 * n).reshape(n, 3),
-        7,
-        amplitude=np.arange(n, dtype=np.float32),
-        color=np.arange(3 * n).reshape(n, 3).astype(np.uint8),
-    )
-    thin = as_cloud(item, 100)
-    assert 50 <= len(thin) <= 100
-    assert thin.index == 7
-    np.testing.assert_array_equal(thin.points[:, 0], 3 * thin.amplitude)
-    np.testing.assert_array_equal(thin.points.astype(np.uint8), thin.color)
-    assert len(as_cloud(item, 5000)) == n

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -124,25 +121,6 @@ def test_groups_match_library_triangles() -> None:
     a, b, c = group[whole.faces].T
     found = group[whole.faces][(a != b) & (b != c) & (c != a)]
     np.testing.assert_allclose(places[found], moved[left] * unit + middle, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_result_is_same_in_another_process() -> None:
-    code = (
-        "import hashlib, sys; sys.path.insert(0, sys.argv[1])\n"
-        "from test_fusion_decimation import digest, hills\n"
-        "print(digest(hills().decimated(700)))"
-    )
-    folder = __file__.rpartition("test_fusion_decimation")[0]
-    done = subprocess.run(
-        [sys.executable, "-c", code, folder], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == digest(hills().decimated(700))
-
-
-def digest(mesh: Mesh) -> str:
-    parts = (mesh.vertices, mesh.faces, mesh.normals, mesh.color, mesh.sigma, mesh.views)
-    return hashlib.sha256(b"".join(each.tobytes() for each in parts)).hexdigest()
 
 
 def test_small_and_empty_meshes_are_unchanged() -> None:

@@ -49,17 +49,6 @@ def test_variance_matches_monte_carlo() -> None:
         assert _variance(points, C)[k] == pytest.approx((moved**2).sum(1).mean() / 3, rel=0.05)
 
 
-@pytest.mark.parametrize("offset", [(0.0, 0, 0), (10.0, -5, 2)])
-def test_pose_errors_add_to_noise(offset) -> None:
-    points = wall().points
-    T = np.eye(4)
-    T[:3, 3] = offset
-    found = with_pose_errors(
-        model_of(points, offset), [wall()], T[None], covariance(0.02)[None]
-    ).cloud.sigma
-    np.testing.assert_allclose(found, np.hypot(SIGMA, 0.02), rtol=1e-4)
-
-
 def test_most_accurate_view_determines_sigma() -> None:
     poses = np.stack([np.eye(4), np.eye(4)])
     both = np.stack([covariance(0.05), covariance(0.01)])

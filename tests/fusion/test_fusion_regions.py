@@ -73,16 +73,6 @@ def test_round_robin_colours_and_two_cameras_make_no_seam() -> None:
         )
 
 
-def test_memory_limit_keeps_voxel_size(room) -> None:
-    views, poses = room
-    layout = Layout.of(views, poses, 0.03)
-    assert layout.voxel_m == 0.03
-    for region in layout.regions(1_000_000 // layout.block_bytes):
-        volume = Volume.of(layout, region)
-        arrays = (volume.distance, volume.weight, volume.seen, volume.color, volume.free)
-        assert sum(a.nbytes for a in arrays) <= 1e6
-
-
 def test_each_block_has_one_region_with_its_neighbours(room) -> None:
     views, poses = room
     layout = Layout.of(views, poses, 0.03)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ball_views import CAMERA, EYE, around_a_ball, frame_of, look, plane_range, sphere_range
-from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.spill import Spill
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion import layout
@@ -25,7 +25,7 @@ from tofuse.engine.fusion.block_kernels import (
 from tofuse.engine.fusion.model import ModelBuilder
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import DECODED, RangeView, with_camera_correction
-from tofuse.engine.fusion.tsdf import fitting_voxel, fuse_surface
+from tofuse.engine.fusion.tsdf import fuse_surface
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.refinement import without_errors
 from tofuse.engine.views.prepared_view import prepare_view
@@ -230,21 +230,6 @@ def test_surfaces_end_at_depth_jumps() -> None:
     assert (np.minimum(np.abs(z - 1), np.abs(z - 2)) < 0.01).all()
 
 
-def test_weights_follow_noise_and_incidence() -> None:
-    straight = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
-    slanted = plane_range(EYE, np.array([np.sin(1.0), 0, np.cos(1.0)]), 2 * np.cos(1.0))
-    centre = (36, 43)
-    quiet = RangeView.of(frame_of(straight, sigma=0.005))
-    loud = RangeView.of(frame_of(straight, sigma=0.02))
-    assert 2 < pixels_of(quiet)[centre][4] / pixels_of(loud)[centre][4] < 16
-    tilted = RangeView.of(frame_of(slanted, sigma=0.005))
-    cut = pixels_of(tilted)[centre][4] / pixels_of(quiet)[centre][4]
-    assert cut == pytest.approx(np.cos(1.0) ** -2, rel=0.15)
-    np.testing.assert_allclose(
-        pixels_of(tilted)[centre][:3], [np.sin(1.0), 0, np.cos(1.0)], atol=0.02
-    )
-
-
 @pytest.mark.parametrize("sigma", [0.002, 0.01, 0.03])
 def test_weights_reflect_residual_noise(sigma) -> None:
     straight = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
@@ -260,29 +245,6 @@ def test_weights_reflect_residual_noise(sigma) -> None:
     ratio = off[fitted].std() / np.median(stated[fitted])
     assert 0.2 < ratio < 1.6  # possible relief counts as uncertainty, but not as noise
     assert off[fitted].std() < sigma
-
-
-def test_islands_are_removed_and_large_pieces_kept() -> None:
-    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
-    ranges[28:40, 28:40] = 1.0 * ray_lengths(CAMERA)[28:40, 28:40]
-    view = RangeView.of(frame_of(ranges))
-    both = fuse_surface([view], EYE[None], Fusion(voxel_m=0.02, island=0))
-    assert (both.vertices[:, 2] < 1.2).any()
-    large = fuse_surface([view], EYE[None], Fusion(voxel_m=0.02, island=200))
-    assert (large.vertices[:, 2] > 1.9).all()
-    assert len(large) > 1000
-    assert large.faces.max() == len(large) - 1
-
-
-def test_colour_is_mean_of_views() -> None:
-    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
-    red = np.zeros((72, 88, 3), np.uint8)
-    red[..., 0] = 200
-    blue = red[..., ::-1].copy()
-    views = [RangeView.of(frame_of(ranges, k, color_image=c)) for k, c in enumerate((red, blue))]
-    mesh = fuse_surface(views, np.stack([EYE, EYE]), Fusion(voxel_m=0.03))
-    np.testing.assert_array_equal(np.unique(mesh.color, axis=0), [[100, 0, 100]])
-    assert (mesh.views == 2).all()
 
 
 def test_views_without_colour_do_not_darken() -> None:
@@ -307,30 +269,6 @@ def test_albedo_is_grey_and_does_not_fall_with_range() -> None:
     near, far = mesh.vertices[:, 2] < 1.5, mesh.vertices[:, 2] > 1.5
     assert np.median(mesh.color[near]) == np.median(mesh.color[far])
     assert mesh.color.min() < 60
-
-
-def test_min_views_removes_rarely_seen_surface() -> None:
-    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
-    side = se3.exp(np.array([0.8, 0, 0, 0, 0, 0]))
-    views = [RangeView.of(frame_of(ranges, k)) for k in range(2)]
-    poses = np.stack([EYE, side])
-    either = fuse_surface(views, poses, Fusion(voxel_m=0.03))
-    both = fuse_surface(views, poses, Fusion(voxel_m=0.03, min_views=2))
-    assert np.ptp(either.vertices[:, 0]) > np.ptp(both.vertices[:, 0]) + 1.0
-    assert (both.views == 2).all()
-
-
-def test_voxel_size_follows_sensor() -> None:
-    camera = Pinhole(100, 80, 200.0, 200.0, 50.0, 40.0)
-
-    def views(z):
-        depth = np.full((80, 100), z, np.float32)
-        return [RangeView.of(RangeFrame(0, 0.0, camera, depth))]
-
-    assert fitting_voxel(views(2.0)) == pytest.approx(0.01, rel=0.02)  # 2 m / 200
-    assert fitting_voxel(views(0.02)) == 0.002
-    assert fitting_voxel(views(200.0)) == 0.1
-    assert fitting_voxel([]) > 0
 
 
 def test_large_images_are_stored_at_half_resolution() -> None:

@@ -14,7 +14,6 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import Optimisation, Optimiser
 from tofuse.engine.loops.loops import PriorLoop
 from tofuse.engine.mapping.config import changed, from_method
@@ -22,7 +21,6 @@ from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.parts import part
 from tofuse.lab.methods.filters_temporal import TemporalDeviation
-from tofuse.lab.simulation.peaks import peaks_views
 
 # Fine enough for few frames, and fast.
 CONFIG = changed(
@@ -261,37 +259,3 @@ def test_unreadable_neighbours_are_left_out(recording, room_recording, tmp_path)
     result = reconstruct(tofuse.open(copy).select(0, None, 3), config)
     assert [(i, past) for i, past, _ in SeesHistory.seen] == [(0, []), (3, [1]), (6, [4, 5])]
     assert result.has_pose.all()
-
-
-def test_joined_recordings_share_no_history(room_recording) -> None:
-    SeesHistory.seen.clear()
-    joined = tofuse.open(room_recording, room_recording).select(6, 11)
-    reconstruct(joined, replace(CONFIG, filters=(SeesHistory(),)))
-    found = [(i, past) for i, past, _ in SeesHistory.seen]
-    assert found == [(6, [4, 5]), (7, [5, 6]), (8, []), (9, [8]), (10, [8, 9])]
-
-
-@pytest.mark.slow
-def test_model_before_loop_closure_is_kept() -> None:
-    views, poses = peaks_views(0.06, 0)
-    recording = Recording.of(ArraySource(views, poses), "peaks", "peaks")
-    changes = {
-        "filters": [],
-        "odometry": {
-            "registration": {
-                "resolution": 1.0,
-                "source": {"part": "all"},
-                "target": {"part": "all"},
-            }
-        },
-        "loops": {"per_frame": 0},
-    }
-    config = changed(from_method("thesis", "cloud"), changes, where="test")
-    closing = se3.inverse(poses[0]) @ poses[-1]
-    closed = reconstruct(recording, config, loops=[PriorLoop(0, len(views) - 1, closing)])
-    opened = reconstruct(recording, config)
-    before = closed.diagnostics.cloud_before
-    assert opened.diagnostics.cloud_before is None
-    assert before is not None
-    np.testing.assert_array_equal(before.points, opened.cloud.points)
-    assert len(closed.cloud) != len(before)

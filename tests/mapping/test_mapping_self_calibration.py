@@ -246,15 +246,6 @@ def any_result(room_recording):
     return reconstruct(open_recording(room_recording).select(end=3), COARSE)
 
 
-def test_no_correction_without_alarm(any_result) -> None:
-    first = assessed(any_result, None, 0.1)
-
-    def never(config):
-        raise AssertionError("reconstructed again")
-
-    assert self_calibrated(first, from_method("default"), never, Silent()) is first
-
-
 def test_correction_undone_by_views_is_dropped(any_result) -> None:
     first = assessed(any_result, 0.1, 0.2)
     for left, kept in ((-0.05, False), (-0.005, True), (0.05, True)):
@@ -289,18 +280,6 @@ def test_correction_is_kept_only_if_it_helps(any_result, again, kept) -> None:
     assert (result.diagnostics.calibrated is not None) == kept
     assert configs[0].corrections[0] == CameraErrors(focal=0.05, focal_sigma=0.001)
     assert (result is first) == (not kept)
-
-
-def test_support_decides_where_nothing_is_bounded(any_result) -> None:
-    first = assessed(any_result, 0.05, np.inf)
-    for support, kept in ((0.6, True), (0.4, False)):
-        result = self_calibrated(
-            first,
-            from_method("default"),
-            lambda _, s=support: assessed(any_result, None, np.inf, support=s),
-            Silent(),
-        )
-        assert (result.diagnostics.calibrated is not None) == kept
 
 
 def test_second_estimate_is_composed_with_first(any_result) -> None:

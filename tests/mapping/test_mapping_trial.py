@@ -132,20 +132,6 @@ def test_correction_of_another_error_does_not_help(straight: Recording) -> None:
     assert not nothing.predicted
 
 
-def test_trial_needs_several_consistent_runs() -> None:
-    def of(*strengths: float) -> Trial:
-        return Trial(strengths, (1.0,) * len(strengths))
-
-    assert not Trial((), ()).is_significant
-    assert not of(0.5, 0.5, 0.5).is_significant
-    assert of(0.5, 0.6, 0.4, 0.5).is_significant
-    assert not of(1.5, -0.9, 1.4, -0.2).is_significant
-    assert not of(0.05, 0.05, 0.06, 0.05).is_significant  # significant, but too small
-    found = of(0.5, 0.6, 0.4, 0.5)
-    assert found.strength == pytest.approx(0.5, abs=0.01)
-    assert found.error == pytest.approx(np.std([0.5, 0.6, 0.4, 0.5], ddof=1) / 2, rel=0.5)
-
-
 def test_single_run_of_bad_poses_does_not_decide() -> None:
     """Not even if it has most of the predicted effect."""
     strengths = np.array([0.2, 0.3, 0.25, 0.35, 0.2, 0.3, 0.25, -0.4])

@@ -270,13 +270,3 @@ def test_slide_along_bare_walls_is_unbounded(scene) -> None:
 def test_single_pose_is_not_assessed() -> None:
     one = build_graph([7], TRUE[:1], [])
     assert accuracy_of(GraphCovariances(one), ObservedErrors(), 1.0) == Accuracy()
-
-
-def test_displacement_ignores_common_motion() -> None:
-    moved = se3.exp(np.array([1.0, 2, 3, 0.3, -0.2, 0.5])) @ TRUE
-    np.testing.assert_allclose(displacement(TRUE, moved), 0, atol=1e-9)
-    other = moved.copy()
-    other[3, :3, 3] += [0.0, 0.1, 0.0]
-    distance, angle = displacement(TRUE, other)
-    assert 0.02 < distance < 0.1 / np.sqrt(N) + 1e-9
-    assert angle == pytest.approx(0, abs=1e-9)

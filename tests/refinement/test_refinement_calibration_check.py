@@ -133,13 +133,6 @@ def test_few_views_need_larger_error() -> None:
     ).large
 
 
-def test_few_views_raise_no_alarm():
-    views, refined = kept(0.06, views=5)
-    found = check_calibration(views, refined, OPTIONS, Priors.none())
-    assert not found.alarm
-    assert not found.errors
-
-
 def test_correction_must_close_the_loop():
     assert Gap(0, 9, (0.3, 0.2), (0.1, 0.19)).closes
     assert not Gap(0, 9, (0.3, 0.2), (0.2, 0.15)).closes  # less than half closed

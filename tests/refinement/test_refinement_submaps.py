@@ -10,14 +10,11 @@ import pytest
 from aligned_surfaces import away, drifted, path, surfaces
 from refined_submaps import refined
 from tofuse.engine.compute.spill import Scratch
-from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.calibration_check import CalibrationCheck, combine_checks
 from tofuse.engine.refinement.refinement import Joint
 from tofuse.engine.refinement.submaps import partition, submaps
 from tofuse.engine.stored_views import view_store as of_views
 from tofuse.engine.stored_views.view_store import (
-    Spacing,
-    ViewStore,
     candidate_pairs,
 )
 from tofuse.engine.views.view_descriptors import (
@@ -63,29 +60,6 @@ def test_memory_limit_does_not_change_result(swing, tmp_path: Path) -> None:
         little = refined(Joint(submap=submap), *some, Scratch(200_000, tmp_path))
         np.testing.assert_array_equal(much.poses, little.poses)
         assert [e.i for e in much.edges] == [e.i for e in little.edges]
-
-
-def test_store_spills_to_disk_and_spaces_views_by_motion(swing, tmp_path: Path) -> None:
-    views, _ = swing
-    spacing = Spacing(angle=1e-3, distance=1e-3, max_views=8, max_stretch=4)
-    little, much = (
-        ViewStore(spacing, scratch=scratch) for scratch in (Scratch(100_000, tmp_path), Scratch())
-    )
-    steps = [se3.exp(np.array([0.02 * k, 0, 0, 0, 0, 0])) for k in range(COUNT)]
-    for view, T in zip(views, steps, strict=True):
-        for store in (little, much):
-            store.push(view, T)
-    kept = [p.index for p in little.views]
-    assert kept == [p.index for p in much.views]
-    assert max(np.diff(kept)) <= 4  # not every 8th or 16th, for a total of 8
-    assert len(kept) > 8
-    for a, b in zip(little.views, much.views, strict=True):
-        assert a.index == a.view.index
-        np.testing.assert_array_equal(a.view.z, b.view.z)
-        np.testing.assert_array_equal(a.view.target, b.view.target)
-        np.testing.assert_array_equal(a.view.albedo, b.view.albedo)
-        assert a.view.projection is views[0].projection
-        assert a.depth == a.view.depth
 
 
 def test_places_are_divided_into_equal_parts() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from searched_pair import CAMERA, TRUE, A, B, camera, error, seen
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
 from tofuse.engine.search.floor import find_floor, find_floors
@@ -17,7 +16,6 @@ from tofuse.engine.search.search import (
     Search,
     SearchOptions,
 )
-from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.rough import with_rough_planes
 from tofuse.engine.views.surface_options import SurfaceOptions
@@ -374,16 +372,6 @@ def test_views_of_different_places_agree_less(pair):
     assert found.margin < 0.1
 
 
-def test_result_is_independent_of_threads(pair):
-    answers = []
-    for count in (1, 3):
-        with threads(count):
-            answers.append(search(*pair))
-    for a, b in zip(*(answer.candidates for answer in answers), strict=True):
-        assert a.T_target_source.tobytes() == b.T_target_source.tobytes()
-        assert a.score == b.score
-
-
 @pytest.mark.slow
 def test_albedo_resolves_geometric_ambiguity():
     """Bare textured walls, 27 degrees apart."""
@@ -413,26 +401,6 @@ def test_empty_view_is_not_searched(pair):
     empty = prepare_view(replace(frame, depth=np.zeros_like(frame.depth)), SurfaceOptions())
     assert search(empty, pair[1]) is None
     assert search(pair[0], empty) is None
-
-
-def test_tracker_connects_view_after_large_step_by_search():
-    """It continues, or is linked to the view before; without searches it starts a component."""
-    frames = [seen(A, seed=0), seen(B, seed=1)]
-    for searches in (False, True):
-        tracker = Keyframes(searches=searches).start(0)
-        step = [tracker.push(frame) for frame in frames][1]
-        if not searches:
-            assert step.component == 1
-            assert step.links == ()
-    found = step.T_component_camera
-    if step.component == 1:
-        (link,) = step.links
-        assert (link.i, link.j) == (0, 1)
-        assert link.certain
-        found = link.T_i_j
-    metres, degrees = error(found, TRUE)
-    assert metres < 0.02
-    assert degrees < 0.5
 
 
 def test_recorded_views_are_found_without_guess(shared_data):

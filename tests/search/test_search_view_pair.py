@@ -215,14 +215,6 @@ def test_views_of_different_scale_are_refused(pair):
         tofuse.register(large, pair[1])
 
 
-def test_empty_images_are_refused(pair):
-    for value in (0, np.nan):
-        empty = replace(pair[0], index=7, depth=np.full_like(pair[0].depth, value))
-        for views in ((empty, pair[1]), (pair[1], empty)):
-            with pytest.raises(tofuse.RegistrationError, match="frame 7: has 0 points"):
-                tofuse.register(*views)
-
-
 def test_constant_depths_are_rejected(pair):
     flat = replace(pair[0], depth=np.full_like(pair[0].depth, 1.5), amplitude_image=None)
     for views in ((flat, flat), (flat, pair[1])):

@@ -122,14 +122,6 @@ def test_gain_is_estimated_from_flatness_of_surfaces(albedo: float) -> None:
     assert np.median(np.abs(after)) < 0.6 * np.median(np.abs(before))
 
 
-def test_gain_of_flat_wall_follows_from_prior_albedo() -> None:
-    wall = Seen(WALL, albedo=0.35)
-    estimator = GainEstimator(REFLECTIONS)
-    assert estimator.gain is None
-    estimator.add(wall.image)
-    assert estimator.gain == pytest.approx(GAIN * 0.35 / GainEstimator.ALBEDO, rel=0.15)
-
-
 def test_images_without_depth_or_amplitude_have_no_estimate() -> None:
     dark = replace(Seen(WALL).image, amplitude=np.zeros((48, 60), np.float32))
     empty = replace(dark, z=np.zeros((48, 60), np.float32))

@@ -81,18 +81,6 @@ def test_block_means_use_median_surface() -> None:
     assert nodes[1, 1, AREA] == pytest.approx(16 * 1e-4, rel=1e-4)
 
 
-def test_blocks_with_few_pixels_or_unknown_rays_are_skipped() -> None:
-    rays = grid_rays(4, 8)
-    z = np.zeros((4, 8), np.float32)
-    z[0, :3] = 1.0  # three of sixteen
-    z[:, 4:] = 1.0
-    rays[z == 0] = np.nan
-    nodes = means(z, rays, np.ones_like(z), 4)
-    assert nodes[0, 0, W] == 0
-    assert nodes[0, 1, W] == pytest.approx(1.0)
-    assert np.isfinite(nodes).all()
-
-
 def roof(shape: tuple[int, int] = (24, 32)) -> tuple[np.ndarray, np.ndarray]:
     """Nodes that see two planes meet in a vertical edge at x = 0, and 1 for the right one."""
     rays = grid_rays(*shape, pitch=0.02).astype(float)
@@ -128,33 +116,6 @@ def test_edge_nodes_are_compared_with_corrected_planes() -> None:
     inner = nodes[..., X] > 0.02
     assert strip[inner].any()
     np.testing.assert_allclose(nodes[inner & strip][:, A], 0.3, atol=1e-6)
-
-
-def test_upsampled_bias_stays_on_its_surface() -> None:
-    rays = grid_rays(48, 64)
-    right = rays[..., 0] > 0.045
-    z = np.where(right, 1.0, 2.0).astype(np.float32)
-    z[5, 5] = 0
-    nodes = fitted(means(z, rays, np.ones_like(z), 4))
-    near = nodes[..., W] > 0.75
-    shift, factor = np.where(near, 0.0, 0.1), np.where(near, 1.0, 1.5)
-    z_out, factor_out = np.empty_like(z), np.empty_like(z)
-    for a, b in ((0, 20), (20, 48)):
-        kernels.upsample_correction(nodes, shift, factor, z, rays, 4, 0.03, a, b, z_out, factor_out)
-    wanted = z - np.where(right, 0.0, 0.1) / np.sqrt(1 + (rays**2).sum(-1))
-    seen = z > 0
-    np.testing.assert_allclose(z_out[seen], wanted[seen], atol=1e-3)
-    np.testing.assert_allclose(factor_out[seen], np.where(right, 1.0, 1.5)[seen], atol=1e-2)
-    assert z_out[5, 5] == 0
-
-
-def test_flat_nodes_are_counted_on_planes_but_not_on_curved_surfaces() -> None:
-    nodes, _ = roof()
-    bent = nodes.copy()
-    bent[..., W] *= 1 + bent[..., X] ** 2
-    flat = kernels.flat_nodes(fitted(nodes), 4, 0.1, 0.003)
-    assert flat > 5000
-    assert kernels.flat_nodes(fitted(bent), 4, 0.1, 0.003) < 0.8 * flat
 
 
 SLANTEST = 0.6

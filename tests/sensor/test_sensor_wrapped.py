@@ -53,11 +53,3 @@ def test_dark_surfaces_within_period_are_kept(albedo: float) -> None:
     albedos[80:] = albedo  # a dark floor
     albedos[50:80, 60:90] = albedo
     assert Wrapped().mask(image(radial, albedos), ()).all()
-
-
-def test_all_is_kept_without_amplitude_or_period() -> None:
-    frame = image(corridor(6.2), 0.5)
-    plain = RangeFrame(0, 0.0, CAMERA, frame.depth, "range", ambiguity_m=PERIOD)
-    endless = RangeFrame(0, 0.0, CAMERA, frame.depth, "range", frame.amplitude_image)
-    assert Wrapped().mask(plain, ()).all()
-    assert Wrapped().mask(endless, ()).all()

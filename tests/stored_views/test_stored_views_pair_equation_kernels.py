@@ -30,20 +30,6 @@ def pair():
     return corner(T_target_source), corner(np.eye(4)), T_target_source
 
 
-def test_steps_converge_to_truth(pair):
-    source, target, T = pair
-    xi = np.array([0.01, -0.008, 0.006, 0.004, 0.006, -0.005])
-    start = T @ se3.exp(xi)
-    for _ in range(6):
-        H, g = unpack(evaluate(source, target, start, settings=(0.0, 1.0, 0.1, 0.02, 4.0, 0.5)))
-        H[7:, 7:] = np.eye(kernels.ERRORS)
-        step = -np.linalg.solve(H, g)
-        start = start @ se3.exp(step[:6])
-    away = se3.log(se3.inverse(T) @ start)
-    assert np.abs(away[:3]).max() < 1e-3
-    assert np.abs(away[3:]).max() < 5e-4
-
-
 def as_measured(frame, kind):
     """Return the frame with the depth that a camera of a kind, "z" or "range", measures."""
     return frame if kind == "z" else replace(frame, depth=frame.radial_range, depth_kind=kind)

@@ -68,12 +68,6 @@ def test_keyframes_of_different_components_are_not_compared(small) -> None:
     assert kept(small) == [0, 2, 3, 4]
 
 
-def test_oldest_of_single_keyframe_components_is_removed(small) -> None:
-    for k in range(7):
-        small.add(along(0.0, k, k))
-    assert kept(small) == [3, 4, 5, 6]
-
-
 def test_motion_decides_when_view_becomes_keyframe() -> None:
     keyframes = KeyframeMap(0.2, 0.1)
     first = along(0.0, 0)

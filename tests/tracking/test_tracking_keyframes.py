@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.formats.recordings.open import open_recording
@@ -328,13 +326,6 @@ def test_interruption_starts_component_without_motion_prior(room):
     assert_right(run(in_order(frames)), poses)
 
 
-def test_motion_may_change_at_low_frame_rates(room):
-    frames, poses = [*room.frames[:4], *room.frames[:4]], [*room.poses[:4], *room.poses[:4]]
-    steps = run([replace(f, index=k, timestamp=0.8 * k) for k, f in enumerate(frames)])
-    assert components(steps) == [0] * 8
-    assert_right(steps, poses)
-
-
 def test_prepared_view_gives_same_pose_as_frame(room):
     plain, early = Keyframes().start(0), Keyframes().start(0)
     for frame in room.frames[:3]:
@@ -342,11 +333,6 @@ def test_prepared_view_gives_same_pose_as_frame(room):
         one, two = plain.push(frame), early.push(frame, surface=made)
         assert one.T_component_camera.tobytes() == two.T_component_camera.tobytes()
     assert early.prepare(scaled(room.frames[0], 0)) is None
-
-
-def test_clouds_are_refused():
-    with pytest.raises(InputError, match="needs images"):
-        Keyframes().start(0).push(CloudFrame.of(np.zeros((500, 3))))
 
 
 @pytest.mark.slow

@@ -53,17 +53,6 @@ def cost(T, a, matches):
 # Selectors
 
 
-def test_random_selection_is_sorted_without_repetition():
-    view = CloudFrame.of(np.zeros((5000, 3)))
-    index = Random(1000).select(view, np.random.default_rng(4))
-    assert len(np.unique(index)) == 1000
-    assert (np.diff(index) > 0).all()
-    assert index.min() >= 0
-    assert index.max() < 5000
-    np.testing.assert_array_equal(index, Random(1000).select(view, np.random.default_rng(4)))
-    assert (index != Random(1000).select(view, np.random.default_rng(5))).any()
-
-
 def test_random_selection_is_uniform():
     view = CloudFrame.of(np.zeros((100, 3)))
     rng = np.random.default_rng(0)
