@@ -11,7 +11,6 @@ import tofuse
 from registration_scenes import box_walls, bumpy_ball, turn
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.clouds import cloud_pair
 from tofuse.engine.clouds.cloud_agreement import CloudMap, cloud_agreement
 from tofuse.engine.clouds.cloud_pair import register_clouds
 from tofuse.engine.clouds.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
@@ -411,15 +410,7 @@ def test_folder_of_scans_becomes_one_model(tmp_path):
 
 @pytest.mark.slow
 def test_candidates_of_same_pose_are_not_rivals():
-    """With large noise, iterations stop slightly apart; a pose elsewhere remains a rival."""
-    views, truth = peaks_views(0.1, 101)
-    source, target, T = views[1], views[0], se3.inverse(truth[0]) @ truth[1]
-    both = cloud_pair._Views.of(source, target, np.random.default_rng(0))
-    best = both.evaluated(T)
-    beside = both.evaluated(T @ se3.exp([0.3, 0, 0, 0, 0.05, 0]))
-    elsewhere = both.evaluated(T @ se3.exp([0, 0, 0, 0, 0, 2.5]))
-    assert both.are_distinct_poses(beside.T_target_source, T)
-    assert cloud_pair._rival(both, [best, beside, elsewhere], best, T) is elsewhere
-    assert cloud_pair._rival(both, [best, beside], best, T) is cloud_pair._NO_RIVAL
-    found = register_clouds(source, target, None, np.random.default_rng(0))
+    """With large noise, iterations stop slightly apart; such poses do not contradict each other."""
+    views, _ = peaks_views(0.1, 101)
+    found = register_clouds(views[1], views[0], None, np.random.default_rng(0))
     assert found.probability > 0.5

@@ -13,7 +13,6 @@ from tofuse.engine.compute.spill import Scratch
 from tofuse.engine.refinement.calibration_check import CalibrationCheck, combine_checks
 from tofuse.engine.refinement.refinement import Joint
 from tofuse.engine.refinement.submaps import partition, submaps
-from tofuse.engine.stored_views import view_store as of_views
 from tofuse.engine.stored_views.view_store import (
     candidate_pairs,
 )
@@ -92,23 +91,21 @@ def test_every_pair_is_in_at_most_one_submap() -> None:
     assert len(np.unique(np.concatenate([s.views for s in found]))) == 500
 
 
-def test_views_of_nearby_places_are_compared(monkeypatch) -> None:
-    for name, number in (("_MAX_EXHAUSTIVE", 50), ("_NEAREST", 12), ("_PREVIOUS", 5)):
-        monkeypatch.setattr(of_views, name, number)
+def test_views_of_nearby_places_are_compared() -> None:
     rng = np.random.default_rng(2)
-    there = np.stack([np.linspace(0, 40, 200), np.zeros(200), np.zeros(200)], 1)
-    middles = np.concatenate([there, there[::-1]]) + 0.01 * rng.standard_normal((400, 3))
+    there = np.stack([np.linspace(0, 200, 1000), np.zeros(1000), np.zeros(1000)], 1)
+    middles = np.concatenate([there, there[::-1]]) + 0.01 * rng.standard_normal((2000, 3))
     i, j = candidate_pairs(middles)
     assert (i < j).all()
-    assert len(i) < 400 * 17
+    assert len(i) < 2000 * 1999 / 8
     pairs = set(zip(i.tolist(), j.tolist(), strict=True))
-    assert all((k, 399 - k) in pairs for k in range(190))  # the way back
-    assert all((j - n, j) in pairs for j in range(5, 400) for n in range(1, 6))
+    assert all((k, 1999 - k) in pairs for k in range(990))  # the way back
+    assert all((j - 1, j) in pairs for j in range(1, 2000))
     # The same for the newest view alone, except for distant views that select it.
-    a, b = candidate_pairs(middles, 399)
-    assert set(b.tolist()) == {399}
-    assert {(0, 399), (398, 399), (394, 399)} <= set(zip(a.tolist(), b.tolist(), strict=True))
-    assert len(candidate_pairs(middles[:50])[0]) == 50 * 49 // 2
+    a, b = candidate_pairs(middles, 1999)
+    assert set(b.tolist()) == {1999}
+    assert {(0, 1999), (1998, 1999)} <= set(zip(a.tolist(), b.tolist(), strict=True))
+    assert len(candidate_pairs(middles[:50])[0]) == 50 * 49 // 2  # few are all compared
 
 
 @pytest.mark.slow

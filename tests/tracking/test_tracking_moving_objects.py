@@ -126,8 +126,7 @@ def test_static_room_has_no_moving_objects(room):
         assert 0.5 < moving.scale / typical_scale < 2
 
 
-@pytest.mark.parametrize("cover", [0.1, 0.25, 0.4])
-@pytest.mark.parametrize("motion", ["sideways", "towards", "away"])
+@pytest.mark.parametrize(("motion", "cover"), [("sideways", 0.1), ("towards", 0.25), ("away", 0.4)])
 def test_moving_box_is_segmented(room, motion, cover):
     frames, poses, noise = room
     centres, half = trajectory(motion, cover, frames[0])
@@ -294,11 +293,10 @@ def test_masks_of_keyframes_are_kept_up_to_limit(room):
     assert not objects.predicted_mask(poses[9], views[9]).any()
 
 
-def test_result_is_independent_of_threads(room, monkeypatch):
+def test_result_is_independent_of_threads(room):
     frames, poses, noise = room
     centres, half = trajectory("away", 0.25, frames[0])
     made = [with_box(frames[n], centres[n], half, noise, n)[0] for n in range(8)]
-    monkeypatch.setattr("tofuse.engine.tracking.moving_objects._CHUNK_ROWS", 10)
     results = []
     for count in (1, 2):
         with threads(count):
