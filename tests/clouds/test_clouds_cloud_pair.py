@@ -85,7 +85,7 @@ def test_viewpoint_of_image_points_is_their_origin(frames):
         assert found.spacing == pytest.approx(pixel.spacing * np.sqrt(len(frame) / 5000), rel=0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_moved_points_have_no_viewpoint(frames, scans):
     """Mostly: from some places the surfaces of a small image are sampled as evenly."""
     rng = np.random.default_rng(4)
@@ -392,7 +392,7 @@ def test_views_are_chained_and_rejected_views_start_components(scans):
             Pairwise(**bad)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_folder_of_scans_becomes_one_model(tmp_path):
     """Through a door, with any heading: neighbours are found, and walls keep their thickness."""
     places = (([-2.6, -2.5, 1.3], 0.4), ([-1.6, -2.2, 1.3], 2.6), ([-0.5, -2.3, 1.3], -1.0))

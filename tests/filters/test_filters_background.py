@@ -78,7 +78,7 @@ def test_person_is_segmented() -> None:
     check(shown("torso", off=SLOW), 0.93)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_box_is_segmented() -> None:
     check(shown("box"), 0.85)
 

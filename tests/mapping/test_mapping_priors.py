@@ -145,7 +145,7 @@ def past_a_corner(covered: Collection[int] = ()) -> Recording:
     return Recording.of(ArraySource(frames, poses, metadata={}), "simulated", "native")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("covered", [(), range(22, 32)])
 def test_device_poses_bound_slide_along_wall(covered) -> None:
     """The images alone do not constrain the motion along it."""

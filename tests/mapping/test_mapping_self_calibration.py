@@ -137,7 +137,7 @@ def test_wrong_focal_length_is_corrected(wrong) -> None:
     assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_wrong_focal_length_of_range_camera_is_corrected(recording) -> None:
     """Rotation scales with the focal length and all views agree: only the loop reveals it."""
     wrong = seen_by(recording, 1.05, "range")
@@ -148,7 +148,7 @@ def test_wrong_focal_length_of_range_camera_is_corrected(recording) -> None:
     assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_bound_without_loop_includes_focal_length_error(recording) -> None:
     half = replace(recording, indices=recording.indices[:12])
     wrong = seen_by(half, 1.05)
@@ -172,7 +172,7 @@ SWEPT[:, :3, 3] = np.stack([0.4 * np.sin(SWEEP), 0.1 * np.sin(SWEEP), 0.4 * (np.
 WIDE = BrownConrady(64, 64, 32.0, 32.0, 31.5, 31.5)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("true", "errors", "corrected"),
     [

@@ -244,7 +244,7 @@ def test_disconnected_parts_are_unbounded() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", ["wall", "corridor"])
+@pytest.mark.parametrize("scene", ["wall", pytest.param("corridor", marks=pytest.mark.nightly)])
 def test_slide_along_bare_walls_is_unbounded(scene) -> None:
     """Whatever the error happens to be: it was not measured."""
     effects = Effects.none(shot_noise=True)

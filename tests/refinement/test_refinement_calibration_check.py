@@ -160,7 +160,7 @@ def test_longest_loop_uses_consecutive_views_only():
     assert longest_loop(pairs[:0]) is None
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_kinect_loop_raises_alarm(shared_data):
     """Its intrinsics are wrong by 5 %, as box corners of 87 degrees confirm."""
     from tofuse.engine.mapping.config import changed, from_method

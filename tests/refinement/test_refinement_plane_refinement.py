@@ -169,7 +169,7 @@ def test_distant_clouds_are_not_moved(count):
     np.testing.assert_array_equal(same.poses, apart)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_view_of_another_place_does_not_drag_others():
     views, truth = peaks_views(0.02, 0)
     noise = np.random.default_rng(5).uniform(-8, 8, (2500, 3)).astype(np.float32)
@@ -203,7 +203,7 @@ def test_two_sides_of_wall_stay_separate():
     assert np.abs(found.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_frames_that_are_not_kept_follow_the_others():
     views, truth = peaks_views(0.03, 0)
     part = Planes(max_views=12)

@@ -219,7 +219,7 @@ def test_corrupted_image_stays_unconnected(request, scene, damage, amplitude):
     assert found[-1] == 0 or any(i < BAD < j for i, j in certain_links(steps))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("damage", PLAUSIBLE.values(), ids=PLAUSIBLE.keys())
 def test_plausible_wrong_image_does_not_affect_other_poses(request, damage):
     steps, poses = tracked_with_bad_frame(request, "room", True, damage)
@@ -231,7 +231,7 @@ def test_plausible_wrong_image_does_not_affect_other_poses(request, damage):
     assert_right(after, poses[BAD + 1 :], 0.03, 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("damage", ["mirrored", "upside down", "turned round"])
 def test_run_of_wrong_images_forms_its_own_component(corner, damage):
     frames = list(corner.frames)
@@ -358,7 +358,7 @@ def test_real_camera_after_large_move_is_correct_or_doubtful(shared_data):
         assert np.linalg.norm(relative[:3, 3]) < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_real_camera_near_door_does_not_slide(shared_data):
     """At a distance of 0.25 m, moved by less than 1 cm: poses must not slide along the door."""
     recording = open_recording(shared_data / "iphone_record3d")
