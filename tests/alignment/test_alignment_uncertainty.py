@@ -133,17 +133,6 @@ def _made_patches(means, weights, change=0.0):
     )
 
 
-def test_systematic_errors_are_distinguished_from_noise_by_size():
-    rng = np.random.default_rng(4)
-    weights = np.full(48, 1e2)  # noise of 10 cm
-    options = UncertaintyOptions(noise_pixels=1.0)
-    noise = covariance_of_patches(_made_patches(0.1 * rng.normal(size=48), weights), options)
-    large = covariance_of_patches(_made_patches(1.0 * rng.normal(size=48), weights), options)
-    ratio = np.sqrt(np.trace(large / np.outer(UNITS, UNITS)))
-    ratio /= np.sqrt(np.trace(noise / np.outer(UNITS, UNITS)))
-    assert 4 < ratio < 25
-
-
 def test_residuals_near_limit_do_not_inflate_uncertainty():
     """The slope of the robust weights may vanish there, and have any sign."""
     found = _made_patches(np.zeros(48), np.full(48, 1e2))

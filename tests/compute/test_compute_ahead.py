@@ -57,37 +57,6 @@ def test_run_uses_listed_signatures(room_recording: Path) -> None:
     assert len(called) > 40
 
 
-def test_only_first_run_starts_compiler_processes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
-    monkeypatch.setattr(ahead, "usable_cores", lambda: 7)
-    started = []
-
-    class Process:
-        ended = 0
-
-        def terminate(self) -> None:
-            self.ended += 1
-
-        def wait(self) -> None:
-            self.ended += 1
-
-    def start(words: list[str], **_: object) -> Process:
-        started.append(Process())
-        assert words[1:] == ["-m", "tofuse.engine.compute.ahead", str(len(started) - 1), "3"]
-        return started[-1]
-
-    monkeypatch.setattr(subprocess, "Popen", start)
-    with pytest.raises(RuntimeError), ahead.compiling_in_background():
-        raise RuntimeError
-    assert [p.ended for p in started] == [2, 2, 2]
-    ahead.compiled_marker().touch()
-    with ahead.compiling_in_background():
-        pass
-    assert len(started) == 3
-
-
 def test_failed_process_start_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object, **__: object) -> None:
         raise OSError("no more processes")

@@ -112,16 +112,3 @@ def test_lens_scattering_is_estimated_and_corrected() -> None:
         assert bias > 0.004
         assert left < 0.4 * bias
         assert (after.valid == before.valid).all()
-
-
-def test_given_scattering_needs_no_fit_and_requires_amplitude() -> None:
-    frame = shown("box").frames[0]
-    given = LensScattering(fractions=(0.01, 0.0, 0.01))
-    assert not given.needs_fit
-    assert not np.array_equal(given.start().apply(frame).depth, frame.depth)
-    dark = replace(frame, amplitude_image=None)
-    assert given.start().apply(dark) is dark
-    assert LensScattering().fit([dark] * 8).fractions == (0.0, 0.0, 0.0)
-    for options in ({"fractions": (0.1,)}, {"widths": ()}, {"widths": (0.0,)}, {"period_m": 0.0}):
-        with pytest.raises(ValueError, match=r"fractions|widths|period_m"):
-            LensScattering(**options)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,14 +15,11 @@ from tofuse.engine.fusion import atlas as atlas_module
 from tofuse.engine.fusion.atlas import MARGIN, unwrap
 from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
 from tofuse.engine.fusion.colors import NO_COLOR
-from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.texture import TextureView, baked, exposures, textured
 from tofuse.engine.geometry import se3
-from tofuse.formats.geometry.glb import linear, write_glb
-from tofuse.formats.geometry.obj import write_obj
+from tofuse.formats.geometry.glb import linear
 from tofuse.formats.geometry.ply import read_ply
-from tofuse.formats.images.images import png_bytes
 
 CAMERA = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
 
@@ -213,26 +209,6 @@ def test_missing_colour_does_not_darken(tmp_path) -> None:
     assert set(np.unique(colors[:, :3]).tolist()) == set(light.tolist())
     small.save(tmp_path / "data.ply")
     assert set(np.unique(read_ply(tmp_path / "data.ply").color).tolist()) == {0, 180}
-
-
-def test_textures_round_trip(tmp_path: Path) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    mesh = sheet(5, 4, 0.2)
-    made = textured(mesh, [TextureView.of(look(np.eye(4), 1.0))], POSES[:1], 128)
-    atlas, image = made.atlas, png_bytes(made.image)
-    points, normals = mesh.vertices[atlas.vertices], mesh.normals[atlas.vertices]
-    for write, name in ((write_glb, "m.glb"), (write_obj, "m.obj")):
-        path = tmp_path / name
-        write(path, GeometryRecord(points, atlas.faces, normals, uv=atlas.uv, texture=image))
-        (read,) = trimesh.load_scene(path, process=False).geometry.values()
-        np.testing.assert_allclose(read.triangles, points[atlas.faces], atol=1e-6)
-        material = read.visual.material
-        shown = material.baseColorTexture if name == "m.glb" else material.image
-        np.testing.assert_array_equal(np.asarray(shown.convert("RGB")), made.image)
-        # In the files v is measured upwards from the lower edge.
-        uv = np.asarray(read.visual.uv)[read.faces] * [1, -1] + [0, 1]
-        np.testing.assert_allclose(uv, atlas.uv[atlas.faces], atol=1e-5)
-    assert {p.name for p in tmp_path.iterdir()} == {"m.glb", "m.obj", "m.mtl", "m.png"}
 
 
 def test_holes_are_filled_and_borders_kept() -> None:

@@ -531,13 +531,3 @@ def test_near_cubes_match_slow_twin(stride) -> None:
     for parent, mark in zip(parents, marks, strict=True):
         octants = {parent_of(k)[1] for k in set(keys.tolist()) if parent_of(k)[0] == parent}
         assert mark == sum(1 << e for e in octants)
-
-
-def test_sparse_image_has_surface() -> None:
-    """Four pixels in five are missing, scattered: a block of the halved image has a few."""
-    camera = Pinhole(320, 240, 420.0, 420.0, 159.5, 119.5)
-    depth = np.full((240, 320), 1.5, np.float32)
-    depth[np.random.default_rng(2).random(depth.shape) < 0.8] = 0
-    frame = RangeFrame(0, 0.0, camera, depth)
-    measured = prepare_view(frame, SurfaceOptions()).z > 0
-    assert np.count_nonzero(RangeView.of(frame).z) > 0.9 * np.count_nonzero(measured)

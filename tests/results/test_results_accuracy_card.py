@@ -54,14 +54,6 @@ def test_unbounded_and_unassessed_accuracy() -> None:
     assert weakest_frame(loose) == "frames 4-6, 9, not bounded"
 
 
-@pytest.mark.parametrize("text", ["30mm", "3cm", "0.03", "0.03m", "3e-2", " 30 mm "])
-def test_tolerance_has_units(text, room_recording, tmp_path) -> None:
-    from tofuse.apps.cli.parser import make_parser
-
-    words = ["run", str(room_recording), "--out", str(tmp_path), "--tolerance", text]
-    assert make_parser().parse_args(words).tolerance == pytest.approx(0.03)
-
-
 @pytest.mark.parametrize("text", ["0", "-1mm", "3 km", "mm", "nan", "inf", "1e999", "", "3mmm"])
 def test_invalid_tolerance_is_refused(text, room_recording, tmp_path, capsys) -> None:
     words = ["run", str(room_recording), "--out", str(tmp_path / "out"), f"--tolerance={text}"]

@@ -326,15 +326,6 @@ def test_interruption_starts_component_without_motion_prior(room):
     assert_right(run(in_order(frames)), poses)
 
 
-def test_prepared_view_gives_same_pose_as_frame(room):
-    plain, early = Keyframes().start(0), Keyframes().start(0)
-    for frame in room.frames[:3]:
-        made = early.prepare(frame)
-        one, two = plain.push(frame), early.push(frame, surface=made)
-        assert one.T_component_camera.tobytes() == two.T_component_camera.tobytes()
-    assert early.prepare(scaled(room.frames[0], 0)) is None
-
-
 @pytest.mark.slow
 def test_real_camera_after_large_move_is_correct_or_doubtful(shared_data):
     """Two positions 305 mm apart along a corridor, with nothing recorded in between."""
