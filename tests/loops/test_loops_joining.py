@@ -379,8 +379,9 @@ def probable(first, second, p, T=None):
 
 
 @pytest.fixture
-def min_probability(three):
+def min_probability(three, monkeypatch):
     """Join two components by links alone, and return the probability; None if rejected."""
+    monkeypatch.setattr(JoinChecks, "confirming", lambda *_: [])
 
     def joined(links, at_least=0.9):
         groups = replace(BY_LINKS, min_probability=at_least).join(three[:2], links)
