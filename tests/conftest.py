@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -40,3 +41,18 @@ def room_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("simulated") / "room"
     return simulate("room", folder, frames=8, effects=Effects.none(shot_noise=True))
+
+
+@pytest.fixture(scope="session")
+def posed_views(room_recording: Path) -> tuple[list[Any], Any]:
+    """Prepared views of the room with their true poses, and these poses (N, 4, 4)."""
+    from tofuse.engine.views.surface_options import SurfaceOptions
+
+    from tofuse.engine.stored_views.view_store import PosedView
+    from tofuse.engine.views.prepared_view import prepare_view
+    from tofuse.formats.recordings.open import open_recording
+
+    recording = open_recording(room_recording)
+    views = [prepare_view(frame, SurfaceOptions()) for frame in recording]
+    posed = [PosedView(v, T) for v, T in zip(views, recording.reference, strict=True)]
+    return posed, recording.reference

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align, points_of
+from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.views.prepared_view import prepare_view
@@ -226,23 +226,3 @@ def test_view_with_infinite_planes_stays_at_prediction(room):
     assert not found.converged
     assert found.inliers == 0
     assert len(found.unobservable) == 6
-
-
-def test_points_are_on_fitted_surface(room):
-    view = room.views[0]
-    some = points_of(view, 4)
-    every = points_of(view, 1)
-    assert len(every) == np.count_nonzero(view.planes[..., 3])
-    assert len(some) == pytest.approx(len(every) / 16, rel=0.1)
-    z = np.float32(1) / view.planes[view.planes[..., 3] > 0][:, 3]
-    np.testing.assert_allclose(every[:, 2], z, rtol=1e-6)
-
-
-def test_all_pixels_of_a_small_image_are_sampled(room):
-    small = SurfaceOptions(columns=22)
-    target, source = (prepare_view(frame, small) for frame in room.frames[:2])
-    found = align(source, [Target(target, np.eye(4))], room.poses[1], OPTIONS)
-    assert found.points == np.count_nonzero(source.planes[..., 3] > 0)
-    assert align(room.views[1], [room.target], room.poses[1], OPTIONS).points == len(
-        points_of(room.views[1], OPTIONS.levels[-1].stride)
-    )

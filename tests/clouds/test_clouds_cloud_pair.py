@@ -11,7 +11,6 @@ import tofuse
 from registration_scenes import box_walls, bumpy_ball, turn
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.clouds import cloud_pair
 from tofuse.engine.clouds.cloud_agreement import CloudMap, cloud_agreement
 from tofuse.engine.clouds.cloud_pair import register_clouds
 from tofuse.engine.clouds.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
@@ -86,14 +85,7 @@ def test_viewpoint_of_image_points_is_their_origin(frames):
         assert found.spacing == pytest.approx(pixel.spacing * np.sqrt(len(frame) / 5000), rel=0.2)
 
 
-def test_viewpoint_of_scan_is_detected(scans):
-    assert viewpoint_of(CloudFrame.of(scans[0])) is not None
-    origin = np.array([3.0, 4.0, -2.0])
-    moved = CloudFrame(0, 0.0, scans[0] + origin.astype(np.float32), origin=origin)
-    np.testing.assert_array_equal(viewpoint_of(moved).origin, origin)
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_moved_points_have_no_viewpoint(frames, scans):
     """Mostly: from some places the surfaces of a small image are sampled as evenly."""
     rng = np.random.default_rng(4)
@@ -159,11 +151,6 @@ def test_cloud_with_z_up_is_rendered_upright(frames):
     assert np.mean(near >= 0) > 0.95
 
 
-def test_full_sphere_does_not_fit_into_image(scans):
-    cloud = CloudFrame.of(scans[0])
-    assert as_image(cloud, viewpoint_of(cloud)) is None
-
-
 def test_range_sphere_stores_free_space(scans):
     cloud = CloudFrame.of(scans[0])
     sphere = RangeSphere.of(cloud, viewpoint_of(cloud))
@@ -184,14 +171,6 @@ def test_range_sphere_stores_free_space(scans):
 def maps(source, target, size=0.12):
     views = CloudFrame.of(source), CloudFrame.of(target)
     return [CloudMap.of(averaged(v, size), size, v) for v in views]
-
-
-def test_correct_pose_is_supported_and_not_contradicted(scans):
-    source, target, true = scans
-    agreement = cloud_agreement(*maps(source, target), true)
-    assert agreement.support > 0.6
-    assert agreement.contradiction < 0.01
-    assert agreement.rms_m < 0.03
 
 
 def test_wrong_pose_is_contradicted_by_free_space(scans):
@@ -294,16 +273,6 @@ def test_clouds_of_different_density(scans):
         assert off(found.T_target_source, T, pair[0])[1] < 1.5
 
 
-@pytest.mark.parametrize("scale", [0.01, 20.0])
-def test_registration_is_independent_of_scale(scans, scale):
-    source, target, true = scans
-    scaled = true.copy()
-    scaled[:3, 3] *= scale
-    found = tofuse.register(source * scale, target * scale)
-    assert off(found.T_target_source, scaled, source * scale)[0] < 0.02 * scale
-    assert found.believed
-
-
 @pytest.mark.slow
 def test_views_without_overlap_are_rejected(scans):
     _, elsewhere = scanned([2.5, -2.5, 1.3], 1.0, seed=3)
@@ -341,15 +310,6 @@ def test_different_units_are_reported(scans, scale):
     assert found.believed is False
     assert f"{1 / scale:g} times as large" in found.reason
     assert "unit" in found.reason
-
-
-def test_different_units_are_reported_without_an_accepted_pose():
-    """A square room fits in four ways, so that no scale is accepted."""
-    scale = 100.0
-    walls, other = (box_walls(4000, seed, 0.003, "xyz") for seed in (0, 1))
-    with pytest.raises(RegistrationError, match="check the units of both clouds") as caught:
-        tofuse.register(other * scale, walls)
-    assert f"{scale:g} times that of the target" in str(caught.value)
 
 
 def test_guess_resolves_symmetry():
@@ -432,7 +392,7 @@ def test_views_are_chained_and_rejected_views_start_components(scans):
             Pairwise(**bad)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_folder_of_scans_becomes_one_model(tmp_path):
     """Through a door, with any heading: neighbours are found, and walls keep their thickness."""
     places = (([-2.6, -2.5, 1.3], 0.4), ([-1.6, -2.2, 1.3], 2.6), ([-0.5, -2.3, 1.3], -1.0))
@@ -450,15 +410,7 @@ def test_folder_of_scans_becomes_one_model(tmp_path):
 
 @pytest.mark.slow
 def test_candidates_of_same_pose_are_not_rivals():
-    """With large noise, iterations stop slightly apart; a pose elsewhere remains a rival."""
-    views, truth = peaks_views(0.1, 101)
-    source, target, T = views[1], views[0], se3.inverse(truth[0]) @ truth[1]
-    both = cloud_pair._Views.of(source, target, np.random.default_rng(0))
-    best = both.evaluated(T)
-    beside = both.evaluated(T @ se3.exp([0.3, 0, 0, 0, 0.05, 0]))
-    elsewhere = both.evaluated(T @ se3.exp([0, 0, 0, 0, 0, 2.5]))
-    assert both.are_distinct_poses(beside.T_target_source, T)
-    assert cloud_pair._rival(both, [best, beside, elsewhere], best, T) is elsewhere
-    assert cloud_pair._rival(both, [best, beside], best, T) is cloud_pair._NO_RIVAL
-    found = register_clouds(source, target, None, np.random.default_rng(0))
+    """With large noise, iterations stop slightly apart; such poses do not contradict each other."""
+    views, _ = peaks_views(0.1, 101)
+    found = register_clouds(views[1], views[0], None, np.random.default_rng(0))
     assert found.probability > 0.5

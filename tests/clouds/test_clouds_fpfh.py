@@ -10,7 +10,6 @@ from registration_scenes import rng, turn
 from searched_pair import TRUE, A, B, seen
 from tofuse.engine.clouds.fpfh import fpfh, mutually_nearest
 from tofuse.engine.geometry import se3
-from tofuse.engine.icp.coarse_to_fine import CoarseToFine
 from tofuse.formats.geometry.ply import read_ply
 
 
@@ -105,24 +104,6 @@ def test_histograms_match_reference(signed):
     )
 
 
-@pytest.mark.parametrize("signed", [True, False])
-def test_histograms_are_invariant_to_pose(signed):
-    points, normals = surface(200)
-    for k in range(3):
-        T = se3.exp(rng(k).normal(size=6))
-        other = fpfh(se3.transform(T, points), normals @ T[:3, :3].T, 0.4, signed)
-        # Except for values on the border of two bins, to rounding.
-        assert np.mean(np.abs(other - fpfh(points, normals, 0.4, signed)) > 1e-9) < 0.01
-
-
-def test_unsigned_histograms_ignore_sign_of_normals():
-    points, normals = surface(100)
-    sides = rng(3).choice([-1.0, 1.0], 100)[:, None]
-    same = fpfh(points, normals, 0.5, False)
-    np.testing.assert_allclose(fpfh(points, sides * normals, 0.5, False), same, atol=1e-12)
-    assert np.abs(fpfh(points, sides * normals, 0.5, True) - same).max() > 0.1
-
-
 def test_rows_are_matched_mutually():
     a, b = rng(0).normal(size=(300, 5)), rng(1).normal(size=(280, 5))
     i, j = mutually_nearest(a, b)
@@ -131,15 +112,3 @@ def test_rows_are_matched_mutually():
         (k, int(apart[k].argmin())) for k in range(300) if apart[:, apart[k].argmin()].argmin() == k
     ]
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == expected
-
-
-def test_good_start_is_kept_by_skipping_coarse_levels(corners):
-    """With `coarsest`, levels beyond the error of the guess are skipped."""
-    source, _target = corners
-    data, model = (seen(T, seed=k) for k, T in ((1, B), (2, A)))
-    found = CoarseToFine(coarsest=0.05).register(data, model, TRUE, rng(0))
-    assert off(found.T_target_source, TRUE, source)[0] < 0.01
-    everything = CoarseToFine().register(data, model, TRUE, rng(0))
-    assert found.iterations <= everything.iterations
-    with pytest.raises(ValueError, match="coarsest"):
-        CoarseToFine(coarsest=0.0)

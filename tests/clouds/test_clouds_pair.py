@@ -8,20 +8,16 @@ import pytest
 import tofuse
 from registration_scenes import (
     box_walls,
-    bumpy_ball,
     error,
     relief,
-    relief_image,
     rng,
     stone,
     turn,
     view,
 )
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
-from tofuse.engine.icp.coarse_to_fine import CoarseToFine, averaged
+from tofuse.engine.icp.coarse_to_fine import averaged
 from tofuse.engine.icp.icp import Remapping
-from tofuse.engine.icp.surface_metrics import PointToPlane
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.lab.methods.variants import Tricp
 
@@ -56,19 +52,6 @@ def test_half_of_each_view_may_be_outside_overlap():
         assert error(found, T)[0] < 0.005
         assert error(found, T)[1] < 0.5
         assert 0.4 < found.inlier_ratio < 0.65
-
-
-def test_images_of_camera_are_registered():
-    T = se3.exp([0.05, -0.04, 0.06, 0.05, -0.04, 0.06])
-    found = tofuse.register(relief_image(T, 1, 0.003), relief_image(np.eye(4), 0, 0.003))
-    assert error(found, T)[0] < 0.002
-    assert error(found, T)[1] < 0.1
-
-
-def test_view_and_array_may_be_mixed():
-    T = turn([1, 2, 0.5], 3)
-    found = tofuse.register(view(relief(3000, 1), T), relief(3000, 0))
-    assert error(found, T)[0] < 0.003
 
 
 @pytest.mark.slow
@@ -142,18 +125,6 @@ def test_ball_does_not_constrain_rotation():
     np.testing.assert_allclose(se3.transform(found.T_target_source, ball), [[0, 0, 2]], atol=2e-3)
 
 
-def test_remapping_projects_motions():
-    points = rng(1).normal(size=(50, 3)) + np.array([0, 0, 2])
-    slide = np.array([[1.0, 0, 0, 0, 0, 0]])
-    remapping = Remapping.of(slide, points)
-    xi = np.array([0.1, 0.02, 0.03, 0, 0, 0])
-    np.testing.assert_allclose(
-        se3.log(remapping.along(se3.exp(xi))), [0.1, 0, 0, 0, 0, 0], atol=1e-12
-    )
-    across = se3.log(remapping.across(se3.exp(xi)))
-    np.testing.assert_allclose(across, [0, 0.02, 0.03, 0, 0, 0], atol=1e-12)
-
-
 def test_other_method_may_be_given():
     T = turn([1, 2, 0.5], 3)
     source, target = source_of(relief(3000, 1), T), relief(3000, 0)
@@ -163,16 +134,6 @@ def test_other_method_may_be_given():
     assert found.T_target_source.tobytes() == again.T_target_source.tobytes()
     other = tofuse.register(source, target, method=Tricp(0.02, points=300, overlap=0.9), seed=1)
     assert found.T_target_source.tobytes() != other.T_target_source.tobytes()
-
-
-def test_result_is_independent_of_threads():
-    target, source = bumpy_ball(12000, 0, 0.002), bumpy_ball(12000, 1, 0.002)
-    results = []
-    for count in (1, 2, 5):
-        with threads(count):
-            results.append(tofuse.register(source, target))
-    assert len({r.T_target_source.tobytes() for r in results}) == 1
-    assert len({r.information.tobytes() for r in results}) == 1
 
 
 def test_averaged_is_mean_of_each_cube():
@@ -194,12 +155,9 @@ GOOD = np.random.default_rng(0).normal(size=(200, 3))
     ("bad", "message"),
     [
         (np.zeros((0, 3)), "has 0 finite points"),
-        (np.full((50, 3), np.nan), "has 0 finite points"),
         (GOOD[:2], "has 2 finite points"),
         (np.zeros((10, 2)), r"shape \(10, 2\)"),
-        (np.zeros(3), r"shape \(3,\)"),
         ("cloud.ply", "type <U9"),
-        (None, "type object"),
         ([[1, 2, 3], [1, 2]], "is not an array"),
         (GOOD + 1j, "complex"),
         (GOOD * 1e12, "coordinates up to"),
@@ -231,13 +189,6 @@ def test_degenerate_clouds_are_refused(source, target):
         tofuse.register(source, target, guess=np.eye(4))
 
 
-def test_empty_views_are_refused():
-    empty, full = view(np.zeros((0, 3)), index=7), view(relief(100, 0))
-    for pair in ((empty, full), (full, empty), (empty, empty)):
-        with pytest.raises(tofuse.RegistrationError, match="frame 7: has 0 points"):
-            tofuse.register(*pair)
-
-
 def test_invalid_guess_is_refused():
     for guess in (np.zeros((4, 4)), np.eye(3), 2 * np.eye(4), np.full((4, 4), np.nan)):
         with pytest.raises(tofuse.InputError, match="guess"):
@@ -250,23 +201,3 @@ def test_non_finite_points_are_dropped():
     source[::7] = np.nan
     target[5] = np.inf
     assert error(tofuse.register(source, target), T)[0] < 0.003
-
-
-def test_finest_level_depends_on_noise():
-    plane = rng(0).uniform(-1, 1, (20000, 3)) * [1, 1, 0] + np.array([0, 0, 2])
-    sizes = []
-    for noise in (0.0, 0.02):
-        noisy = plane + rng(1).normal(0, noise, plane.shape) * [0, 0, 1]
-        sizes.append(CoarseToFine().finest(view(noisy), view(noisy), 0.01)[0])
-    assert sizes[1] > 2 * sizes[0]
-    given = CoarseToFine(resolution=0.1, metric=PointToPlane())
-    found = given.register(view(plane), view(plane), np.eye(4), rng(2))
-    assert found.points == len(averaged(view(plane), 0.1))
-
-
-@pytest.mark.parametrize(
-    "make", [lambda: CoarseToFine(resolution=0.0), lambda: CoarseToFine(points=5)]
-)
-def test_invalid_options_are_refused(make):
-    with pytest.raises(ValueError, match="must be"):
-        make()

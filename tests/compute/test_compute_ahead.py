@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import subprocess
 import sys
 import textwrap
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -57,76 +55,6 @@ def test_run_uses_listed_signatures(room_recording: Path) -> None:
     ):
         assert name in called
     assert len(called) > 40
-
-
-def test_only_first_run_starts_compiler_processes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
-    monkeypatch.setattr(ahead, "usable_cores", lambda: 7)
-    started = []
-
-    class Process:
-        ended = 0
-
-        def terminate(self) -> None:
-            self.ended += 1
-
-        def wait(self) -> None:
-            self.ended += 1
-
-    def start(words: list[str], **_: object) -> Process:
-        started.append(Process())
-        assert words[1:] == ["-m", "tofuse.engine.compute.ahead", str(len(started) - 1), "3"]
-        return started[-1]
-
-    monkeypatch.setattr(subprocess, "Popen", start)
-    with pytest.raises(RuntimeError), ahead.compiling_in_background():
-        raise RuntimeError
-    assert [p.ended for p in started] == [2, 2, 2]
-    ahead.compiled_marker().touch()
-    with ahead.compiling_in_background():
-        pass
-    assert len(started) == 3
-
-
-@pytest.mark.parametrize("cores", [1, 2, 4])
-def test_half_of_the_cores_compile_in_background(
-    cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
-    monkeypatch.setattr(ahead, "usable_cores", lambda: cores)
-    started = []
-    monkeypatch.setattr(subprocess, "Popen", lambda words, **_: started.append(words) or Ended())
-    before = gc.get_threshold()
-    with ahead.compiling_in_background():
-        assert (gc.get_threshold() != before) == (cores > 1)
-    assert gc.get_threshold() == before
-    assert len(started) == cores // 2
-
-
-class Ended:
-    """A process that has ended."""
-
-    def terminate(self) -> None:
-        """Do nothing."""
-
-    def wait(self) -> None:
-        """Do nothing."""
-
-
-def test_helpers_begin_at_different_places(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    compiled: list[str] = []
-    monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
-    monkeypatch.setattr(ahead, "signatures", lambda: [(f"motion.{k}", ()) for k in "abcd"])
-    kernels = {k: SimpleNamespace(compile=lambda _, k=k: compiled.append(k)) for k in "abcd"}
-    monkeypatch.setattr(ahead, "import_module", lambda _: SimpleNamespace(**kernels))
-    ahead.compile_listed()
-    assert compiled == list("dcba")
-    compiled.clear()
-    ahead.compile_listed(1, 2)
-    assert compiled == list("badc")
-    assert ahead.compiled_marker().exists()
 
 
 def test_failed_process_start_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

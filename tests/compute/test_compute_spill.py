@@ -56,12 +56,6 @@ def test_items_round_trip_for_any_budget(tmp_path: Path, budget: int) -> None:
     assert len(spill) == 30
 
 
-def test_resident_item_is_same_object() -> None:
-    spill: Spill[Item] = Spill(10**6)
-    item = made(1)
-    assert spill.get(spill.put(item)) is item
-
-
 def test_shared_arrays_stay_shared(tmp_path: Path) -> None:
     spill: Spill[Item] = Spill(0, tmp_path)
     for k in range(4):

@@ -11,7 +11,6 @@ import pytest
 from tofuse.engine.compute.thread_pool import (
     chunk_bounds,
     job_pool,
-    run_all,
     run_chunks,
     serial_chunks,
     set_thread_count,
@@ -56,12 +55,6 @@ def test_chunks_run_in_parallel_and_results_keep_order() -> None:
         found = run_chunks(wait, 2, chunks=2)
     assert [start for start, _ in found] == [0, 1]
     assert len({name for _, name in found}) == 2
-
-
-def test_task_results_keep_order() -> None:
-    with threads(3):
-        assert run_all([lambda k=k: k * k for k in range(20)]) == [k * k for k in range(20)]
-        assert run_all([]) == []
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])

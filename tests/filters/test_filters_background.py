@@ -16,10 +16,8 @@ import pytest
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.background import Background
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.parts import to_dict
 from tofuse.engine.sensor.scattering import LensScattering
 from tofuse.formats.cameras.correction_file import corrected_depth
-from tofuse.lab.scenes import box
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 
@@ -80,22 +78,9 @@ def test_person_is_segmented() -> None:
     check(shown("torso", off=SLOW), 0.93)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_box_is_segmented() -> None:
     check(shown("box"), 0.85)
-
-
-@pytest.mark.slow
-def test_smaller_box_farther_away_is_segmented(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(box, "DISTANCE", 1.3)
-    for name, value in zip(("WIDTH", "DEPTH", "HEIGHT"), (0.16, 0.2, 0.25), strict=True):
-        monkeypatch.setattr(box, name, value)
-    check(shown.__wrapped__("box", off=SLOW), 0.82)
-
-
-@pytest.mark.slow
-def test_box_is_segmented_with_other_camera() -> None:
-    check(shown("box", camera="ifm-o3r", off=SLOW), 0.85)
 
 
 def test_moving_camera_is_rejected() -> None:
@@ -103,31 +88,6 @@ def test_moving_camera_is_rejected() -> None:
     frames = [rendered.frame for rendered in made.frames(None)]
     with pytest.raises(InputError, match="leave it out if the camera moves"):
         Background().fit(frames)
-
-
-def test_filter_needs_fit_and_keeps_options() -> None:
-    filter_ = Background(sigmas=5.0)
-    case = shown("box")
-    with pytest.raises(InputError, match="is not fitted"):
-        filter_.mask(case.frames[0], ())
-    found = filter_.fit(case.frames)
-    assert filter_.needs_fit
-    assert not found.needs_fit
-    assert (
-        to_dict(found)
-        == to_dict(filter_)
-        == {"part": "background", "sigmas": 5.0, "fraction": 0.02}
-    )
-    small = case.frames[0]
-    small = replace(
-        small,
-        camera=replace(small.camera, width=20, height=10),
-        depth=small.depth[:10, :20],
-        amplitude_image=None,
-        confidence_image=None,
-    )
-    with pytest.raises(InputError, match="20 x 10"):
-        found.mask(small, ())
 
 
 @pytest.mark.slow
@@ -152,16 +112,3 @@ def test_lens_scattering_is_estimated_and_corrected() -> None:
         assert bias > 0.004
         assert left < 0.4 * bias
         assert (after.valid == before.valid).all()
-
-
-def test_given_scattering_needs_no_fit_and_requires_amplitude() -> None:
-    frame = shown("box").frames[0]
-    given = LensScattering(fractions=(0.01, 0.0, 0.01))
-    assert not given.needs_fit
-    assert not np.array_equal(given.start().apply(frame).depth, frame.depth)
-    dark = replace(frame, amplitude_image=None)
-    assert given.start().apply(dark) is dark
-    assert LensScattering().fit([dark] * 8).fractions == (0.0, 0.0, 0.0)
-    for options in ({"fractions": (0.1,)}, {"widths": ()}, {"widths": (0.0,)}, {"period_m": 0.0}):
-        with pytest.raises(ValueError, match=r"fractions|widths|period_m"):
-            LensScattering(**options)

@@ -157,13 +157,3 @@ def test_invalid_scenes_are_refused(scene: Callable[[int], np.ndarray], why: str
     with pytest.raises(InputError, match=why) as caught:
         moving_object(frames)
     assert "--max-depth" in str(caught.value)
-
-
-def test_few_frames_and_mixed_sizes_are_refused() -> None:
-    frames, _ = recording(5)
-    with pytest.raises(InputError, match="needs 6 frames"):
-        moving_object(frames)
-    small = Pinhole(width=10, height=10, fx=9.0, fy=9.0, cx=4.5, cy=4.5)
-    other = RangeFrame(9, 9.0, small, np.ones((10, 10), np.float32))
-    with pytest.raises(InputError, match="same size"):
-        moving_object([*frames, other])

@@ -7,14 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tofuse.engine import parts
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.errors import InputError
-from tofuse.engine.filters.base import Filter, Removal, apply_filters
+from tofuse.engine.filters.base import Removal, apply_filters
 from tofuse.engine.filters.thresholds import Confidence, Distance, Foreground, otsu
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-
-NAN = float("nan")
 
 
 def frame(z: Any, **images: Any) -> RangeFrame:
@@ -36,14 +32,6 @@ def test_confidence_level_is_rescaled(highest: int, level: int) -> None:
     assert Confidence(5).on_scale(highest) == Confidence(level, highest)
     assert Confidence(7).on_scale(highest).minimum == highest
     assert Confidence(0).on_scale(highest).minimum == 0
-
-
-def test_views_without_channel_are_kept() -> None:
-    f = frame(np.ones((2, 3)))
-    cloud = CloudFrame.of(np.ones((5, 3)))
-    assert Confidence(7).mask(f, ()).all()
-    assert Confidence(7).mask(cloud, ()).shape == (5,)
-    assert Confidence(7).mask(cloud, ()).all()
 
 
 def test_distance_distinguishes_z_and_range() -> None:
@@ -99,37 +87,6 @@ def test_otsu_maximises_between_class_variance() -> None:
     assert between(limit) == pytest.approx(best, rel=1e-3)
     assert eta == pytest.approx(best / float(values.var()), rel=1e-2)
     assert otsu(np.zeros(0, np.float32)) == (np.inf, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("cls", "options"),
-    [
-        (Confidence, {"minimum": -1}),
-        (Confidence, {"minimum": 8}),
-        (Confidence, {"minimum": 8, "highest": 256}),
-        (Confidence, {"minimum": True}),
-        (Confidence, {"minimum": NAN}),
-        (Distance, {"minimum": -0.1}),
-        (Distance, {"maximum": NAN}),
-        (Distance, {"minimum": 2.0, "maximum": 1.0}),
-        (Distance, {"measure": "y"}),
-        (Foreground, {"limit": 0.0}),
-        (Foreground, {"separability": 1.5}),
-    ],
-)
-def test_invalid_options_are_rejected(cls: type, options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"must|lower"):
-        cls(**options)
-
-
-def test_option_errors_name_field() -> None:
-    parts.discover("tofuse.engine.filters")
-    data = {"part": "distance", "minimum": 2, "maximum": 1}
-    with pytest.raises(InputError, match=r"my.toml: filters\[0\].*maximum must be above 2"):
-        parts.from_dict(Filter, data, where="my.toml: filters[0]")
-    built = parts.from_dict(Filter, {"part": "confidence", "minimum": 5}, where="x")
-    assert built == Confidence(5)
-    assert parts.to_dict(built) == {"part": "confidence", "minimum": 5, "highest": 7}
 
 
 def test_filters_are_applied_in_sequence() -> None:

@@ -10,7 +10,6 @@ import pytest
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.fusion import cloud as fusion
 from tofuse.engine.fusion.cloud import CloudBuilder, as_cloud, choose_voxel
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.geometry import se3
@@ -95,13 +94,6 @@ def test_cloud_is_independent_of_threads() -> None:
     assert len(set(found)) == 1
 
 
-def test_points_of_few_views_are_removed() -> None:
-    both, once = [0.05, 0.05, 1.05], [0.55, 0.05, 1.05]
-    views = [view([both, once]), view([both], 1)]
-    np.testing.assert_allclose(fuse(views, min_views=2).points, [both], atol=1e-6)
-    assert len(fuse(views, min_views=3)) == 0
-
-
 def test_no_points_give_empty_cloud() -> None:
     for found in (fuse([]), fuse([view(np.zeros((0, 3)))])):
         assert len(found) == 0
@@ -118,10 +110,6 @@ def test_normals_face_camera() -> None:
     T_behind[:3, 3] = [0, 0, 4]
     behind = fuse([view(se3.transform(se3.inverse(T_behind), points))], poses=[T_behind])
     np.testing.assert_allclose(behind.normals, np.tile([0, 0, 1], (len(behind), 1)), atol=1e-5)
-
-
-def test_too_few_points_for_a_plane_have_no_normals() -> None:
-    assert fuse([view([[0, 0, 1.0], [1, 0, 1.0]])]).normals is None
 
 
 def test_amplitude_is_range_compensated_to_grey() -> None:
@@ -172,52 +160,9 @@ def test_colour_is_averaged_and_preferred_to_amplitude() -> None:
     assert fuse([view(point)]).color is None
 
 
-def test_memory_is_bounded_for_many_views(monkeypatch) -> None:
-    monkeypatch.setattr(fusion, "_BUFFER_ROWS", 20_000)
-    item = view(plane(np.random.default_rng(4)))
-    builder = CloudBuilder(Fusion(), 0.01)
-    most = 0
-    for k in range(50):
-        builder.add(view(item.points, k), EYE)
-        most = max(most, sum(len(keys) for keys in builder._keys))
-    found = builder.finish()
-    assert most <= 20_000 + len(item)
-    assert set(found.views.tolist()) == {50}
-
-
 def test_voxel_size_follows_point_spacing() -> None:
     square = np.mgrid[0:50, 0:50, 0:1].reshape(3, -1).T * 0.02
     assert choose_voxel(view(square)) == pytest.approx(0.02, rel=0.1)
     assert choose_voxel(view(square / 1000)) == 0.002
     assert choose_voxel(view(square * 1000)) == 0.1
     assert choose_voxel(view(np.zeros((0, 3)))) > 0
-
-
-def test_thinning_keeps_channels_aligned() -> None:
-    n = 1003
-    item = view(
-        np.arange(3 * n).reshape(n, 3),
-        7,
-        amplitude=np.arange(n, dtype=np.float32),
-        color=np.arange(3 * n).reshape(n, 3).astype(np.uint8),
-    )
-    thin = as_cloud(item, 100)
-    assert 50 <= len(thin) <= 100
-    assert thin.index == 7
-    np.testing.assert_array_equal(thin.points[:, 0], 3 * thin.amplitude)
-    np.testing.assert_array_equal(thin.points.astype(np.uint8), thin.color)
-    assert len(as_cloud(item, 5000)) == n
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"voxel_m": 0.0},
-        {"voxel_m": float("nan")},
-        {"voxel_m": 1e6},
-        {"min_views": 0},
-    ],
-)
-def test_invalid_options_are_rejected(options) -> None:
-    with pytest.raises(ValueError, match=next(iter(options))):
-        Fusion(**options)

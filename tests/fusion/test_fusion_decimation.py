@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tofuse.engine.fusion import mesh as mesh_module
 from tofuse.engine.fusion.mesh import Mesh, collapse_edges
 from tofuse.engine.geometry.kdtree import KdTree
 from tofuse.lab.experiments.surface_error import Surface, distances
@@ -126,25 +122,6 @@ def test_groups_match_library_triangles() -> None:
     np.testing.assert_allclose(places[found], moved[left] * unit + middle, atol=1e-9)
 
 
-@pytest.mark.slow
-def test_result_is_same_in_another_process() -> None:
-    code = (
-        "import hashlib, sys; sys.path.insert(0, sys.argv[1])\n"
-        "from test_fusion_decimation import digest, hills\n"
-        "print(digest(hills().decimated(700)))"
-    )
-    folder = __file__.rpartition("test_fusion_decimation")[0]
-    done = subprocess.run(
-        [sys.executable, "-c", code, folder], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == digest(hills().decimated(700))
-
-
-def digest(mesh: Mesh) -> str:
-    parts = (mesh.vertices, mesh.faces, mesh.normals, mesh.color, mesh.sigma, mesh.views)
-    return hashlib.sha256(b"".join(each.tobytes() for each in parts)).hexdigest()
-
-
 def test_small_and_empty_meshes_are_unchanged() -> None:
     whole = hills(20)
     assert whole.decimated(len(whole.faces)) is whole
@@ -170,32 +147,6 @@ def test_meshes_of_several_pieces_are_decimated() -> None:
         None, np.ones(n, np.float32), np.ones(n, np.int32), np.zeros(3),
     )  # fmt: skip
     assert len(scraps.decimated(100).faces) <= 100
-
-
-def test_failed_collapse_falls_back_to_clustering(monkeypatch) -> None:
-    whole = hills(30)
-    monkeypatch.setattr(
-        mesh_module,
-        "collapse_edges",
-        lambda vertices, *_: (np.arange(len(vertices)), vertices.astype(float)),
-    )
-    assert digest(whole.decimated(200)) == digest(whole.clustered(200))
-
-
-def test_large_meshes_are_clustered_first(monkeypatch) -> None:
-    whole = hills()
-    seen = []
-
-    def recorded(vertices, faces, count, spacing):
-        seen.append(len(faces))
-        return collapse_edges(vertices, faces, count, spacing)
-
-    monkeypatch.setattr(mesh_module, "collapse_edges", recorded)
-    monkeypatch.setattr(mesh_module, "_MAX_COLLAPSED", 10_000)
-    assert len(whole.decimated(1500).faces) <= 1500
-    assert digest(whole.decimated(12_000)) == digest(whole.clustered(12_000))
-    assert len(seen) == 1
-    assert 5000 < seen[0] <= 10_000
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -12,7 +12,7 @@ from made_rooms import at, seen
 from tofuse.engine.compute.spill import Spill
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.fusion import tsdf_kernels as tsdf
-from tofuse.engine.fusion.block_kernels import EDGE, block_key, block_of
+from tofuse.engine.fusion.block_kernels import EDGE, block_of
 from tofuse.engine.fusion.layout import Frusta, Layout
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import RangeView
@@ -71,16 +71,6 @@ def test_round_robin_colours_and_two_cameras_make_no_seam() -> None:
         )
 
 
-def test_memory_limit_keeps_voxel_size(room) -> None:
-    views, poses = room
-    layout = Layout.of(views, poses, 0.03)
-    assert layout.voxel_m == 0.03
-    for region in layout.regions(1_000_000 // layout.block_bytes):
-        volume = Volume.of(layout, region)
-        arrays = (volume.distance, volume.weight, volume.seen, volume.color, volume.free)
-        assert sum(a.nbytes for a in arrays) <= 1e6
-
-
 def test_each_block_has_one_region_with_its_neighbours(room) -> None:
     views, poses = room
     layout = Layout.of(views, poses, 0.03)
@@ -134,33 +124,6 @@ def test_skipped_views_contribute_nothing(room, which) -> None:
     assert skipped > len(views)
 
 
-def test_contributing_views_touch_block() -> None:
-    """Including blocks in free space, which is integrated up to the camera."""
-    rng = np.random.default_rng(11)
-    T = look([0.2, -0.1, 0.3], [0.6, 0.2, 2.3])
-    view = RangeView.of(frame_of(rng.uniform(0.8, 2.0, (72, 88)), sigma=0.01))
-    frusta = Frusta.of([view], T[None], _free_space_limits(0.05))
-    contributing = 0
-    for _ in range(200):
-        i, j, k = (int(n) for n in rng.integers(-14, 15, 3))
-        keys = np.array([block_key(i, j, k + 4)], np.int64)
-        layout = Layout(0.02, 0.05, keys, 1, 1)
-        volume = Volume.of(layout, layout.single_region())
-        volume.add([view], T[None])
-        low = 0.16 * np.array([i, j, k + 4])
-        something = bool(volume.weight.any() or volume.free.any())
-        contributing += something
-        assert frusta.touching(low, low + 0.16)[0] or not something
-    assert 3 < contributing < 100
-
-
-def test_empty_view_touches_nothing() -> None:
-    empty = RangeView.of(frame_of(np.full((72, 88), np.inf)))
-    frusta = Frusta.of([empty], EYE[None], _free_space_limits(0.05))
-    assert not frusta.touching(np.full(3, -9.0), np.full(3, 9.0)).any()
-    assert fuse_surface([empty], EYE[None], Fusion(memory_mb=1)).faces.shape == (0, 3)
-
-
 def test_islands_are_measured_across_regions() -> None:
     """A strip across several regions exceeds the island size, but not in any single region."""
     ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
@@ -180,13 +143,6 @@ def test_islands_are_measured_across_regions() -> None:
     mesh = stitch(pieces, len(layout.keys), 2 * largest)
     assert len(mesh) > 3 * largest
     assert len(stitch(pieces, len(layout.keys), 2 * len(mesh))) == 0
-
-
-def test_progress_advances_once_per_view(room) -> None:
-    views, poses = room
-    calls = []
-    fuse_surface(views, poses, Fusion(voxel_m=0.03, memory_mb=1), lambda: calls.append(1))
-    assert len(calls) == len(views)
 
 
 def test_view_counts_saturate() -> None:

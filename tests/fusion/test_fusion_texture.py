@@ -4,29 +4,22 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from parsed_glb import parse
-from tofuse.apps.cli.program import main
-from tofuse.apps.jobs import run_options as options_module
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion import atlas as atlas_module
-from tofuse.engine.fusion.atlas import MARGIN, plain_atlas, unwrap
+from tofuse.engine.fusion.atlas import MARGIN, unwrap
 from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
 from tofuse.engine.fusion.cloud import NO_COLOR
-from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.texture import TextureView, baked, exposures, textured
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping import texturing as paint
-from tofuse.formats.geometry.glb import linear, write_glb
-from tofuse.formats.geometry.obj import write_obj
+from tofuse.formats.geometry.glb import linear
 from tofuse.formats.geometry.ply import read_ply
-from tofuse.formats.images.writing import png_bytes
 
 CAMERA = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
 
@@ -201,10 +194,6 @@ def test_occluded_surface_is_not_painted_by_occluder() -> None:
     assert textured(turned, [view], POSES[:1], 256).coverage == 0
 
 
-def test_frames_without_channel_give_no_view() -> None:
-    assert TextureView.of(RangeFrame(0, 0.0, CAMERA, np.ones((60, 80), np.float32))) is None
-
-
 def test_missing_colour_does_not_darken(tmp_path) -> None:
     wall = sheet(40, 40, 0.05)
     dark = wall.vertices[:, 0] > 0
@@ -220,42 +209,6 @@ def test_missing_colour_does_not_darken(tmp_path) -> None:
     assert set(np.unique(colors[:, :3]).tolist()) == set(light.tolist())
     small.save(tmp_path / "data.ply")
     assert set(np.unique(read_ply(tmp_path / "data.ply").color).tolist()) == {0, 180}
-
-
-def test_batched_atlas_holds_every_triangle_once(monkeypatch) -> None:
-    pytest.importorskip("xatlas")
-    monkeypatch.setattr(atlas_module, "_MAX_PART", 100)
-    wall = sheet(20, 20, 0.05)
-    atlas = unwrap(wall, 512)
-    np.testing.assert_array_equal(atlas.vertices[atlas.faces], wall.faces)
-    assert len(np.unique(atlas.vertices)) == len(wall)
-    owner = np.full((atlas.size, atlas.size), NO_TRIANGLE, np.int32)
-    draw_triangles(atlas.texels[atlas.faces], 0.0, owner, np.zeros((*owner.shape, 2), np.float32))
-    p = atlas.texels[atlas.faces].astype(float)
-    b, c = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
-    area = 0.5 * np.abs(b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
-    own = np.bincount(owner[owner != NO_TRIANGLE], minlength=len(p))
-    assert own.sum() == pytest.approx(area.sum(), rel=0.1)  # triangles do not overlap
-
-
-def test_textures_round_trip(tmp_path: Path) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    mesh = sheet(5, 4, 0.2)
-    made = textured(mesh, [TextureView.of(look(np.eye(4), 1.0))], POSES[:1], 128)
-    atlas, image = made.atlas, png_bytes(made.image)
-    points, normals = mesh.vertices[atlas.vertices], mesh.normals[atlas.vertices]
-    for write, name in ((write_glb, "m.glb"), (write_obj, "m.obj")):
-        path = tmp_path / name
-        write(path, GeometryRecord(points, atlas.faces, normals, uv=atlas.uv, texture=image))
-        (read,) = trimesh.load_scene(path, process=False).geometry.values()
-        np.testing.assert_allclose(read.triangles, points[atlas.faces], atol=1e-6)
-        material = read.visual.material
-        shown = material.baseColorTexture if name == "m.glb" else material.image
-        np.testing.assert_array_equal(np.asarray(shown.convert("RGB")), made.image)
-        # In the files v is measured upwards from the lower edge.
-        uv = np.asarray(read.visual.uv)[read.faces] * [1, -1] + [0, 1]
-        np.testing.assert_allclose(uv, atlas.uv[atlas.faces], atol=1e-5)
-    assert {p.name for p in tmp_path.iterdir()} == {"m.glb", "m.obj", "m.mtl", "m.png"}
 
 
 def test_holes_are_filled_and_borders_kept() -> None:
@@ -308,29 +261,3 @@ def test_decimation_keeps_edges_sharp_and_sides_separate() -> None:
     z = thin.vertices[:, 2].astype(float)
     assert np.abs(np.minimum(np.abs(z - 2.0), np.abs(z - 2.01))).max() < 1e-3
     np.testing.assert_array_equal(z > 2.005, thin.normals[:, 2] > 0)
-
-
-def test_plain_atlas_cells_shrink_with_more_triangles() -> None:
-    many = plain_atlas(sheet(60, 60, 0.01), 256)
-    assert 256 < many.size <= 60 * 6
-
-
-@pytest.mark.slow
-def test_run_with_texture(room_recording: Path, tmp_path: Path, capsys, monkeypatch) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    monkeypatch.setattr(options_module, "TEXTURE", 256)
-    monkeypatch.setattr(paint, "_FACES", 3000)
-    words = ["run", str(room_recording), "--every", "7", "--voxel", "3cm", "--no-report", "--out"]
-    for threads, name in (("1", "a"), ("2", "b")):
-        out = str(tmp_path / name)
-        assert main([*words, out, "--texture", "--threads", threads]) == 0
-    a, b = tmp_path / "a", tmp_path / "b"
-    for name in ("mesh.glb", "mesh.obj", "mesh.mtl", "mesh.png"):
-        assert (a / name).read_bytes() == (b / name).read_bytes()
-    (mesh,) = trimesh.load_scene(a / "mesh.glb", process=False).geometry.values()
-    image = np.asarray(mesh.visual.material.baseColorTexture.convert("L"))
-    assert np.ptp(image) > 100
-    # A run without a texture removes the earlier one.
-    assert main([*words, str(a), "--overwrite"]) == 0
-    assert not (a / "mesh.obj").exists()
-    assert not (a / "mesh.png").exists()

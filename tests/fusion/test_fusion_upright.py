@@ -103,7 +103,14 @@ def test_up_follows_cameras_without_surface(mesh) -> None:
     assert np.isfinite(upright(mesh, poses)).all()
 
 
-@pytest.mark.parametrize("name", ["iphone_chair_3dscannerapp", "iphone_stray", "iphone_record3d"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "iphone_stray",
+        pytest.param("iphone_chair_3dscannerapp", marks=pytest.mark.nightly),
+        pytest.param("iphone_record3d", marks=pytest.mark.nightly),
+    ],
+)
 def test_up_of_phone_recording_matches_gravity(shared_data: Path, name: str) -> None:
     """ARKit's world has y up."""
     recording = open_recording(shared_data / name)

@@ -55,7 +55,3 @@ def test_places_are_apart_by_position_direction_depth_and_component() -> None:
 def test_a_camera_that_moves_on_keeps_all_images() -> None:
     places = PlaceCounts(0.1, 0.1, 4)
     assert all(places.keeps(2.0, turned(0.0, x=0.1 * k)) for k in range(500))
-
-
-def test_images_without_depth_count_as_well() -> None:
-    assert 0 < kept(PlaceCounts(0.1, 0.1, 4), 100, np.eye(4), depth=0.0) < 30

@@ -179,11 +179,6 @@ def test_quaternion_product_matches_matrix_product(a: np.ndarray, b: np.ndarray)
     np.testing.assert_allclose(quaternion.to_matrix(quaternion.multiply(a, b)), A @ B, atol=1e-12)
 
 
-def test_quaternion_of_quarter_turn() -> None:
-    q = [0, 0, np.sqrt(0.5), np.sqrt(0.5)]
-    np.testing.assert_allclose(quaternion.to_matrix(q) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
-
-
 @pytest.mark.parametrize("angle", [0.0, 1e-5, 0.03, 0.0999, 0.1001, 1.0, 3.1])
 def test_jacobian_matches_series(angle):
     """sum (-ad)^n / (n + 1)!, which converges for every twist; and the two are inverse."""

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import graph_covariances
 from tofuse.engine.graph.graph import Measured, Optimisation, PoseGraph, build_graph
 from tofuse.engine.graph.graph_covariances import (
     MIN_WEIGHT,
@@ -19,6 +18,7 @@ from tofuse.engine.graph.graph_covariances import (
     relative_covariance,
 )
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
+from tofuse.engine.graph.solver import solve
 from walks import round_walk, step_of, true_poses
 
 N = 12
@@ -143,33 +143,23 @@ def with_branches(graph: PoseGraph) -> PoseGraph:
     )
 
 
-@pytest.fixture
-def without_removal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(graph_covariances, "_LEVELS", 0)
-
-
-def test_covariances_of_branches_are_those_of_the_whole_system(request) -> None:
+def test_covariances_of_branches_are_those_of_the_whole_system() -> None:
     graph = with_branches(LevenbergMarquardt().optimise(walk()).graph)
     some = np.array([2, 3, N, N + 1, N + 2])
     known = GraphCovariances(graph)
-    found = known.of_poses, known.joint(some), loop_errors(graph, graph.poses)
-    request.getfixturevalue("without_removal")
-    whole = GraphCovariances(graph)
-    np.testing.assert_allclose(found[0], whole.of_poses, atol=1e-12)
-    np.testing.assert_allclose(found[1], whole.joint(some), atol=1e-12)
-    np.testing.assert_allclose(found[2], loop_errors(graph, graph.poses), rtol=1e-9)
+    # The solver itself removes no branches.
+    factor = solve(graph.poses, graph.edges, graph.measurements, graph.information).factor()
+    assert factor is not None
+    np.testing.assert_allclose(known.of_poses, factor.covariances(), atol=1e-9)
+    np.testing.assert_allclose(known.joint(some), factor.joint_covariance(some), atol=1e-9)
 
 
-def test_branches_follow_the_optimised_poses(request) -> None:
+def test_branches_follow_the_optimised_poses() -> None:
     graph = with_branches(walk(np.random.default_rng(5)))
     found = LevenbergMarquardt().optimise(graph)
-    request.getfixturevalue("without_removal")
-    whole = LevenbergMarquardt().optimise(graph)
-    assert whole.improved
-    np.testing.assert_allclose(found.graph.poses, whole.graph.poses, atol=1e-6)
-    np.testing.assert_allclose(found.objective[-1], whole.objective[-1], rtol=1e-6)
-    residuals = found.graph.residuals()[-3:]
-    np.testing.assert_allclose(residuals, 0, atol=1e-12)
+    whole = solve(graph.poses, graph.edges, graph.measurements, graph.information).poses
+    np.testing.assert_allclose(found.graph.poses, whole, atol=1e-5)
+    np.testing.assert_allclose(found.graph.residuals()[-3:], 0, atol=1e-12)
 
 
 def test_branches_with_error_are_corrected() -> None:

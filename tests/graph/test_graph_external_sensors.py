@@ -256,21 +256,6 @@ def test_missing_sensors_change_nothing():
     assert with_sensors(graph, measured) is graph
 
 
-@pytest.mark.parametrize(
-    ("part", "options"),
-    [
-        (GravityEdges, {"shared_rad": 0}),
-        (GravityEdges, {"gate": -1}),
-        (OdometryEdges, {"relative": -1}),
-        (OdometryEdges, {"min_m": 0}),
-        (OdometryEdges, {"limit": 0.5}),
-    ],
-)
-def test_invalid_options_are_refused(part, options):
-    with pytest.raises(ValueError, match=next(iter(options))):
-        part(**options)
-
-
 def test_refinement_takes_unconstrained_tilt_from_gravity():
     """Views of a bare wall, invariant to rotation about its normal and translation along it."""
     poses = se3.exp(np.linspace(0, 0.2, 6)[:, None] * np.array([1.0, 0, 0, 0, -0.5, 0]))

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import robust
-from tofuse.engine.graph.graph import Gravity, Measured, PoseGraph, build_graph
+from tofuse.engine.graph.graph import Measured, PoseGraph, build_graph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
 from tofuse.engine.graph.solver import Settings, solve
 from tofuse.engine.graph.sparse import Blocks, PairSystem
@@ -237,84 +236,6 @@ def test_robust_kernels(kernel):
     assert ate(done.graph.poses, truth) < 0.8 * ate(plain.graph.poses, truth)
 
 
-def test_optimal_switch_cost_equals_kernel():
-    x = np.array([0.1, 4.0, 100.0])
-    s = np.linspace(0, 1, 200001)[:, None]
-    best = (s**2 * x + 4.0 * (1 - s) ** 2).min(axis=0)
-    np.testing.assert_allclose(robust.cost("switchable", x, 4.0), best, rtol=1e-6)
-
-
-def test_gravity_stabilises_tilt_of_chain():
-    """Without loops the tilt drifts; gravity edges stop it, the heading is unchanged."""
-    graph, truth, _ = walk(60, 0)
-    down = np.swapaxes(truth[:, :3, :3], 1, 2) @ np.array([0.1, 0.9, np.sqrt(1 - 0.82)])
-    for world in (None, np.array([0.1, 0.9, np.sqrt(1 - 0.82)])):
-        gravity = Gravity(np.arange(60), down, np.full(60, 1e-4), world)
-        done = minimise(replace(graph, gravity=gravity), Settings(tolerance=1e-10))
-
-        def tilt(poses: Float64) -> Float64:
-            up = poses[:, :3, :3] @ down[..., None]
-            return np.linalg.norm(np.cross(up[..., 0], truth[0, :3, :3] @ down[0]), axis=1)
-
-        assert tilt(graph.poses).max() > 0.01
-        assert tilt(done.graph.poses).max() < 5e-4
-        assert done.converged
-        np.testing.assert_array_equal(done.graph.poses[0], graph.poses[0])
-
-
-def test_parts_are_solved_and_reported_separately():
-    a, _, _ = walk(20, 8)
-    b, _, _ = walk(12, 5, seed=1)
-    n, m = len(a.ids), len(a.edges)
-    both = PoseGraph(
-        np.concatenate([a.ids, 100 + b.ids, [500]]),
-        np.concatenate([a.poses, b.poses, np.eye(4)[None]]),
-        np.concatenate([a.edges, b.edges + n]),
-        np.concatenate([a.measurements, b.measurements]),
-        np.concatenate([a.information, b.information]),
-        np.concatenate([a.loop, b.loop]),
-    )
-    optimiser = LevenbergMarquardt()
-    done = optimiser.optimise(both)
-    np.testing.assert_array_equal(done.graph.poses[:n], optimiser.optimise(a).graph.poses)
-    np.testing.assert_array_equal(done.graph.poses[n:-1], optimiser.optimise(b).graph.poses)
-    assert [(p.first, p.vertices, p.edges) for p in done.parts] == [
-        (0, 20, m),
-        (100, 12, len(b.edges)),
-        (500, 1, 0),
-    ]
-    assert [p.improved for p in done.parts] == [True, True, False]
-    assert done.objective[-1] == pytest.approx(sum(p.after for p in done.parts))
-
-
-def test_optimal_input_is_unchanged():
-    graph, truth, _ = walk(10, 4)
-    i, j = graph.edges.T
-    exact = replace(graph, poses=truth, measurements=se3.inverse(truth[i]) @ truth[j])
-    best = minimise(exact, Settings(tolerance=1e-15))
-    again = minimise(best.graph, Settings(tolerance=1e-15))
-    assert not again.parts[0].improved
-    np.testing.assert_array_equal(again.graph.poses, best.graph.poses)
-    empty = LevenbergMarquardt().optimise(PoseGraph.empty())
-    assert (len(empty.graph.ids), empty.converged) == (0, True)
-
-
-def test_invalid_graphs_and_options_are_refused():
-    graph, _, _ = walk(8, 2)
-    poses = graph.poses.copy()
-    poses[2, 0, 3] = np.nan
-    with pytest.raises(InputError, match="pose 2 is not finite"):
-        LevenbergMarquardt().optimise(graph.with_poses(poses))
-    information = graph.information.copy()
-    information[3, 1, 1] *= -1
-    with pytest.raises(InputError, match="edge 3 4: the information matrix is not positive"):
-        LevenbergMarquardt().optimise(replace(graph, information=information))
-    with pytest.raises(ValueError, match="gate must be above 0"):
-        LevenbergMarquardt(gate=0.0)
-    with pytest.raises(InputError, match="names no vertex"):
-        replace(graph, gravity=Gravity(np.array([8]), np.array([[0.0, 1, 0]]), np.ones(1)))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least"), [("sphere", 63789.07892761), ("parking-garage", 0.63419240)]
@@ -326,9 +247,3 @@ def test_benchmark_graphs_match_gtsam(shared_data, name, least):
     assert done.converged
     assert done.graph.chi2() / 2 < 1.00001 * least
     assert (done.weights == 1).all()
-
-
-def test_options_match_settings():
-    part, function = LevenbergMarquardt(), Settings()
-    for name in ("robust", "gate"):
-        assert getattr(part, name) == getattr(function, name)

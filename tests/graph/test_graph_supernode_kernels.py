@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.arrays import Float64, Int64
+from tofuse.engine.arrays import Float64
 from tofuse.engine.graph import supernode_kernels as kernels
 
 
@@ -53,21 +53,6 @@ def test_pattern_is_that_of_the_factor(n: int, links: int) -> None:
         (i, k) for k in range(n) for i in range(k, n) if np.abs(L[i, :, k]).max() > 0
     }
     assert all((np.diff(rows[start[k] : start[k + 1]]) > 0).all() for k in range(n))
-
-
-def test_panels_contain_the_pattern_and_few_zeros() -> None:
-    A = Sparse(90, 130)
-    start, rows = kernels.fill_in(A.start, A.rows)
-    panels: kernels.Panels = A.panels
-    assert len(panels.first) - 1 < 60  # columns were joined
-    for s in range(len(panels.first) - 1):
-        own: Int64 = panels.rows[panels.row_start[s] : panels.row_start[s + 1]]
-        first, end = panels.first[s : s + 2]
-        np.testing.assert_array_equal(own[: end - first], np.arange(first, end))
-        for c in range(first, end):
-            assert np.isin(rows[start[c] : start[c + 1]], own).all()
-    blocks = panels.value_start[-1] / 36
-    assert blocks < 2 * len(rows)
 
 
 @pytest.mark.slow

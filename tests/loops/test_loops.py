@@ -7,18 +7,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from tofuse.engine import parts
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError, RegistrationError
+from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import Measured, build_graph
 from tofuse.engine.icp.icp import algorithm_1
-from tofuse.engine.loops.loops import Confirmation, LoopDetector, PriorLoop, mean_error
+from tofuse.engine.loops.loops import Confirmation, PriorLoop, mean_error
 from tofuse.engine.loops.nearby import Nearby, yaw
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.formats.poses.given_loops import read_loops
 from tofuse.lab.simulation.peaks import peaks_views
 
 
@@ -64,13 +61,6 @@ def test_candidates_are_near_similar_in_heading_and_not_recent():
     assert detector.candidates(poses[:1]).tolist() == []
 
 
-def test_full_turn_revisits_its_start_only():
-    poses = turning(40)
-    detector = Nearby(max_yaw_rad=np.radians(5), min_gap=10, per_frame=5)
-    found = {(int(i), k) for k in range(len(poses)) for i in detector.candidates(poses[: k + 1])}
-    assert found == {(k - 40, k) for k in range(40, 50)}
-
-
 @dataclass(frozen=True)
 class Scripted:
     """A registrar with scripted results that depend on the error of the guess."""
@@ -98,22 +88,6 @@ class Scripted:
 
 def view(index: int) -> CloudFrame:
     return CloudFrame(index, float(index), np.zeros((5, 3), np.float32))
-
-
-def test_good_fit_is_accepted_with_its_measurement():
-    truth = pose(0.3, heading=0.1)
-    registrar = Scripted(truth)
-    closed = Confirmation((registrar,)).confirm(view(9), view(2), np.eye(4), seed=4)
-    assert (closed.record.i, closed.record.j) == (2, 9)
-    assert closed.record.accepted
-    assert (
-        closed.record.reason == "60% of the points correspond, with an error of 0.20 of the "
-        "resolution"
-    )
-    assert closed.record.overlap == pytest.approx(0.6)
-    assert closed.record.rms_m == 0.01
-    np.testing.assert_array_equal(closed.T_i_j, truth)
-    np.testing.assert_array_equal(closed.information, np.eye(6) * 7)
 
 
 @pytest.mark.parametrize(
@@ -205,74 +179,3 @@ def test_real_registrations_distinguish_loop_from_other_place():
     assert np.linalg.norm(away[3:]) < 0.05
     other = confirmation.confirm(views[10], views[0], truth[10], seed=0)
     assert not other.record.accepted
-
-
-def test_detector_is_configurable():
-    data = parts.to_dict(Nearby(min_gap=30))
-    assert data["part"] == "nearby"
-    parts.discover("tofuse.engine.clouds")
-    assert parts.from_dict(LoopDetector, data, where="x") == Nearby(min_gap=30)
-    for bad in ({"min_gap": 0}, {"max_distance_m": 0.0}, {"confirmation": {"min_fraction": 2.0}}):
-        with pytest.raises(InputError, match="x"):
-            parts.from_dict(LoopDetector, {"part": "nearby", **bad}, where="x")
-
-
-def test_loops_from_file(tmp_path):
-    file = tmp_path / "loops.txt"
-    file.write_text(
-        f"# seen by eye\n\n0 56\n12 3   # the other way round\n"
-        f"5 30 1 2 3 0 0 {np.sin(0.2)} {np.cos(0.2)}\n"
-        f"31 5 1 2 3 0 0 {np.sin(0.2)} {np.cos(0.2)}\n"
-    )
-    first, second, third, fourth = read_loops(file, range(57))
-    assert (first.i, first.j, first.T_i_j) == (0, 56, None)
-    assert (second.i, second.j) == (3, 12)
-    T = se3.exp([0, 0, 0, 0, 0, 0.4])
-    T[:3, 3] = [1, 2, 3]
-    assert (third.i, third.j) == (5, 30)
-    np.testing.assert_allclose(third.T_i_j, T, atol=1e-12)
-    # T_31_5 was given, T_5_31 is kept.
-    assert (fourth.i, fourth.j) == (5, 31)
-    np.testing.assert_allclose(fourth.T_i_j @ T, np.eye(4), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("line", "problem"),
-    [
-        ("1", "has 1 values"),
-        ("1 2 3", "has 3 values"),
-        ("a 2", "is not understood"),
-        ("1.5 2", "is not understood"),
-        ("4 4", "joins frames 4 and 4"),
-        ("-1 4", "joins frames -1 and 4"),
-        ("1 99", "there is no frame 99"),
-        ("3 0", "is given twice"),
-        ("1 2 0 0 0 0 0 0 0", "is not a rigid motion"),
-        ("1 2 nan 0 0 0 0 0 1", "is not a rigid motion"),
-        ("1 2 0 0 0 0 0 x 1", "is not understood"),
-    ],
-)
-def test_invalid_line_is_named(tmp_path, line, problem):
-    file = tmp_path / "loops.txt"
-    file.write_text(f"0 3\n{line}\n")
-    with pytest.raises(InputError) as caught:
-        read_loops(file, range(10))
-    assert str(caught.value).startswith(f"{file}, line 2: ")
-    assert problem in str(caught.value)
-
-
-def test_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match="nowhere"):
-        read_loops(tmp_path / "nowhere.txt")
-
-
-def test_edges_refer_to_frames_with_pose():
-    poses = np.array([np.eye(4), pose(1.0), pose(2.0)])
-    edges = [Measured(4, 7, pose(1.0), np.eye(6)), Measured(7, 9, pose(1.0), np.eye(6))]
-    graph = build_graph([4, 7, 9], poses, edges, [Measured(4, 9, pose(2.0), np.eye(6))])
-    assert graph.ids.tolist() == [4, 7, 9]
-    assert graph.edges.tolist() == [[0, 1], [1, 2], [0, 2]]
-    assert graph.chi2() == pytest.approx(0)
-    with pytest.raises(InputError, match="names frame 8, which has no pose"):
-        build_graph([4, 7, 9], poses, edges, [Measured(4, 8, pose(2.0), np.eye(6))])
-    assert len(build_graph([4], np.eye(4)[None], []).edges) == 0

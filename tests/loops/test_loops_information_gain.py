@@ -54,10 +54,3 @@ def test_successive_ones_of_many_views_share_a_position():
     assert gain.of(2500, 2501) == 0
     gain.add(0, 4999)
     assert gain.of(3, 4997) <= 1
-
-
-def test_certain_positions_gain_nothing():
-    gain = InformationGain(np.zeros(4))
-    assert gain.of(0, 3) == 0
-    gain.add(0, 3)
-    assert gain.of(0, 3) == 0

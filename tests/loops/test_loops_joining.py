@@ -12,17 +12,16 @@ from made_rooms import OTHER, at, seen, surface
 from tofuse.engine.alignment.base import Link, Registration
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
-from tofuse.engine.loops import joining
 from tofuse.engine.loops.join_checks import JoinChecks
 from tofuse.engine.loops.joining import Joining
 from tofuse.engine.loops.merged_components import MergedComponents, TrackedComponent
-from tofuse.engine.search.search import SearchOptions
 from tofuse.engine.search.verification import MAX_OVERLAP_DISTANCE
 from tofuse.engine.search.view_pair import follow, register_pair
 from tofuse.engine.stored_views.view_store import PosedView
 
 RATE = 10.0
 SPARSELY = Joining(searches=2, bridge=False)
+BY_LINKS = replace(SPARSELY, tries=0)  # without a search for others
 # A camera that moves on a circle and rotates.
 PATH = [at(0.3 * np.sin(0.2 * k), 0.3 * np.cos(0.2 * k), 0.08 * k) for k in range(40)]
 STRANGE = {"boxes": OTHER, "half": (2.3, 1.2, 2.2), "scene": 9}
@@ -170,30 +169,27 @@ def test_certain_but_wrong_link_is_outvoted(three) -> None:
     assert all(link is not wrong for link in pairs.values())
 
 
-def test_contradictory_certain_links_are_not_used(three, monkeypatch) -> None:
-    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
+def test_contradictory_certain_links_are_not_used(three) -> None:
     wrong = linked(three[0], three[1], off=se3.exp([0.8, 0, -0.5, 0, 0.5, 0]))
     right = linked(three[0], three[1])
-    assert members(SPARSELY.join(three[:2], [right])) == [[0, 1]]
-    assert members(SPARSELY.join(three[:2], [right, wrong])) == [[0], [1]]
+    assert members(BY_LINKS.join(three[:2], [right])) == [[0, 1]]
+    assert members(BY_LINKS.join(three[:2], [right, wrong])) == [[0], [1]]
 
 
 @pytest.mark.parametrize(
     "off", [[0, 0, -0.5, 0, 0, 0], [0, 0, 0.5, 0, 0, 0], [0.4, 0, 0, 0, 0.3, 0]]
 )
-def test_link_contradicted_by_free_space_is_rejected(three, off, monkeypatch) -> None:
-    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
+def test_link_contradicted_by_free_space_is_rejected(three, off) -> None:
     wrong = linked(three[0], three[1], off=se3.exp(np.array(off)))
-    assert members(SPARSELY.join(three[:2], [wrong])) == [[0], [1]]
+    assert members(BY_LINKS.join(three[:2], [wrong])) == [[0], [1]]
 
 
-def test_uncertain_link_needs_confirmation_by_another_view(three, elsewhere, monkeypatch) -> None:
-    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
-    (group,) = SPARSELY.join(three[:2], [linked(three[0], three[1], certain=False)])
+def test_uncertain_link_needs_confirmation_by_another_view(three, elsewhere) -> None:
+    (group,) = BY_LINKS.join(three[:2], [linked(three[0], three[1], certain=False)])
     assert_joined(group, three)
     # No confirmation is found if the scene is another one.
     unlike = linked(three[0], elsewhere, certain=False)
-    assert members(SPARSELY.join([three[0], elsewhere], [unlike])) == [[0], [1]]
+    assert members(BY_LINKS.join([three[0], elsewhere], [unlike])) == [[0], [1]]
 
 
 def turned_back(late):
@@ -207,11 +203,10 @@ def turned_back(late):
 
 
 @pytest.mark.parametrize(("late", "joined"), [(0.0, False), (5.0, True)])
-def test_link_must_imply_feasible_motion(late, joined, monkeypatch) -> None:
+def test_link_must_imply_feasible_motion(late, joined) -> None:
     """The camera rotated at 0.5 rad/s, and would have to rotate by 1.5 rad at once."""
-    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     path, parts, link = turned_back(late)
-    groups = SPARSELY.join(parts, [link])
+    groups = BY_LINKS.join(parts, [link])
     assert members(groups) == ([[0, 1]] if joined else [[0], [1]])
     if joined:
         assert_joined(groups[0], parts, path)
@@ -279,10 +274,9 @@ def test_short_gap_does_not_support_distant_pose(three) -> None:
     assert not checks.is_near(a, b, right @ se3.exp([0, 0, -4.0, 0, 1.5, 0]), MAX_OVERLAP_DISTANCE)
 
 
-def test_motion_between_recordings_is_unconstrained(monkeypatch) -> None:
-    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
+def test_motion_between_recordings_is_unconstrained() -> None:
     path, parts, link = turned_back(0.0)
-    (group,) = SPARSELY.join([parts[0], replace(parts[1], recording=1)], [link])
+    (group,) = BY_LINKS.join([parts[0], replace(parts[1], recording=1)], [link])
     assert_joined(group, parts, path)
 
 
@@ -362,9 +356,8 @@ def test_links_to_frames_without_pose_are_left_out(three) -> None:
     assert all(999 not in (join.link.i, join.link.j) for join in group.joins)
 
 
-def test_links_of_real_searches_and_alignments_are_used(three, monkeypatch) -> None:
+def test_links_of_real_searches_and_alignments_are_used(three) -> None:
     """As relocalization finds them during tracking."""
-    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     a, b, c = three
     ends = [(a.views[-1].view, b.views[0].view), (b.views[-1].view, c.views[0].view)]
     made = [register_pair(*reversed(ends[0])), follow(*reversed(ends[1]), np.eye(4))]
@@ -372,7 +365,7 @@ def test_links_of_real_searches_and_alignments_are_used(three, monkeypatch) -> N
         Link(target.index, source.index, found, bool(found.believed), found.how)
         for (target, source), found in zip(ends, made, strict=True)
     ]
-    (group,) = SPARSELY.join(three, links)
+    (group,) = BY_LINKS.join(three, links)
     assert_joined(group, three)
 
 
@@ -387,11 +380,10 @@ def probable(first, second, p, T=None):
 @pytest.fixture
 def min_probability(three, monkeypatch):
     """Join two components by links alone, and return the probability; None if rejected."""
-    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     monkeypatch.setattr(JoinChecks, "confirming", lambda *_: [])
 
     def joined(links, at_least=0.9):
-        groups = replace(SPARSELY, min_probability=at_least).join(three[:2], links)
+        groups = replace(BY_LINKS, min_probability=at_least).join(three[:2], links)
         found = {join.probability for group in groups for join in group.joins}
         assert len(found) <= 1
         return found.pop() if found else None
@@ -411,42 +403,8 @@ def test_independent_links_raise_probability(three, min_probability) -> None:
     assert other > same
 
 
-def test_failed_tries_lower_probability(three, monkeypatch) -> None:
-    monkeypatch.setattr(JoinChecks, "confirming", lambda *_: [])
-    a, b = three[0].views, three[1].views
-    right = probable(a[-1], b[0], 0.96)
-    joiner = joining._Joiner(replace(SPARSELY, min_probability=0.9), three[:2], SearchOptions())
-    joiner.add(right)
-    assert joiner._probability(*joiner._merged.all, [right]) == pytest.approx(0.96)
-    joiner._tried |= {(a[k].index, b[k].index) for k in range(3)}  # and nothing was found
-    assert joiner._probability(*joiner._merged.all, [right]) == pytest.approx(24 / 28)
-    joiner.decide(single=True)
-    assert len(joiner.groups()) == 2
-
-
-def test_single_link_is_never_certain(three, min_probability) -> None:
-    a, b = three[0].views, three[1].views
-    assert min_probability([probable(a[-1], b[0], 1.0)]) == pytest.approx(joining._MAX_PROBABILITY)
-    assert min_probability([probable(a[-1], b[0], 1.0)], at_least=0.999) is None
-
-
 @pytest.mark.slow
 def test_first_group_is_main_on_request(elsewhere, three) -> None:
     strange = stretch(0, range(4), **STRANGE)
     groups = replace(SPARSELY, main="first").join([strange, three[1], three[2]], [])
     assert members(groups) == [[0], [1, 2]]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"searches": -1},
-        {"tries": -1},
-        {"min_probability": 1.0},
-        {"min_probability": np.nan},
-        {"main": "last"},
-    ],
-)
-def test_options_are_checked(options) -> None:
-    with pytest.raises(ValueError, match=next(iter(options))):
-        Joining(**options)

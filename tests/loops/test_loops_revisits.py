@@ -185,12 +185,6 @@ def test_searched_loops_are_accepted_or_agree(turn, monkeypatch, probable, wrong
             assert np.linalg.norm(gap[:3, 3]) < 0.05
 
 
-@pytest.mark.parametrize("options", [{"overlap": 0.05}, {"per_view": -1}, {"max_drift": 2}])
-def test_options_are_checked(options):
-    with pytest.raises(ValueError, match=next(iter(options))):
-        Revisits(**options)
-
-
 def test_loops_are_searched_again_after_views_moved(turn):
     frames, truth, start = turn
     # Drift that bends the path so far that no candidate is left.

@@ -8,7 +8,6 @@ import pytest
 
 from tofuse.apps.jobs.run_options import Options, resolve
 from tofuse.engine.errors import InputError
-from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.mapping.config import changed, views_bytes, voxels_mb
 from tofuse.engine.mapping.methods import from_method
 
@@ -19,11 +18,6 @@ def test_memory_budget_is_divided_consistently() -> None:
     assert config.fusion.memory_mb == voxels_mb(1000) == 300
     # Voxels, half as much for images, and views leave room for the program itself.
     assert 1.5 * voxels_mb(2000) * 1_000_000 + views_bytes(2000) < 0.7 * 2e9
-
-
-def test_default_budget_equals_fusion_default() -> None:
-    config = from_method("default")
-    assert config.fusion.memory_mb == Fusion().memory_mb == voxels_mb(config.memory_mb)
 
 
 def test_configured_memory_is_divided_too() -> None:

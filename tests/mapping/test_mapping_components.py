@@ -125,18 +125,6 @@ def test_result_is_independent_of_threads(there_and_back, joined) -> None:
 
 
 @pytest.mark.slow
-def test_blank_frames_leave_one_model() -> None:
-    places = [*range(6), 6, 7, 8, *range(9, 15)]
-    frames = frames_of(places)
-    for k in (6, 7, 8):
-        frames[k] = blank(frames[k])
-    result, _ = run(in_order(frames))
-    assert result.has_pose.tolist() == [not 6 <= k < 9 for k in range(15)]
-    assert_right(result.trajectory, places, [k for k in range(15) if result.has_pose[k]])
-    assert all(component.connected for component in result.components)
-
-
-@pytest.mark.slow
 def test_two_scenes_give_two_components_with_models() -> None:
     places = [*range(10), *range(8)]
     result, _ = run(in_order([*frames_of(range(10)), *frames_of(range(8), **STRANGE)]))

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
-from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import ray_lengths
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
@@ -24,39 +23,35 @@ from tofuse.lab.simulation.render import render
 from tofuse.lab.world.scene import build
 
 
+def rendered(scene: str, change=lambda path: path) -> list[RangeFrame]:
+    """Frames along the path of a scene, or along another one."""
+    built, path = build(scene, texture=True)
+    path, model = change(path), camera_model("sr4000")
+    effects = Effects.none(shot_noise=True)
+    taken = [render(built, path, model, k, effects=effects).frame for k in range(0, 48, 2)]
+    return [replace(frame, index=n, timestamp=n / 15) for n, frame in enumerate(taken)]
+
+
 @pytest.fixture(scope="module")
 def frames() -> list[RangeFrame]:
-    scene, path = build("room", texture=True)
-    effects = Effects.none(shot_noise=True)
-    model = camera_model("sr4000")
-    taken = [render(scene, path, model, k, effects=effects).frame for k in range(0, 48, 2)]
-    return [replace(frame, index=n, timestamp=n / 15) for n, frame in enumerate(taken)]
+    return rendered("room")
 
 
 @pytest.fixture(scope="module")
 def forward() -> list[RangeFrame]:
     """Forward into a furnished room, so that ranges change."""
-    scene, sequence = build("room", texture=True)
-    start = sequence.T_room_camera(0.0)
 
-    def path(t: float) -> Float64:
-        return start @ se3.exp(np.array([0.05 * t, 0, 0.3 * t, 0, 0.1 * t, 0]))
+    def forwards(sequence):
+        start, twist = sequence.T_room_camera(0.0), np.array([0.05, 0, 0.3, 0, 0.1, 0])
+        return replace(sequence, camera_path=lambda t: start @ se3.exp(t * twist))
 
-    going = replace(sequence, camera_path=path)
-    effects = Effects.none(shot_noise=True)
-    model = camera_model("sr4000")
-    taken = [render(scene, going, model, k, effects=effects).frame for k in range(0, 48, 2)]
-    return [replace(frame, index=n, timestamp=n / 15) for n, frame in enumerate(taken)]
+    return rendered("room", forwards)
 
 
 @pytest.fixture(scope="module")
 def wall() -> list[RangeFrame]:
     """Along a wall with pictures, where only amplitude shows the motion."""
-    scene, path = build("wall", texture=True)
-    effects = Effects.none(shot_noise=True)
-    model = camera_model("sr4000")
-    taken = [render(scene, path, model, k, effects=effects).frame for k in range(0, 48, 2)]
-    return [replace(frame, index=n, timestamp=n / 15) for n, frame in enumerate(taken)]
+    return rendered("wall")
 
 
 def recording(frames: list[RangeFrame], exponent: float) -> Recording:
@@ -154,14 +149,6 @@ def test_falloff_of_infrared_images_is_estimated(forward, exponent):
     expected = prepare_view(compensated, SurfaceOptions(falloff=0.0, range_falloff=0.0))
     alone = prepare_view(raw, SurfaceOptions(falloff=0.0, range_falloff=exponent))
     assert np.nanstd(alone.albedo[..., 0] - expected.albedo[..., 0]) < 0.02
-
-
-def test_infrared_image_alone_is_assumed_raw(forward):
-    raw = infrared(forward[:1], 2.0)[0]
-    assert isinstance(raw, RangeFrame)
-    alone = prepare_view(raw, SurfaceOptions(falloff=0.0))
-    expected = prepare_view(raw, SurfaceOptions(falloff=0.0, range_falloff=2.0))
-    np.testing.assert_array_equal(alone.albedo, expected.albedo)
 
 
 def test_colour_falloff_is_compensated(forward):

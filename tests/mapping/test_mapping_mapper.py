@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.engine.compute.thread_pool import thread_count
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import Optimisation, Optimiser
 from tofuse.engine.loops.loops import PriorLoop
 from tofuse.engine.mapping.config import changed
@@ -24,7 +22,6 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.parts import part
 from tofuse.lab.methods.filters_temporal import TemporalDeviation
-from tofuse.lab.simulation.peaks import peaks_views
 
 # Fine enough for few frames, and fast.
 CONFIG = changed(
@@ -45,12 +42,6 @@ def frames(recording):
 @pytest.fixture(scope="module")
 def whole(recording):
     return reconstruct(recording, CONFIG)
-
-
-@dataclass(frozen=True)
-class OnlyClouds(Filter):
-    part_name: ClassVar[str] = "only clouds"
-    takes: ClassVar[frozenset[str]] = frozenset({"cloud"})
 
 
 def in_memory(frames, **options) -> Recording:
@@ -95,14 +86,6 @@ def test_seed_and_threads(recording, whole) -> None:
     other = reconstruct(recording, CONFIG, seed=1)
     assert other.trajectory.tobytes() != whole.trajectory.tobytes()
     np.testing.assert_allclose(other.trajectory, whole.trajectory, atol=0.1)
-
-
-def test_thread_count_is_restored(frames) -> None:
-    before = thread_count()
-    mapper = Mapper(threads=before + 1)
-    mapper.push(frames[0])
-    mapper.finish()
-    assert thread_count() == before
 
 
 def test_order_kind_and_end_are_checked(frames) -> None:
@@ -165,13 +148,6 @@ def test_preparation_out_of_order_gives_same_result(
     assert a.cloud.points.tobytes() == b.cloud.points.tobytes()
     assert a.diagnostics.removed == b.diagnostics.removed
     assert [s.index for s in a.diagnostics.samples] == [s.index for s in b.diagnostics.samples]
-
-
-def test_clouds_and_unsuitable_frames_are_not_prepared(frames) -> None:
-    assert Mapper().prepare(CloudFrame.of(np.ones((5, 3)))) is None
-    assert Mapper(from_method("default", "cloud")).prepare(frames[0]) is not None
-    only_clouds = replace(from_method("default"), filters=(OnlyClouds(),))
-    assert Mapper(only_clouds).prepare(frames[0]) is None
 
 
 def test_lost_frame_has_no_pose_and_tracking_continues(frames) -> None:
@@ -284,72 +260,3 @@ def test_unreadable_neighbours_are_left_out(recording, room_recording, tmp_path)
     result = reconstruct(tofuse.open(copy).select(0, None, 3), config)
     assert [(i, past) for i, past, _ in SeesHistory.seen] == [(0, []), (3, [1]), (6, [4, 5])]
     assert result.has_pose.all()
-
-
-def test_joined_recordings_share_no_history(room_recording) -> None:
-    SeesHistory.seen.clear()
-    joined = tofuse.open(room_recording, room_recording).select(6, 11)
-    reconstruct(joined, replace(CONFIG, filters=(SeesHistory(),)))
-    found = [(i, past) for i, past, _ in SeesHistory.seen]
-    assert found == [(6, [4, 5]), (7, [5, 6]), (8, []), (9, [8]), (10, [8, 9])]
-
-
-def test_pushed_frames_form_the_history(frames) -> None:
-    SeesHistory.seen.clear()
-    mapper = Mapper(replace(CONFIG, filters=(SeesHistory(),)))
-    for frame in frames[:4]:
-        mapper.push(frame)
-    assert [past for _, past, _ in SeesHistory.seen] == [[], [0], [0, 1], [1, 2]]
-    assert SeesHistory.seen[3][2] == [len(frames[1]), len(frames[2])]
-
-
-@pytest.mark.slow
-def test_odometry_is_used_as_guess_on_request(frames, recording) -> None:
-    config = replace(CONFIG, odometry=replace(CONFIG.odometry, guess="odometry"))
-    odometry = recording.reference.copy()
-    with_odometry = reconstruct(in_memory(frames, odometry=odometry), config)
-    without = reconstruct(in_memory(frames), config)
-    assert with_odometry.trajectory.tobytes() != without.trajectory.tobytes()
-    odometry[3] = np.nan
-    assert reconstruct(in_memory(frames, odometry=odometry), config).has_pose.all()
-
-
-@pytest.mark.slow
-def test_model_before_loop_closure_is_kept() -> None:
-    views, poses = peaks_views(0.06, 0)
-    recording = Recording.of(ArraySource(views, poses), "peaks", "peaks")
-    changes = {
-        "filters": [],
-        "odometry": {
-            "registration": {
-                "resolution": 1.0,
-                "source": {"part": "all"},
-                "target": {"part": "all"},
-            }
-        },
-        "loops": {"per_frame": 0},
-    }
-    config = changed(from_method("thesis", "cloud"), changes, where="test")
-    closing = se3.inverse(poses[0]) @ poses[-1]
-    closed = reconstruct(recording, config, loops=[PriorLoop(0, len(views) - 1, closing)])
-    opened = reconstruct(recording, config)
-    before = closed.diagnostics.cloud_before
-    assert opened.diagnostics.cloud_before is None
-    assert before is not None
-    np.testing.assert_array_equal(before.points, opened.cloud.points)
-    assert len(closed.cloud) != len(before)
-
-
-@pytest.mark.slow
-def test_camera_that_jumps_back_is_tracked(frames) -> None:
-    mapper = Mapper("default")
-    again = [replace(f, index=k) for k, f in enumerate([*frames[:6], *frames[:4]])]
-    for frame in again:
-        mapper.push(frame)
-    result = mapper.finish()
-    assert [f.status for f in result.diagnostics.frames] == ["tracked"] * 10
-    assert [f.index for f in result.diagnostics.frames] == list(range(10))
-    assert list(result.graph.ids) == list(range(10))
-    for k in range(4):
-        apart = se3.inverse(result.trajectory[k]) @ result.trajectory[6 + k]
-        assert np.linalg.norm(apart[:3, 3]) < 0.02

@@ -83,10 +83,3 @@ def test_missing_sensor_files_change_nothing(room_recording):
     np.testing.assert_array_equal(asked.trajectory, not_asked.trajectory)
     np.testing.assert_array_equal(asked.graph.information, not_asked.graph.information)
     np.testing.assert_array_equal(asked.cloud.points, not_asked.cloud.points)
-
-
-def test_rotating_object_has_no_gravity(tmp_path):
-    from tofuse.apps.jobs.run_options import Options, resolve
-
-    assert resolve(Options(tmp_path)).priors == (GravityEdges(),)
-    assert resolve(Options(tmp_path, object=True)).priors == ()

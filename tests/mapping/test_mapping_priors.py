@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from report_results import lonely
-from tofuse.apps.cli.program import main
-from tofuse.apps.results.run_json import read_run_json
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
@@ -105,11 +103,6 @@ def test_odometry_file_takes_precedence_over_device_poses(recording) -> None:
     assert with_prior(phone, with_odometry, "device")[1] is with_odometry
 
 
-def test_unknown_prior_is_refused(recording) -> None:
-    with pytest.raises(InputError, match="auto, none or device"):
-        with_prior(recording, from_method("default"), "some")
-
-
 @pytest.mark.slow
 def test_inconsistent_device_poses_are_ignored(recording) -> None:
     """A phone that lost tracking: its poses contradict the images."""
@@ -153,7 +146,7 @@ def past_a_corner(covered: Collection[int] = ()) -> Recording:
     return Recording.of(ArraySource(frames, poses, metadata={}), "simulated", "native")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("covered", [(), range(22, 32)])
 def test_device_poses_bound_slide_along_wall(covered) -> None:
     """The images alone do not constrain the motion along it."""
@@ -176,17 +169,3 @@ def test_device_poses_bound_slide_along_wall(covered) -> None:
     assert displacement(right[seen], result.trajectory[seen])[0] < accuracy.position_m < 0.1
     seen = alone.has_pose
     assert covered or displacement(right[seen], alone.trajectory[seen])[0] > 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("prior", "sensors"), [("auto", ["gravity"]), ("none", []), ("device", None)]
-)
-def test_prior_option(prior, sensors, room_recording, tmp_path, capsys) -> None:
-    given = ["run", str(room_recording), "--out", str(tmp_path / "out"), "--prior", prior]
-    assert main([*given, "--end", "2", "--voxel", "10cm"]) == (2 if sensors is None else 0)
-    if sensors is None:
-        assert "--prior" in capsys.readouterr().err
-        return
-    config = read_run_json(tmp_path / "out" / "run.json")["config"]
-    assert [sensor["part"] for sensor in config["priors"]] == sensors

@@ -11,7 +11,7 @@ import pytest
 import tofuse
 from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.frames.recording import Recording
-from tofuse.engine.mapping.adaptation import adapted, with_recording_defaults
+from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.trial import Trial, trial
@@ -133,43 +133,8 @@ def test_correction_of_another_error_does_not_help(straight: Recording) -> None:
     assert not nothing.predicted
 
 
-def test_trial_needs_several_consistent_runs() -> None:
-    def of(*strengths: float) -> Trial:
-        return Trial(strengths, (1.0,) * len(strengths))
-
-    assert not Trial((), ()).is_significant
-    assert not of(0.5, 0.5, 0.5).is_significant
-    assert of(0.5, 0.6, 0.4, 0.5).is_significant
-    assert not of(1.5, -0.9, 1.4, -0.2).is_significant
-    assert not of(0.05, 0.05, 0.06, 0.05).is_significant  # significant, but too small
-    found = of(0.5, 0.6, 0.4, 0.5)
-    assert found.strength == pytest.approx(0.5, abs=0.01)
-    assert found.error == pytest.approx(np.std([0.5, 0.6, 0.4, 0.5], ddof=1) / 2, rel=0.5)
-
-
 def test_single_run_of_bad_poses_does_not_decide() -> None:
     """Not even if it has most of the predicted effect."""
     strengths = np.array([0.2, 0.3, 0.25, 0.35, 0.2, 0.3, 0.25, -0.4])
     predicted = np.array([*[1.0] * 7, 12.0])
     assert Trial(tuple(strengths * predicted), tuple(predicted)).is_significant
-
-
-def test_views_without_amplitude_are_not_tried(straight: Recording) -> None:
-    source = straight.source
-
-    class Dark:
-        metadata = source.metadata
-        timestamps = source.timestamps
-
-        def __len__(self) -> int:
-            return len(source)
-
-        def read(self, index: int) -> Frame:
-            assert index == 0, "one frame tells that there is nothing to compensate"
-            frame = source.read(index)
-            assert isinstance(frame, RangeFrame)
-            return replace(frame, amplitude_image=None)
-
-    known = with_recording_defaults(from_method("default"), straight)
-    config = adapted(known, replace(straight, source=Dark()), 1)
-    assert multipath_of(config) == Multipath(trial=False)

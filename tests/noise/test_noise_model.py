@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +14,7 @@ from paths import DOCS
 from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.engine.noise import noise_kernels as kernels
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.noise.model import (
     NOISE,
     AmplitudeLaw,
@@ -68,15 +66,6 @@ def test_compensated_amplitude_excludes_falloff(power: float) -> None:
     np.testing.assert_allclose(model.sigma(seen), expected, rtol=1e-5)
     raw = frame(amplitude_image=image(500.0))
     np.testing.assert_allclose(model.sigma(raw), 2.0 / 500.0, rtol=1e-5)
-
-
-def test_terms_add_in_squares_up_to_ceiling() -> None:
-    model = NoiseModel("all", RangeLaw(0.01, 0.0), AmplitudeLaw(0.3, 2.0, 0.02), ceiling_m=1.0)
-    sigma = model.sigma(frame(amplitude_image=image(50.0)))
-    assert sigma[0, 0] == pytest.approx(math.sqrt(0.02**2 + 0.09 / 50 + (2 / 50) ** 2))
-    amplitude = image(50.0)
-    amplitude[0, :3] = 0.01, 0.0, SATURATED_AMPLITUDE
-    np.testing.assert_allclose(model.sigma(frame(amplitude_image=amplitude))[0, :3], 1.0)
 
 
 def test_confidence_is_monotone_and_saturates_at_last_level() -> None:
@@ -185,18 +174,6 @@ def test_kernel_matches_numpy_for_any_number_of_threads() -> None:
     np.testing.assert_allclose(one, twin(seen, model, cosine), rtol=2e-5)
 
 
-def test_kernel_writes_only_its_rows() -> None:
-    out = np.full((30, 40), -1, np.float32)
-    none = np.empty((0, 0), np.float32)
-    parameters = np.array([1, 0, 0, 0, 0, 0.01, 0, 0, 0.29])
-    kernels.range_sigma(
-        image(1.0), True, CAMERA.rays(), kernels.BY_RANGE, none, False,
-        np.zeros(1), none, parameters, 5, 9, out,
-    )  # fmt: skip
-    assert (out[5:9] > 0).all()
-    assert (np.delete(out, range(5, 9), 0) == -1).all()
-
-
 def test_json_round_trip(tmp_path: Path) -> None:
     for model in NOISE.values():
         write_noise(tmp_path / "noise.json", model)
@@ -208,17 +185,11 @@ def test_json_round_trip(tmp_path: Path) -> None:
     [
         ({"schema": 2}, "schema: is 2"),
         ({"range": {"a": 5.2e3, "b": 0.0}}, "a must be 0 to 5, not 5200.0"),
-        ({"range": {"a": 0.0, "b": 3.0}}, "b must be 0 to 1, not 3.0"),
-        ({"range": {"a": -0.1, "b": 0.0}}, "a must be 0 to 5, not -0.1"),
         ({"range": {"a": float("nan"), "b": 0.0}}, "a must be 0 to 5, not nan"),
         ({"confidence": {"sigma_m": [0.1, 0.2]}}, "grows with confidence"),
-        ({"confidence": {"sigma_m": [604.0, 180.0, 15.0]}}, "sigma_m must be 0 to 5"),
         ({"confidence": {"sigma_m": []}}, "sigma_m must be non-empty, not ()"),
         ({"amplitude": {"shot": 0, "dark": 0}}, "both 0"),
         ({"amplitude": {"shot": "loud", "dark": 0}}, "is 'loud'"),
-        ({"amplitude": {"shot": float("inf"), "dark": 1}}, "shot must be 0 or more, not inf"),
-        ({"amplitude": {"shot": 1, "dark": 1, "floor": 20.0}}, "floor must be 0 to 5, not 20.0"),
-        ({"ceiling_m": 0.0}, "ceiling_m must be between 0 and 100"),
         ({"loudness": 1}, "unknown option 'loudness'"),
         ({"range": None}, "range"),
     ],

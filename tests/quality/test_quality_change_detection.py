@@ -7,7 +7,6 @@ import pytest
 
 from made_rooms import BOXES, at, seen, surface
 from made_sessions import HERE, with_moved
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.change_detection import changes
 
@@ -76,16 +75,3 @@ def test_added_or_removed_box_is_detected(earlier, kind) -> None:
 def test_occluded_regions_give_no_changes(earlier) -> None:
     """A box that is occluded by another one in all views of the earlier session."""
     assert compared(earlier, boxes=(*BOXES, ((0.1, 0.95, 1.65), (0.08, 0.1, 0.05), 0.0))) == []
-
-
-def test_no_views_give_no_changes(earlier) -> None:
-    assert changes([], np.zeros((0, 4, 4)), earlier, np.array(FIRST)) == []
-
-
-def test_changes_are_independent_of_threads(earlier) -> None:
-    moved = with_moved(CHAIR, (0.25, 0.0, 0.0))
-    found = []
-    for count in (1, 2):
-        with threads(count):
-            found.append([c.points.tobytes() for c in compared(earlier, boxes=moved)])
-    assert found[0] == found[1]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pose_deviation import measured_pairs
 
@@ -26,13 +25,3 @@ def test_pairs_measure_true_motion_from_inexact_poses(posed_views) -> None:
     assert np.median(np.linalg.norm(e[:, :3], axis=1)) < 0.004
     # Six if errors are as large as stated.
     assert np.median(np.einsum("mi,mij,mj->m", e, graph.information, e)) < 12
-
-
-def test_result_is_independent_of_threads(posed_views) -> None:
-    posed, truth = posed_views
-    found = []
-    for count in (1, 2):
-        with threads(count):
-            found.append(measured_pairs(posed, truth))
-    assert np.array_equal(found[0].measurements, found[1].measurements)
-    assert np.array_equal(found[0].information, found[1].information)

@@ -100,14 +100,6 @@ def test_true_error_is_within_bounds(fit, truth, size) -> None:
             assert found.estimate_m > 0.7 * true
 
 
-def test_jump_is_localized(fit, truth) -> None:
-    found = deviation(fit, jumped(truth, [0.06, 0, 0, 0, 0.03, 0]))
-    half = len(truth) // 2
-    assert [half - 1, half] in found.steps.tolist()
-    assert len(found.steps) == 1
-    assert found.to_dict()["inconsistent_steps"] == [[half - 1, half]]
-
-
 def test_significance_scales_with_registration_noise(truth) -> None:
     """An error that precise registrations reveal is insignificant among noisy ones."""
     wrong = jumped(truth, [0.015, 0, 0, 0, 0.005, 0])
@@ -154,13 +146,6 @@ def test_unconstrained_directions_are_free(truth) -> None:
     away[6:, 1, 3] += 0.06
     found = deviation(fit, away)
     assert 0 < found.at_least_m < 0.04
-
-
-def test_uninformative_graph_is_rejected(truth) -> None:
-    fit = fitted(measured(truth, stated=np.full(6, 1e3)), DEPTH_M)
-    assert fit.dof == 0
-    with pytest.raises(ValueError, match="nothing was measured"):
-        deviation(fit, truth)
 
 
 def test_correction_is_minimal(fit, truth) -> None:

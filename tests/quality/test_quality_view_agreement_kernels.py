@@ -9,9 +9,7 @@ import pytest
 
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.geometry import se3
 from tofuse.engine.quality.map_agreement import SurfaceImage
-from tofuse.engine.quality.view_agreement_kernels import agreement_sums, transform_points
 
 SIZE = (64, 48, 50.0, 51.0, 31.0, 24.0)
 
@@ -40,41 +38,3 @@ def test_projection_matches_camera(camera: Camera) -> None:
     inside = (found >= -0.5).all(1) & (found < [63.5, 47.5]).all(1)
     wide = np.hypot(points[:, 0], points[:, 1]) > 1.1 * math.sqrt(image.max_radius2) * points[:, 2]
     assert not (inside & wide).any()
-
-
-def test_moved_points_keep_invalid_ones_at_origin() -> None:
-    points = np.array([[0.0, 0, 0], [1, 2, 3]])
-    T = se3.exp([1, 2, 3, 0.1, 0.2, 0.3])
-    out = np.full((2, 3), np.nan)
-    transform_points(points, T, out)
-    assert out[0].tolist() == [0, 0, 0]
-    assert out[1] == pytest.approx(se3.transform(T, points)[1])
-
-
-def test_agreement_sums_of_plane() -> None:
-    target = np.zeros((2, 3, 3))
-    target[..., 2] = 2.0
-    target[1, 2, 2] = 0.0  # invalid
-    normals = np.zeros((2, 3, 3), np.float32)
-    normals[0, :, 2] = -1
-    moved = np.array(
-        [
-            [0, 0, 2.03],  # an inlier
-            [0, 0, 1.96],  # an inlier
-            [0, 0, 2.2],  # the same surface, but no inlier
-            [0, 0, 2.3],  # neither
-            [0, 0, 2.01],  # projects to a pixel without a normal
-            [0, 0, 2.01],  # projects to an invalid pixel
-            [0, 0, 2.01],  # projects outside
-            [0, 0, 2.01],  # does not project
-            [0, 0, 0.04],  # too near
-        ]
-    )
-    pixels = np.array(
-        [[0, 0], [1.4, -0.4], [2, 0.2], [0.5, 0], [0, 1], [2, 1], [2.6, 0], [np.nan, 0], [0, 0]]
-    )
-    overlapping, compared, inliers, squares = agreement_sums(
-        moved, pixels, target, normals, 0.25, 0.1
-    )
-    assert (overlapping, compared, inliers) == (4, 4, 2)
-    assert squares == pytest.approx(0.03**2 + 0.04**2)

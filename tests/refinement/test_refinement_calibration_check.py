@@ -14,11 +14,10 @@ from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
     check_calibration,
-    proposal,
     significance_of,
 )
 from tofuse.engine.refinement.camera_response import response
-from tofuse.engine.refinement.joint_alignment import Priors, Refined, align_pairs, refine
+from tofuse.engine.refinement.joint_alignment import Priors, Refined, refine
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, longest_loop
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views.pair_equations import Round
@@ -33,14 +32,8 @@ def kept(offset: float, views: int = 12) -> tuple[list[SampledView], Refined]:
 
 
 @pytest.mark.slow
-def test_range_offset_raises_alarm(monkeypatch):
+def test_range_offset_raises_alarm():
     views, refined = kept(0.06)
-    # With many pairs, a part of them and of their points is as conclusive.
-    monkeypatch.setattr(
-        "tofuse.engine.refinement.calibration_check._MAX_PAIRS", len(refined.pairs) // 2
-    )
-    some = check_calibration(views, refined, OPTIONS, Priors.none())
-    monkeypatch.undo()
     found = check_calibration(views, refined, OPTIONS, Priors.none())
     assert found.alarm
     assert found.errors["offset"] == pytest.approx(0.06, abs=0.015)
@@ -53,11 +46,6 @@ def test_range_offset_raises_alarm(monkeypatch):
     assert found.gap.closes
     assert found.support is not None
     assert found.support[1] > found.support[0]
-    assert some.alarm
-    assert some.errors["offset"] == pytest.approx(found.errors["offset"], abs=0.01)
-    assert some.errors != found.errors
-    assert some.gap is not None
-    assert some.gap.before == found.gap.before
 
 
 def test_correct_camera_raises_no_alarm():
@@ -133,13 +121,6 @@ def test_few_views_need_larger_error() -> None:
     ).large
 
 
-def test_few_views_raise_no_alarm():
-    views, refined = kept(0.06, views=5)
-    found = check_calibration(views, refined, OPTIONS, Priors.none())
-    assert not found.alarm
-    assert not found.errors
-
-
 def test_correction_must_close_the_loop():
     assert Gap(0, 9, (0.3, 0.2), (0.1, 0.19)).closes
     assert not Gap(0, 9, (0.3, 0.2), (0.2, 0.15)).closes  # less than half closed
@@ -161,32 +142,6 @@ def test_unclosed_gap_contradicts_errors() -> None:
     assert not Gap(0, 9, (0.009, 0.008), (0.009, 0.008), 1.5, changed).contradicts  # no gap
 
 
-@pytest.mark.slow
-def test_error_that_only_closes_a_loop_is_rejected(monkeypatch):
-    """Drift of odometry leaves a gap, too: views of a correct camera do not keep the error."""
-    truth = path(24)[:8]
-    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
-    refined = refine(views, truth, OPTIONS)
-    drift = np.zeros(kernels.ERRORS)
-    drift[kernels.FOCAL] = -0.06
-
-    def drifting(views, pairs, T_i_j, options, errors):
-        # The last one closes the loop. It is measured by views that hardly differ, so an error of
-        # the camera does not matter there.
-        right = align_pairs(views, pairs, T_i_j, options, np.zeros_like(errors))
-        drifted = align_pairs(views, pairs, T_i_j, options, errors - drift)
-        return np.concatenate([drifted[:-1], right[-1:]])
-
-    monkeypatch.setattr("tofuse.engine.refinement.loop_drift.align_pairs", drifting)
-    assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm
-    monkeypatch.setattr(Loop, "error_by_views", lambda *args: -0.5 * args[-1])
-    assert not check_calibration(views, refined, OPTIONS, Priors.none()).alarm  # the opposite one
-    monkeypatch.setattr(Loop, "error_by_views", lambda *args: args[-1])
-    found = check_calibration(views, refined, OPTIONS, Priors.none())
-    assert found.alarm
-    assert found.best == "focal"
-
-
 @pytest.mark.parametrize("true", [0.0, 0.06])
 def test_views_keep_only_true_error_of_loop(true):
     views, refined = kept(true)
@@ -204,7 +159,7 @@ def test_longest_loop_uses_consecutive_views_only():
     assert longest_loop(pairs[:0]) is None
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_kinect_loop_raises_alarm(shared_data):
     """Its intrinsics are wrong by 5 %, as box corners of 87 degrees confirm."""
     from tofuse.engine.mapping.config import changed, from_method
@@ -237,15 +192,3 @@ def test_kinect_loop_raises_alarm(shared_data):
     assert calibrated.calibrated is not None
     assert calibrated.calibrated.focal == pytest.approx(-0.05, abs=0.015)
     assert calibrated.accuracy.position_m < 0.1 * result.diagnostics.accuracy.position_m
-
-
-def test_proposal_names_two_alternatives_or_the_best() -> None:
-    errors = {"focal": -0.05, "distortion": -0.02}
-    assert proposal(errors, "focal") == (
-        "a focal length 5.3% larger or 2.0% more pincushion distortion at 45 degrees"
-    )
-    errors |= {"center_y": 0.03}
-    assert proposal(errors, "center_y") == (
-        "a principal point 3.0% of the focal length further up (or other calibration errors with a "
-        "similar effect)"
-    )

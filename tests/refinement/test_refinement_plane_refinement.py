@@ -12,8 +12,7 @@ from tofuse.engine.refinement import plane_kernels as kernels
 from tofuse.engine.refinement.common_planes import PlaneOptions, refine_clouds
 from tofuse.engine.refinement.plane_refinement import Planes
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
-from tofuse.lab.experiments.bound import mean_distance, mean_distances, pose_covariances
-from tofuse.lab.experiments.peaks import PoseErrors, peaks_bound, peaks_bound_quantiles, run_peaks
+from tofuse.lab.experiments.peaks import PoseErrors, peaks_bound, run_peaks
 from tofuse.lab.simulation.peaks import peaks_views
 
 
@@ -170,7 +169,7 @@ def test_distant_clouds_are_not_moved(count):
     np.testing.assert_array_equal(same.poses, apart)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_view_of_another_place_does_not_drag_others():
     views, truth = peaks_views(0.02, 0)
     noise = np.random.default_rng(5).uniform(-8, 8, (2500, 3)).astype(np.float32)
@@ -204,7 +203,7 @@ def test_two_sides_of_wall_stay_separate():
     assert np.abs(found.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_frames_that_are_not_kept_follow_the_others():
     views, truth = peaks_views(0.03, 0)
     part = Planes(max_views=12)
@@ -214,54 +213,3 @@ def test_frames_that_are_not_kept_follow_the_others():
     assert 6 <= found.views <= 12
     error = PoseErrors.of(found.poses, truth).position
     assert error.mean() < PoseErrors.of(start, truth).position.mean() / 2
-
-
-def test_bound_of_cube_seen_twice():
-    """Difference of two noisy heights, averaged over the samples that face each axis."""
-    corners = np.array([[0, 0.5, 0.5], [0, 0.5, -0.5], [0, -0.5, 0.5], [0, -0.5, -0.5]])
-    points, normals = [], []
-    for axis in range(3):
-        for side in (1, -1):
-            points.append(np.roll(corners, axis, 1) + side * np.eye(3)[axis])
-            normals.append(np.tile(side * np.eye(3)[axis], (4, 1)))
-    points, normals = np.concatenate(points), np.concatenate(normals)
-    seen = np.ones((24, 2), bool)
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    C = pose_covariances(points, normals, seen, poses, 0.1)
-    np.testing.assert_array_equal(C[0], 0)
-    # 8 samples face each axis; 16 of them, with a lever of 0.5 m, constrain each rotation.
-    np.testing.assert_allclose(np.diag(C[1]), [2 * 0.01 / 8] * 3 + [2 * 0.01 / 4] * 3)
-    # A third view of the unknown surface improves its accuracy.
-    third = pose_covariances(
-        points, normals, np.ones((24, 3), bool), np.tile(np.eye(4), (3, 1, 1)), 0.1
-    )
-    np.testing.assert_allclose(third[1:], np.broadcast_to(C[1], (2, 6, 6)), atol=1e-12)
-    assert mean_distance(C[1:, :3, :3]) == pytest.approx(
-        np.sqrt(2 * 0.01 / 8) * np.sqrt(8 / np.pi), rel=0.01
-    )
-
-
-def test_bound_of_peaks_grows_with_noise():
-    assert peaks_bound(0.1) == pytest.approx(0.046, abs=0.001)
-    assert peaks_bound(0.02) == pytest.approx(peaks_bound(0.1) / 5)
-
-
-def test_bound_of_single_recordings_varies_with_first_view():
-    low, high = peaks_bound_quantiles(0.1, (0.05, 0.95))
-    assert low < peaks_bound(0.1) < high
-    assert high > 2 * low
-    # Two views: half the distance of the second one.
-    C = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
-    assert mean_distances(C).mean() == pytest.approx(np.sqrt(8 / np.pi) / 2, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("cls", "options"),
-    [
-        (Planes, {"points": 10}),
-        (Planes, {"max_views": 1}),
-    ],
-)
-def test_options_are_checked(cls, options):
-    with pytest.raises(ValueError, match=next(iter(options))):
-        cls(**options)

@@ -8,20 +8,14 @@ import numpy as np
 import pytest
 
 from searched_pair import CAMERA, TRUE, A, B, camera, error, seen
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
-from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, agreement
+from tofuse.engine.search.pair_agreement import AgreementOptions, agreement
 from tofuse.engine.search.plane_detection import find_floor, find_floors
 from tofuse.engine.search.search import (
-    DISTINCT_M,
-    Candidate,
     Search,
     SearchOptions,
-    _distinct,
-    are_distinct_poses,
 )
-from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.views.extended_planes import with_rough_planes
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
@@ -252,13 +246,6 @@ def test_agreement_matches_loop_over_pixels(pair):
 # Agreement of two images
 
 
-def test_images_agree_on_true_pose(pair):
-    found = agreement(*pair, TRUE)
-    assert found.support > 0.9 * found.overlap > 0.4
-    assert found.violation < 0.005
-    assert found.rms_m < 0.01
-
-
 @pytest.mark.parametrize("aside", [0.15, -0.15])
 def test_wrong_pose_violates_free_space(pair, aside):
     """Too near, source points are in front of the target's surfaces; too far, vice versa."""
@@ -318,22 +305,6 @@ def test_lowest_plane_has_most_points_and_few_below():
         assert kernels.lowest_plane(p, n, band, tried, cosine, most, 3.0) == tried[on.argmax()]
 
 
-def test_best_of_distinct_poses_are_kept():
-    rng = np.random.default_rng(1)
-    found = Agreement(1.0, 1.0, 0.0, 0.0, 0.0, 1, 0.0)
-    poses = [se3.exp(rng.normal(size=6) * ([0.07] * 3 + [0.06] * 3)) for _ in range(60)]
-    found = [
-        Candidate(T, replace(found, score=s)) for T, s in zip(poses, rng.random(60), strict=True)
-    ]
-    kept = []
-    for one in sorted(found, key=lambda c: -c.score):
-        if all(are_distinct_poses(one.T_target_source, c.T_target_source) for c in kept):
-            kept.append(one)
-    assert 3 < len(kept) < 50
-    assert _distinct(found, DISTINCT_M) == tuple(kept)
-    assert _distinct([], DISTINCT_M) == ()
-
-
 def test_no_floor_is_found_in_view_of_wall():
     level = view(camera(0.0, 2.4, 0.0, pitch=0.0), boxes=[])
     assert find_floors(level, level) is None
@@ -371,46 +342,6 @@ def test_large_step_is_found_without_guess(pair, mode):
     assert found.agreement.violation < 0.01
 
 
-def test_single_box_is_ambiguous_by_90_degrees():
-    box = [((0.0, 0.6, 2.0), (0.4, 0.4, 0.4), 0.4)]
-    around = [np.array([0, 0.6, 2.0]) + 2.2 * np.array([np.sin(a), 0, -np.cos(a)]) for a in (0, 1)]
-    poses = []
-    for a, place in zip((0, 1), around, strict=True):
-        T = camera(0, 0, -a, -0.25)
-        T[:3, 3] = place[0], -0.05, place[2]
-        poses.append(T)
-    target, source = (view(T, boxes=box, walls=False, seed=k) for k, T in enumerate(poses))
-    found = search(source, target, SearchOptions(yaw=1.5, reach=1.2, mode="planar"))
-    centre = se3.exp([0, 0.6, 2.0, 0, 0, 0])
-    quarter = centre @ se3.exp([0, 0, 0, 0, np.pi / 2, 0]) @ se3.inverse(centre)
-    alike = [se3.inverse(poses[0]) @ turn @ poses[1] for turn in (np.eye(4), quarter)]
-    metres, degrees = min(error(found.T_target_source, one) for one in alike)
-    assert metres < 0.1
-    assert degrees < 1
-    # Neither image contradicts either pose.
-    for found in (agreement(source, target, one) for one in alike):
-        assert found.score > 0.3
-        assert found.contradiction < 0.02
-
-
-def test_views_of_different_places_agree_less(pair):
-    other = [((-0.3, 0.4, 1.4), (0.15, 0.6, 0.3), 0.1), ((0.6, 0.85, 1.9), (0.4, 0.15, 0.3), 0.0)]
-    elsewhere = view(camera(0.0, 0.2, 0.9), boxes=other)
-    found = search(elsewhere, pair[1], SearchOptions())
-    assert found.score < 0.8 * agreement(*pair, TRUE).score
-    assert found.margin < 0.1
-
-
-def test_result_is_independent_of_threads(pair):
-    answers = []
-    for count in (1, 3):
-        with threads(count):
-            answers.append(search(*pair))
-    for a, b in zip(*(answer.candidates for answer in answers), strict=True):
-        assert a.T_target_source.tobytes() == b.T_target_source.tobytes()
-        assert a.score == b.score
-
-
 @pytest.mark.slow
 def test_albedo_resolves_geometric_ambiguity():
     """Bare textured walls, 27 degrees apart."""
@@ -440,35 +371,6 @@ def test_empty_view_is_not_searched(pair):
     empty = prepare_view(replace(frame, depth=np.zeros_like(frame.depth)), SurfaceOptions())
     assert search(empty, pair[1]) is None
     assert search(pair[0], empty) is None
-
-
-def test_tracker_connects_view_after_large_step_by_search():
-    """It continues, or is linked to the view before; without searches it starts a component."""
-    frames = [seen(A, seed=0), seen(B, seed=1)]
-    for searches in (False, True):
-        tracker = Keyframes(searches=searches).start(0)
-        step = [tracker.push(frame) for frame in frames][1]
-        if not searches:
-            assert step.component == 1
-            assert step.links == ()
-    found = step.T_component_camera
-    if step.component == 1:
-        (link,) = step.links
-        assert (link.i, link.j) == (0, 1)
-        assert link.certain
-        found = link.T_i_j
-    metres, degrees = error(found, TRUE)
-    assert metres < 0.02
-    assert degrees < 0.5
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"mode": "none"}, {"reach": -1.0}, {"full_candidates": 0}, {"turn": 4.0}],
-)
-def test_options_out_of_range_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        SearchOptions(**wrong)
 
 
 def test_recorded_views_are_found_without_guess(shared_data):

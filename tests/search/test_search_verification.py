@@ -116,12 +116,6 @@ def test_each_statistic_has_its_own_range(usual, twice, far):
     assert not known.assess(aligned(**far)).is_usual
 
 
-def test_range_is_not_too_narrow_for_uniform_recordings():
-    known = taught(200, spread=0.0, outliers=0.1)
-    assert known.assess(aligned(outliers=0.18)).is_usual
-    assert not known.assess(aligned(outliers=0.5)).is_usual
-
-
 def test_few_outlier_views_do_not_change_usual_fit():
     """Location and spread are medians."""
     known = taught(outliers=0.05)
@@ -133,23 +127,6 @@ def test_few_outlier_views_do_not_change_usual_fit():
     for _ in range(15):
         other.learn(aligned(outliers=0.7), 2.0)
     assert not all(other.assess(aligned(outliers=x)).is_usual for x in (0.05, 0.9))
-
-
-def test_stricter_limits_accept_fewer_fits():
-    fits = [aligned(outliers=x) for x in np.linspace(0, 0.9, 40)]
-    counts = []
-    for sigmas in (1.0, 3.0, 6.0):
-        known = FitStatistics(sigmas)
-        for _ in range(20):
-            known.learn(aligned(), 2.0)
-        found = [known.assess(fit) for fit in fits]
-        # Beyond some fraction all are unusual, with an excess that grows with the outliers.
-        usual = [f.is_usual for f in found]
-        assert usual == sorted(usual, reverse=True)
-        excess = [f.excess for f in found if not f.is_usual]
-        assert excess == sorted(excess)
-        counts.append(sum(usual))
-    assert counts[0] < counts[1] <= counts[2]
 
 
 def test_noise_scale_is_learned_from_alignments():

@@ -68,9 +68,3 @@ def test_objects_are_not_unpickled(tmp_path) -> None:
     np.savez(path, range_m=np.array([{}], object), bias_m=np.zeros(1))
     with pytest.raises(InputError):
         read_correction(path)
-
-
-def test_images_of_another_size_are_refused() -> None:
-    correction = DepthCorrection(np.zeros(1), np.zeros(1), np.zeros((2, 2), np.float32))
-    with pytest.raises(InputError, match="2 x 2"):
-        correction.correct(np.ones((3, 3)))

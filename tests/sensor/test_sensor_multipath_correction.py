@@ -10,9 +10,6 @@ import pytest
 from multipath_corner import CAMERA, FLOOR, GAIN, LEFT, PERIOD_M, RIGHT, Seen
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
-from tofuse.engine.mapping.config import changed
-from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.sensor.multipath import (
     GainEstimator,
     MultipathEstimate,
@@ -84,24 +81,6 @@ def test_increase_of_amplitude_is_estimated(corner: Seen) -> None:
     assert np.median(np.abs(found.factor / true - 1)) < 0.02
 
 
-def test_error_decreases_with_iterations(corner: Seen) -> None:
-    errors = [
-        np.abs(corner.errors(solved(corner, replace(REFLECTIONS, iterations=n)).z)).mean()
-        for n in (1, 2, 3)
-    ]
-    assert errors[0] > errors[1] > errors[2]
-
-
-def test_all_bounces_correct_more_than_one(corner: Seen) -> None:
-    one = solved(corner).z
-    every = solved(corner, replace(REFLECTIONS, bounces="all")).z
-    assert np.median(every - one) < -0.002
-
-
-def test_illumination_beyond_image_increases_correction(corner: Seen) -> None:
-    assert np.median(solved(corner, replace(REFLECTIONS, lamp=1.3)).z - solved(corner).z) < -0.002
-
-
 def test_correction_depends_on_ratio_of_amplitude_and_gain_only(corner: Seen) -> None:
     brighter = replace(corner.image, amplitude=corner.image.amplitude * np.float32(8))
     found = REFLECTIONS.solve(brighter, 8 * GAIN)
@@ -141,24 +120,6 @@ def test_gain_is_estimated_from_flatness_of_surfaces(albedo: float) -> None:
     found = solved(seen, gain=estimator.gain)
     before, after = seen.errors(seen.image.z), seen.errors(found.z)
     assert np.median(np.abs(after)) < 0.6 * np.median(np.abs(before))
-
-
-def test_gain_of_flat_wall_follows_from_prior_albedo() -> None:
-    wall = Seen(WALL, albedo=0.35)
-    estimator = GainEstimator(REFLECTIONS)
-    assert estimator.gain is None
-    estimator.add(wall.image)
-    assert estimator.gain == pytest.approx(GAIN * 0.35 / GainEstimator.ALBEDO, rel=0.15)
-
-
-def test_gain_is_estimated_from_limited_number_of_images(corner: Seen) -> None:
-    estimator = GainEstimator(replace(REFLECTIONS, columns=16, iterations=1))
-    used = 0
-    for _ in range(GainEstimator.EVERY * GainEstimator.MAX_IMAGES + 40):
-        before = len(estimator._bright)
-        estimator.add(corner.image)
-        used += len(estimator._bright) - before
-    assert used == GainEstimator.MAX_IMAGES
 
 
 def test_images_without_depth_or_amplitude_have_no_estimate() -> None:
@@ -278,36 +239,6 @@ def test_result_is_independent_of_threads(corner: Seen) -> None:
             assert fixed.amplitude_image is not None
             results.append(fixed.depth.tobytes() + fixed.amplitude_image.tobytes())
     assert len(set(results)) == 1
-
-
-def test_configured_correction_is_applied_to_every_frame(corner: Seen) -> None:
-    base = replace(from_method("thesis"), filters=())
-    wanted = Multipath(gain=GAIN, lamp=1.0)
-    corrections = [{"part": "multipath", "gain": GAIN, "lamp": 1}]
-    config = changed(base, {"corrections": corrections}, where="test.toml")
-    assert config.corrections == (wanted,)
-    frames = [replace(corner.frame(), index=k, timestamp=k / 10) for k in range(3)]
-    corrector = wanted.start()
-
-    mapper, plain = Mapper(config), Mapper(base)
-    for frame in frames:
-        mapper.push(frame)
-        plain.push(corrector.apply(frame))
-    result, expected = mapper.finish(), plain.finish()
-    np.testing.assert_array_equal(result.cloud.points, expected.cloud.points)
-    np.testing.assert_array_equal(result.trajectory, expected.trajectory)
-    assert result.config["corrections"][0]["part"] == "multipath"
-
-
-def test_invalid_options_are_refused() -> None:
-    for options in (
-        {"gain": 0.0},
-        {"period_m": -1.0},
-        {"lamp": 0.5},
-        {"relative_sigma": -0.1},
-    ):
-        with pytest.raises(ValueError, match="must be"):
-            Multipath(**options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("texture", "share"), [(True, 2.5), (False, 2.5)])

@@ -62,14 +62,6 @@ def test_exchange_sums_disc_form_factors_with_delays() -> None:
     assert (np.abs(wanted) > 0).sum() > 100
 
 
-def test_touching_disc_sends_at_most_all_its_light() -> None:
-    sources = np.float32([[0, 0, 1, 0, 0, -1, 0.1, 1, 0]])
-    receivers = np.float32([[0], [0], [1 - 1e-4], [0], [0], [1]])
-    out = np.zeros((2, 1), np.float32)
-    kernels.add_irradiance(sources, 0, 1, receivers, 10.0, out)
-    assert 0.99 < out[0, 0] <= 1.0
-
-
 def test_block_means_use_median_surface() -> None:
     rays = grid_rays(8, 8)
     z = np.full((8, 8), 2.0, np.float32)
@@ -87,25 +79,6 @@ def test_block_means_use_median_surface() -> None:
     assert nodes[..., AMPLITUDE] == pytest.approx(10.0)
     assert nodes[0, 0, AREA] == pytest.approx(13 * 1e-4, rel=1e-4)
     assert nodes[1, 1, AREA] == pytest.approx(16 * 1e-4, rel=1e-4)
-
-
-def test_blocks_with_few_pixels_or_unknown_rays_are_skipped() -> None:
-    rays = grid_rays(4, 8)
-    z = np.zeros((4, 8), np.float32)
-    z[0, :3] = 1.0  # three of sixteen
-    z[:, 4:] = 1.0
-    rays[z == 0] = np.nan
-    nodes = means(z, rays, np.ones_like(z), 4)
-    assert nodes[0, 0, W] == 0
-    assert nodes[0, 1, W] == pytest.approx(1.0)
-    assert np.isfinite(nodes).all()
-
-
-def test_border_blocks_may_be_partial() -> None:
-    nodes = means(np.full((6, 7), 2.0), grid_rays(6, 7), np.ones((6, 7)), 4)
-    assert nodes.shape[:2] == (2, 2)
-    assert nodes[..., W] == pytest.approx(0.5)
-    assert nodes[1, 1, AREA] == pytest.approx(6 * 1e-4, rel=1e-4)
 
 
 def roof(shape: tuple[int, int] = (24, 32)) -> tuple[np.ndarray, np.ndarray]:
@@ -143,40 +116,6 @@ def test_edge_nodes_are_compared_with_corrected_planes() -> None:
     inner = nodes[..., X] > 0.02
     assert strip[inner].any()
     np.testing.assert_allclose(nodes[inner & strip][:, A], 0.3, atol=1e-6)
-
-
-def test_rough_nodes_get_no_plane() -> None:
-    nodes, _ = roof()
-    nodes[..., W] *= np.random.default_rng(0).uniform(0.9, 1.1, nodes.shape[:2])
-    fitted(nodes)
-    assert (nodes[..., C] != 0).mean() < 0.05
-
-
-def test_upsampled_bias_stays_on_its_surface() -> None:
-    rays = grid_rays(48, 64)
-    right = rays[..., 0] > 0.045
-    z = np.where(right, 1.0, 2.0).astype(np.float32)
-    z[5, 5] = 0
-    nodes = fitted(means(z, rays, np.ones_like(z), 4))
-    near = nodes[..., W] > 0.75
-    shift, factor = np.where(near, 0.0, 0.1), np.where(near, 1.0, 1.5)
-    z_out, factor_out = np.empty_like(z), np.empty_like(z)
-    for a, b in ((0, 20), (20, 48)):
-        kernels.upsample_correction(nodes, shift, factor, z, rays, 4, 0.03, a, b, z_out, factor_out)
-    wanted = z - np.where(right, 0.0, 0.1) / np.sqrt(1 + (rays**2).sum(-1))
-    seen = z > 0
-    np.testing.assert_allclose(z_out[seen], wanted[seen], atol=1e-3)
-    np.testing.assert_allclose(factor_out[seen], np.where(right, 1.0, 1.5)[seen], atol=1e-2)
-    assert z_out[5, 5] == 0
-
-
-def test_flat_nodes_are_counted_on_planes_but_not_on_curved_surfaces() -> None:
-    nodes, _ = roof()
-    bent = nodes.copy()
-    bent[..., W] *= 1 + bent[..., X] ** 2
-    flat = kernels.flat_nodes(fitted(nodes), 4, 0.1, 0.003)
-    assert flat > 5000
-    assert kernels.flat_nodes(fitted(bent), 4, 0.1, 0.003) < 0.8 * flat
 
 
 SLANTEST = 0.6
@@ -328,15 +267,6 @@ def test_offscreen_sources_use_known_or_nearest_border_plane() -> None:
         rays, size, planes, albedo, border[:0], border_albedo[:0], growth, 4.0, SLANTEST, 2.5, out
     )
     assert none == count - guessed
-
-
-def test_ray_bounds_cover_known_rays() -> None:
-    rays = np.random.default_rng(9).normal(size=(7, 9, 2)).astype(np.float32)
-    rays[0] = rays[3, 4] = np.nan
-    found = kernels.ray_bounds(rays)
-    x, y = rays[..., 0], rays[..., 1]
-    np.testing.assert_array_equal(found, [np.nanmin(x), np.nanmax(x), np.nanmin(y), np.nanmax(y)])
-    assert np.isnan(kernels.ray_bounds(np.full_like(rays, np.nan))).all()
 
 
 def test_projected_patches_average_nearest_front_faces() -> None:

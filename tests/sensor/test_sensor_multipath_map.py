@@ -148,16 +148,6 @@ def test_views_are_stored_by_motion_up_to_a_limit() -> None:
     assert known.patches[:, 0].min() > 20
 
 
-def test_only_trusted_surfaces_are_stored() -> None:
-    surfaces = surfaces_of(Seen(LEFT, RIGHT, FLOOR))
-    trusted = everywhere(surfaces)
-    trusted[:, : trusted.shape[1] // 2] = False
-    known = ReflectorMap()
-    known.add(surfaces, trusted, np.eye(4))
-    assert len(known.patches) > 50
-    assert (known.patches[:, 0] > -0.1).all()
-
-
 @pytest.mark.slow
 def test_correction_uses_map_only_with_poses() -> None:
     world = (LEFT, RIGHT, FLOOR)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 import tofuse
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import with_recording_defaults
@@ -78,15 +76,3 @@ def test_only_known_camera_families_have_noise_model(tmp_path):
     lit = recording(tmp_path, lidar, confidence=True, amplitude=True)
     assert model_of(with_recording_defaults(from_method("default"), lit)) is None
     assert model_of(with_recording_defaults(from_method("default"), recording(tmp_path))) is None
-
-
-def test_configured_noise_model_takes_precedence(tmp_path):
-    write_noise(tmp_path / "noise.json", NOISE["kinect1"])
-    config = replace(from_method("default"), corrections=(Noise(MINE),))
-    assert model_of(with_recording_defaults(config, recording(tmp_path))) == MINE
-
-
-def test_invalid_noise_model_is_refused(tmp_path):
-    (tmp_path / "noise.json").write_text('{"schema": 1, "name": "x", "range": {"a": -1, "b": 0}}')
-    with pytest.raises(InputError, match=r"noise\.json"):
-        tofuse.reconstruct(recording(tmp_path))

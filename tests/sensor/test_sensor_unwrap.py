@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import tofuse
-from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.cameras.depth_conversion import range_from_z
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
@@ -18,9 +16,6 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.sensor.frequencies import SPEED_OF_LIGHT, combined
 from tofuse.engine.sensor.unwrap import (
     Unwrap,
-    UnwrapOptions,
-    _Blocks,
-    _shift_surfaces,
     count_periods,
     on_surface,
 )
@@ -98,15 +93,6 @@ def test_amplitude_is_adapted_to_unwrapped_range() -> None:
     np.testing.assert_array_equal(out.amplitude_image[still], frame.amplitude_image[still])
 
 
-def test_views_without_ambiguity_are_unchanged() -> None:
-    camera = Pinhole(16, 12, 12.0, 12.0, 7.5, 5.5)
-    frame = RangeFrame(0, 0.0, camera, np.full((12, 16), 2.0, np.float32))
-    corrector = Unwrap().fit([frame]).start()
-    assert corrector.apply(frame) is frame
-    empty = replace(frame, depth=np.zeros((12, 16), np.float32), ambiguity_m=PERIOD)
-    assert corrector.apply(empty) is empty
-
-
 def test_result_is_independent_of_threads() -> None:
     frame, _ = taken("hall", 180)[0]
     corrector = Unwrap(white=3000.0).start()
@@ -137,26 +123,6 @@ def test_messages_find_minimum_of_a_chain() -> None:
         cost += np.minimum(np.abs(np.diff(along, axis=1)) / 0.5, 3.0).sum(1)
         assert np.array_equal(found, states[np.argmin(cost)])
     assert len(NEIGHBOURS) == 4
-
-
-def test_surface_part_off_by_one_period_is_corrected() -> None:
-    """A floor that crosses the period, with a part too far and a speck too near."""
-    along = np.linspace(3.0, 9.0, 60)[:, None] * np.ones((60, 40))
-    range_m = np.mod(along, PERIOD).astype(np.float32)
-    true = (along // PERIOD).astype(np.intp)
-    blocks = _Blocks(range_m, np.ones_like(range_m), np.ones(range_m.shape, bool))
-    wrong = true.copy()
-    wrong[5:45, 10:25] += 1
-    wrong[50, 30] = 0
-    unary = np.zeros((*range_m.shape, 3), np.float32)
-    unary[:] = 0.01 * np.arange(3)  # a small cost per period
-    found = _shift_surfaces(blocks, unary, wrong, PERIOD, UnwrapOptions())
-    np.testing.assert_array_equal(found, true)
-    # If everything is off, only the cost of periods, or the amplitude, decides.
-    nearer = _shift_surfaces(blocks, unary, true + 1, PERIOD, UnwrapOptions())
-    np.testing.assert_array_equal(nearer, true)
-    farther = _shift_surfaces(blocks, -unary, true, PERIOD, UnwrapOptions())
-    np.testing.assert_array_equal(farther, true + 1)
 
 
 def test_dark_surfaces_are_not_unwrapped() -> None:
@@ -263,20 +229,6 @@ def test_native_recordings_with_several_frequencies(
     both = a.valid & b.valid
     assert both.sum() > 0.98 * a.valid.sum()
     assert np.quantile(np.abs(a.depth - b.depth)[both], 0.999) < 0.003
-
-
-@pytest.mark.slow
-def test_several_frequencies_give_same_trajectory_as_depth(
-    room_recording: Path, two_frequencies: Path
-) -> None:
-    """From the folder to the trajectory; depth/ itself is not used."""
-    for path in (two_frequencies / "depth").iterdir():
-        write_png(path, np.zeros((144, 176), np.uint16))
-    plain = tofuse.reconstruct(tofuse.open(room_recording).select(end=4))
-    other = tofuse.reconstruct(tofuse.open(two_frequencies).select(end=4))
-    assert np.isfinite(other.trajectory).all()
-    apart = np.linalg.norm(other.trajectory[:, :3, 3] - plain.trajectory[:, :3, 3], axis=1)
-    assert apart.max() < 0.004
 
 
 def test_invalid_frequencies_are_refused(two_frequencies: Path) -> None:

@@ -7,7 +7,6 @@ import pytest
 
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.mapping.methods import default
 from tofuse.engine.sensor.wrapped import Wrapped
 
 PERIOD = 5.0
@@ -54,23 +53,3 @@ def test_dark_surfaces_within_period_are_kept(albedo: float) -> None:
     albedos[80:] = albedo  # a dark floor
     albedos[50:80, 60:90] = albedo
     assert Wrapped().mask(image(radial, albedos), ()).all()
-
-
-def test_all_is_kept_without_amplitude_or_period() -> None:
-    frame = image(corridor(6.2), 0.5)
-    plain = RangeFrame(0, 0.0, CAMERA, frame.depth, "range", ambiguity_m=PERIOD)
-    endless = RangeFrame(0, 0.0, CAMERA, frame.depth, "range", frame.amplitude_image)
-    assert Wrapped().mask(plain, ()).all()
-    assert Wrapped().mask(endless, ()).all()
-
-
-def test_default_method_filters_only_the_model() -> None:
-    config = default("range")
-    assert any(isinstance(part, Wrapped) for part in config.model_filters)
-    assert not any(isinstance(part, Wrapped) for part in config.filters)
-
-
-@pytest.mark.parametrize("wrong", [{"min_albedo": -0.1}, {"min_albedo": 2.0}])
-def test_invalid_options_are_rejected(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        Wrapped(**wrong)

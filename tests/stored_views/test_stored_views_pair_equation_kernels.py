@@ -30,20 +30,6 @@ def pair():
     return corner(T_target_source), corner(np.eye(4)), T_target_source
 
 
-def test_steps_converge_to_truth(pair):
-    source, target, T = pair
-    xi = np.array([0.01, -0.008, 0.006, 0.004, 0.006, -0.005])
-    start = T @ se3.exp(xi)
-    for _ in range(6):
-        H, g = unpack(evaluate(source, target, start, settings=(0.0, 1.0, 0.1, 0.02, 4.0, 0.5)))
-        H[7:, 7:] = np.eye(kernels.ERRORS)
-        step = -np.linalg.solve(H, g)
-        start = start @ se3.exp(step[:6])
-    away = se3.log(se3.inverse(T) @ start)
-    assert np.abs(away[:3]).max() < 1e-3
-    assert np.abs(away[3:]).max() < 5e-4
-
-
 def as_measured(frame, kind):
     """Return the frame with the depth that a camera of a kind, "z" or "range", measures."""
     return frame if kind == "z" else replace(frame, depth=frame.radial_range, depth_kind=kind)
@@ -131,32 +117,6 @@ def test_known_errors_are_corrected_as_if_they_were_unknowns(pair, kind, error):
     assert np.abs(effect[:6]).max() > 5e-5
     found = step(errors) - step(errors, unknown)
     assert np.abs(found[:6]).max() < 0.2 * np.abs(effect[:6]).max()
-
-
-@pytest.mark.parametrize("kind", ["z", "range"])
-def test_few_points_with_known_errors_have_finite_equations(pair, kind):
-    source, target, T = pair
-    points = points_of(prepare_view(source, SHARP), 1)[::97]
-    surface = prepare_view(as_measured(target, kind), SHARP)
-    row, _ = pair_equations(points, surface, T, SETTINGS, np.full(kernels.ERRORS, 0.01))
-    assert 0 < row[kernels.COMPARED] <= len(points) < 128
-    assert np.isfinite(row).all()
-
-
-def test_points_behind_target_are_not_compared_with_known_errors(pair):
-    source, target, T = pair
-    errors = np.zeros(kernels.ERRORS)
-    errors[kernels.OFFSET] = 0.1
-    behind = T @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
-    assert evaluate(source, target, behind, errors)[kernels.COMPARED] == 0
-
-
-def test_fixed_unknowns_have_no_equations(pair):
-    source, target, T = pair
-    H, g = unpack(evaluate(source, target, T))
-    assert not H[7:].any()
-    assert not g[7:].any()
-    assert np.linalg.eigvalsh(H[:7, :7]).min() > 0
 
 
 def test_free_space_and_support_are_counted(pair):

@@ -45,13 +45,6 @@ def test_keyframe_count_is_bounded_and_newest_is_kept(small) -> None:
         assert small.newest.view.index == k
 
 
-def test_default_capacity_is_not_exceeded() -> None:
-    keyframes = KeyframeMap(0.2, 0.1)
-    for k in range(keyframe_map.CAPACITY + 10):
-        keyframes.add(along(0.3 * k, k))
-    assert len(keyframes) == keyframe_map.CAPACITY
-
-
 def test_later_of_two_close_keyframes_is_removed(small) -> None:
     """Out and back: frames 0 to 4 cover the path, later ones revisit it."""
     for n, place in enumerate([0, 1, 2, 3, 4, 3, 2, 1]):
@@ -73,19 +66,6 @@ def test_keyframes_of_different_components_are_not_compared(small) -> None:
         small.add(along(x, index, component))
     # Two or one of each component: the nearest two of one component are 0 and 1.
     assert kept(small) == [0, 2, 3, 4]
-
-
-def test_only_keyframe_of_component_is_kept(small) -> None:
-    small.add(along(0.0, 0, 0))
-    for k in range(1, 12):
-        small.add(along(0.3 * k, k, 1))
-    assert kept(small)[0] == 0
-
-
-def test_oldest_of_single_keyframe_components_is_removed(small) -> None:
-    for k in range(7):
-        small.add(along(0.0, k, k))
-    assert kept(small) == [3, 4, 5, 6]
 
 
 def test_motion_decides_when_view_becomes_keyframe() -> None:
@@ -181,12 +161,6 @@ def test_newest_and_most_similar_keyframes_are_searched(around, monkeypatch) -> 
     last = surface(seen(at(0, 0.3, 3.52), 7))
     relocalizer().links(last, keyframes, 2)
     assert [j for _, j in asked] == [5]
-
-
-def test_no_search_without_options(around, monkeypatch) -> None:
-    asked = counted(monkeypatch)
-    assert Relocalizer(None, FitStatistics()).links(VIEW, around[0], 9) == ()
-    assert asked == []
 
 
 def test_lost_view_is_linked_at_correct_pose(around) -> None:

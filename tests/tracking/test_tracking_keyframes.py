@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.errors import InputError
-from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.config import changed
-from tofuse.engine.mapping.methods import from_method
-from tofuse.engine.tracking import hypotheses, keyframe_map
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
@@ -134,60 +128,6 @@ def test_motion_thresholds_decide_keyframes(room):
     assert [step.reference for step in always[1:]] == list(range(7))
 
 
-def test_tracking_works_with_few_keyframes(room, monkeypatch):
-    monkeypatch.setattr(keyframe_map, "CAPACITY", 3)
-    steps = run(room.frames, Keyframes(keyframe_angle=0.001))
-    assert components(steps) == [0] * 8
-    assert_right(steps, room.poses)
-
-
-def test_alignments_for_unmatched_frame_are_limited(corner, elsewhere, monkeypatch):
-    tracker = Keyframes(keyframe_angle=0.001).start(0)
-    for frame in corner.frames:
-        tracker.push(frame)
-    tried = []
-    align = hypotheses.align
-
-    def counted(view, targets, *rest, **more):
-        tried.append(targets[0].view.index)
-        return align(view, targets, *rest, **more)
-
-    monkeypatch.setattr(hypotheses, "align", counted)
-    assert tracker.push(replace(elsewhere[0], index=8, timestamp=2.0)).component == 1
-    # However many keyframes there are.
-    assert len(set(tried)) <= 2
-    assert len(tried) < 50
-
-
-def test_missing_prediction_and_albedo_are_reported(room):
-    frames = list(room.frames)
-    frames[BAD] = scaled(frames[BAD], 0)
-    steps = run(frames)
-    assert steps[0].reason == ""
-    assert "no prediction" in steps[1].reason
-    assert steps[2].reason == ""
-    dark = [replace(f, amplitude_image=np.zeros_like(f.amplitude_image)) for f in room.frames]
-    assert all("albedo took no part" in step.reason for step in run(dark)[1:3])
-
-
-def test_last_motion_is_extrapolated(room, monkeypatch):
-    """It gives the initial pose; the mean motion is used along degenerate directions."""
-    asked = []
-    align = hypotheses.align
-
-    def watched(view, targets, predicted, options, *, start=None, **more):
-        asked.append((view.index, start, np.array(predicted)))
-        return align(view, targets, predicted, options, start=start, **more)
-
-    monkeypatch.setattr(hypotheses, "align", watched)
-    T = [step.T_component_camera for step in run(in_order(room.frames[:4]))]
-    start, predicted = next(poses for index, *poses in asked if index == 3)
-    np.testing.assert_allclose(start, T[2] @ se3.inverse(T[1]) @ T[2], atol=1e-9)
-    motions = [se3.log(se3.inverse(a) @ b) for a, b in itertools.pairwise(T[:3])]
-    steady = T[2] @ se3.exp(0.7 * motions[0] + 0.3 * motions[1])
-    np.testing.assert_allclose(predicted, steady, atol=1e-3)
-
-
 @pytest.mark.slow
 def test_odometry_fills_degenerate_directions():
     sequence = Sequence("wall", range(0, 15, 3))
@@ -200,12 +140,6 @@ def test_odometry_fills_degenerate_directions():
     # By chance noise may seem to determine a direction of one of the pairs.
     assert min(degenerate) >= 2
     assert sum(degenerate) >= 3 * len(degenerate) - 1
-
-
-def test_camera_is_tracked_with_identity_guess(room):
-    steps = run(room.frames, Keyframes(guess="identity"))
-    assert components(steps) == [0] * 8
-    assert_right(steps, room.poses)
 
 
 RNG = np.random.default_rng(3)
@@ -285,7 +219,7 @@ def test_corrupted_image_stays_unconnected(request, scene, damage, amplitude):
     assert found[-1] == 0 or any(i < BAD < j for i, j in certain_links(steps))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("damage", PLAUSIBLE.values(), ids=PLAUSIBLE.keys())
 def test_plausible_wrong_image_does_not_affect_other_poses(request, damage):
     steps, poses = tracked_with_bad_frame(request, "room", True, damage)
@@ -297,7 +231,7 @@ def test_plausible_wrong_image_does_not_affect_other_poses(request, damage):
     assert_right(after, poses[BAD + 1 :], 0.03, 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("damage", ["mirrored", "upside down", "turned round"])
 def test_run_of_wrong_images_forms_its_own_component(corner, damage):
     frames = list(corner.frames)
@@ -341,18 +275,6 @@ def test_jump_away_and_back_gives_three_components(corner, elsewhere, searches):
     links = certain_links(steps)
     assert not any(4 <= i < 7 or 4 <= j < 7 for i, j in links)
     assert any(i < 4 and j >= 7 for i, j in links) == searches
-
-
-@pytest.mark.slow
-def test_links_connect_different_components(corner, elsewhere):
-    frames = in_order([*corner.frames[:4], *elsewhere, *corner.frames[2:5]])
-    steps = run(frames)
-    for k, step in enumerate(steps):
-        for link in step.links:
-            assert link.j == k
-            assert link.i < k
-            assert steps[link.i].component != step.component
-            assert np.linalg.eigvalsh(link.information).min() > 0
 
 
 @pytest.mark.slow
@@ -404,53 +326,6 @@ def test_interruption_starts_component_without_motion_prior(room):
     assert_right(run(in_order(frames)), poses)
 
 
-def test_motion_may_change_at_low_frame_rates(room):
-    frames, poses = [*room.frames[:4], *room.frames[:4]], [*room.poses[:4], *room.poses[:4]]
-    steps = run([replace(f, index=k, timestamp=0.8 * k) for k, f in enumerate(frames)])
-    assert components(steps) == [0] * 8
-    assert_right(steps, poses)
-
-
-def test_prepared_view_gives_same_pose_as_frame(room):
-    plain, early = Keyframes().start(0), Keyframes().start(0)
-    for frame in room.frames[:3]:
-        made = early.prepare(frame)
-        one, two = plain.push(frame), early.push(frame, surface=made)
-        assert one.T_component_camera.tobytes() == two.T_component_camera.tobytes()
-    assert early.prepare(scaled(room.frames[0], 0)) is None
-
-
-def test_clouds_are_refused():
-    with pytest.raises(InputError, match="needs images"):
-        Keyframes().start(0).push(CloudFrame.of(np.zeros((500, 3))))
-
-
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("views.columns", -1),
-        ("views.columns", "wide"),
-        ("views.falloff", float("nan")),
-        ("views.range_falloff", -1.0),
-        ("views.photometric", 2),
-        ("searches", "often"),
-        ("minimum_points", -5),
-        ("keyframe_angle", float("nan")),
-        ("keyframe_distance", 0),
-        ("guess", "luck"),
-        ("speed", 9),
-        ("recovery", {}),
-    ],
-)
-def test_invalid_options_are_refused_by_name(path, value):
-    options = value
-    for name in reversed(path.split(".")):
-        options = {name: options}
-    with pytest.raises(InputError, match=path.split(".")[-1]) as refused:
-        changed(from_method("default"), {"odometry": options}, where="my.toml")
-    assert "my.toml: odometry" in str(refused.value)
-
-
 @pytest.mark.slow
 def test_real_camera_after_large_move_is_correct_or_doubtful(shared_data):
     """Two positions 305 mm apart along a corridor, with nothing recorded in between."""
@@ -474,7 +349,7 @@ def test_real_camera_after_large_move_is_correct_or_doubtful(shared_data):
         assert np.linalg.norm(relative[:3, 3]) < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_real_camera_near_door_does_not_slide(shared_data):
     """At a distance of 0.25 m, moved by less than 1 cm: poses must not slide along the door."""
     recording = open_recording(shared_data / "iphone_record3d")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.engine.tracking.motion import FrameTime, MotionModel, find_jumps, is_small
+from tofuse.engine.tracking.motion import FrameTime, MotionModel, find_jumps
 
 STEP = se3.exp(np.array([0.03, 0, 0.01, 0, 0.04, 0.01]))
 
@@ -140,23 +140,6 @@ def test_gate_is_unbounded_after_long_loss_of_unknown_duration() -> None:
     assert np.isinf(motion.gate(counted(12))).all()
 
 
-def test_gate_is_unbounded_after_interruption() -> None:
-    motion = followed(walk(6))
-    motion.interrupt()
-    assert motion.predicted_pose(counted(6)) is None
-    assert np.isinf(motion.gate(counted(6))).all()
-    assert not motion.gate_violation(elsewhere(np.eye(4), 5.0, 2.0), counted(6))
-
-
-def test_irregular_motion_stays_within_gate() -> None:
-    rng = np.random.default_rng(1)
-    poses = [np.eye(4)]
-    for _ in range(12):
-        step = rng.normal(0, [0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
-        poses.append(poses[-1] @ se3.exp(np.array([0.5, 0, 0, 0, 0.4, 0]) + 0.4 * step))
-    followed(poses)
-
-
 def test_jumps_of_path_are_found() -> None:
     poses, moments = walk(20), [counted(k) for k in range(20)]
     assert find_jumps(poses, moments) == []
@@ -182,19 +165,6 @@ def test_gate_widens_with_frame_interval(seconds, usual) -> None:
     assert (words == "") == usual
 
 
-def test_gate_stays_bounded_at_longest_interval() -> None:
-    poses, when = walk(8), timed(1 / 60.0)
-    motion = followed(poses[:7], when)
-    assert motion.gate_violation(elsewhere(poses[7], 1.5), when(7))
-
-
-def test_gate_widens_over_lost_frames() -> None:
-    poses, when = walk(9), timed(1 / 0.25)
-    motion = followed(poses[:7], when)
-    assert motion.gate_violation(elsewhere(poses[7], 0.2), when(7))
-    assert not motion.gate_violation(elsewhere(poses[8], 0.2), when(8))
-
-
 def test_frame_numbers_are_not_timestamps() -> None:
     assert FrameTime(5, 0.5).seconds_since(FrameTime(3, 0.3)) == pytest.approx(0.2)
     assert FrameTime(5, 5.0).seconds_since(FrameTime(3, 3.0)) is None
@@ -203,21 +173,6 @@ def test_frame_numbers_are_not_timestamps() -> None:
     # Constant timestamps carry no information.
     assert FrameTime(5, 0.3).seconds_since(FrameTime(3, 0.3)) is None
     assert FrameTime(5, 0.3).since(FrameTime(3, 0.3)) == 2
-
-
-def test_jump_detection_uses_timestamps() -> None:
-    poses = walk(20)
-    broken = [*poses[:8], *(elsewhere(np.eye(4), 0.3) @ T for T in poses[8:])]
-    for rate, found in ((30.0, [8]), (2.0, [])):
-        moments = [FrameTime(k, k / rate) for k in range(20)]
-        assert [k for k, _ in find_jumps(broken, moments)] == found
-
-
-def test_limits_of_small_motion() -> None:
-    assert is_small(np.eye(4))
-    assert is_small(elsewhere(np.eye(4), 0.05, 0.06))
-    assert not is_small(elsewhere(np.eye(4), 0.07))
-    assert not is_small(elsewhere(np.eye(4), 0.0, 0.08))
 
 
 def test_new_component_inherits_velocity() -> None:

@@ -19,7 +19,6 @@ from tofuse.engine.tracking import moving_object_kernels as kernels
 from tofuse.engine.tracking.moving_objects import (
     Moving,
     MovingObjects,
-    _robust_scale,
     without_pixels,
 )
 from tofuse.engine.views.prepared_view import prepare_view
@@ -127,8 +126,7 @@ def test_static_room_has_no_moving_objects(room):
         assert 0.5 < moving.scale / typical_scale < 2
 
 
-@pytest.mark.parametrize("cover", [0.1, 0.25, 0.4])
-@pytest.mark.parametrize("motion", ["sideways", "towards", "away"])
+@pytest.mark.parametrize(("motion", "cover"), [("sideways", 0.1), ("towards", 0.25), ("away", 0.4)])
 def test_moving_box_is_segmented(room, motion, cover):
     frames, poses, noise = room
     centres, half = trajectory(motion, cover, frames[0])
@@ -295,11 +293,10 @@ def test_masks_of_keyframes_are_kept_up_to_limit(room):
     assert not objects.predicted_mask(poses[9], views[9]).any()
 
 
-def test_result_is_independent_of_threads(room, monkeypatch):
+def test_result_is_independent_of_threads(room):
     frames, poses, noise = room
     centres, half = trajectory("away", 0.25, frames[0])
     made = [with_box(frames[n], centres[n], half, noise, n)[0] for n in range(8)]
-    monkeypatch.setattr("tofuse.engine.tracking.moving_objects._CHUNK_ROWS", 10)
     results = []
     for count in (1, 2):
         with threads(count):
@@ -335,15 +332,6 @@ def test_masked_pixels_keep_free_space_but_no_surface(room):
     assert agreement(rest, other, T).violation <= agreement(view, other, T).violation + 0.01
     with pytest.raises(ValueError, match="the mask is"):
         without_pixels(view, mask[1:])
-
-
-def test_robust_scale_ignores_outliers():
-    rng = np.random.default_rng(0)
-    ratios = np.abs(rng.normal(0, 1.7, 4000))
-    assert _robust_scale(ratios.astype(np.float32)) == pytest.approx(1.7, rel=0.05)
-    ratios[:1600] += rng.uniform(10, 300, 1600)
-    assert _robust_scale(ratios.astype(np.float32)) == pytest.approx(1.7, rel=0.1)
-    assert _robust_scale(np.zeros(3, np.float32)) == 1
 
 
 def pair(seed=3):

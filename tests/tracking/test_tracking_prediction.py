@@ -48,11 +48,6 @@ def test_error_grows_as_for_random_walk_of_velocity(n) -> None:
     assert usual.error(n, 2)[0] == pytest.approx(np.hypot(n - 1, n))
 
 
-def test_single_prediction_has_its_own_error() -> None:
-    assert Prediction((0.3, 0.2)).error(1, 1) == (0.3, 0.2)
-    assert Prediction((0.3, 0.2)).error(0, 0) == (0.0, 0.0)
-
-
 @pytest.mark.parametrize(
     ("walk", "low", "high"), [(random_walk, 1.5, 2), (around_a_mean, 0.7, 1.3)]
 )

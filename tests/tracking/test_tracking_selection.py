@@ -192,7 +192,7 @@ def test_new_component_continues_motion() -> None:
         assert off(step, pose, WALK[12])[0] < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
     """Steps of 26 cm: a wall fits anywhere, and the objects before it are out of reach."""
     from tofuse.engine.mapping.config import changed, from_method
@@ -209,7 +209,7 @@ def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
     assert not any(len(f.unobservable) for f in result.diagnostics.frames)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_starts_along_corridor_correct_short_prediction(tmp_path) -> None:
     """Steps of 14, 37 and 46 cm: the walls fit anywhere, and the prediction is too short."""
     from tofuse.engine.mapping.config import changed, from_method

@@ -14,7 +14,6 @@ from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.views.extended_planes import with_extended_planes
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
-from tofuse.engine.views.projection import Projection
 from tofuse.engine.views.view_planes import FineScale, SurfaceOptions
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
@@ -148,24 +147,6 @@ def test_planes_match_scene_for_any_depth_kind(kind):
     assert (view.normals[view.planes[..., 3] == 0] == 0).all()
 
 
-@pytest.mark.parametrize("amplitude", ["raw", "range_compensated"])
-def test_albedo_is_independent_of_range_and_incidence(amplitude):
-    view = prepare_view(wall(amplitude=amplitude, texture=2.0), OPTIONS)
-    assert view.has_albedo
-    found = view.albedo[np.isfinite(view.albedo).all(-1)]
-    assert len(found) > 0.8 * view.z.size
-    assert np.abs(found[:, 1:] - [2, 0]).max() < 0.05
-    level = view.albedo[..., 0] - 2 * view.rays[..., 0]
-    assert np.nanmax(level) - np.nanmin(level) < 0.02
-
-
-def test_view_without_amplitude_has_no_albedo():
-    view = prepare_view(wall(amplitude=None), OPTIONS)
-    assert not view.has_albedo
-    assert np.isnan(view.albedo).all()
-    assert view.planar_fraction > 0.9
-
-
 def test_saturated_pixels_have_no_albedo():
     frame = wall()
     light = frame.amplitude_image.copy()
@@ -225,32 +206,6 @@ def test_frame_of_invalid_values_is_prepared():
     for frame in (base, replace(base, sigma_image=sigma)):
         view = prepare_view(frame, OPTIONS)
         assert np.isfinite(view.planes).all()
-
-
-def test_vga_is_reduced_to_requested_columns():
-    camera = Pinhole(640, 480, 570.0, 570.0, 319.5, 239.5)
-    view = prepare_view(wall(camera), SurfaceOptions(columns=320))
-    assert view.z.shape == (240, 320)
-    assert np.abs(view.planes[inside(view)][..., :3] - PLANE).max() < 1e-3
-    smaller = Pinhole(320, 240, 285.0, 285.0, 159.5, 119.5)
-    np.testing.assert_allclose(view.rays, smaller.rays(), atol=1e-6)
-
-
-@pytest.mark.parametrize("step", [1, 2])
-def test_lookup_finds_pixel_of_ray(step):
-    lens = BrownConrady(88, 72, 115.0, 115.0, 43.5, 35.5, k1=-0.25, k2=0.08, p1=0.01)
-    projection = Projection.of(lens, step)
-    rays = lens.rays()[5:-5:3, 5:-5:3].reshape(-1, 2).astype(float)
-    x0, y0, per_x, per_y = projection.frame
-    f = (rays - [x0, y0]) * [per_x, per_y]
-    base = f.astype(int)
-    (au, av), (iu, iv) = (f - base).T[..., None], base.T
-    L = projection.lookup
-    found = (1 - av) * ((1 - au) * L[iv, iu] + au * L[iv, iu + 1]) + av * (
-        (1 - au) * L[iv + 1, iu] + au * L[iv + 1, iu + 1]
-    )
-    wanted = (lens.project(np.concatenate([rays, np.ones((len(rays), 1))], 1)) + 0.5) / step - 0.5
-    assert np.abs(found - wanted).max() < 0.05
 
 
 def test_result_is_independent_of_threads():
@@ -445,39 +400,6 @@ def test_shared_error_is_not_averaged_out() -> None:
     np.testing.assert_array_equal(unknown.plane_variance, plain.plane_variance)
 
 
-def test_shared_error_is_downsampled_with_image() -> None:
-    frame = wall(sigma=0.004)
-    shared = np.repeat(np.linspace(0.001, 0.02, 88, dtype=np.float32)[None], 72, 0)
-    small = SurfaceOptions(columns=44)
-    plain = prepare_view(frame, small)
-    view = prepare_view(replace(frame, shared_sigma_image=shared), small)
-    assert view.z.shape == (36, 44)
-    added = np.sqrt((view.plane_variance - plain.plane_variance) / 100)
-    seen = view.planes[..., 3] > 0
-    lengths = np.sqrt(1 + (view.rays**2).sum(-1))
-    halved = np.sqrt((shared**2).reshape(36, 2, 44, 2).mean(axis=(1, 3)))
-    wanted = halved / lengths * view.planes[..., 3] ** 2
-    np.testing.assert_allclose(added[seen], wanted[seen], rtol=0.15)
-
-
-def test_subsampled_view_is_cached():
-    view = prepare_view(wall(sigma=0.01), OPTIONS)
-    thin = view.subsampled(50)
-    assert thin is view.subsampled(44)
-    assert view.subsampled(88) is view
-    np.testing.assert_array_equal(thin.z, view.z[1::2, 1::2])
-
-
-def test_views_without_amplitude_share_one_albedo_image():
-    dark = [prepare_view(replace(wall(), amplitude_image=None), OPTIONS) for _ in range(2)]
-    assert dark[0].albedo is dark[1].albedo
-    assert dark[0].subsampled(50).albedo is dark[1].subsampled(50).albedo
-    assert not dark[0].has_albedo
-    assert np.isnan(dark[0].albedo).all()
-    assert np.isnan(dark[0].subsampled(50).albedo).all()
-    assert prepare_view(wall(), OPTIONS).albedo is not dark[0].albedo
-
-
 def test_planes_are_extended_to_edges_but_not_to_flying_pixels():
     """A slanted wall with a bar in front, whose left border has flying pixels."""
     frame = wall(sigma=0.004, seed=5)
@@ -501,14 +423,3 @@ def test_planes_are_extended_to_edges_but_not_to_flying_pixels():
     sigma = np.sqrt(more.plane_variance[6:-6][new]) * truth[6:-6][new] ** 2
     assert 0.5 < np.std(off / sigma) < 1.6
     assert np.median(sigma) > 1.2 * np.median(np.sqrt(view.plane_variance[before.nonzero()]) * 4)
-
-
-def test_windows_are_smaller_in_coarse_images():
-    fine, coarse = OPTIONS.for_image(0.005), OPTIONS.for_image(0.02)
-    assert fine == OPTIONS
-    assert coarse.radii == (1, 2)
-
-
-def test_windows_are_small_where_few_pixels_determine_a_slope():
-    assert OPTIONS.for_image(0.005, noise=0.002).radii == OPTIONS.radii
-    assert OPTIONS.for_image(0.01, noise=0.002).radii == OPTIONS.fine_scale.radii

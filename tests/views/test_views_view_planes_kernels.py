@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
-from tofuse.engine.compute.partition import median
 from tofuse.engine.views.view_planes_kernels import (
     albedo_image,
     fit_planes,
@@ -34,12 +33,6 @@ def fit(w, rays, weight, radii=(2, 5), limit=1e-6, fill=0.7, offset=0.2):
             planes, quality, start, stop,
         )  # fmt: skip
     return planes, quality
-
-
-@pytest.mark.parametrize("count", [1, 2, 7, 8])
-def test_median_of_even_count_is_upper_one(count):
-    values = np.random.default_rng(count).normal(size=(count, 1)).astype(np.float32)
-    assert median(values) == np.sort(values.ravel())[count // 2]
 
 
 # --- halve ---------------------------------------------------------------------------------------
@@ -80,13 +73,6 @@ def test_halving_matches_slow_twin(shape):
         np.testing.assert_allclose(found, wanted, rtol=1e-6)
 
 
-def test_halving_never_mixes_two_surfaces():
-    z = np.where(np.arange(41) < 21, 1, 3).astype(np.float32)[None].repeat(8, 0)
-    found, value, _ = halved(z, z * 10)
-    assert set(np.unique(found)) <= {1.0, 3.0}
-    np.testing.assert_allclose(value, 10 * found)
-
-
 def test_halving_preserves_planes():
     rays = CAMERA.rays()
     found, _, _ = halved(1 / plane_w(rays), plane_w(rays), jump=0.5)
@@ -125,16 +111,6 @@ def test_fits_are_independent_of_row_chunks():
         found.append(planes)
     np.testing.assert_allclose(found[0], found[1], rtol=1e-5, atol=1e-6)
     assert (found[0][5:-5, 5:-5, 3] > 0).mean() > 0.9
-
-
-@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
-def test_plane_coefficients_are_exact(camera):
-    rays = camera.rays()
-    planes, quality = fit(plane_w(rays), rays, np.full(rays.shape[:2], 1e4, np.float32), limit=0.01)
-    inside = np.s_[3:-3, 3:-3]
-    assert np.abs(planes[inside][..., :3] - [A, B, C]).max() < 2e-5
-    np.testing.assert_allclose(planes[inside][..., 3], plane_w(rays)[inside], rtol=1e-5)
-    assert (quality[inside][..., 0] < 0.01).all()
 
 
 def twin_of_one_fit(w, rays, weight, i, j, r):
@@ -214,15 +190,6 @@ def test_creases_are_not_bridged_by_wide_windows():
     np.testing.assert_allclose(planes[8:-8, 23:25, 0], -0.6, atol=1e-3)
 
 
-def test_wide_window_does_not_override_small_one():
-    rays = CAMERA.rays()
-    w = plane_w(rays)
-    # The pixel's neighbourhood is off the plane of the surroundings.
-    w[13:18, 18:23] += np.linspace(-0.3, 0.3, 25).reshape(5, 5).astype(np.float32) ** 2
-    planes, _ = fit(w, rays, np.full(w.shape, 1e6, np.float32), radii=(2, 12), limit=1.0)
-    assert (planes[15, 20] == 0).all()
-
-
 def test_pixels_at_outlines_are_dropped():
     rays = CAMERA.rays()
     w = plane_w(rays)
@@ -273,16 +240,6 @@ def test_lambertian_plane_has_uniform_albedo(power, camera, falloff):
     holes[[3, 5, 5], [4, 6, 7]] = True
     np.testing.assert_array_equal(np.isnan(out), holes)
     np.testing.assert_allclose(out[~holes], np.log(0.4), atol=1e-5)
-
-
-def test_passive_light_is_not_compensated():
-    rays = CAMERA.rays()
-    planes = np.broadcast_to(np.float32([A, B, C, 0]), (*rays.shape[:2], 4)).copy()
-    planes[..., 3] = plane_w(rays)
-    light = np.full(rays.shape[:2], 90, np.float32)
-    out = np.zeros(light.shape, np.float32)
-    albedo_image(planes, rays, light, False, False, 0.0, out)
-    np.testing.assert_allclose(out, np.log(90), rtol=1e-6)
 
 
 def test_surface_at_grazing_incidence_has_no_albedo():

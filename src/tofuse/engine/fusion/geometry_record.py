@@ -124,12 +124,12 @@ class Exportable:
 
         Meshes: .glb, .gltf, .ply, .obj, .stl; clouds: .ply, .pcd, .las, .laz, .e57.
         """
-        import_module(_WRITERS).save(self.record(), path)
+        import_module(_WRITERS).exchange.save(self.record(), path)
 
     def to_trimesh(self) -> Any:
         """Return a `trimesh.Trimesh` or `trimesh.PointCloud` in the world frame."""
-        return import_module(_WRITERS).to_trimesh(self.record())
+        return import_module(_WRITERS).exchange.to_trimesh(self.record())
 
     def to_open3d(self) -> Any:
         """Return an Open3D `TriangleMesh` or `PointCloud` in the world frame."""
-        return import_module(_WRITERS).to_open3d(self.record())
+        return import_module(_WRITERS).exchange.to_open3d(self.record())
