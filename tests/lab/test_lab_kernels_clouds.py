@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.lab.methods.cloud_search_kernels import grid_search
 from tofuse.lab.methods.featured_tree import FeaturedKdTree
@@ -89,8 +88,3 @@ def test_grid_search_descends_from_pixel():
     assert list(index[2:]) == [-1, -1, 9 * 20 + 9]
     grid_search(grid, points, moved, pixels, 0, index, squared)
     assert list(index) == [21, -1, -1, -1, -1]
-
-
-def test_search_rejects_wrong_shape():
-    with pytest.raises(InputError, match="shape"):
-        FeaturedKdTree(np.zeros((3, 3))).moments(np.zeros((3, 2)), 1.0)

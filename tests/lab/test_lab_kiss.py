@@ -9,7 +9,7 @@ from registration_scenes import box_walls, rng
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp.icp_kernels import transform_points
-from tofuse.lab.methods.kiss import AdaptiveThreshold, Kiss, first_of_voxels
+from tofuse.lab.methods.kiss import AdaptiveThreshold, Kiss
 
 
 def room(n, seed):
@@ -94,18 +94,3 @@ def test_empty_and_unrelated_frames_are_lost():
     assert [s.status for s in steps] == ["tracked", "tracked", "lost", "lost", "tracked"]
     assert "needed" in steps[2].reason
     assert "registered" in steps[3].reason
-
-
-def test_one_point_is_kept_per_voxel():
-    p = rng(0).uniform(-1, 1, (9000, 3))
-    kept = first_of_voxels(p, 0.25)
-    cells = np.floor(kept / 0.25).astype(int)
-    assert len(np.unique(cells, axis=0)) == len(kept) == 8**3
-    assert {tuple(x) for x in kept} <= {tuple(x) for x in p}
-
-
-def test_options_are_checked():
-    with pytest.raises(ValueError, match="voxel"):
-        Kiss(voxel=0.0)
-    with pytest.raises(ValueError, match="minimum_points"):
-        Kiss(minimum_points=1)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import gc
-import os
 import struct
 import sys
 import tempfile
@@ -242,13 +240,6 @@ def test_realsense_color_with_inverse_distortion(tmp_path: Path) -> None:
     np.testing.assert_allclose(lens.project(points), np.stack([COLOR_U, COLOR_V], -1), atol=0.1)
 
 
-def test_orbbec_color_without_pose_is_ignored(tmp_path: Path) -> None:
-    recording = open_recording(orbbec(tmp_path, (0.0,) * 8, color="jpeg", R=np.zeros((3, 3))))
-    frame = recording[0]
-    assert frame.color_image is None
-    assert ["colour is ignored" in line for line in recording.warnings] == [True]
-
-
 @pytest.mark.parametrize(("encoding", "off"), [("jpeg", 14), ("rgb8", 0)])
 def test_orbbec_color_matches_points(tmp_path: Path, encoding: str, off: int) -> None:
     R = T_COLOR[:3, :3] * 0.999  # as stored
@@ -283,24 +274,6 @@ def test_missing_topics_are_named(tmp_path: Path) -> None:
         open_recording(bag.close())
 
 
-def fifo(path: Path) -> None:
-    if not hasattr(os, "mkfifo"):
-        pytest.skip("no FIFOs on this system")
-    path.unlink()
-    os.mkfifo(path)
-
-
-@pytest.mark.parametrize("name", ["metadata.yaml", "a.db3"])
-def test_fifos_in_folders_are_rejected(tmp_path: Path, name: str) -> None:
-    bag = Bag(tmp_path, "ros2")
-    depth_bag(bag)
-    path = bag.close()
-    fifo(path / name)
-    for format_ in ("ros", "realsense-bag"):
-        with pytest.raises(InputError, match="not a regular file"):
-            open_recording(path, format=format_)
-
-
 @pytest.mark.parametrize(
     ("kind", "packed"),
     [("ros1", "BZ2"), ("ros1", "LZ4"), ("mcap", "STORAGE"), ("mcap", "MESSAGE"),
@@ -319,19 +292,6 @@ def test_compressed_bags(
     del recording
     gc.collect()
     assert list(temporary.iterdir()) == []
-
-
-def test_no_space_for_decompressed_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bag = Bag(tmp_path, "ros2", "FILE")
-    depth_bag(bag)
-    path = bag.close()
-
-    def full(*_words: object, **_options: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(tempfile, "mkdtemp", full)
-    with pytest.raises(InputError, match=r"no space for the decompressed files .* TMPDIR"):
-        open_recording(path)
 
 
 def test_missing_rosbags_is_reported_with_remedy(

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import os
 import shutil
 import threading
 import time
@@ -32,11 +31,6 @@ def write(folder: Path, depths: list[float], *, poses: bool = False) -> Path:
 
 def depths(recording: Recording) -> list[float]:
     return [round(float(f.points[0, 2]), 3) for f in recording]
-
-
-def test_every_format_has_a_reader() -> None:
-    names = {"7scenes", "native", "pcd", "ply", "redwood", "slam6d", "sr4000", "tum", "xyz"}
-    assert names <= set(readers())
 
 
 def test_several_paths_are_joined_in_given_order(tmp_path: Path) -> None:
@@ -171,22 +165,6 @@ def test_unreadable_first_frame(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.skipif(
-    os.name == "nt" or (hasattr(os, "geteuid") and os.geteuid() == 0),
-    reason="permissions don't hold back this user",
-)
-def test_permissions(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a", [1])
-    for path in (folder / "camera.json", folder / "depth", folder):
-        mode = path.stat().st_mode
-        path.chmod(0)
-        try:
-            with pytest.raises(InputError, match="permission"):
-                open_recording(folder)
-        finally:
-            path.chmod(mode)
-
-
 def test_permission_denied_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As above, for users to whom permissions do not apply."""
     folder = write(tmp_path / "a", [1, 2])
@@ -232,14 +210,6 @@ def test_frames_come_in_order_with_errors_in_place() -> None:
         "frame 49: is bad",
     ]
     assert reader_threads() == []
-
-
-def test_work_is_done_in_reader_thread() -> None:
-    _, recording = counting(6, 3)
-    found = list(recording.read_with(lambda f: (f.index, threading.current_thread().name), first=1))
-    assert [work and work[0] for _, work in found] == [1, 2, None, 4, 5]
-    assert str(found[2][0]) == "frame 3: is bad"
-    assert all(work is None or work[1].startswith("tofuse-reader") for _, work in found)
 
 
 def test_iteration_raises_at_unreadable_frame() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.geometry import se3
 from tofuse.lab.simulation import mesh as meshes
 from tofuse.lab.simulation.scene import Scene
 from tofuse.lab.simulation.scenes import blends, torso
@@ -57,15 +56,6 @@ def test_normals_are_smooth_on_curved_surfaces_and_sharp_at_edges():
     )
 
 
-def test_joined_meshes_keep_surfaces_and_positions():
-    a = meshes.box((1, 1, 1)).of_surface(3)
-    b = meshes.box((1, 1, 1)).transformed(se3.exp([5, 0, 0, 0, 0, 1])).of_surface(4)
-    both = meshes.joined([a, b])
-    assert list(np.unique(both.surface)) == [3, 4]
-    np.testing.assert_allclose(both.corners()[12:], b.corners())
-    assert volume(both) == pytest.approx(2.0)
-
-
 def test_surface_net_of_ball_is_closed_and_accurate():
     ball = blends.surface_net(
         blends.ellipsoid((0.1, 0, 0), (0.5, 0.5, 0.5)), (-1, -1, -1), (1, 1, 1), 0.08
@@ -74,19 +64,6 @@ def test_surface_net_of_ball_is_closed_and_accurate():
     radius = np.linalg.norm(ball.vertices - (0.1, 0, 0), axis=1)
     assert np.abs(radius - 0.5).max() < 1e-5
     assert volume(ball) == pytest.approx(4 / 3 * np.pi * 0.125, rel=0.02)
-
-
-def test_blending_is_local():
-    a = blends.ellipsoid((-0.5, 0, 0), (0.4, 0.4, 0.4))
-    b = blends.limb((0.5, 0, 0), (1.0, 0, 0), 0.4, 0.2)
-    both = blends.blend([(a, 0.0), (b, 0.3)])
-    gap = np.array([[0.0, 0.0, 0.0]])
-    assert a(gap)[0] > 0
-    assert b(gap)[0] > 0
-    assert both(gap)[0] < min(a(gap)[0], b(gap)[0])
-    far = np.array([[-1.0, 0, 0], [1.3, 0, 0]])
-    np.testing.assert_allclose(both(far), [a(far)[0], b(far)[1]])
-    assert b(np.array([[1.2, 0, 0]]))[0] == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -105,21 +82,6 @@ def test_person_is_closed_and_human_sized(person):
     assert high[0] < 0.66
     # A person of 60 to 85 kg has about the density of water.
     assert 0.055 < volume(mesh) < 0.085
-
-
-def test_person_is_asymmetric(person):
-    mesh, materials = person
-    head = mesh.vertices[(mesh.vertices[:, 2] > 1.15)]
-    assert head[:, 0].max() > 0.12 > 0.11 > -head[:, 0].min()
-    left = mesh.vertices[mesh.vertices[:, 1] > 0.2]
-    right = mesh.vertices[mesh.vertices[:, 1] < -0.2]
-    assert abs(left[:, 2].min() - right[:, 2].min()) > 0.005
-    middle = mesh.corners().mean(1)
-    names = [m.name for m in materials]
-    hair = middle[mesh.surface == names.index("hair")]
-    skin = middle[mesh.surface == names.index("skin")]
-    face = skin[skin[:, 2] > 1.2]
-    assert face[:, 0].mean() > hair[hair[:, 2] > 1.2][:, 0].mean() + 0.05
 
 
 def test_no_ray_leaves_the_person(person):

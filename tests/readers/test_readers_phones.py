@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -13,7 +12,7 @@ import pytest
 import made_phones as made
 from phone_checks import check_frames, check_lens
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.quality.map_agreement import map_consistency
 from tofuse.formats.recordings.open import open_recording
@@ -42,16 +41,6 @@ def test_scanner_app_derives_image_size_from_projection(tmp_path: Path) -> None:
     frame = open_recording(tmp_path / "scan")[0]
     assert isinstance(frame.camera, Pinhole)
     assert frame.camera.fx == pytest.approx(made.FX / 60)
-
-
-def test_scanner_app_skips_frame_without_json(tmp_path: Path) -> None:
-    made.make_scanner_app(tmp_path / "scan")
-    (tmp_path / "scan" / "frame_00001.json").write_text('{"time": 1}')
-    recording = open_recording(tmp_path / "scan")
-    items = list(recording.read_all())
-    assert isinstance(items[1], UnreadableFrameError)
-    assert "frame_00001.json: intrinsics: is missing" in str(items[1])
-    assert isinstance(items[2], RangeFrame)
 
 
 def test_stray(tmp_path: Path) -> None:
@@ -94,20 +83,6 @@ def test_stray_with_video_and_lens_of_each_frame(tmp_path: Path) -> None:
     assert any("colour is ignored" in line for line in open_recording(tmp_path / "scan").warnings)
 
 
-def test_stray_without_rows_or_lens(tmp_path: Path) -> None:
-    made.make_stray(tmp_path / "scan")
-    (tmp_path / "scan" / "camera_matrix.csv").unlink()
-    with pytest.raises(InputError, match=r"camera_matrix\.csv: is missing"):
-        open_recording(tmp_path / "scan")
-    made.make_stray(tmp_path / "other")
-    path = tmp_path / "other" / "odometry.csv"
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join(lines[:-1]))
-    recording = open_recording(tmp_path / "other")
-    assert np.isnan(recording.reference[2]).all()
-    assert any("1 frames have no row" in line for line in recording.warnings)
-
-
 def test_record3d_folder(tmp_path: Path) -> None:
     made.make_record3d(tmp_path / "scan")
     recording = open_recording(tmp_path / "scan")
@@ -129,12 +104,6 @@ def test_r3d_archive(tmp_path: Path) -> None:
     (tmp_path / "scan.r3d").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="damaged archive"):
         open_recording(tmp_path / "scan.r3d")
-
-
-def test_camera_option_is_refused(tmp_path: Path) -> None:
-    made.make_r3d(tmp_path / "scan.r3d")
-    with pytest.raises(InputError, match="--camera"):
-        open_recording(tmp_path / "scan.r3d", camera=tmp_path / "camera.json")
 
 
 @pytest.mark.nightly
@@ -192,12 +161,3 @@ def test_real_depth_is_registered_to_colour(shared_data: Path) -> None:
             for dy in range(-6, 7, 2)
         }
         assert max(scores, key=lambda shift: scores[shift]) == (0, 0)
-
-
-def test_incomplete_folders_are_not_taken_for_phones(tmp_path: Path) -> None:
-    made.make_record3d(tmp_path / "scan")
-    shutil.rmtree(tmp_path / "scan" / "rgb")
-    assert open_recording(tmp_path / "scan")[0].color is None
-    (tmp_path / "scan" / "metadata.json").unlink()
-    with pytest.raises(InputError):
-        open_recording(tmp_path / "scan")

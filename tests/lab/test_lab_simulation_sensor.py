@@ -9,7 +9,6 @@ import pytest
 
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.formats.recordings.correction_file import corrected_depth
 from tofuse.lab.simulation import sensor
@@ -122,12 +121,6 @@ def test_amplitude_follows_albedo_incidence_and_range() -> None:
     assert counts(tilted) == pytest.approx(one * np.sqrt(0.5), rel=0.03)
 
 
-def test_compensated_amplitude_is_independent_of_range() -> None:
-    near = shoot(wall(1.5), Effects.none()).frame.amplitude_image
-    far = shoot(wall(3.0), Effects.none()).frame.amplitude_image
-    np.testing.assert_allclose(near, far, rtol=0.02)
-
-
 def test_shot_noise_falls_with_amplitude() -> None:
     effects = Effects.none(shot_noise=True)
     found, expected = [], []
@@ -150,12 +143,6 @@ def test_ambient_light_adds_noise_but_no_bias() -> None:
     lit = stack(bright, Effects.none(shot_noise=True, ambient=1.0), 30)
     assert lit.std(0).mean() > 1.3 * dark.std(0).mean()
     assert abs(lit.mean() - dark.mean()) < 0.002
-
-
-def test_noise_is_unbiased() -> None:
-    seen = stack(wall(2.0, 0.3), Effects.none(shot_noise=True), 40).mean(0)
-    truth = ranges(wall(2.0, 0.3), Effects.none())
-    assert abs((seen - truth).mean()) < 0.0005
 
 
 def test_other_noise_has_same_variance_heavy_tails_and_correlation() -> None:
@@ -210,31 +197,6 @@ def test_mixed_pixels_are_phasor_sums() -> None:
         assert flagged[:, 25].all()
         assert not flagged[:, :24].any()
         assert not flagged[:, 27:].any()
-
-
-def test_mixed_pixel_can_lie_outside_both_surfaces() -> None:
-    # With more than half a period between them, the mean phase lies outside.
-    near, far, albedo = 0.9, 3.9, 0.9
-    scene = edge(near, far, 25 - 0.25)
-    scene.boards[0].albedo, scene.boards[1].albedo = 0.1, albedo
-    seen = ranges(scene, Effects.none(mixed_pixels=True))[18, 25]
-    assert not near < seen < far * 1.02
-    assert ranges(scene, Effects.none())[18, 25] == pytest.approx(far, rel=0.02)
-
-
-def test_blur_widens_edge_in_place() -> None:
-    scene = edge(1.2, 2.2, 24.5)
-    sharp, soft = (
-        shoot(scene, Effects.none(mixed_pixels=True), model=replace(MODEL, blur_px=blur))
-        for blur in (0.0, 0.75)
-    )
-    between = [int(((r.frame.z[18] > 1.25) & (r.frame.z[18] < 2.15)).sum()) for r in (sharp, soft)]
-    assert between[0] <= 1
-    assert 2 <= between[1] <= 4
-    inside = np.s_[3:-3, 3:20]
-    np.testing.assert_allclose(soft.frame.depth[inside], sharp.frame.depth[inside], atol=3e-4)
-    assert (soft.flags[:, 24:26] & Flag.MIXED).all()
-    assert not (soft.flags[:, :20] & Flag.MIXED).any()
 
 
 def test_range_beyond_period_wraps() -> None:
@@ -305,18 +267,6 @@ def test_scattering_biases_background_towards_bright_foreground() -> None:
     assert flags[18, 24:40].all()
 
 
-def test_scattering_kernel_conserves_light() -> None:
-    from tofuse.lab.simulation.optics import LensScatter
-
-    spread = LensScatter(176, 144, 0.02)
-    point = np.zeros((144, 176))
-    point[72, 88] = 1.0
-    out = spread(point)
-    assert out[72, 88] == pytest.approx(0.98, abs=0.001)
-    assert 0.9 < out.sum() <= 1.001
-    assert out[72, 98] > out[72, 118] > out[72, 158] > 0
-
-
 def corner(albedo: float = 0.6) -> Boards:
     """Two walls at a right angle, whose edge is seen at 2 m in the image's middle."""
     s = np.sqrt(0.5)
@@ -341,40 +291,6 @@ def test_multipath_rounds_corners() -> None:
     # Half the albedo, half the fraction of light by way of the other wall.
     dark = ranges(corner(0.3), Effects.none(multipath=True)) - ranges(corner(), Effects.none())
     assert dark.mean() / bias.mean() == pytest.approx(0.5, abs=0.1)
-
-
-def test_single_wall_has_no_multipath() -> None:
-    one, other = (ranges(wall(2.0), Effects.none(multipath=on)) for on in (True, False))
-    np.testing.assert_array_equal(one, other)
-
-
-def test_single_bounce_light_matches_form_factor_integral() -> None:
-    """The light that a small patch receives from a lit one, compared with the integral."""
-    from tofuse.lab.simulation.optics import single_bounce_light
-
-    # A floor 1 m below the lens, a lit wall 3 m ahead; no shadows between.
-    scene = Boards(
-        [
-            Board((0, 1, 2), a=(1, 0, 0), b=(0, 0, 1), albedo=0.0),
-            Board((0, 0, 3), a=(1, 0, 0), b=(0, 1, 0), albedo=0.8),
-        ]
-    )
-    model = replace(MODEL, falloff=0.0, camera=Pinhole(44, 36, 20.0, 20.0, 21.5, 17.5))
-    z = np.linspace(2.0, 2.6, 4)
-    points = np.full((36, 44, 3), np.inf)
-    normals = np.zeros((36, 44, 3))
-    for k, depth in enumerate(z):
-        points[2 + 4 * k, :] = (0, 1, depth)
-        normals[2 + 4 * k, :] = (0, -1, 0)
-    light = single_bounce_light(scene, model, points, normals, np.eye(4), None)[0]
-    x, y = np.meshgrid(np.linspace(-1, 1, 400), np.linspace(-1, 1, 400))
-    area = (2 / 400) ** 2
-    for k, depth in enumerate(z):
-        lit = 0.8 * 3 / (x**2 + y**2 + 9) ** 1.5
-        dx, dy, dz = x, y - 1, 3 - depth
-        d2 = dx**2 + dy**2 + dz**2
-        form = (-dy) * dz / (np.pi * d2**2)
-        assert light[2 + 4 * k, 22, 0] == pytest.approx((lit * form).sum() * area, rel=0.12)
 
 
 @pytest.mark.slow
@@ -440,36 +356,6 @@ def test_strong_light_saturates() -> None:
     assert (rendered.flags & Flag.SATURATED).all()
     fine = shoot(wall(2.0, 0.9), Effects.none(saturation=True))
     assert (fine.frame.amplitude_image < 65535).all()
-
-
-def test_weak_light_gives_noise_without_confidence() -> None:
-    rendered = shoot(wall(4.0, 0.004), Effects.none(shot_noise=True))
-    frame = rendered.frame
-    assert (frame.confidence_image == 0).mean() > 0.99
-    assert frame.radial_range.std() > 0.5
-    assert (rendered.flags & Flag.UNDER_EXPOSED).all()
-
-
-def test_under_exposed_pixels_are_dropped() -> None:
-    model = replace(camera_model("kinect2"), camera=MODEL.camera)
-    dark = wall(4.0, 0.004)
-    effects = Effects.none(shot_noise=True, under_exposure=True)
-    assert (shoot(dark, effects, model=model).frame.depth == 0).mean() > 0.9
-    kept = Effects.none(shot_noise=True)
-    assert (shoot(dark, kept, model=model).frame.depth > 0).mean() > 0.9
-
-
-def test_strong_amplitudes_are_compressed_but_not_ranges() -> None:
-    model = replace(MODEL, amplitude_kind="raw")
-    share = []
-    for z in (0.6, 1.2, 4.0):
-        bent = shoot(wall(z), Effects.none(amplitude_nonlinearity=1.0), model=model).frame
-        plain = shoot(wall(z), Effects.none(), model=model).frame
-        share.append(bent.amplitude_image[CENTRE] / plain.amplitude_image[CENTRE])
-        np.testing.assert_allclose(bent.depth, plain.depth, atol=1.01e-4)
-    assert share[0] < share[1] < share[2] <= 1.0
-    assert share[0] < 0.99
-    assert share[2] > 0.99
 
 
 def test_confidence_rises_with_falling_noise() -> None:
@@ -569,19 +455,6 @@ def test_rendering_is_independent_of_threads_and_other_frames() -> None:
         take(1)
         assert take(3) == one
     assert take(3, seed=1)[0] != one[0]
-
-
-def test_effects_are_selected_by_name() -> None:
-    assert Effects().without("all") == Effects.none()
-    assert Effects().without("scatter", "smear") == replace(Effects(), scatter=0.0, smear=False)
-    with pytest.raises(InputError, match="no effect called 'rain'"):
-        Effects().without("rain")
-    with pytest.raises(InputError, match="scatter"):
-        Effects(scatter=1.5)
-    with pytest.raises(InputError, match="noise"):
-        Effects(noise="pink")
-    with pytest.raises(InputError, match="no camera called"):
-        camera_model("polaroid")
 
 
 def test_ifm_states_correct_noise() -> None:

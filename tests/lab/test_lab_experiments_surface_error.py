@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.errors import InputError
 from tofuse.lab.experiments.surface_error import Surface, compare_surfaces, distances
 
 SQUARE = Surface(
@@ -57,28 +56,3 @@ def test_missing_half_is_accurate_but_incomplete() -> None:
     back = compare_surfaces(SQUARE, half, samples=20_000)
     assert back.recall == 1
     assert back.accuracy_p95_m == pytest.approx(0.45, abs=0.01)
-
-
-def test_samples_are_uniform_on_faces() -> None:
-    points, face = SQUARE.samples(10_000)
-    assert SQUARE.area == pytest.approx(1)
-    assert np.abs(points[:, 2]).max() == 0
-    assert np.bincount(face).tolist() == [5000, 5000]
-    counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], 5, ((0, 1), (0, 1)))
-    assert 300 < counts.min() <= counts.max() < 500
-    same, _ = SQUARE.samples(10_000)
-    np.testing.assert_array_equal(same, points)
-
-
-def test_clouds_are_compared_by_their_points() -> None:
-    cloud = Surface(SQUARE.samples(5000)[0])
-    found = compare_surfaces(cloud, SQUARE, samples=20_000)
-    assert found.accuracy_m == pytest.approx(0, abs=1e-5)
-    assert 0.002 < found.completeness_m < 0.02  # the spacing of 5000 points
-
-
-def test_invalid_surfaces_are_rejected() -> None:
-    with pytest.raises(InputError, match="model"):
-        compare_surfaces(Surface(np.zeros((0, 3))), SQUARE)
-    with pytest.raises(InputError, match="finite"):
-        Surface(np.full((2, 3), np.nan))

@@ -9,11 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.errors import InputError, OutputError
 from tofuse.lab.experiments.page import run_experiments
 from tofuse.lab.experiments.peaks import PeaksSweep
-from tofuse.lab.experiments.statements import STATEMENTS, Results, graded, judge_all
-from tofuse.lab.experiments.statements import _straighter as straighter
+from tofuse.lab.experiments.statements import STATEMENTS, Results, graded
 
 
 @pytest.fixture(scope="module")
@@ -101,52 +99,3 @@ def test_scene_is_run_with_all_variants(rail_page):
     text = rail_page.read_text(encoding="utf-8")
     assert "Translation of the camera" in text
     assert not re.search(r"\bnan\b", re.sub(r"data:[^\"']+", "", text), re.IGNORECASE)
-
-
-@pytest.mark.slow
-def test_only_earlier_experiments_are_overwritten(peaks_page, tmp_path):
-    with pytest.raises(OutputError, match="overwrite"):
-        run_experiments(peaks_page.parent, cases=("peaks",), seeds=1)
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "thesis.tex").write_text("mine")
-    for overwrite in (False, True):
-        with pytest.raises(OutputError, match="not empty"):
-            run_experiments(other, cases=("peaks",), seeds=1, overwrite=overwrite)
-    assert [p.name for p in other.iterdir()] == ["thesis.tex"]
-    before = read(peaks_page)
-    with pytest.raises(InputError, match="no case 'sofa'"):
-        run_experiments(peaks_page.parent, cases=("sofa",), overwrite=True)
-    assert read(peaks_page) == before
-
-
-def test_unknown_cases_leave_no_output(tmp_path):
-    with pytest.raises(InputError, match="use some of"):
-        run_experiments(tmp_path / "new", cases=("peaks", "sofa"))
-    assert not (tmp_path / "new").exists()
-
-
-def test_statements_without_case_are_not_judged():
-    assert judge_all(Results({}, None), ("thesis",)) == ()
-
-
-def test_straightness_is_judged_by_trajectories():
-    class Runs:
-        def __init__(self, *runs):
-            self.runs = runs
-
-        def select(self, _method, _guess="previous"):
-            return self.runs
-
-    straight = np.tile(np.eye(4), (20, 1, 1))
-    straight[:, 0, 3] = np.linspace(0, 1, 20)
-    bent = straight.copy()
-    bent[:, 1, 3] = np.linspace(0, 1, 20) ** 2
-
-    class Run:
-        def __init__(self, before, after):
-            self.before, self.after = before, after
-
-    good, bad = Run(bent, straight), Run(straight, bent)
-    for runs, outcome in (((good, good), "agrees"), ((good, bad), "partly"), ((bad,), "disagrees")):
-        assert straighter(Results({"rail": Runs(*runs)}, None), "thesis").outcome == outcome

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.measured_graph import Measured
-from tofuse.lab.experiments.peaks import PoseErrors, chain, run_peaks, sweep_peaks
+from tofuse.lab.experiments.peaks import PoseErrors, run_peaks, sweep_peaks
 from tofuse.lab.simulation.peaks import peaks, peaks_cameras, peaks_points, peaks_views
 
 
@@ -119,21 +118,3 @@ def test_noise_sweep_reproduces_thesis():
     for run in sweep.runs:
         assert run.sequential.position[0] == run.optimised.position[0] == 0
         assert (np.diff(run.objective) <= 0).all()
-
-
-def test_same_seed_gives_same_result():
-    a, b = run_peaks(0.08, 5), run_peaks(0.08, 5)
-    np.testing.assert_array_equal(a.optimised.axes, b.optimised.axes)
-
-
-def test_chain_is_product_of_motions():
-    rng = np.random.default_rng(0)
-    relative = se3.exp(rng.normal(size=(9, 6)))
-    graph = chain(relative, [Measured(0, 9, np.eye(4), np.eye(6) * 3)])
-    T = np.eye(4)
-    for k, pose_k in enumerate(graph.poses):
-        np.testing.assert_allclose(pose_k, T, atol=1e-12)
-        T = T @ relative[k] if k < 9 else T
-    np.testing.assert_allclose(graph.residuals()[:-1], 0, atol=1e-9)
-    assert graph.loop.tolist() == [False] * 9 + [True]
-    np.testing.assert_array_equal(graph.information[-1], np.eye(6) * 3)

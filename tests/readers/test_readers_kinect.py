@@ -11,8 +11,7 @@ import pytest
 
 import made_kinect as made
 from tofuse.engine.cameras.cameras import RayTable
-from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.formats.readers import azure_kinect
+from tofuse.engine.errors import InputError
 from tofuse.formats.recordings.camera_file import ColorCamera
 from tofuse.formats.recordings.open import open_recording
 
@@ -163,35 +162,6 @@ def test_missing_tracks_and_calibration_are_named(tmp_path: Path) -> None:
         open_recording(path)
 
 
-def test_truncated_recording_keeps_complete_frames(tmp_path: Path) -> None:
-    path = tmp_path / "a.mkv"
-    depth = made.small_counts()
-    made.make_mkv(path, depth)
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) - 1000])
-    recording = open_recording(path)
-    assert any("is cut off" in line for line in recording.warnings)
-    items = list(recording.read_all())
-    assert [isinstance(item, UnreadableFrameError) for item in items] == [False, False, True]
-
-
-def test_header_that_exceeds_its_parent_is_cut_off(tmp_path: Path) -> None:
-    """The last byte of a tag is the start of an element whose size is in the next tag."""
-    depth = made.small_counts(2)
-    made.make_mkv(tmp_path / "a.mkv", depth)
-    data = (tmp_path / "a.mkv").read_bytes()
-    mode = made.tag("K4A_DEPTH_MODE", "NFOV_2X2BINNED")
-    name = bytes.fromhex("4487")  # of the tag's value
-    at = data.index(mode) + mode.rindex(name)
-    size = int.from_bytes(data[at + 2 : at + 10], "big") & 0xFFFFFF
-    broken = data[: at + 10 + size - 1] + b"\xae" + data[at + 10 + size :]
-    broken = broken[: at + 2] + (1 << 56 | size - 1).to_bytes(8, "big") + broken[at + 10 :]
-    (tmp_path / "a.mkv").write_bytes(broken)
-    recording = open_recording(tmp_path / "a.mkv")
-    np.testing.assert_allclose(recording[0].depth, depth[0] / 1000, atol=1e-6)
-    assert any("is cut off" in line for line in recording.warnings)
-
-
 def test_real_capture(shared_data: Path) -> None:
     folder = shared_data / "azure_kinect_mkv"
     recording = open_recording(folder)
@@ -234,9 +204,3 @@ def test_real_capture(shared_data: Path) -> None:
     best = max(scores, key=lambda shift: scores[shift])
     assert np.hypot(*best) <= 3.1
     assert scores[best] > 0.3
-
-
-def test_modes_of_reader_are_as_documented() -> None:
-    for mode, (width, height, whole, left, top) in SIZES.items():
-        window = azure_kinect.DEPTH_MODES[mode]
-        assert window == azure_kinect.Window((whole, whole), (left, top), (width, height))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.errors import InputError
 from tofuse.formats.images.images import read_image
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.passing import Passing
@@ -74,23 +73,3 @@ def test_passing_pixels_are_flagged_and_nearer(tmp_path) -> None:
     assert nearer[flags].mean() > 0.9
     assert nearer[~flags].mean() < 0.02
     np.testing.assert_array_equal(memory.reference, empty.reference)
-
-
-def test_rotating_object_still_defines_world() -> None:
-    made = plan("box", every=30, frames=4, passing=Passing("person", 0.2, start_s=0.0))
-    np.testing.assert_array_equal(made.poses, plan("box", every=30, frames=4).poses)
-    assert made.sequence.T_room_bodies(0.5).shape == (6, 4, 4)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [({"kind": "dog"}, "dog"), ({"fraction": 0.0}, "fraction"), ({"seconds": 5.0}, "end before")],
-)
-def test_invalid_options_are_rejected(options, words) -> None:
-    with pytest.raises(InputError, match=words):
-        Passing(**options)
-
-
-def test_first_frame_must_exist() -> None:
-    with pytest.raises(InputError, match="first"):
-        plan("wall", first=60)

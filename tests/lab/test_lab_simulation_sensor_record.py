@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.geometry import se3
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.formats.images.images import read_image
@@ -107,39 +106,3 @@ def test_bias_remains_without_correction(tmp_path) -> None:
     corrected = simulate_recording("wall", every=10, frames=1, effects=effects)[0]
     assert np.sqrt(((raw.depth - truth) ** 2).mean()) > 0.004
     assert np.sqrt(((corrected.depth - truth) ** 2).mean()) < 0.001
-
-
-def test_flags_are_written_as_16_bit_images(folder) -> None:
-    flags = read_image(folder / "truth" / "flags" / "000000.png")
-    assert flags.dtype == np.uint16
-    assert flags.shape == (144, 176)
-    assert flags.any()
-
-
-def test_peaks_are_written_as_clouds(tmp_path) -> None:
-    path = simulate("peaks", tmp_path / "peaks", sigma_m=0.02)
-    source = NativeSource(path)
-    assert len(source.timestamps) == 20
-    memory = simulate_recording("peaks", sigma_m=0.02)
-    np.testing.assert_allclose(source.read(3).points, memory[3].points, atol=1e-6)
-    np.testing.assert_allclose(source.reference, memory.reference, atol=1e-9)
-    truth = read_ply(path / "truth" / "surface.ply").points.astype(float)
-    seen = se3.transform(memory.reference[5], memory[5].points)
-    near = np.linalg.norm(seen[::100, None] - truth[None], axis=-1).min(1)
-    assert np.median(near) < 0.05
-    assert len(simulate_recording("peaks", every=4)) == 5
-
-
-def test_invalid_options_are_rejected(tmp_path) -> None:
-    for options, words in (
-        ({"scene": "moon"}, "moon"),
-        ({"scene": "wall", "camera": "polaroid"}, "polaroid"),
-        ({"scene": "wall", "every": 0}, "every"),
-        ({"scene": "wall", "frames": 0}, "frames"),
-    ):
-        with pytest.raises(InputError, match=words):
-            simulate_recording(**options)
-    (tmp_path / "file").write_text("mine")
-    with pytest.raises(OutputError):
-        simulate("wall", tmp_path, frames=1)
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]

@@ -1,15 +1,12 @@
 from __future__ import annotations
 
 import json
-import shutil
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from paths import DOCS
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
 from tofuse.engine.cameras.depth_conversion import points_from_z
 from tofuse.engine.errors import InputError, OutputError, UnreadableFrameError
@@ -256,15 +253,6 @@ def test_invalid_fields_are_named(tmp_path: Path, changes: dict[str, Any], words
     assert "\n" not in str(caught.value)
 
 
-def test_invalid_color_transform(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a", 1)
-    intrinsics = {"width": 40, "height": 30, "fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 2.0}
-    for T in ([[1, 2]], (2 * np.eye(4)).tolist(), "T", None):
-        edit(folder, color={"intrinsics": intrinsics, "T_color_depth": T})
-        with pytest.raises(InputError, match="T_color_depth"):
-            NativeSource(folder)
-
-
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", '{"schema": 1,}', "[" * 100000, "\x00"])
 def test_broken_json(tmp_path: Path, text: str) -> None:
     folder = write(tmp_path / "a", 1)
@@ -358,18 +346,6 @@ def test_rays_with_forged_header(tmp_path: Path) -> None:
         NativeSource(folder)
 
 
-def test_correction_with_forged_header(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a")
-    with zipfile.ZipFile(folder / "correction.npz", "w") as archive:
-        for name in ("range_m", "bias_m"):
-            with archive.open(f"{name}.npy", "w") as file:
-                claim = {"descr": "<f8", "fortran_order": False, "shape": (10**14,)}
-                np.lib.format.write_array_header_1_0(file, claim)
-                file.write(bytes(1000))
-    with pytest.raises(InputError, match=r"correction\.npz"):
-        NativeSource(folder)
-
-
 def test_damaged_frame_is_an_unreadable_frame(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
     path = folder / "depth" / "000001.png"
@@ -393,20 +369,6 @@ def test_camera_of_different_image_size(tmp_path: Path) -> None:
     assert not isinstance(caught.value, UnreadableFrameError)
 
 
-def test_given_camera_replaces_that_of_folder(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a")
-    other = tmp_path / "other.json"
-    shutil.copy(folder / "camera.json", other)
-    data = json.loads(other.read_text())
-    other.write_text(json.dumps(data | {"fx": 99.0, "depth_unit_m": 0.001}))
-    np.save(folder / "rays.npy", PINHOLE.rays())
-    source = NativeSource(folder, other)
-    assert isinstance(source.camera, Pinhole)
-    assert source.camera.fx == 99
-    frame = source.read(0)
-    np.testing.assert_allclose(frame.z, 2 * image(0).z, atol=0.001)
-
-
 def test_writer_refuses_invalid_frames(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a", PINHOLE)
     with pytest.raises(InputError, match="no frames"):
@@ -428,18 +390,6 @@ def test_writer_refuses_invalid_frames(tmp_path: Path) -> None:
     writer.finish()
     with pytest.raises(OutputError, match="isn't empty"):
         RecordingWriter(tmp_path / "a", PINHOLE)
-
-
-def test_example_of_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (DOCS / "formats.md").read_text()
-    code = page.split("```python\n")[1].split("```")[0]
-    about = json.loads(page.split("```json\n")[1].split("```")[0])
-    monkeypatch.chdir(tmp_path)
-    exec(code, {"depth_images": np.full((2, 424, 512), 1.5, np.float32)})
-    source = NativeSource(tmp_path / "my_recording")
-    assert source.read(1).points[:, 2] == pytest.approx(1.5, abs=1e-4)
-    written = json.loads((tmp_path / "my_recording" / "camera.json").read_text())
-    assert written == about
 
 
 def test_same_frames_give_same_bytes(tmp_path: Path) -> None:

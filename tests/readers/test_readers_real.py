@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.engine.cameras.cameras import Pinhole, RayTable
-from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry.se3 import inverse, transform
@@ -141,12 +140,6 @@ def test_lidar_pair_gt(shared_data: Path) -> None:
     rows = np.frombuffer(data, "<f4", offset=body).reshape(-1, 4)
     np.testing.assert_array_equal(recording[0].points, rows[:, :3])
     np.testing.assert_array_equal(recording[0].amplitude, rows[:, 3])
-
-
-@pytest.mark.parametrize("name", ["kinectv2_loop", "pose_graphs"])
-def test_unknown_formats_are_refused(shared_data: Path, name: str) -> None:
-    with pytest.raises(InputError, match=name):
-        open_recording(shared_data / name)
 
 
 @pytest.mark.nightly
