@@ -11,9 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-import made_rooms
 import tofuse
-from coarse_steps import without_multipath
 from tofuse.apps.cli.program import main
 from tofuse.apps.inspection import channels
 from tofuse.apps.inspection.finding import CODES, Finding
@@ -101,15 +99,6 @@ def test_facts_of_synthetic_frames() -> None:
     assert inspect_recording(of(numbered)).facts["duration"].startswith("unknown")
 
 
-def test_known_poses_are_counted() -> None:
-    poses = np.stack([np.eye(4)] * 3)
-    poses[1] = np.nan
-    facts = inspect_recording(
-        of([image(2.0, k) for k in range(3)], odometry=poses, reference=poses[:, :, :] + 0)
-    ).facts
-    assert facts["odometry"] == facts["reference poses"] == "for 2 frames"
-
-
 def test_facts_of_clouds(tmp_path) -> None:
     rng = np.random.default_rng(0)
     for k in range(3):
@@ -131,14 +120,6 @@ def test_wrong_unit_is_detected(z) -> None:
         )
         assert "depth_unit_m" in warning
         assert f"{z:.2g}"[:1] in warning
-
-
-def test_millimetres_read_as_metres_are_reported(tmp_path, capsys) -> None:
-    folder = written(tmp_path / "rec", [image(2.0), image(2.0, 1)], depth_unit_m=1.0)
-    assert main(["inspect", str(folder)]) == 0
-    reported = capsys.readouterr().out
-    assert "severe: depth_unit: The median depth is" in reported
-    assert "Check depth_unit_m: it may be wrong by a factor of" in reported
 
 
 def test_few_and_no_valid_points_are_detected() -> None:
@@ -172,19 +153,6 @@ def test_warnings_of_the_reader_are_reported(tmp_path, capsys) -> None:
     assert "\\" not in reported
 
 
-def test_long_recording_is_sampled() -> None:
-    class Counting(ArraySource):
-        def read(self, index):
-            requested.append(index)
-            return super().read(index)
-
-    requested: list[int] = []
-    frames = [image(2.0, k) for k in range(1000)]
-    inspect_recording(Recording.of(Counting(frames), "x", "frames"))
-    assert len(requested) <= 16
-    assert (requested[0], requested[-1]) == (0, 999)
-
-
 def test_recording_without_readable_frames_is_rejected() -> None:
     class Broken(ArraySource):
         def read(self, index):
@@ -193,12 +161,6 @@ def test_recording_without_readable_frames_is_rejected() -> None:
     recording = Recording.of(Broken([image(2.0)]), "somewhere", "frames")
     with pytest.raises(InputError, match="somewhere: no frame can be read; file 0: is broken"):
         inspect_recording(recording)
-
-
-def test_channels_are_listed() -> None:
-    colour = np.zeros((30, 40, 3), np.uint8)
-    frame = replace(image(2.0), color_image=colour, amplitude_image=np.ones((30, 40), np.float32))
-    assert inspect_recording(of([frame])).facts["other images"] == "amplitude, colour"
 
 
 # What follows: each check has a recording that triggers it, and one that must not.
@@ -441,14 +403,6 @@ def test_bare_wall_is_detected_and_curved_scene_gives_no_lens_findings() -> None
 
 
 @pytest.mark.slow
-def test_joined_recordings_are_not_unsorted(turn) -> None:
-    twice = stamped([*turn[:5], *turn[:5]], np.tile(TIMES[:5], 2))
-    parts = {"parts": [{"frames": 5}, {"frames": 5}]}
-    assert "time_unsorted" not in codes(twice, metadata=parts)
-    assert "time_unsorted" in codes(twice)
-
-
-@pytest.mark.slow
 def test_contact_sheet_is_saved(few, tmp_path, capsys) -> None:
     wrong = of(FAULTS["range_taken_for_z"](few))
     path = tofuse.inspect(wrong, quick=True).save_sheet(tmp_path / "a/sheet.png")
@@ -457,19 +411,6 @@ def test_contact_sheet_is_saved(few, tmp_path, capsys) -> None:
     assert picture[..., :3].std() > 20
     with pytest.raises(OutputError, match="can't be written"):
         tofuse.inspect(of(few[:2]), quick=True).save_sheet(path / "below.png")
-
-
-@pytest.mark.slow
-def test_run_reports_findings(turn, tmp_path, capfd) -> None:
-    folder = written(tmp_path / "rec", turn[:3], depth_unit_m=0.01)
-    main(["run", str(folder), "--out", str(tmp_path / "out")])
-    assert "note: The median depth is" in capfd.readouterr().err
-    data = json.loads((tmp_path / "out/run.json").read_text())
-    assert "depth_unit" in [f["code"] for f in data["findings"]]
-    assert data["verdict"] != "good"
-    assert "faulty_recording" in [r["code"] for r in data["reasons"]]
-    assert any("median depth" in w for w in data["warnings"])
-    assert "The median depth is" in (tmp_path / "out/report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -526,29 +467,6 @@ def test_corrected_intrinsics_do_not_affect_verdict(
     assert faults(severe)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("degrees", [6.0, 15.0])
-def test_rotating_object_is_distinguished_from_moving_camera(degrees) -> None:
-    """Its background is static, so a run without --object would estimate no motion."""
-    frames = []
-    for k in range(8):
-        thing = ((0.0, 0.3, 0.4), (0.5, 0.6, 0.15), np.radians(degrees) * k)
-        frames.append(made_rooms.seen(made_rooms.at(0, -1.2, 0), k, boxes=[thing]))
-    findings = inspect_recording(of(frames), quick=True).findings
-    hints = [str(f) for f in findings if "--object" in str(f)]
-    assert hints, [str(f) for f in findings]
-    remaining = inspect_recording(of(frames), turning=True, quick=True).findings
-    assert not any("--object" in str(f) for f in remaining)
-
-
-@pytest.mark.slow
-def test_depth_errors_are_not_attributed_to_lens(tmp_path) -> None:
-    """In a corridor few surfaces are visible, and depth errors bend them."""
-    recording = without_multipath(tmp_path, "corridor", "ifm-o3r", every=12)
-    found = tofuse.inspect(recording).findings
-    assert not {f.code for f in found if f.severity == "severe"}
-
-
 @pytest.mark.parametrize(
     ("unit", "found"),
     [(1.0, []), (30.0, []), (1e3, [1e3]), (1e6, [1e6]), (1e9, [1e9]), (1e-9, [1.0])],
@@ -558,12 +476,3 @@ def test_timestamps_in_another_unit_are_reported(unit, found) -> None:
     frames = [replace(image(1.0, k), timestamp=unit * k / 30) for k in range(8)]
     reported = tofuse.inspect(of(frames), quick=True).findings
     assert [f.evidence["factor"] for f in reported if f.code == "time_unit"] == found
-
-
-@pytest.mark.slow
-def test_focal_length_of_larger_images_is_estimated(turn) -> None:
-    factor, camera = 3.0, turn[0].camera
-    wrong = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
-    reported = tofuse.inspect(of(seen_by(turn, wrong))).findings
-    (found,) = [f for f in reported if f.code == "focal_length"]
-    assert found.evidence["factor"] * factor == pytest.approx(1, abs=0.1)

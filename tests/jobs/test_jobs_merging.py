@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import made_sessions
-from made_rooms import OTHER, seen
-from made_sessions import made_result, made_result_of, quick
+from made_rooms import OTHER
+from made_sessions import made_result, quick
 from tofuse.apps.cli.program import main
 from tofuse.apps.jobs import merging
 from tofuse.apps.jobs import running as run_module
@@ -21,7 +21,6 @@ from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.jobs.sessions import read_sessions
 from tofuse.apps.results.folder import OutputFolder
 from tofuse.apps.results.output import write_result
-from tofuse.apps.results.run_json import read_run_json
 from tofuse.apps.results.session_words import session_sentences
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
@@ -33,7 +32,6 @@ from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.progress import Silent
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.formats.recordings.open import Opening
 from written_run_json import run_json
 
 HERE, THERE = made_sessions.HERE[::2], made_sessions.THERE[::2]
@@ -97,14 +95,6 @@ def test_two_sessions_in_one_room_give_one_map(both) -> None:
     assert exit_status(both) == 0
 
 
-def test_first_session_defines_the_world(both) -> None:
-    np.testing.assert_array_equal(both.trajectory[0], np.eye(4))
-    first, second = both.sessions
-    np.testing.assert_array_equal(first.T_main_session, np.eye(4))
-    between = se3.inverse(TRUE[0]) @ THERE[0]
-    np.testing.assert_allclose(second.T_main_session, between, atol=0.005)
-
-
 def test_overlap_and_probability_are_reported(both) -> None:
     (pair,) = both.session_pairs
     assert (pair.a, pair.b, pair.joined, pair.before) == (0, 1, True, False)
@@ -141,25 +131,6 @@ def test_flat_of_same_plan_is_not_joined(results) -> None:
     assert "between here and elsewhere" in reason.text
     assert found.components[1].result.has_pose.all()
     assert exit_status(found) == 3
-
-
-@pytest.mark.slow
-def test_first_session_stays_main_if_others_are_larger(results, pair) -> None:
-    """And merged results can be merged again: joined sessions stay joined."""
-    found = merged(results["elsewhere"], pair, searches=3)
-    assert [s.name for s in found.sessions] == ["elsewhere", "here", "there"]
-    assert found.has_pose.tolist() == [True] * N + [False] * 2 * N
-    assert "few_poses" not in {reason.code for reason in found.diagnostics.reasons}
-    assert found.diagnostics.verdict == "degraded"
-    assert [s.T_main_session is None for s in found.sessions] == [False, True, True]
-    assert [(p.a, p.b, p.joined, p.before) for p in found.session_pairs] == [
-        (0, 1, False, False),
-        (0, 2, False, False),
-        (1, 2, True, True),
-    ]
-    (apart,) = [c.result for c in found.components if not c.connected]
-    off = se3.inverse(TRUE[0]) @ TRUE
-    assert np.linalg.norm(off[:, :3, 3] - apart.trajectory[:, :3, 3], axis=1).max() < 0.005
 
 
 @pytest.mark.slow
@@ -270,33 +241,6 @@ def test_results_of_clouds_are_refused(results, tmp_path) -> None:
     refused([results["here"], again], "clouds", "pass their clouds together")
 
 
-def test_result_that_stores_only_the_path_of_its_recording(results, tmp_path) -> None:
-    """As results that are written from Python do."""
-    again = copied(results["there"], tmp_path)
-    run = json.loads((again / "run.json").read_text())
-    changed_run_json(again, input=run["input"] | {"opening": None})
-    _, session = read_sessions([results["here"], again], 1, Silent())
-    assert len(session.recording) == N
-    assert len(session.posed) == N
-
-
-@pytest.mark.slow
-def test_joined_and_selected_recordings_are_merged(results, tmp_path) -> None:
-    """The same frames are opened again: both recordings of a run, every other frame."""
-    paths = [Path(read_run_json(results[k] / "run.json")["input"]["path"]) for k in results][:2]
-    opening = Opening(tuple(paths), every=2, start=1)
-    recording = opening.open()
-    result = reconstruct(recording, quick(), threads=2)
-    of_both = {**result.recording, "opening": opening.to_dict()}
-    write_result(replace(result, recording=of_both), OutputFolder(tmp_path / "both"))
-    sessions = read_sessions([tmp_path / "both", results["elsewhere"]], 1, Silent())
-    assert sessions[0].recording.indices.tolist() == list(range(1, 2 * N, 2))
-    joined, firsts = merging.joined_recording(sessions)
-    assert firsts == [0, 2 * N]
-    assert [part["frames"] for part in joined.metadata["parts"]] == [N, N, N]
-    assert joined.indices.tolist() == [*range(1, 2 * N, 2), *range(2 * N, 3 * N)]
-
-
 @pytest.mark.parametrize(
     "changes", [{"frames": [{}]}, {"frames": 3}, {"input": {}}, {"components": [1]}]
 )
@@ -334,39 +278,3 @@ def test_recording_is_added_to_map(results, tmp_path, monkeypatch, capsys) -> No
     assert main([*words[:-1], str(tmp_path / "new")]) == 2
     assert "same folder as --out" in capsys.readouterr().err
     assert main([*words[:-1], str(tmp_path / "nothing")]) == 2
-
-
-@pytest.mark.slow
-def test_separate_parts_of_result_stay_separate_or_are_joined(results, tmp_path) -> None:
-    """A recording that continues elsewhere after a dark frame, and a session of that place."""
-    first, second = made_sessions.HERE[5:], made_sessions.THERE[5:]
-    frames = [
-        *(seen(T, 400 + k) for k, T in enumerate(first)),
-        *(seen(T, 420 + k, boxes=OTHER) for k, T in enumerate(second)),
-    ]
-    dark = replace(frames[0], depth=np.zeros_like(frames[0].depth))
-    mixed = made_result_of(tmp_path / "mixed", [*frames[:7], dark, *frames[7:]])
-    assert (mixed / "component-1").is_dir()
-    assert run_status(mixed) == ["tracked"] * 7 + ["lost"] + ["tracked"] * 7
-
-    found = merged(results["there"], mixed, searches=4)
-    assert found.has_pose.tolist() == [True] * (N + 7) + [False] * 8
-    lost = found.diagnostics.frames[N + 7]
-    assert lost.status == "lost"
-    assert "valid points" in lost.reason
-    off = se3.inverse(THERE[0]) @ np.array([*THERE, *first])
-    error = np.linalg.norm(off[:, :3, 3] - found.trajectory[: N + 7, :3, 3], axis=1)
-    assert error.max() < 0.005
-    assert found.sessions[1].T_main_session is not None
-    (apart,) = [c for c in found.components if not c.connected]
-    assert apart.frames == ((N + 8, N + 14),)
-
-    found = merged(results["elsewhere"], mixed, searches=4)
-    assert found.has_pose.tolist() == [True] * N + [False] * 8 + [True] * 7
-    off = se3.inverse(THERE[0]) @ np.array([*THERE, *second])
-    error = np.linalg.norm(off[:, :3, 3] - found.trajectory[found.has_pose, :3, 3], axis=1)
-    assert error.max() < 0.005
-
-
-def run_status(folder: Path) -> list[str]:
-    return [frame["status"] for frame in json.loads((folder / "run.json").read_text())["frames"]]

@@ -16,7 +16,6 @@ from tofuse.apps.jobs.run_options import Options
 from tofuse.apps.jobs.running import run
 from tofuse.apps.viewer.coverage import Coverage
 from tofuse.apps.viewer.server import serve, stop
-from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.progress import Silent
 
 needs_viser = pytest.mark.skipif(
@@ -110,23 +109,3 @@ def test_accuracy_improves_with_proximity_and_number_of_views():
     np.testing.assert_allclose(coverage.sigma(wall)[left & inside], 0.004, rtol=1e-6)
     np.testing.assert_allclose(coverage.sigma(wall)[~left & inside], 0.008, rtol=1e-6)
     assert np.isinf(coverage.sigma(wall + np.float32([0, 0, 1]))).all()
-
-
-@needs_viser
-def test_views_of_long_run_are_thinned():
-    from tofuse.apps.viewer import live_view as live_module
-
-    server = serve()
-    try:
-        live = live_module.LiveView(server)
-        rng = np.random.default_rng(0)
-        for k in range(2 * live_module._CLOUDS):
-            T = np.eye(4)
-            T[0, 3] = 0.5 * k
-            live.placed(CloudFrame.of(rng.normal(0, 1, (50, 3)), index=k), T)
-        assert len(live._shown) <= live_module._CLOUDS
-        xs = [T[0, 3] for T, _ in live._shown]
-        assert xs == sorted(xs)
-        assert xs[0] == 0
-    finally:
-        stop(server)
