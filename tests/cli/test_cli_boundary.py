@@ -176,18 +176,6 @@ def test_program_bug_is_one_line_unless_traceback_is_requested(capfd, monkeypatc
         cli.report_bugs(fail)
 
 
-def test_ignored_signals_stay_ignored(tmp_path: Path) -> None:
-    """As under nohup."""
-    script = (
-        "import os, signal, sys\n"
-        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-        "from tofuse.apps.cli import program as cli\n"
-        "cli.main = lambda: os.kill(os.getpid(), signal.SIGHUP) or 0\n"
-        "sys.exit(cli.console())\n"
-    )
-    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 @pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_signal_in_destructor_is_not_lost(name: str, status: int) -> None:

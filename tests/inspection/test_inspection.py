@@ -20,13 +20,11 @@ from tofuse.apps.inspection.planar import Distortion
 from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.jobs.running import with_findings
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
-from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.errors import OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.results.types import SelfCalibration
-from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.native import RecordingWriter
 from wrapped_depth import wrapping
@@ -99,19 +97,6 @@ def test_facts_of_synthetic_frames() -> None:
     assert inspect_recording(of(numbered)).facts["duration"].startswith("unknown")
 
 
-def test_facts_of_clouds(tmp_path) -> None:
-    rng = np.random.default_rng(0)
-    for k in range(3):
-        write_ply(
-            tmp_path / f"{k}.ply", GeometryRecord(rng.uniform(1, 2, (500, 3)).astype(np.float32))
-        )
-    facts = inspect_recording(tofuse.open(tmp_path)).facts
-    assert facts["views"] == "clouds of about 500 points"
-    assert facts["format"] == "ply"
-    assert facts["valid points"] == "100%"
-    assert "images" not in facts
-
-
 @pytest.mark.parametrize("z", [2000.0, 0.002])
 def test_wrong_unit_is_detected(z) -> None:
     for frame in (image(z), CloudFrame.of(image(z).points)):
@@ -151,16 +136,6 @@ def test_warnings_of_the_reader_are_reported(tmp_path, capsys) -> None:
     reported = capsys.readouterr().out
     assert "colour[x]" in reported  # brackets are not interpreted as markup
     assert "\\" not in reported
-
-
-def test_recording_without_readable_frames_is_rejected() -> None:
-    class Broken(ArraySource):
-        def read(self, index):
-            raise tofuse.engine.errors.UnreadableFrameError("is broken", where=f"file {index}")
-
-    recording = Recording.of(Broken([image(2.0)]), "somewhere", "frames")
-    with pytest.raises(InputError, match="somewhere: no frame can be read; file 0: is broken"):
-        inspect_recording(recording)
 
 
 # What follows: each check has a recording that triggers it, and one that must not.
@@ -300,33 +275,6 @@ def test_faults_are_detected(code, few, turn) -> None:
     assert all(np.isfinite(v) for v in named.evidence.values())
     assert found.severe == any(f.severity == "severe" for f in found.findings)
     assert str(named) in found.warnings
-
-
-def test_unrelated_edges_are_not_reported_as_mirrored() -> None:
-    """Many depth edges on the left and colour edges on the right correlate when mirrored."""
-    camera = Pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
-    rng = np.random.default_rng(5)
-
-    def boxes(image, columns, value) -> None:
-        for _ in range(12):
-            x, y = rng.integers(*columns), rng.integers(0, 105)
-            image[y : y + rng.integers(6, 15), x : x + rng.integers(6, 15)] = value()
-
-    frames = []
-    for k in range(6):
-        depth = np.full((120, 160), 2.0, np.float32)
-        grey = np.full((120, 160), 60, np.uint8)
-        boxes(depth, (0, 45), lambda: rng.uniform(1.0, 1.8))
-        boxes(grey, (100, 145), lambda: rng.integers(90, 250))
-        frames.append(RangeFrame(k, k / 10, camera, depth, color_image=np.dstack([grey] * 3)))
-    assert "mirrored" not in codes(frames)
-    turned = [replace(f, depth=np.ascontiguousarray(f.depth[:, ::-1])) for f in frames]
-    same = [replace(f, color_image=_shades(f.depth)[:, ::-1]) for f in turned]
-    assert "mirrored" in codes(same)
-
-
-def _shades(depth):
-    return np.dstack([(depth * 100).astype(np.uint8)] * 3)
 
 
 @pytest.mark.slow

@@ -69,20 +69,6 @@ def test_realsense_stream(install: Install) -> None:
     assert frames[0].depth_kind == "z"
 
 
-def test_realsense_inverse_distortion_maps_pixel_to_ray(install: Install) -> None:
-    install(FakeRealSense(model="inverse_brown_conrady"))
-    with device_named("realsense", {}).open() as stream:
-        rays = stream.settings.camera.rays()
-    x, y = (20 - 15.2) / 30.0, (5 - 11.9) / 31.0
-    r2 = x * x + y * y
-    radial = 1 + 0.1 * r2 - 0.05 * r2**2 + 0.01 * r2**3
-    expected = (
-        x * radial + 2 * 0.001 * x * y - 0.002 * (r2 + 2 * x * x),
-        y * radial - 2 * 0.002 * x * y + 0.001 * (r2 + 2 * y * y),
-    )
-    assert np.allclose(rays[5, 20], expected, atol=1e-6)
-
-
 def test_realsense_errors_are_reported(install: Install) -> None:
     package = FakeRealSense(model="ftheta")
     install(package)

@@ -9,7 +9,6 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.geometry.se3 import exp
 from tofuse.formats.poses.trajectory import (
     associate,
-    associated_poses,
     read_tum,
     tum_text,
     write_tum,
@@ -83,25 +82,12 @@ def test_bad_lines_are_reported(tmp_path: Path, line: str, words: str) -> None:
     assert "t.txt, line 3" in str(caught.value)
 
 
-def test_poses_of_nan_are_left_out(tmp_path: Path) -> None:
-    nan = " nan" * 7
-    (tmp_path / "t.txt").write_text(f"0 0 0 0 0 0 0 1\n1{nan}\n2 0 0 0 0 0 0 1\n3 {nan}\n")
-    times, poses = read_tum(tmp_path / "t.txt")
-    assert times.tolist() == [0, 2]
-    np.testing.assert_array_equal(poses, [np.eye(4)] * 2)
-
-
 def test_association_is_nearest_within_limit() -> None:
     others = [1.0, 0.0, 2.0]  # unsorted
     assert associate([0.019, 0.981, 1.5, 2.02], others).tolist() == [1, 0, -1, 2]
     assert associate([0.0211], [0.0]).tolist() == [-1]
     assert associate([], others).tolist() == []
     assert associate([1.0], []).tolist() == [-1]
-
-
-def test_association_is_exclusive_by_default() -> None:
-    assert associate([0.99, 1.005, 1.01], [1.0]).tolist() == [-1, 0, -1]
-    assert associate([0.99, 1.005, 1.01], [1.0], exclusive=False).tolist() == [0, 0, 0]
 
 
 def test_association_matches_slow_search() -> None:
@@ -116,11 +102,3 @@ def test_association_matches_slow_search() -> None:
         else:
             nearest = int(gaps.argmin())
             assert gaps.min() > 0.02 or nearest in found
-
-
-def test_poses_are_associated_with_timestamps() -> None:
-    poses = _poses(2)
-    out = associated_poses([0.0, 5.0, 1.01], [1.0, 0.01], poses)
-    np.testing.assert_array_equal(out[0], poses[1])
-    assert np.isnan(out[1]).all()
-    np.testing.assert_array_equal(out[2], poses[0])

@@ -16,7 +16,6 @@ from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.formats.poses.trajectory import write_kitti, write_log, write_tum
 from tofuse.formats.poses.trajectory_formats import TimedPoses, read_poses
 
-RNG = np.random.default_rng(3)
 POSES = np.stack(
     [se3.exp(np.array([0.1 * k, -0.05 * k, 0.02, 0.01 * k, 0.3 * k, -0.02 * k])) for k in range(5)]
 )
@@ -77,24 +76,12 @@ def test_all_formats_give_same_poses(name: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(found.timestamps, TIMES, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["images.txt", "transforms.json", "trajectory.log"])
-def test_poses_are_read_from_folder(name: str, tmp_path: Path) -> None:
-    FORMATS[name](tmp_path / name)
-    assert len(read_poses(tmp_path).poses) == 5
-
-
 def test_numbered_poses_are_assigned_to_selected_frames(tmp_path: Path) -> None:
     transforms(tmp_path / "transforms.json")
     found = read_poses(tmp_path / "transforms.json")
     some = found.of_frames(TIMES[:3], np.array([2, 9, 4]))
     np.testing.assert_allclose(some[[0, 2]], POSES[[2, 4]], atol=1e-9)
     assert np.isnan(some[1]).all()
-
-
-def test_equal_count_assigns_poses_in_order(tmp_path: Path) -> None:
-    np.save(tmp_path / "p.npy", POSES)
-    found = read_poses(tmp_path / "p.npy").of_frames(TIMES, np.arange(10, 60, 10))
-    np.testing.assert_allclose(found, POSES, atol=1e-12)
 
 
 def test_lost_frames_are_skipped(tmp_path: Path) -> None:
@@ -225,32 +212,3 @@ def test_true_error_is_within_interval() -> None:
         reference, estimate = off(truth, 0.01), off(truth, 0.005)
         low, high = ate(estimate, reference).ate_within(ate(reference, truth).ate_rms_m)
         assert low <= ate(estimate, truth).ate_rms_m <= high
-
-
-def test_evaluate_needs_frame_timestamps(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], room_recording: Path
-) -> None:
-    reference = room_recording / "groundtruth.txt"
-    from tofuse.formats.recordings.open import open_recording
-
-    recording = open_recording(room_recording)
-    assert recording.reference is not None
-    np.save(tmp_path / "a.npy", recording.reference)
-    given = ["evaluate", str(tmp_path / "a.npy"), str(reference)]
-    assert main(given) == 2
-    assert "--recording" in capsys.readouterr().err
-    assert main([*given, "--recording", str(room_recording), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
-    assert data["associated"] == len(recording)
-    assert data["ate_rms_m"] < 1e-6
-
-
-@pytest.mark.parametrize(("rate", "warns"), [(1.0, False), (30.0, True)])
-def test_different_clocks_are_reported(rate, warns, tmp_path: Path, capfd) -> None:
-    """The timestamps of a recording without any count seconds."""
-    line = "0 0 0 0 0 1"
-    for name, step in (("estimate.txt", 1.0), ("reference.txt", 1 / rate)):
-        rows = (f"{k * step:.6f} {0.1 * k * k:.3f} {line}" for k in range(60))
-        (tmp_path / name).write_text("\n".join(rows))
-    assert main(["evaluate", str(tmp_path / "estimate.txt"), str(tmp_path / "reference.txt")]) == 0
-    assert ("only 2 of 60 estimated poses" in capfd.readouterr().err) == warns

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from parsed_glb import parse
-from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.geometry.glb import write_glb
 
@@ -46,19 +45,6 @@ def test_mesh_without_faces_is_empty_scene(tmp_path) -> None:
     # Empty lists are not allowed.
     assert all(value != [] for value in document.values())
     assert document["scenes"] == [{}]
-
-
-def test_inconsistent_arrays_are_rejected(tmp_path) -> None:
-    points, faces = np.zeros((3, 3)), np.array([[0, 1, 2]])
-    for problem in (
-        {"points": points, "faces": faces + 1},
-        {"points": points, "faces": faces[0]},
-        {"points": points[:, :2], "faces": faces},
-        {"points": points, "faces": faces, "normals": np.zeros((2, 3))},
-    ):
-        with pytest.raises(InputError, match=r"m\.glb"):
-            write_glb(tmp_path / "m.glb", GeometryRecord(**problem))
-    assert not (tmp_path / "m.glb").exists()
 
 
 def test_node_transform_places_mesh(tmp_path) -> None:

@@ -155,14 +155,6 @@ def test_all_encodings_are_equivalent(tmp_path: Path, kind: str) -> None:
     np.testing.assert_array_equal(pcd.viewpoint, [1, 2, 3, 1, 0, 0, 0])
 
 
-def test_float_packed_color_is_read(tmp_path: Path) -> None:
-    rows = _rows()
-    (tmp_path / "a.pcd").write_bytes(_header("binary", rgb_type="F") + rows.tobytes())
-    color = read_pcd(tmp_path / "a.pcd").cloud.color
-    assert color is not None
-    assert color[3].tolist() == [int(rows["rgb"][3]) >> s & 255 for s in (16, 8, 0)]
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

@@ -26,21 +26,6 @@ def test_png_round_trips(tmp_path: Path) -> None:
     assert (header.width, header.height, header.channels, header.bits) == (64, 48, 1, 16)
 
 
-def test_color_is_rgb(tmp_path: Path) -> None:
-    image = np.zeros((4, 6, 3), np.uint8)
-    image[..., 0] = 200
-    write_png(tmp_path / "a.png", image)
-    np.testing.assert_array_equal(read_color(tmp_path / "a.png"), image)
-    # OpenCV stores blue first: the file itself must be red.
-    assert cv2.imread(str(tmp_path / "a.png"))[0, 0].tolist() == [0, 0, 200]
-
-
-def test_grey_is_expanded_to_rgb(tmp_path: Path) -> None:
-    write_png(tmp_path / "a.png", np.full((4, 6), 7, np.uint8))
-    assert (read_color(tmp_path / "a.png") == 7).all()
-    assert read_color(tmp_path / "a.png").shape == (4, 6, 3)
-
-
 def test_jpeg_size_is_read_from_header(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.jpg"), np.full((30, 50, 3), 90, np.uint8))
     header = read_header(tmp_path / "a.jpg")
@@ -113,8 +98,3 @@ def test_other_files_are_rejected_as_images(tmp_path: Path) -> None:
     for name in ("a.png", "folder.png", "loop.png", "missing.png"):
         with pytest.raises(InputError, match=name):
             read_image(tmp_path / name)
-
-
-def test_float_images_are_rejected(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="float64"):
-        write_png(tmp_path / "a.png", np.zeros((4, 4)))
