@@ -72,14 +72,6 @@ def run_json(folder: Path) -> dict:
 
 
 @pytest.fixture(scope="module")
-def plain_run(room_recording, tmp_path_factory) -> Path:
-    """The result of a run without options, with its report."""
-    out = tmp_path_factory.mktemp("plain") / "out"
-    assert main(["run", str(room_recording), "--out", str(out), "--threads", "2"]) == 0
-    return out
-
-
-@pytest.fixture(scope="module")
 def quick_run(room_recording, tmp_path_factory) -> Path:
     """The result of a quick run, without its report."""
     out = tmp_path_factory.mktemp("quick") / "out"
@@ -87,27 +79,27 @@ def quick_run(room_recording, tmp_path_factory) -> Path:
     return out
 
 
-def test_output_files_follow_contract(plain_run, room_recording) -> None:
-    assert {p.name for p in plain_run.iterdir()} == FILES
-    times, poses = read_tum(plain_run / "trajectory.txt")
+def test_output_files_follow_contract(room_result, room_recording) -> None:
+    assert {p.name for p in room_result.iterdir()} == FILES
+    times, poses = read_tum(room_result / "trajectory.txt")
     recorded, _ = read_tum(room_recording / "groundtruth.txt")
     np.testing.assert_allclose(times, recorded, atol=1e-6)
     np.testing.assert_array_equal(poses[0], np.eye(4))
-    graph = read_g2o(plain_run / "pose_graph.g2o")
+    graph = read_g2o(room_result / "pose_graph.g2o")
     np.testing.assert_allclose(graph.poses, poses, atol=1e-6)
     assert len(graph.edges) >= 7
     assert (np.linalg.eigvalsh(graph.information) > 0).all()
-    cloud = read_ply(plain_run / "cloud.ply")
+    cloud = read_ply(room_result / "cloud.ply")
     assert len(cloud) > 1000
     np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-4)
     assert np.ptp(cloud.color) > 100
-    report = (plain_run / "report.html").read_text()
+    report = (room_result / "report.html").read_text()
     assert report.lower().startswith("<!doctype html")
     assert not re.search(r"(src|href)=[\"']https?:", report)
 
 
-def test_run_json_follows_contract(plain_run, room_recording) -> None:
-    data = run_json(plain_run)
+def test_run_json_follows_contract(room_result, room_recording) -> None:
+    data = run_json(room_result)
     assert set(data) == set(RUN_KEYS.split())
     assert data["schema"] == 1
     opening = data["input"].pop("opening")
@@ -136,11 +128,11 @@ def test_run_json_follows_contract(plain_run, room_recording) -> None:
 
 
 @pytest.mark.slow
-def test_result_depends_on_neither_threads_nor_reference(recording, plain_run, tmp_path) -> None:
-    assert run_json(plain_run)["threads"] == 2
+def test_result_depends_on_neither_threads_nor_reference(recording, room_result, tmp_path) -> None:
+    assert run_json(room_result)["threads"] == 2
     (recording / "groundtruth.txt").write_text("0 5 5 5 0 0 0 1\n0.1 -5 5 5 0 0 0 1\n")
     run(recording, "--out", tmp_path / "out", "--threads", 1)
-    assert same(tmp_path / "out") == same(plain_run)
+    assert same(tmp_path / "out") == same(room_result)
 
 
 @pytest.mark.slow
@@ -514,8 +506,8 @@ def test_peaks_demo(tmp_path, capsys, monkeypatch) -> None:
     assert {p.name for p in out.iterdir()} == made
 
 
-def test_run_is_evaluated(plain_run, room_recording, capsys) -> None:
-    words = ["evaluate", str(plain_run), str(room_recording), "--recording", str(room_recording)]
+def test_run_is_evaluated(room_result, room_recording, capsys) -> None:
+    words = ["evaluate", str(room_result), str(room_recording), "--recording", str(room_recording)]
     assert main([*words, "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["ate_rms_m"] < 0.1
@@ -527,14 +519,14 @@ def test_run_is_evaluated(plain_run, room_recording, capsys) -> None:
         assert part in table
 
 
-def test_evaluate_uses_reference_of_recording(plain_run, room_recording, tmp_path, capsys):
+def test_evaluate_uses_reference_of_recording(room_result, room_recording, tmp_path, capsys):
     """In any format, not only the native one."""
     out = tmp_path / "tum"
     assert main(["convert", str(room_recording), "--out", str(out), "--to", "tum"]) == 0
-    words = ["evaluate", str(plain_run), "--json"]
-    assert main(["evaluate", str(plain_run), str(room_recording), "--json"]) == 0
+    words = ["evaluate", str(room_result), "--json"]
+    assert main(["evaluate", str(room_result), str(room_recording), "--json"]) == 0
     expected = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert main(["evaluate", str(plain_run), str(out), "--json"]) == 0
+    assert main(["evaluate", str(room_result), str(out), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["ate_rms_m"] == pytest.approx(expected["ate_rms_m"], abs=1e-5)
     bare = tmp_path / "bare"
@@ -546,13 +538,13 @@ def test_evaluate_uses_reference_of_recording(plain_run, room_recording, tmp_pat
     assert "none.txt: doesn't exist" in capsys.readouterr().err
 
 
-def test_optimize_command_keeps_refined_poses(plain_run, tmp_path, capsys) -> None:
+def test_optimize_command_keeps_refined_poses(room_result, tmp_path, capsys) -> None:
     out = tmp_path / "out.g2o"
-    assert main(["optimize", str(plain_run / "pose_graph.g2o"), "--out", str(out)]) == 0
+    assert main(["optimize", str(room_result / "pose_graph.g2o"), "--out", str(out)]) == 0
     output = capsys.readouterr().out
     assert re.match(r"8 poses, \d+ edges: squared error", output)
     # The edges are those of the refinement, so there is nothing to improve.
-    before, after = read_g2o(plain_run / "pose_graph.g2o"), read_g2o(out)
+    before, after = read_g2o(room_result / "pose_graph.g2o"), read_g2o(out)
     assert after.ids.tolist() == list(range(8))
     assert np.abs(after.poses - before.poses).max() < 2e-3
     assert main(["optimize", str(out), "--out", str(out)]) == 2
