@@ -116,15 +116,6 @@ def test_killed_job_is_restarted(folder: BatchFolder) -> None:
     assert status_of(JOBS, folder) == 0
 
 
-def test_repeatedly_killed_job_fails(folder: BatchFolder) -> None:
-    workers = Scripted({"a": [killed] * 9})
-    run(folder, workers)
-    assert workers.started.count("a") == 3
-    assert table(folder)[0]["state"] == "failed"
-    assert "(SIGKILL), 3 times; was there enough memory?" in table(folder)[0]["reason"]
-    assert status_of(JOBS, folder) == 3
-
-
 def test_failed_job_does_not_stop_others(folder: BatchFolder) -> None:
     workers = Scripted({"b": [failed]})
     run(folder, workers)
@@ -317,17 +308,6 @@ def test_dask_outcomes_are_translated() -> None:
     assert handed("cancelled").cancelled()
     # The scheduler disappeared between two calls.
     assert handed("finished", OSError("gone")).cancelled()
-
-
-def test_missing_dask_is_reported(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "dask", None)
-    (tmp_path / "list.txt").write_text("/a\n")
-    words = ["batch", str(tmp_path / "list.txt"), "--out", str(tmp_path / "out")]
-    assert main([*words, "--scheduler", "tcp://127.0.0.1:1"]) == 2
-    text = capsys.readouterr().err
-    assert "pip install 'tofuse[dask]'" in text
-    assert text.count("\n") == 1
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

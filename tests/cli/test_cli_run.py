@@ -228,46 +228,6 @@ def test_unreadable_frame_is_skipped_and_blank_one_lost(recording, tmp_path, cap
 
 
 @pytest.mark.slow
-def test_single_frame_run_succeeds(room_recording, tmp_path) -> None:
-    run(room_recording, "--out", tmp_path / "out", "--end", 1, report=True)
-    data = run_json(tmp_path / "out")
-    assert [r["code"] for r in data["reasons"]] == ["single_frame", "correction_left_out"]
-    # Nothing was registered, so the accuracy is unknown.
-    assert data["verdict"] == "degraded"
-    assert data["accuracy"] == {
-        "position_m": None,
-        "rotation_rad": None,
-        "relative": None,
-        "assessed": False,
-        "worst": None,
-        "unbounded": [],
-        "by_odometry": [],
-    }
-    assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
-    assert len(read_ply(tmp_path / "out/cloud.ply")) > 500
-    mesh = read_ply(tmp_path / "out/mesh.ply")
-    assert mesh.faces is not None
-    assert len(mesh.faces) > 1000
-
-
-@pytest.mark.slow
-def test_multiple_inputs_are_concatenated(recording, tmp_path) -> None:
-    both = tmp_path / "both"
-    both.mkdir()
-    for name in ("b", "a"):
-        shutil.copytree(recording, both / name)
-    options = ["--every", 5, "--method", "thesis"]
-    run(both / "a", both / "b", "--out", tmp_path / "listed", *options)
-    run(both, "--out", tmp_path / "folder", *options)
-    assert same(tmp_path / "listed") == same(tmp_path / "folder")
-    data = run_json(tmp_path / "listed")
-    assert [f["index"] for f in data["frames"]] == [0, 5, 10, 15]
-    times = [f["timestamp"] for f in data["frames"]]
-    assert sorted(times) == times
-    assert data["input"]["path"] == f"{both / 'a'} {both / 'b'}"
-
-
-@pytest.mark.slow
 def test_loops_are_read_from_file(room_recording, tmp_path) -> None:
     loops = tmp_path / "loops.txt"
     T = read_tum(room_recording / "groundtruth.txt")[1][6]

@@ -13,11 +13,9 @@ import pytest
 
 import tofuse
 from tofuse.apps.cli.program import main
-from tofuse.apps.inspection import channels
 from tofuse.apps.inspection.finding import CODES, Finding
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.apps.inspection.planar import Distortion
-from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.jobs.running import with_findings
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.engine.errors import OutputError
@@ -288,29 +286,6 @@ def test_wrong_focal_length_is_estimated(kind, factor) -> None:
     reported = tofuse.inspect(of(seen_by(frames, wrong)), quick=kind == "range").findings
     (found,) = [f for f in reported if f.code == "focal_length"]
     assert found.evidence["factor"] == pytest.approx(1 / factor, abs=0.09)
-
-
-@pytest.mark.parametrize("boxes", [False, True])
-def test_colour_shift_is_reported_only_if_unambiguous(boxes: bool) -> None:
-    """Parallel edges do not constrain a shift along themselves (aperture problem)."""
-    camera = Pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
-    rng = np.random.default_rng(61)
-    frames = []
-    for k in range(4):
-        depth = np.full((120, 160), 2.0, np.float32)
-        grey = np.full((120, 160), 60, np.uint8)
-        for at in rng.integers(15, 120, 4):
-            top, bottom = int(rng.integers(10, 60)), int(rng.integers(70, 110))
-            rows = slice(top, bottom) if boxes else slice(None)
-            depth[rows, at : at + 18] -= 0.3
-            grey[rows, at + 10 : at + 28] += 45  # shifted by 10 pixels
-        depth += rng.normal(0, 0.002, depth.shape).astype(np.float32)
-        color = np.repeat(grey[..., None], 3, -1)
-        frames.append(RangeFrame(k, k / 10, camera, depth, color_image=color))
-    found = list(channels.check_color(Sample.of(of(frames), 8)))
-    assert [f.code for f in found] == ["color_unregistered"] * boxes
-    if found:
-        assert found[0].evidence["shift_px"] == pytest.approx(10, abs=1.5)
 
 
 def test_folding_distortion_is_rejected() -> None:

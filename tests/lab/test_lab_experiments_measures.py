@@ -37,19 +37,6 @@ def test_box_fit_recovers_size_and_rotation(widths, turn):
     np.testing.assert_allclose(fit.corners.mean(0), [0.04, -0.03], atol=0.003)
 
 
-def test_girth_is_circumference():
-    rng = np.random.default_rng(2)
-    angle = rng.uniform(0, 2 * np.pi, 20_000)
-    z = rng.uniform(0, 1, 20_000)
-    body = np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), z], 1) + np.array([1.0, 2.0, 0.0])
-    assert measures.girth_m(body, 0.4, 0.5) == pytest.approx(2 * np.pi * 0.2, rel=0.01)
-    wider = body.copy()
-    wider[z > 0.6, :2] = 1.1 * (wider[z > 0.6, :2] - [1, 2]) + [1, 2]
-    assert measures.girth_m(wider, 0.4, 0.5) == pytest.approx(2 * np.pi * 0.2, rel=0.01)
-    assert measures.girth_m(wider, 0.7, 0.8) == pytest.approx(2 * np.pi * 0.22, rel=0.01)
-    assert np.isnan(measures.girth_m(body, 5.0, 6.0))
-
-
 def test_path_score_localizes_errors():
     truth = np.tile(np.eye(4), (11, 1, 1))
     truth[:, 0, 3] = 0.1 * np.arange(11)
@@ -65,17 +52,6 @@ def test_path_score_localizes_errors():
     np.testing.assert_allclose(score.step_m[[1, 2, 3, 6, 10]], 0.01)
     # Only alignment removes the tilt of the straight path.
     assert score.ate_m < 0.02
-
-
-def test_straightness_and_circle_radius():
-    t = np.linspace(0, 1, 50)
-    line = np.stack([t, 2 * t, -t], 1)
-    assert measures.straightness_m(line) == pytest.approx(0, abs=1e-12)
-    bent = line + np.stack([0 * t, 0 * t, 0.1 * np.sign(np.arange(50) % 2 - 0.5)], 1)
-    assert measures.straightness_m(bent) == pytest.approx(0.1 * np.sqrt(5 / 6), rel=0.02)
-    arc = 1.4 * np.stack([np.cos(4 * t), 0 * t, np.sin(4 * t)], 1) + [3, 2, 1]
-    arc[3] = np.nan
-    assert measures.circle_radius_m(arc) == pytest.approx(1.4)
 
 
 def test_surface_error_is_distance_to_model():

@@ -116,15 +116,6 @@ def test_temporal_deviation_is_sample_deviation_of_z() -> None:
     assert part.mask(frames[-1], frames[:-1]).tolist() == [[True, False], [True, True]]
 
 
-def test_temporal_uses_z_not_range() -> None:
-    camera = Pinhole(2, 2, 0.1, 0.1, 0.0, 0.0)  # off the axis z is a tenth of the range
-    frames = [
-        RangeFrame(0, 0.0, camera, np.full((2, 2), r, np.float32), "range") for r in (1.0, 1.1)
-    ]
-    keep = TemporalDeviation(0.025, 2).mask(frames[1], frames[:1])
-    assert keep.tolist() == [[False, True], [True, True]]
-
-
 def test_temporal_removes_edges_and_keeps_surfaces() -> None:
     """As in the thesis (figure 3.2 c): edges are removed, surfaces facing the camera kept."""
     rng = np.random.default_rng(3)

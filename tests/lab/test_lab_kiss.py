@@ -82,15 +82,3 @@ def test_correspondences_are_within_three_sigma():
         found = steps[1].registration
         assert found is not None
         assert found.correspondences == pairs
-
-
-def test_empty_and_unrelated_frames_are_lost():
-    poses = path(4)
-    given = frames(poses)
-    empty = CloudFrame(2, 2.0, np.zeros((0, 3), np.float32))
-    far = CloudFrame(3, 3.0, given[3].points + np.float32(100))
-    tracker = Kiss().start(0)
-    steps = [tracker.push(f) for f in (given[0], given[1], empty, far, given[3])]
-    assert [s.status for s in steps] == ["tracked", "tracked", "lost", "lost", "tracked"]
-    assert "needed" in steps[2].reason
-    assert "registered" in steps[3].reason

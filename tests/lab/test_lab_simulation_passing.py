@@ -47,19 +47,6 @@ def test_ground_truth_is_unaffected_by_passing_object() -> None:
     assert not plain.scene.passing_surfaces
 
 
-def test_motion_is_continuous_and_limbs_swing() -> None:
-    made = plan("flat", frames=40, passing=Passing("person", 0.25, seconds=2.0, start_s=0.0))
-    times = np.linspace(0.01, 1.99, 100)
-    poses = np.array([made.sequence.T_room_bodies(t) for t in times])
-    assert poses.shape == (100, 5, 4, 4)
-    places = poses[:, :, :3, 3]
-    assert np.abs(np.diff(places, axis=0)).max() < 0.1  # at 50 Hz
-    assert np.ptp(poses[:, 0, 2, 3]) < 1e-9  # the trunk stays at its height
-    assert np.ptp(poses[:, 1, 2, 2]) > 0.05  # a leg leans
-    away = made.sequence.T_room_bodies(3.0)
-    assert (away[:, 2, 3] < -50).all()
-
-
 def test_passing_pixels_are_flagged_and_nearer(tmp_path) -> None:
     effects = Effects.none()
     options = {"every": 3, "frames": 3, "first": 66, "effects": effects}

@@ -12,11 +12,8 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.icp.icp import Icp
 from tofuse.engine.icp.icp_parts import All, Random, SmallStep
 from tofuse.lab.methods.variants import (
-    GeneralizedIcp,
     Iccp,
     Icpif,
-    PointToPlaneIcp,
-    SymmetricIcp,
     Tricp,
 )
 
@@ -91,14 +88,3 @@ def test_icpif_converges_from_larger_rotations_than_icp(features):
             plain.append(error(found, T)[1])
     assert max(invariant) < 6
     assert min(plain, default=90) > 20
-
-
-def test_named_variants_register():
-    T = turn([1, 2, 0.5], 2)
-    source, target = view(relief(2500, 1), T), view(relief(2500, 0))
-    for method in (PointToPlaneIcp(0.02), SymmetricIcp(0.02), GeneralizedIcp(0.02)):
-        found = method.register(source, target, np.eye(4), rng())
-        assert found.converged
-        assert found.points == 1000
-        assert error(found, T)[0] < 0.002
-        assert error(found, T)[1] < 0.3

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from registration_scenes import MIDDLE, directions, relief, rng, turn, view
+from registration_scenes import MIDDLE, directions, rng, turn, view
 from tofuse.engine import parts
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp.icp_kernels import transform_points
@@ -95,20 +95,6 @@ def test_refinement_corrects_drift(method):
     assert found.support[1] > found.support[0]
     np.testing.assert_allclose(found.poses[0], T[0], atol=1e-9)
     assert errors_of(found.poses, T).max() < 0.25 * errors_of(start, T).max()
-
-
-@pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
-def test_views_without_overlap_are_unchanged(method):
-    refiner = method.start(ViewStore[PreparedView](Spacing()))
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[1, 0, 3] = 50.0
-    for k in range(2):
-        refiner.push(view(relief(500, k), index=k), poses[k])
-    found = refiner.finish([0, 1], poses)
-    assert not found.kept
-    np.testing.assert_array_equal(found.poses, poses)
-    alone = method.start(ViewStore[PreparedView](Spacing())).finish([0], poses[:1])
-    assert not alone.kept
 
 
 def test_pulli_distributes_misfit_evenly_over_ring():

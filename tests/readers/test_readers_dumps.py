@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -56,16 +55,6 @@ def test_nerfstudio(tmp_path: Path) -> None:
         WIDTH, HEIGHT, 25.0, 201 / 8, 130 / 8 - 0.5, 95 / 8 - 0.5, -0.05, 0.01, 0.001
     )
     np.testing.assert_allclose(frame.camera.rays(), expected.rays(), atol=1e-6)
-
-
-def test_nerfcapture(tmp_path: Path) -> None:
-    made.make_nerfcapture(tmp_path / "scan")
-    recording = open_recording(tmp_path / "scan")
-    np.testing.assert_allclose(recording.timestamps, [7.0, 7.1, 7.2])
-    check_frames(recording, exact=7e-5)
-    for k, frame in enumerate(recording):
-        assert frame.camera == Pinhole(WIDTH, HEIGHT, 30.0 + k, 30.0 + k, 16.0, 12.0)
-        assert frame.color_image is not None
 
 
 def test_exported_nerfstudio_is_read_back(tmp_path: Path) -> None:
@@ -172,16 +161,6 @@ def test_incomplete_hololens(tmp_path: Path) -> None:
     table.write_bytes(table.read_bytes()[:-12])
     with pytest.raises(InputError, match="not 12 for each of"):
         open_recording(folder)
-
-
-def test_hololens_prefers_long_throw(tmp_path: Path) -> None:
-    made.make_hololens(tmp_path / "scan")
-    made.make_hololens(tmp_path / "other", stream="Depth AHaT")
-    for path in (tmp_path / "other").iterdir():
-        shutil.copy(path, tmp_path / "scan")
-    recording = open_recording(tmp_path / "scan")
-    assert "Long Throw" in recording.metadata["sensor"]
-    assert any("Depth AHaT is ignored" in line for line in recording.warnings)
 
 
 def test_pgm() -> None:

@@ -145,14 +145,6 @@ def test_ground_truth_is_associated_by_time(tmp_path: Path) -> None:
     assert "1 of 3 frames have a pose" in source.warnings[0]
 
 
-def test_without_timestamps(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a", 3, frame_rate_hz=10.0)
-    (folder / "timestamps.txt").unlink()
-    assert NativeSource(folder).timestamps.tolist() == [0, 0.1, 0.2]
-    edit(folder, frame_rate_hz=None)
-    assert NativeSource(folder).timestamps.tolist() == [0, 1, 2]
-
-
 def test_clouds(tmp_path: Path) -> None:
     rng = np.random.default_rng(13)
     writer = RecordingWriter(tmp_path / "a", None, frame_rate_hz=5.0)
@@ -196,13 +188,6 @@ def test_color_of_other_camera_is_projected(tmp_path: Path) -> None:
     edit(folder, color=None)
     with pytest.raises(InputError, match=r'"color" in camera.json'):
         NativeSource(folder)
-
-
-def test_unknown_keys_warn(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a", 1)
-    edit(folder, exposure=5, depth_units="mm")
-    (warning,) = NativeSource(folder).warnings
-    assert "exposure, depth_units" in warning
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import shutil
 import threading
 import time
 from pathlib import Path
@@ -15,7 +14,6 @@ from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.geometry.ply import write_ply
-from tofuse.formats.images.images import write_png
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording, readers
 
@@ -238,21 +236,6 @@ def test_other_errors_are_raised_from_thread() -> None:
     with pytest.raises(InputError, match="breaks down"):
         list(Recording.of(source, "memory", "array").read_all())
     assert reader_threads() == []
-
-
-def test_wrong_dtype_of_all_frames(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a", [1])
-    write_png(folder / "depth" / "000000.png", np.ones((30, 40), np.uint8))
-    with pytest.raises(InputError, match="store one channel of uint16"):
-        open_recording(folder)
-
-
-def test_opening_leaves_recording_unchanged(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a", [1, 2])
-    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
-    list(open_recording(folder))
-    files = sorted(p.relative_to(folder) for p in folder.rglob("*"))
-    assert files == sorted(p.relative_to(copy) for p in copy.rglob("*"))
 
 
 def test_two_readers_keep_the_order() -> None:

@@ -14,17 +14,14 @@ import numpy as np
 import pytest
 
 from report_results import lonely, make_room
-from tofuse.apps.report import thumbnails
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.fields import fields
 from tofuse.apps.report.html import write_report
 from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import (
     MAX_FACES,
-    Scene,
     make_scene,
     packed,
-    render_thumbnail,
 )
 from tofuse.apps.report.subject import Subject
 from tofuse.engine.cameras.cameras import Pinhole
@@ -556,29 +553,3 @@ def test_long_recording_of_large_images_stays_below_size_limit(tmp_path):
     detailed = replace(result, diagnostics=replace(result.diagnostics, samples=kept))
     write_report(detailed, tmp_path / "r.html", extras)
     assert (tmp_path / "r.html").stat().st_size < 20e6
-
-
-SIZE = (160, 100)
-
-
-def model_scene(points: np.ndarray) -> Scene:
-    none = np.zeros((0, 4, 4))
-    camera = np.eye(4)[None].copy()
-    camera[0, 2, 3] = -3.0
-    loops = np.zeros((0, 2, 3))
-    white = np.full((len(points), 3), 255, np.uint8)
-    return Scene(points, white, None, len(points), 0.01, none, camera, none, loops)
-
-
-@pytest.mark.parametrize("scale", [0.01, 1.0, 300.0])
-def test_model_fills_the_thumbnail(scale: float) -> None:
-    rng = np.random.default_rng(3)
-    shape = np.array([1.0, 0.6, 0.4])
-    points = scale * (rng.uniform(-1, 1, (20_000, 3)) * shape + [40.0, -7.0, 3.0])
-    image = render_thumbnail(model_scene(points), SIZE)
-    assert image.shape == (100, 160, 3)
-    rows, columns = np.nonzero((image != thumbnails.BACKGROUND).any(2))
-    reach = np.array([np.ptp(columns) / SIZE[0], np.ptp(rows) / SIZE[1]])
-    assert 0.6 < reach.max() <= 1
-    assert abs(np.mean([rows.min(), rows.max()]) - 50) < 15
-    assert abs(np.mean([columns.min(), columns.max()]) - 80) < 15
