@@ -23,8 +23,6 @@ from attacks.environments import ENVIRONMENTS, Environment, attempt
 # One of each kind; `benchmarks/attack.py` runs all of them.
 CHOSEN = (
     "512 MB of addresses",
-    "1024 MB of addresses",
-    "1536 MB of addresses",
     "12 file handles",
     "no threads",
     "files of 20 kB at most",
@@ -33,9 +31,11 @@ CHOSEN = (
     "a reader that leaves",
     "the output folder is read-only",
     "SIGINT at tracking",
-    "SIGTERM at moves",
-    "SIGTERM at the end",
 )
+# Others of a kind that is chosen already.
+NIGHTLY = (
+    "1024 MB of addresses", "1536 MB of addresses", "SIGTERM at moves", "SIGTERM at the end"
+)  # fmt: skip
 # These are independent of each other, so that one run is enough.
 TOGETHER = (
     "stdin closed",
@@ -68,7 +68,10 @@ def together(several: list[Environment]) -> Environment:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*CHOSEN, "together"])
+@pytest.mark.parametrize(
+    "name",
+    [*CHOSEN, "together", *(pytest.param(name, marks=pytest.mark.nightly) for name in NIGHTLY)],
+)
 def test_hostile_environments_give_result_or_one_line_error(
     name: str, clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

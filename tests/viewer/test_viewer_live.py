@@ -53,7 +53,7 @@ class Recorder(Silent):
         self.frames.append((frame.index, T_world_camera.copy(), len(self.stages)))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @needs_viser
 def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser, monkeypatch):
     from tofuse.apps.viewer.live_view import LiveView
