@@ -120,45 +120,4 @@ def test_discontinuity_is_wrong_join_but_drift_is_not(scoring) -> None:
     assert compare(scoring, three[order], truth[order]).joins == 2
 
 
-def result(poses, indices, reasons=(), components=None):
-    found = SimpleNamespace(
-        trajectory=poses,
-        diagnostics=SimpleNamespace(frames=[record(k) for k in indices], reasons=tuple(reasons)),
-    )
-    if components is not None:
-        found.components = components
-    return found
-
-
-def component(frames, T=None, joined=None, own=None):
-    return SimpleNamespace(frames=frames, T_main_component=T, joined=joined, result=own)
-
-
-@pytest.mark.parametrize("counted_from", [20, 0])
-def test_unconnected_components_are_separate_parts(scoring, counted_from) -> None:
-    """Frames 0 to 9 are the main one, 10 to 19 are joined to it, 20 to 24 are not."""
-    truth = walk(25)
-    main = truth.copy()
-    main[20:] = np.nan
-    own = result(ANYWHERE @ truth[20:], range(counted_from, counted_from + 5))
-    found = result(
-        main,
-        range(25),
-        components=(
-            component(((0, 9),), np.eye(4)),
-            component(((10, 19),), np.eye(4), "motion"),
-            component(((20, 24),), None, None, own),
-        ),
-    )
-    parts = scoring.parts_of(found, range(25))
-    assert [int(p.posed.sum()) for p in parts] == [20, 5]
-    assert parts[0].by_motion
-    whole = np.array([0] * 20 + [1] * 5)
-    score = scoring.score(parts, scoring.Truth(truth, whole))
-    assert (score.main, score.covered, score.wrong, score.joins) == (20, 25, 0, 0)
-    # Where all could be connected, unconnected frames are not covered.
-    score = scoring.score(parts, scoring.Truth(truth, np.zeros(25, np.intp)))
-    assert score.covered == 20
-
-
 # ---- Cases ---------------------------------------------------------------------------------------

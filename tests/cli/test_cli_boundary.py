@@ -75,7 +75,7 @@ def together(several: list[Environment]) -> Environment:
 def test_hostile_environments_give_result_or_one_line_error(
     name: str, clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Kernels are not compiled anew where the home can't be written; see test_kernels_jit.py.
+    # Kernels are not compiled anew where the home can't be written; see test_compute_jit.py.
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(Path(jit.cache_folder()).parent))
     known = {environment.name: environment for environment in ENVIRONMENTS}
     environment = together([known[n] for n in TOGETHER]) if name == "together" else known[name]
