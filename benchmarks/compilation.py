@@ -4,8 +4,8 @@
     python benchmarks/compilation.py --list RECORDING [RECORDING ...]
 
 Each row is a `tofuse run` in its own process: with all kernels cached, with an empty cache, and
-with an empty cache and the second process (`tofuse.engine.compute.ahead`). `--list` writes the list of
-kernels that this process compiles, from those that runs of the recordings call.
+with an empty cache and the second process (`tofuse.engine.compute.ahead`). `--list` writes the list
+of kernels that this process compiles, from those that runs of the recordings call.
 """
 
 from __future__ import annotations
