@@ -4,8 +4,8 @@
     python benchmarks/compilation.py --list RECORDING [RECORDING ...]
 
 Each row is a `tofuse run` in its own process: with all kernels cached, with an empty cache, and
-with an empty cache and the second process (`tofuse.engine.compute.ahead`). `--list` writes the list of
-kernels that this process compiles, from those that runs of the recordings call.
+with an empty cache and the second process (`tofuse.engine.compute.ahead`). `--list` writes the list
+of kernels that this process compiles, from those that runs of the recordings call.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _text_of(kind: Any) -> str:
     if isinstance(kind, kinds.BaseNamedTuple):
         named = kind.instance_class
         fields = ",".join(_text_of(field) for field in kind.types)
-        return f"{named.__module__.rsplit('.', 1)[1]}.{named.__name__}({fields})"
+        return f"{named.__module__.removeprefix('tofuse.')}.{named.__name__}({fields})"
     if isinstance(kind, kinds.UniTuple):
         return f"{kind.count}x{_text_of(kind.dtype)}"
     if isinstance(kind, kinds.Array):
@@ -92,8 +92,8 @@ def called(recordings: list[Path]) -> list[str]:
             def on_start(self, event: Any) -> None:
                 nonlocal depth
                 kernel = event.data["dispatcher"].py_func
-                if depth == 0 and kernel.__module__.startswith("tofuse.engine.compute."):
-                    name = f"{kernel.__module__.rsplit('.', 1)[1]}.{kernel.__name__}"
+                if depth == 0 and kernel.__module__.startswith("tofuse."):
+                    name = f"{kernel.__module__.removeprefix('tofuse.')}.{kernel.__name__}"
                     lines.setdefault(signature_line(name, event.data["args"]))
                 depth += 1
 

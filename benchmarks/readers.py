@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "tests" / "helpers"), str(ROOT / "tests" / "recordings")]
+sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 
 from camera_files import MAKERS, OTHERS  # noqa: E402
 from damaged_files import damage  # noqa: E402

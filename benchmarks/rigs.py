@@ -29,11 +29,11 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from tofuse.apps.rigs.calibrating import calibrate, calibrate_cameras, largest_sigmas
+from tofuse.apps.rigs.calibrating import calibrate, calibrate_cameras
 from tofuse.apps.rigs.checking import compare
 from tofuse.apps.rigs.hand_eye import Track, hand_eye
 from tofuse.apps.rigs.inputs import Camera, open_cameras
-from tofuse.apps.rigs.joint import View, disagreements, refine_together
+from tofuse.apps.rigs.joint import RigView, disagreements, refine_together
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
@@ -154,7 +154,7 @@ def systematic(seeds: int) -> None:
                     seed=seed,
                 )
                 views = [
-                    View(k, 0, SampledView.of(camera.surface(camera.images(1)[0]), 6000))
+                    RigView(k, 0, SampledView.of(camera.surface(camera.images(1)[0]), 6000))
                     for k, camera in enumerate(cameras_of(recordings))
                 ]
                 away = rng.normal(size=(len(truth), 6)) * start
@@ -280,7 +280,7 @@ def real() -> None:
     reference = np.stack([np.array(poses[camera.name], float) for camera in rig.cameras])
     reference = se3.inverse(reference[0]) @ reference
     views = [
-        View(k, 0, SampledView.of(camera.surface(camera.images(1)[0]), 6000))
+        RigView(k, 0, SampledView.of(camera.surface(camera.images(1)[0]), 6000))
         for k, camera in enumerate(open_cameras([REAL / c.name for c in rig.cameras]))
     ]
     apart = np.median([pair.median_m for pair in rig.disagreement])
@@ -290,7 +290,7 @@ def real() -> None:
     for camera, T in zip(rig.cameras[1:], reference[1:], strict=True):
         e = se3.log(se3.inverse(camera.T_rig_camera) @ T)
         C, R = camera.covariance, camera.random_covariance
-        metres, radians = largest_sigmas(camera)
+        metres, radians = se3.largest_sigmas(camera)
         print(
             f"{camera.name:<16}{1e3 * np.linalg.norm(e[:3]):7.1f}"
             f"{np.degrees(np.linalg.norm(e[3:])):7.2f}{1e3 * metres:7.1f}{np.degrees(radians):7.2f}"

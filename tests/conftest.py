@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from cabinet import Cabinet
+
 # The same examples each time, however long one of them takes on a busy machine.
 settings.register_profile("tests", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("tests")
@@ -34,19 +36,57 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def room_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cabinet(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Cabinet:
+    """Finished recordings and results, kept between test runs where pytest keeps anything."""
+    kept = getattr(request.config, "cache", None)
+    return Cabinet(kept.mkdir("cabinet") if kept else tmp_path_factory.mktemp("cabinet"))
+
+
+@pytest.fixture(scope="session")
+def room_recording(cabinet: Cabinet) -> Path:
     """A simulated native recording of 8 frames; tests copy it where they change it."""
     from tofuse.lab.simulation.effects import Effects
     from tofuse.lab.simulation.record import simulate
 
-    folder = tmp_path_factory.mktemp("simulated") / "room"
-    return simulate("room", folder, frames=8, effects=Effects.none(shot_noise=True))
+    def make(folder: Path) -> None:
+        simulate("room", folder, frames=8, effects=Effects.none(shot_noise=True))
+
+    return cabinet.get("room", make)
+
+
+@pytest.fixture(scope="session")
+def room_result(cabinet: Cabinet, room_recording: Path) -> Path:
+    """The result of `tofuse run` on it without options, with its report."""
+    from tofuse.apps.cli.program import main
+
+    def make(folder: Path) -> None:
+        assert main(["run", str(room_recording), "--out", str(folder), "--threads", "2"]) == 0
+
+    return cabinet.get("room-result", make)
+
+
+@pytest.fixture(scope="session")
+def session_results(cabinet: Cabinet) -> dict[str, Path]:
+    """Results of two sessions in a room, and of one in a differently furnished flat of its plan."""
+    from made_rooms import OTHER
+    from made_sessions import HERE, THERE, made_result
+
+    walks = {"here": HERE[::2], "there": THERE[::2], "elsewhere": THERE[::2]}
+
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        for number, (name, path) in enumerate(walks.items(), 1):
+            scene = {"boxes": OTHER} if name == "elsewhere" else {}
+            made_result(folder / name, path, number, **scene)
+
+    folder = cabinet.get("sessions", make)
+    return {name: folder / name for name in walks}
 
 
 @pytest.fixture(scope="session")
 def posed_views(room_recording: Path) -> tuple[list[Any], Any]:
     """Prepared views of the room with their true poses, and these poses (N, 4, 4)."""
-    from tofuse.engine.views.surface_options import SurfaceOptions
+    from tofuse.engine.views import SurfaceOptions
 
     from tofuse.engine.stored_views.view_store import PosedView
     from tofuse.engine.views.prepared_view import prepare_view

@@ -98,7 +98,7 @@ time.time = lambda: 2e9 - 1000.0 * next(passed)
 time.time_ns = lambda: int(1e9 * time.time())
 """
 STAGES = (
-    ("opening", "tofuse.apps.jobs.running:adapted"),
+    ("opening", "tofuse.engine.mapping.adaptation:adapted"),
     ("tracking", "tofuse.engine.mapping.reconstructing:push_frames"),
     ("a model", "tofuse.engine.mapping.backend:BackEnd.run"),
     ("writing", "tofuse.apps.results.output:_write_files"),

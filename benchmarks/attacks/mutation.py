@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 _TESTS = Path(__file__).parents[2] / "tests"  # which make the files
-sys.path[:0] = [str(_TESTS / "helpers"), str(_TESTS / "recordings")]
+sys.path[:0] = [str(_TESTS / "helpers"), str(_TESTS / "readers")]
 _CPU_SECONDS = 20  # for one file
 _MAX_WALL_RATIO = 6  # of wall-clock time to CPU time, on a busy machine
 _MORE_BYTES = 3 << 30  # of address space, beyond that of the loaded program
@@ -154,7 +154,7 @@ def _scans() -> dict[str, Subject]:
 def _bags() -> dict[str, Subject]:
     def make(kind: str) -> Callable[[Path], None]:
         def write(path: Path) -> None:
-            import test_recordings_ros as bags
+            import test_readers_ros as bags
 
             path.mkdir()
             bag = bags.Bag(path, kind)
@@ -182,7 +182,7 @@ def _bags() -> dict[str, Subject]:
         bags.orbbec(path, (0.0,) * 8, color="jpeg", R=bags.T_COLOR[:3, :3])
 
     try:
-        import test_recordings_ros as bags
+        import test_readers_ros as bags
 
         kinds = {f"rosbag {kind}": make(kind) for kind in bags.KINDS}
         kinds |= {f"realsense {kind}": real_sense(kind) for kind in ("ros1", "ros2")}
@@ -228,7 +228,8 @@ def _small() -> dict[str, Subject]:
     from tofuse.apps.jobs import tracked_file
     from tofuse.apps.jobs.run_options import read_changes
     from tofuse.apps.jobs.tracked_file import TrackedFile
-    from tofuse.engine.mapping.config import changed, from_method
+    from tofuse.engine.mapping.config import changed
+    from tofuse.engine.mapping.methods import from_method
     from tofuse.engine.mapping.frame_log import FrameLog
     from tofuse.engine.noise.model import NoiseModel, RangeLaw
     from tofuse.engine.results.types import FrameRecord

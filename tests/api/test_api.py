@@ -10,14 +10,10 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.apps.cli.progress import TerminalProgress
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.icp.icp import Icp
 from tofuse.formats.export.conversion import convert
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.record import simulate
 
 
 @pytest.fixture(scope="module")
@@ -141,24 +137,6 @@ def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
         tofuse.load(tmp_path / "out").evaluate()
 
 
-def test_reprs_are_short(result, arrays):
-    recording = tofuse.from_arrays(arrays[0], arrays[1])
-    assert repr(recording) == "Recording: 6 frames of arrays (arrays)"
-    assert repr(recording[2]).startswith("RangeFrame 2: 80 x 60 at 0.067 s")
-    for thing in (result, result.mesh, result.cloud, result.plot()):
-        assert len(repr(thing)) < 120
-    assert repr(result).startswith(f"Result: {result.diagnostics.verdict}")
-    page = result._repr_html_()
-    assert "data:image/png;base64," in page
-    assert len(page) < 400_000
-    assert result.plot()._repr_html_().count("<svg") == 2
-
-
-def test_plot_is_saved_as_html(result, tmp_path):
-    result.plot().save(tmp_path / "plot.html")
-    assert (tmp_path / "plot.html").read_text().count("<svg") == 2
-
-
 def test_mapper_output_becomes_result(arrays):
     recording = tofuse.from_arrays(arrays[0], arrays[1])
     mapper = tofuse.Mapper(threads=1)
@@ -167,18 +145,6 @@ def test_mapper_output_becomes_result(arrays):
     found = tofuse.Result.of(mapper.finish(), recording)
     assert isinstance(found, tofuse.Reconstruction)
     assert "of 6 frames" in found.accuracy
-
-
-def test_progress_is_shown_on_request(arrays, monkeypatch):
-    stages = []
-    monkeypatch.setattr(
-        TerminalProgress, "stage", lambda self, name, total=None: stages.append(name)
-    )
-    recording = tofuse.from_arrays(arrays[0][:2], arrays[1])
-    tofuse.reconstruct(recording, threads=1)
-    assert stages == []
-    tofuse.reconstruct(recording, threads=1, progress=True)
-    assert stages[0] == "tracking"
 
 
 @pytest.mark.parametrize("kind", ["millimetres", "unit", "list", "camera"])
@@ -273,13 +239,6 @@ def test_unusable_frames_are_rejected(arrays, change, named):
         tofuse.RangeFrame(**given)
 
 
-def test_infinite_amplitude_is_saturated(arrays):
-    amplitude = np.full((6, 60, 80), 100.0)
-    amplitude[0, 0, :2] = [np.inf, -np.inf]
-    frame = tofuse.from_arrays(*arrays[:2], amplitude=amplitude)[0]
-    assert frame.amplitude_image[0, :3].tolist() == [65535, 0, 100]
-
-
 def test_wrong_arguments_are_named(arrays, result, tmp_path):
     recording = tofuse.from_arrays(*arrays[:2])
     far = np.full((20, 3), 1e20, np.float32)
@@ -341,21 +300,6 @@ def test_cloud_format_follows_suffix(result, tmp_path, suffix):
     )
 
 
-def test_unknown_suffix_error_lists_known_ones(result, tmp_path):
-    with pytest.raises(tofuse.InputError, match=r"\.glb, \.gltf, \.ply, \.obj, \.stl"):
-        result.mesh.save(tmp_path / "model.docx")
-    with pytest.raises(tofuse.InputError, match=r"\.ply, \.pcd"):
-        result.cloud.save(tmp_path / "model.glb")
-
-
-def test_missing_library_is_named(result, monkeypatch):
-    import sys
-
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(tofuse.InputError, match="pip install open3d"):
-        result.mesh.to_open3d()
-
-
 @pytest.mark.slow
 def test_view_serves_report_and_images_until_stopped(result):
     from urllib.error import URLError
@@ -370,20 +314,6 @@ def test_view_serves_report_and_images_until_stopped(result):
         urlopen(server.address)
 
 
-def test_reconstruct_rejects_path() -> None:
-    with pytest.raises(InputError, match=r"is a str, not a recording; pass tofuse\.open"):
-        tofuse.reconstruct("recording")  # type: ignore[arg-type]
-
-
-def test_registration_repr_is_one_line() -> None:
-    points = np.random.default_rng(0).random((300, 3))
-    shown = repr(tofuse.register(points, points, method=Icp()))
-    assert shown == (
-        "Registration: not verified, translation 0.0000 m, rotation 0.000 degrees, "
-        "100% inliers, rms 0.00 mm"
-    )
-
-
 def test_options_follow_config_file_schema(arrays) -> None:
     recording = tofuse.from_arrays(arrays[0][:2], arrays[1])
     options = {"method": "thesis", "fusion": {"voxel_m": 0.1}}
@@ -393,15 +323,6 @@ def test_options_follow_config_file_schema(arrays) -> None:
     for wrong, says in (({"fusio": {}}, "fusio"), ({"method": "thesys"}, "thesys")):
         with pytest.raises(InputError, match=says):
             tofuse.reconstruct(recording, wrong)
-
-
-@pytest.mark.slow
-def test_fitted_filter_is_in_report(tmp_path) -> None:
-    simulate("box", tmp_path / "rec", every=20, frames=6, effects=Effects.none(shot_noise=True))
-    options = {"filters": [{"part": "background"}], "fusion": {"voxel_m": 0.02}}
-    found = tofuse.reconstruct(tofuse.open(tmp_path / "rec"), options, threads=1)
-    found.save(tmp_path / "out")
-    assert "background" in (tmp_path / "out/report.html").read_text()
 
 
 def test_result_is_saved_after_recording_is_deleted(arrays, tmp_path) -> None:

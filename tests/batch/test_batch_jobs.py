@@ -38,21 +38,9 @@ def test_list_lines_are_relative_paths_and_globs(recordings: Path) -> None:
     assert all(job.arguments == () for job in found)
 
 
-def test_recording_matched_twice_is_listed_once(recordings: Path) -> None:
-    found = jobs_of(recordings, "a/*\n*/frames9\n")
-    assert [job.name for job in found] == ["frames9", "frames10", "b-frames9"]
-
-
 def test_names_are_stable_when_list_grows(recordings: Path) -> None:
     before = jobs_of(recordings, "a/frames9\n")
     assert jobs_of(recordings, "a/frames9\nb/frames9\n")[0] == before[0]
-
-
-def test_names_are_unique_ignoring_case(tmp_path: Path) -> None:
-    found = jobs_of(tmp_path, "/One\n/one\n/jobs\n/batch.csv\n/..hidden\n/con:x\n")
-    names = [job.name for job in found]
-    assert len({name.lower() for name in names}) == len(names)
-    assert names == ["One", "one-2", "jobs-2", "batch.csv-2", "_hidden", "con_x"]
 
 
 @pytest.mark.parametrize(
@@ -75,12 +63,6 @@ def test_tables_set_options_per_job(name: str, text: str, recordings: Path) -> N
     assert set(one.arguments) == {"--every=2", "--object", f"--config={recordings / 'c.toml'}"}
     assert (one.name, one.memory) == ("frames9", None)
     assert other == Job("far", one.recording, ("--max-depth=4.5",), 2_000_000_000)
-
-
-def test_toml_jobs_share_options(recordings: Path) -> None:
-    text = '[all]\nevery = 2\nseed = 1\n[[job]]\nrecording = "a/*"\nseed = 3\n'
-    found = jobs_of(recordings, text, "list.toml")
-    assert [job.arguments for job in found] == [("--every=2", "--seed=3")] * 2
 
 
 @pytest.mark.parametrize(
@@ -117,16 +99,6 @@ def test_invalid_lists_are_rejected(name: str, text: str, message: str, recordin
     assert str(caught.value).startswith(str(recordings / name))
 
 
-def test_unreadable_lists_are_rejected(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="doesn't exist"):
-        read_jobs([tmp_path / "none.txt"], run_arguments)
-    with pytest.raises(InputError, match="nothing matches"):
-        read_jobs([tmp_path / "*.bag"], run_arguments)
-    (tmp_path / "list.txt").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="is not text"):
-        read_jobs([tmp_path / "list.txt"], run_arguments)
-
-
 def test_recordings_globs_and_lists_are_given_together(
     recordings: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -140,16 +112,6 @@ def test_recordings_globs_and_lists_are_given_together(
     assert [Path(job.recording).resolve() for job in found] == [
         recordings / name for name in ("a/frames9", "a/frames10", "one.bag", "b/frames9")
     ]
-
-
-def test_file_that_reader_recognises_is_recording(tmp_path: Path) -> None:
-    """Even if it is text."""
-    path = tmp_path / "scan.ply"
-    header = "ply\nformat ascii 1.0\nelement vertex 1\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz")
-    path.write_text(f"{header}end_header\n0 0 1\n")
-    (job,) = read_jobs([path], run_arguments)
-    assert job.recording == str(path)
 
 
 def test_job_key_depends_on_recording_and_options(tmp_path: Path) -> None:

@@ -149,55 +149,6 @@ def test_killed_jobs_and_batch_are_resumed(
 
 
 @pytest.mark.slow
-def test_interrupted_batch_reports_progress(
-    batch_benchmark: ModuleType, listed: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    batch = batch_benchmark.start_batch(listed, out)
-    wait_until(lambda: running(out))
-    batch.send_signal(signal.SIGINT)
-    _, output = batch.communicate(timeout=60)
-    assert batch.returncode == 130
-    assert (
-        output
-        == "tofuse: interrupted, 0 of 2 recordings are done; run the same command again to resume\n"
-    )
-
-
-@pytest.mark.slow
-def test_killed_dask_worker_loses_no_results(
-    batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
-) -> None:
-    """In a `LocalCluster`; `benchmarks/batch.py` also kills workers started one by one."""
-    pytest.importorskip("distributed", reason="Dask is not installed")
-    out = tmp_path / "out"
-    with batch_benchmark.local_cluster(2) as (address, pids):
-        batch = batch_benchmark.start_batch(listed, out, "--scheduler", address, "--retries", 10)
-        assert batch_benchmark.kill_often(batch, pids, 1, 0.5, seed=4) == 1
-        batch_benchmark.finish(batch)
-    assert same(batch_benchmark, single_runs, out)
-
-
-@pytest.mark.slow
-def test_batch_resumes_after_lost_scheduler(
-    batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
-) -> None:
-    pytest.importorskip("distributed", reason="Dask is not installed")
-    out = tmp_path / "out"
-    with batch_benchmark.own_processes(1, tmp_path / "dask") as (address, _):
-        batch = batch_benchmark.start_batch(listed, out, "--scheduler", address)
-        wait_until(lambda: "done" in states(out).values() if out.is_dir() else False)
-    _, output = batch.communicate(timeout=60)
-    assert batch.returncode == 3
-    assert output == (
-        f"tofuse: {address}: the scheduler disappeared; restart it, and run the same command again "
-        "to resume\n"
-    )
-    resume(listed, out)
-    assert same(batch_benchmark, single_runs, out)
-
-
-@pytest.mark.slow
 def test_unreachable_scheduler_is_reported(
     listed: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
@@ -213,23 +164,6 @@ def test_unreachable_scheduler_is_reported(
     assert main(words) == 2
     assert "is not a file of a Dask scheduler" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_workers_without_tofuse_are_reported(
-    batch_benchmark: ModuleType, listed: Path, tmp_path: Path, monkeypatch
-) -> None:
-    pytest.importorskip("distributed", reason="Dask is not installed")
-    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['tofuse'] = None\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with batch_benchmark.own_processes(1, tmp_path / "dask") as (address, _):
-        monkeypatch.undo()
-        monkeypatch.syspath_prepend(str(BENCHMARKS))
-        batch = batch_benchmark.start_batch(listed, tmp_path / "out", "--scheduler", address)
-        _, output = batch.communicate(timeout=120)
-    assert batch.returncode == 2, output
-    assert "install this version of tofuse on its scheduler and its workers" in output
-    assert output.count("\n") == 1
 
 
 def test_job_ends_with_its_parent(room_recording: Path, tmp_path: Path) -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import csv
 import errno
 import json
-import subprocess
 import threading
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import replace
@@ -15,13 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from tofuse.apps.batch import batch as loop
 from tofuse.apps.batch.batch import pending, run_batch, status_of
 from tofuse.apps.batch.cluster import DaskWorkers
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
-from tofuse.apps.batch.table import COLUMNS, duration, write_table
-from tofuse.apps.batch.work import Task, work
+from tofuse.apps.batch.table import COLUMNS, write_table
+from tofuse.apps.batch.work import Task
 from tofuse.apps.batch.workers import LocalWorkers, Workers
 from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError, OutputError
@@ -119,15 +116,6 @@ def test_killed_job_is_restarted(folder: BatchFolder) -> None:
     assert status_of(JOBS, folder) == 0
 
 
-def test_repeatedly_killed_job_fails(folder: BatchFolder) -> None:
-    workers = Scripted({"a": [killed] * 9})
-    run(folder, workers)
-    assert workers.started.count("a") == 3
-    assert table(folder)[0]["state"] == "failed"
-    assert "(SIGKILL), 3 times; was there enough memory?" in table(folder)[0]["reason"]
-    assert status_of(JOBS, folder) == 3
-
-
 def test_failed_job_does_not_stop_others(folder: BatchFolder) -> None:
     workers = Scripted({"b": [failed]})
     run(folder, workers)
@@ -163,17 +151,6 @@ def test_batch_resumes_after_lost_workers(folder: BatchFolder, monkeypatch) -> N
     assert again.started == ["b", "c"]
 
 
-def test_cancelled_task_is_resubmitted(folder: BatchFolder) -> None:
-    workers = Scripted({"b": [cancelled]})
-    run(folder, workers)
-    assert workers.started == ["a", "b", "c", "b"]
-
-
-def test_unwritten_record_is_listed(folder: BatchFolder) -> None:
-    run(folder, Scripted({"a": [lambda _: Record("", "failed", reason="it does not see /out")]}))
-    assert table(folder)[0]["reason"] == "it does not see /out"
-
-
 def test_table_is_updated_after_each_job(folder: BatchFolder) -> None:
     seen: list[int] = []
     run(folder, Scripted(), on_ended=lambda *_: seen.append(len(table(folder))))
@@ -182,26 +159,6 @@ def test_table_is_updated_after_each_job(folder: BatchFolder) -> None:
     (row, *_) = table(folder)
     assert tuple(row) == COLUMNS
     assert (row["recording"], row["verdict"], row["seconds"]) == ("/a", "good", "1.5")
-
-
-def test_page_refreshes_while_jobs_are_pending(folder: BatchFolder) -> None:
-    pages: list[str] = []
-    run(folder, Scripted(), on_ended=lambda *_: pages.append(folder.html.read_text()))
-    assert ['http-equiv="refresh"' in page for page in pages] == [True, True, False]
-
-
-def test_waiting_for_workers_is_reported_once(folder: BatchFolder, monkeypatch) -> None:
-    monkeypatch.setattr(loop, "_NO_WORKER_S", 0.0)
-    monkeypatch.setattr(loop, "_POLL_S", 0.001)
-    workers = Scripted()
-    asked: list[Task] = []
-
-    def late(task: Task) -> bool:
-        asked.append(task)
-        return len(asked) > 20
-
-    monkeypatch.setattr(workers, "accepts", late)
-    assert run(folder, workers) == ["no worker is available for a: waiting for one"]
 
 
 def test_changed_options_need_overwrite(folder: BatchFolder) -> None:
@@ -308,26 +265,6 @@ def test_memory_limits_concurrent_jobs(monkeypatch) -> None:
         workers.close()
 
 
-def test_dask_memory_resource_limits_concurrency(monkeypatch) -> None:
-    there = [{"nthreads": 4, "resources": {"memory": 200.0}}, {"nthreads": 2, "resources": {}}]
-    workers = object.__new__(DaskWorkers)
-    workers._address, workers._running, workers._polled_at = "tcp://there", set(), -10.0
-    monkeypatch.setattr(workers, "_workers", lambda: there)
-    small, large = (replace(JOBS[0], memory=memory) for memory in (100, 201))
-    workers.check(small)
-    with pytest.raises(InputError, match="none of the 2 workers declares more than 200"):
-        workers.check(large)
-    at_a_time = {}
-    for job in (JOBS[0], small, large):
-        workers._running = set()
-        while workers.accepts(Task(job, "/out", 1)):
-            workers._running.add(Future())
-        at_a_time[job.memory] = len(workers._running)
-    assert at_a_time == {None: 6, 100: 2, 201: 0}
-    there.clear()
-    workers.check(large)  # suitable workers may join later
-
-
 class Remote:
     """A future of Dask."""
 
@@ -373,17 +310,6 @@ def test_dask_outcomes_are_translated() -> None:
     assert handed("finished", OSError("gone")).cancelled()
 
 
-def test_missing_dask_is_reported(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "dask", None)
-    (tmp_path / "list.txt").write_text("/a\n")
-    words = ["batch", str(tmp_path / "list.txt"), "--out", str(tmp_path / "out")]
-    assert main([*words, "--scheduler", "tcp://127.0.0.1:1"]) == 2
-    text = capsys.readouterr().err
-    assert "pip install 'tofuse[dask]'" in text
-    assert text.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(
     ("words", "text"),
     [
@@ -406,34 +332,3 @@ def test_invalid_arguments_are_reported(words, text, tmp_path: Path, capsys) -> 
     assert text in found
     assert found.count("\n") == 1
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(4.21, "4.2 s"), (59.97, "1 min 0 s"), (200, "3 min 20 s"), (7500, "2 h 5 min")],
-)
-def test_durations_are_formatted(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="reads /proc")
-def test_jobs_do_not_inherit_memory_limit_of_dask_workers(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "65536")
-    monkeypatch.setenv("OF_THE_USER", "1")
-    job = Job("a", str(tmp_path / "missing"))
-    folder = BatchFolder(tmp_path / "out")
-    folder.prepare()
-    write_table([job], folder)
-    seen: list[bytes] = []
-
-    def on_start(process: subprocess.Popen[bytes]) -> None:
-        environ = Path(f"/proc/{process.pid}/environ")
-        while not (content := environ.read_bytes()) and process.poll() is None:
-            time.sleep(0.001)  # Linux fills the file in a moment after Popen has returned
-        seen.append(content)
-
-    record = work(Task(job, str(folder.path), 1), on_start)
-    assert record.state == "failed"
-    assert b"OF_THE_USER=1" in seen[0]
-    assert b"MALLOC_TRIM_THRESHOLD_" not in seen[0]

@@ -25,7 +25,6 @@ SEEDS = 3
 @pytest.fixture
 def attacks(monkeypatch):
     # The subjects are made by helpers of the readers' tests, which are imported when needed.
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "recordings"))
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import attack
     import attacks.mutation
@@ -33,7 +32,7 @@ def attacks(monkeypatch):
     return attack, attacks.mutation
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_fuzzed_files_are_read_or_rejected(attacks, tmp_path: Path) -> None:
     """For every registered format and every function that reads files."""
     _, mutation = attacks
@@ -94,16 +93,6 @@ def reading() -> dict[str, FunctionType]:
     return found
 
 
-@pytest.mark.slow
-def test_crash_is_recorded_and_next_seed_runs(attacks) -> None:
-    _, mutation = attacks
-    found = list(mutation.run("pose", 3, first=7))
-    assert [seed for seed, _ in found] == [7, 8, 9]
-    assert {outcome for _, outcome in found} <= {"read", "rejected"}
-    (crashed,) = mutation.run("no such format", 1)
-    assert crashed == (0, "its process ended with 1")
-
-
 def test_signal_stages_name_existing_functions(attacks) -> None:
     from attacks.environments import ENVIRONMENTS, STAGES
 
@@ -114,28 +103,3 @@ def test_signal_stages_name_existing_functions(attacks) -> None:
         for part in name.split("."):
             owner = getattr(owner, part)
         assert callable(owner)
-
-
-def test_power_cuts_cause_no_faults(attacks) -> None:
-    attack, _ = attacks
-    assert attack.cuts(0, 10, seed=3) == (10, [])
-
-
-def test_journal_resumes_where_it_stopped(attacks, tmp_path: Path) -> None:
-    from attacks.journal import Journal
-
-    path, settings = tmp_path / "new" / "a.jsonl", {"seed": 1}
-    done: list[int] = []
-
-    def work(number: int) -> tuple[int, list[str]]:
-        done.append(number)
-        return 10, ["it crashed"] if number == 1 else []
-
-    for most in (2, 3):
-        journal = Journal(path, settings)
-        for number in range(most):
-            journal.do("some", number, lambda n=number: work(n))
-    assert done == [0, 1, 2]
-    assert Journal(path, settings).table() == [("some", 30, 29)]
-    with pytest.raises(SystemExit, match="other settings"):
-        Journal(path, {"seed": 2})

@@ -8,16 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from boxes_in_room import views_in_room
 from tofuse.apps.calibration.board import Board
-from tofuse.apps.calibration.depth import DepthFit, calibrate_depth, compose
+from tofuse.apps.calibration.depth import DepthFit, calibrate_depth
 from tofuse.apps.calibration.plane_views import PlaneView, board_planes, scene_planes
 from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.geometry import se3
-from tofuse.engine.sensor.camera_errors import DepthCorrection
+from tofuse.engine.frames.recording import Recording
 from tofuse.formats.cameras.correction_file import read_correction
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
@@ -139,15 +136,6 @@ def test_single_distance_is_rejected() -> None:
         calibrate_depth(views, CAMERA)
 
 
-def test_composed_correction_applies_both_in_order() -> None:
-    r = np.linspace(0.5, 4.5, 60)
-    first = DepthCorrection(r, wiggle(r))
-    second = DepthCorrection(r[::3], 0.01 * r[::3], np.full((1, 50), 0.002, np.float32))
-    measured = np.linspace(0.8, 4.2, 50, dtype=np.float32)[None]
-    both = compose(first, second).correct(measured)
-    np.testing.assert_allclose(both, second.correct(first.correct(measured)), atol=2e-4)
-
-
 EFFECTS = Effects(wiggling=2.6, thermal_drift=0.0).without("multipath", "mixed_pixels")
 
 
@@ -231,28 +219,3 @@ def test_real_sr4000_from_two_places_is_rejected(shared_data: Path) -> None:
     assert far[0] - far[1] == pytest.approx(0.31, abs=0.04)
     with pytest.raises(InputError, match="20 places"):
         calibrate_depth(found, camera)
-
-
-@pytest.mark.slow
-def test_missing_amplitude_or_board_is_rejected(views: Recording) -> None:
-    bare = [replace(frame, amplitude_image=None) for frame in views.select(0, 2)]
-    recording = Recording.of(ArraySource(bare), "bare", "simulated")
-    with pytest.raises(InputError, match="omit --board"):
-        board_planes(recording, BOARD, "amplitude", wall=False)
-    with pytest.raises(InputError, match="no board of 9 x 7"):
-        board_planes(views.select(0, 1), Board(9, 7, 0.1), "amplitude", wall=False)
-
-
-@pytest.mark.slow
-def test_camera_without_errors_is_not_corrected_in_room() -> None:
-    """Pixels of other walls are near a wall in its corners, all in front of it."""
-    camera = Pinhole(96, 72, 60.0, 60.0, 47.5, 35.5)
-    rng = np.random.default_rng(3)
-    turns = np.stack([np.zeros(40), 2 * np.pi * np.arange(40) / 40, np.zeros(40)], 1)
-    poses = se3.exp(np.concatenate([np.zeros((40, 3)), turns], 1))
-    poses[:, :3, 3] = rng.uniform(-0.7, 0.7, (40, 3))
-    frames = views_in_room(camera, poses, 0.002, 3)
-    views, _ = scene_planes(Recording.of(ArraySource(frames), "room", "test"), 3, 0)
-    fit = calibrate_depth(views, camera)
-    assert np.abs(fit.correction.bias_m).max() < 0.002
-    assert fit.bias_after_m < 0.001

@@ -74,14 +74,6 @@ def test_estimate_agrees_with_built_in_model() -> None:
     assert np.quantile(ratio, [0.05, 0.95]) == pytest.approx([1, 1], abs=0.15)
 
 
-def test_three_frames_suffice() -> None:
-    fit = estimate_noise(recording_of(still_frames("corner", "sr4000", 8)[:3]))
-    full = estimate_noise(recording_of(still_frames("corner", "sr4000", 8)))
-    frame = still_frames("corner", "sr4000", 1)[0]
-    ratio = fit.model.sigma(frame)[frame.valid] / full.model.sigma(frame)[frame.valid]
-    assert np.median(ratio) == pytest.approx(1, abs=0.07)
-
-
 def plain_frames(
     sigma: np.ndarray, count: int = 12, confidence: np.ndarray | None = None
 ) -> list[RangeFrame]:
@@ -104,15 +96,6 @@ def test_depth_alone_gives_range_law() -> None:
     assert fit.model.name == "mine"
     assert fit.model.range.a == pytest.approx(0.002, rel=0.15)
     assert fit.model.range.b == pytest.approx(0.003, rel=0.1)
-
-
-def test_quantization_noise_is_included() -> None:
-    frames = [
-        replace(f, depth=np.round(f.depth, 3)) for f in plain_frames(np.full((60, 80), 0.0004), 20)
-    ]
-    model = estimate_noise(recording_of(frames)).model
-    # Rounding to 1 mm adds 0.29 mm, in squares.
-    assert model.range.a + model.range.b * 4 == pytest.approx(0.00049, rel=0.15)
 
 
 def test_single_range_gives_conservative_law() -> None:
@@ -139,16 +122,6 @@ def test_confidence_is_used_only_if_informative() -> None:
     assert estimate_noise(recording_of(empty)).model.range.b == pytest.approx(0.004, rel=0.1)
 
 
-def test_uninformative_amplitude_is_ignored() -> None:
-    rng = np.random.default_rng(2)
-    r = np.broadcast_to(np.linspace(0.5, 4, 80), (60, 80))
-    nonsense = rng.uniform(10, 1000, (60, 80)).astype(np.float32)
-    frames = [replace(f, amplitude_image=nonsense) for f in plain_frames(0.004 * r**2)]
-    fit = estimate_noise(recording_of(frames))
-    assert fit.law == "range"
-    assert fit.model.amplitude is None
-
-
 def test_estimate_is_robust_to_flickering_edges() -> None:
     r = np.broadcast_to(np.linspace(0.5, 4, 80), (60, 80))
     frames = plain_frames(0.003 * r**2)
@@ -159,15 +132,6 @@ def test_estimate_is_robust_to_flickering_edges() -> None:
         for f in frames
     ]
     assert estimate_noise(recording_of(flicker)).model.range.b == pytest.approx(0.003, rel=0.15)
-
-
-def test_static_segments_are_combined() -> None:
-    r = np.broadcast_to(np.linspace(0.5, 4, 80), (60, 80))
-    near = plain_frames(0.003 * r**2, 5)
-    far = [replace(f, depth=f.depth + np.float32(0.7)) for f in near]
-    fit = estimate_noise(recording_of([*near, *far]))
-    assert fit.stretches == 2
-    assert fit.frames == 10
 
 
 @pytest.mark.slow
@@ -221,16 +185,6 @@ def test_noise_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     out.write_text('{"schema": 1, "name": "x", "range": {"a": 20, "b": 0}}')
     with pytest.raises(InputError, match="a must be 0 to 5"):
         noise_model_for(recording)
-
-
-def test_sensor_family_is_found_by_name_format_and_size() -> None:
-    frame = plain_frames(np.full(80, 0.01), 1)
-    assert noise_model_for(recording_of(frame)) == NOISE["unknown"]
-    assert noise_model_for(recording_of(frame, sensor="Kinect v1")) == NOISE["kinect1"]
-    assert noise_model_for(recording_of(frame, sensor="MESA SR4000")).name == "sr4000"
-    assert (
-        noise_model_for(recording_of(still_frames("wall", "pico-flexx", 8))) == NOISE["pico-flexx"]
-    )
 
 
 @pytest.mark.parametrize("gain", [0.01, 30.0])

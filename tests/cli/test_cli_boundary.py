@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
-import made_exports
 from paths import BENCHMARKS
 from tofuse.apps.cli import program as cli
 from tofuse.apps.cli.program import main, run_command
@@ -28,8 +24,6 @@ from attacks.environments import ENVIRONMENTS, Environment, attempt
 # One of each kind; `benchmarks/attack.py` runs all of them.
 CHOSEN = (
     "512 MB of addresses",
-    "1024 MB of addresses",
-    "1536 MB of addresses",
     "12 file handles",
     "no threads",
     "files of 20 kB at most",
@@ -38,9 +32,11 @@ CHOSEN = (
     "a reader that leaves",
     "the output folder is read-only",
     "SIGINT at tracking",
-    "SIGTERM at moves",
-    "SIGTERM at the end",
 )
+# Others of a kind that is chosen already.
+NIGHTLY = (
+    "1024 MB of addresses", "1536 MB of addresses", "SIGTERM at moves", "SIGTERM at the end"
+)  # fmt: skip
 # These are independent of each other, so that one run is enough.
 TOGETHER = (
     "stdin closed",
@@ -73,11 +69,14 @@ def together(several: list[Environment]) -> Environment:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*CHOSEN, "together"])
+@pytest.mark.parametrize(
+    "name",
+    [*CHOSEN, "together", *(pytest.param(name, marks=pytest.mark.nightly) for name in NIGHTLY)],
+)
 def test_hostile_environments_give_result_or_one_line_error(
     name: str, clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Kernels are not compiled anew where the home can't be written; see test_kernels_jit.py.
+    # Kernels are not compiled anew where the home can't be written; see test_compute_jit.py.
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(Path(jit.cache_folder()).parent))
     known = {environment.name: environment for environment in ENVIRONMENTS}
     environment = together([known[n] for n in TOGETHER]) if name == "together" else known[name]
@@ -110,27 +109,6 @@ def test_unwritable_stdout_is_reported(clouds: Path) -> None:
     assert "Traceback" not in stderr
     status, stderr = shell("{ sleep 1; tofuse --help; } | true; exit ${PIPESTATUS[0]}")
     assert (status, stderr) == (141, "")
-
-
-@pytest.mark.slow
-def test_damaged_image_prints_no_library_messages(tmp_path: Path) -> None:
-    made_exports.make_tiff3d(tmp_path / "a")
-    path = tmp_path / "a" / "00001.range.tif"
-    noise = np.random.default_rng(0).integers(1000, 3000, (24, 32)).astype(np.uint16)
-    cv2.imwrite(str(path), noise, [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW])
-    data = bytearray(path.read_bytes())
-    data[100:200] = 100 * b"\xff"
-    path.write_bytes(data)
-    camera = {"schema": 1, "model": "brown", "width": 32, "height": 24, "fx": 30.0, "fy": 30.0,
-              "cx": 15.5, "cy": 11.5, "distortion": [0.0] * 4, "depth_unit_m": 0.001,
-              "depth_kind": "range"}  # fmt: skip
-    (tmp_path / "camera.json").write_text(json.dumps(camera))
-    _, stderr = shell(f"tofuse inspect {tmp_path}/a --camera {tmp_path}/camera.json")
-    assert stderr.count("\n") <= 1
-    assert "TIFF_Error" not in stderr
-    script = f"import cv2; cv2.imread({str(path)!r}, cv2.IMREAD_UNCHANGED)"
-    alone = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
-    assert b"TIFF" in alone.stderr  # OpenCV alone prints it
 
 
 class Broken:
@@ -202,28 +180,6 @@ def test_program_bug_is_one_line_unless_traceback_is_requested(capfd, monkeypatc
         cli.report_bugs(fail)
 
 
-@pytest.mark.parametrize("place", ["prepare_process", "report_bugs"])
-def test_interrupt_during_startup_is_reported_in_one_line(place, capfd, monkeypatch) -> None:
-    def interrupted(*_args: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli, place, interrupted)
-    assert cli.console() == 130
-    assert capfd.readouterr().err == f"tofuse: interrupted; {cli._UNCHANGED}\n"
-
-
-def test_ignored_signals_stay_ignored(tmp_path: Path) -> None:
-    """As under nohup."""
-    script = (
-        "import os, signal, sys\n"
-        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-        "from tofuse import cli\n"
-        "cli.main = lambda: os.kill(os.getpid(), signal.SIGHUP) or 0\n"
-        "sys.exit(cli.console())\n"
-    )
-    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 @pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_signal_in_destructor_is_not_lost(name: str, status: int) -> None:
@@ -231,7 +187,7 @@ def test_signal_in_destructor_is_not_lost(name: str, status: int) -> None:
     script = (
         "import os, signal, sys, threading, time, weakref\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from tofuse import cli\n"
+        "from tofuse.apps.cli import program as cli\n"
         "class Some: pass\n"
         "def dropped():\n"
         f"    os.kill(os.getpid(), signal.{name})\n"

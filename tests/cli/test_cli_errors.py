@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -117,39 +116,23 @@ def test_bad_recordings_are_rejected(name, recording, tmp_path, capfd) -> None:
     assert listing(tmp_path) == before
 
 
-def test_unknown_key_adds_no_lines_to_error(recording, tmp_path, capfd) -> None:
-    camera(recording, colour_of_case="grey")
-    blank_all(recording)
-    refuses(capfd, "run", recording, "--out", tmp_path / "out", says=("0 valid points",))
-
-
 def test_unreadable_files_are_rejected(recording, tmp_path, capfd, monkeypatch) -> None:
     # Permissions do not restrict root, so the system call is made to fail.
-    def refuse(self: Path, *_args: object, **_options: object) -> None:
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+    def refusing(original: Callable[..., object]) -> Callable[..., object]:
+        def read(self: Path, *args: object, **named: object) -> object:
+            if self.is_relative_to(recording):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+            return original(self, *args, **named)
 
-    monkeypatch.setattr(Path, "open", refuse)
-    monkeypatch.setattr(Path, "read_bytes", refuse)
+        return read
+
+    for name in ("open", "read_bytes"):
+        monkeypatch.setattr(Path, name, refusing(getattr(Path, name)))
     message = refuses(
         capfd, "run", recording, "--out", tmp_path / "out", says=("rec", "ermission denied")
     )
     assert "Traceback" not in message
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.skipif(
-    sys.platform == "win32" or os.geteuid() == 0, reason="root and Windows can read everything"
-)
-def test_missing_permissions_are_reported(recording, tmp_path, capfd) -> None:
-    (recording / "camera.json").chmod(0)
-    refuses(capfd, "run", recording, "--out", tmp_path / "out", says=("camera.json", "ermission"))
-    (recording / "depth").chmod(0)
-    refuses(capfd, "run", recording, "--out", tmp_path / "out", says=("ermission",))
-    (recording / "depth").chmod(0o700)
-    locked = tmp_path / "locked"
-    locked.mkdir(mode=0o500)
-    (recording / "camera.json").chmod(0o600)
-    refuses(capfd, "run", recording, "--out", locked / "out", says=("locked", "ermission"))
 
 
 OUTPUTS: dict[str, Callable[[Path], Path]] = {
@@ -171,7 +154,7 @@ def _with(folder: Path, name: str) -> Path:
 def test_bad_output_folders_are_rejected(name, options, recording, tmp_path, capfd) -> None:
     out = OUTPUTS[name](tmp_path)
     before = listing(tmp_path)
-    refuses(capfd, "run", recording, "--out", out, *options, says=(str(out), "--out"))
+    refuses(capfd, "run", recording, "--out", out, *options, says=(str(tmp_path),))
     assert listing(tmp_path) == before
 
 
@@ -187,123 +170,78 @@ def test_unwritable_output_is_reported(code, recording, tmp_path, capfd, monkeyp
     monkeypatch.setattr(Path, "open", full)
     before = listing(tmp_path)
     out = tmp_path / "out"
-    message = refuses(capfd, "run", recording, "--out", out, says=(str(out), "can't be written"))
+    message = refuses(
+        capfd, "run", recording, "--out", out, says=(str(tmp_path), "can't be written")
+    )
     assert os.strerror(code).lower() in message.lower()
     assert ".tofuse" not in message
     assert listing(tmp_path) == before
 
 
-def test_failing_folder_creation_is_reported(recording, tmp_path, capfd, monkeypatch) -> None:
-    def refuse(self: Path, *_args: object, **_options: object) -> None:
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
-
-    monkeypatch.setattr(Path, "mkdir", refuse)
-    out = tmp_path / "out"
-    refuses(capfd, "run", recording, "--out", out, says=(str(out), "ermission denied"))
-
-
-RUN = ("run", "REC", "--out", "OUT")
-USAGE: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
-    "unknown command": (("fuse",), ("'fuse'",), "tofuse: "),
-    "misspelt command": (("rnu",), ("'rnu' (did you mean run?)",), "tofuse: "),
-    "no input": (("run", "--out", "OUT"), ("INPUT",), "tofuse run: "),
-    "no out": (("run", "REC"), ("--out",), "tofuse run: "),
-    "unknown option": ((*RUN, "--fast"), ("--fast",), "tofuse"),
-    "no threads": ((*RUN, "--threads", "0"), ("--threads", "0"), "tofuse run: "),
-    "threads a word": ((*RUN, "--threads", "x"), ("--threads", "'x'"), "tofuse run: "),
-    "negative seed": ((*RUN, "--seed", "-1"), ("--seed", "-1"), "tofuse run: "),
-    "seed a word": ((*RUN, "--seed", "1.5"), ("--seed", "1.5"), "tofuse run: "),
-    "every none": ((*RUN, "--every", "0"), ("--every", "0"), "tofuse run: "),
-    "start a word": ((*RUN, "--start", "a"), ("--start", "'a'"), "tofuse run: "),
-    "depth a word": ((*RUN, "--max-depth", "far"), ("--max-depth", "'far'"), "tofuse run: "),
-    "depth negative": ((*RUN, "--min-depth", "-1"), ("--min-depth", "-1"), "tofuse run: "),
-    "depth infinite": ((*RUN, "--max-depth", "inf"), ("--max-depth", "inf"), "tofuse run: "),
-    "memory of a byte": (
-        (*RUN, "--memory", "1"),
-        ("--memory", "is less than 500 MB", "2GB"),
-        "tofuse: ",
-    ),
-    "unknown guess": ((*RUN, "--guess", "luck"), ("--guess", "'luck'"), "tofuse run: "),
-    "depths swapped": (
-        (*RUN, "--min-depth", "3", "--max-depth", "2"),
-        ("--max-depth", "3.0", "2.0"),
-        "tofuse: ",
-    ),
-    "misspelt option": (
-        (*RUN, "--maxdepth", "3"),
-        ("--maxdepth", "did you mean --max-depth?"),
-        "tofuse run: ",
-    ),
-    "one word too many": (("demo", "room"), ("room",), "tofuse demo: "),
-    "unknown method": ((*RUN, "--method", "magic"), ("--method", "'magic'", "thesis"), "tofuse: "),
-    "unknown format": ((*RUN, "--format", "magic"), ("--format", "'magic'", "native"), "tofuse: "),
-    "wrong format": ((*RUN, "--format", "tum"), ("REC",), "tofuse: "),
-    "nothing selected": (
-        (*RUN, "--start", "9"),
-        ("REC", "selection leaves none", "--start"),
-        "tofuse: ",
-    ),
-    "end before start": ((*RUN, "--start", "2", "--end", "1"), ("REC", "--end"), "tofuse: "),
-    "no odometry": ((*RUN, "--guess", "odometry"), ("--guess", "odometry.txt"), "tofuse: "),
-    "no config": ((*RUN, "--config", "none.toml"), ("none.toml",), "tofuse: "),
-    "no camera": ((*RUN, "--camera", "none.json"), ("none.json",), "tofuse: "),
-    "no loops": ((*RUN, "--loops", "none.txt"), ("none.txt",), "tofuse: "),
-    "second input missing": (("run", "REC", "none", "--out", "OUT"), ("none",), "tofuse: "),
-    "simulate unknown scene": (("simulate", "moon", "--out", "OUT"), ("moon", "room"), "tofuse: "),
-    "simulate unknown camera": (
-        ("simulate", "room", "--out", "OUT", "--camera", "eye"),
-        ("eye", "sr4000"),
-        "tofuse: ",
-    ),
-    "simulate unknown effect": (
-        ("simulate", "room", "--out", "OUT", "--without", "magic"),
-        ("magic", "shot_noise"),
-        "tofuse: ",
-    ),
-    "simulate no frames": (
-        ("simulate", "room", "--out", "OUT", "--frames", "0"),
-        ("--frames", "0"),
-        "tofuse simulate: ",
-    ),
-    "simulate onto something": (("simulate", "box", "--out", "REC"), ("REC",), "tofuse: "),
-    "demo unknown scene": (("demo", "--scene", "moon"), ("moon", "room"), "tofuse demo: "),
-    "demo unknown method": (
-        ("demo", "--scene", "peaks", "--out", "OUT", "--method", "magic"),
-        ("magic", "thesis"),
-        "tofuse: ",
-    ),
-    "demo onto something": (("demo", "--out", "REC", "--overwrite"), ("REC",), "tofuse: "),
-    "merge without out": (("merge", "REC", "REC"), ("--out",), "tofuse merge: "),
-    "merge nothing": (("merge", "none", "--out", "OUT"), ("none", "doesn't exist"), "tofuse: "),
-    "merge no results": (("merge", "REC", "--out", "OUT"), ("REC", "run.json"), "tofuse: "),
-    "into nothing": ((*RUN, "--into", "none"), ("none", "doesn't exist"), "tofuse: "),
-    "into no result": ((*RUN, "--into", "REC"), ("REC", "run.json"), "tofuse: "),
-    "into itself": ((*RUN, "--into", "OUT"), ("--into", "two folders"), "tofuse: "),
-    "into in view": ((*RUN, "--into", "REC", "--view"), ("--view", "--into"), "tofuse: "),
-    "inspect nothing": (("inspect", "none"), ("none",), "tofuse: "),
-    "evaluate nothing": (("evaluate", "none", "REC"), ("none",), "tofuse: "),
-    "evaluate no reference": (("evaluate", "REC", "REC"), ("trajectory.txt",), "tofuse: "),
-    "optimize nothing": (("optimize", "none.g2o", "--out", "OUT"), ("none.g2o",), "tofuse: "),
-    "optimize onto something": (
-        ("optimize", "none.g2o", "--out", "REC/camera.json"),
-        ("REC/camera.json", "--overwrite"),
-        "tofuse: ",
-    ),
-    "optimize onto a folder": (
-        ("optimize", "none.g2o", "--out", "REC"),
-        ("--out", "is a folder"),
-        "tofuse: ",
-    ),
-}
+RUN = "run REC --out OUT "
+# Words of the command, parts of the message between bars, and the beginning of the message.
+USAGE = [
+    ("fuse", "'fuse'", "tofuse: "),
+    ("rnu", "'rnu' (did you mean run?)", "tofuse: "),
+    ("run --out OUT", "INPUT", "tofuse run: "),
+    ("run REC", "--out", "tofuse run: "),
+    (RUN + "--fast", "--fast", "tofuse"),
+    (RUN + "--threads 0", "--threads|0", "tofuse run: "),
+    (RUN + "--threads x", "--threads|'x'", "tofuse run: "),
+    (RUN + "--seed -1", "--seed|-1", "tofuse run: "),
+    (RUN + "--seed 1.5", "--seed|1.5", "tofuse run: "),
+    (RUN + "--every 0", "--every|0", "tofuse run: "),
+    (RUN + "--start a", "--start|'a'", "tofuse run: "),
+    (RUN + "--max-depth far", "--max-depth|'far'", "tofuse run: "),
+    (RUN + "--min-depth -1", "--min-depth|-1", "tofuse run: "),
+    (RUN + "--max-depth inf", "--max-depth|inf", "tofuse run: "),
+    (RUN + "--memory 1", "--memory|is less than 500 MB|2GB", "tofuse: "),
+    (RUN + "--guess luck", "--guess|'luck'", "tofuse run: "),
+    (RUN + "--min-depth 3 --max-depth 2", "--max-depth|3.0|2.0", "tofuse: "),
+    (RUN + "--maxdepth 3", "--maxdepth|did you mean --max-depth?", "tofuse run: "),
+    ("demo room", "room", "tofuse demo: "),
+    (RUN + "--method magic", "--method|'magic'|thesis", "tofuse: "),
+    (RUN + "--format magic", "--format|'magic'|native", "tofuse: "),
+    (RUN + "--format tum", "REC", "tofuse: "),
+    (RUN + "--start 9", "REC|selection leaves none|--start", "tofuse: "),
+    (RUN + "--start 2 --end 1", "REC|--end", "tofuse: "),
+    (RUN + "--guess odometry", "--guess|odometry.txt", "tofuse: "),
+    (RUN + "--config none.toml", "none.toml", "tofuse: "),
+    (RUN + "--camera none.json", "none.json", "tofuse: "),
+    (RUN + "--loops none.txt", "none.txt", "tofuse: "),
+    ("run REC none --out OUT", "none", "tofuse: "),
+    ("simulate moon --out OUT", "moon|room", "tofuse: "),
+    ("simulate room --out OUT --camera eye", "eye|sr4000", "tofuse: "),
+    ("simulate room --out OUT --without magic", "magic|shot_noise", "tofuse: "),
+    ("simulate room --out OUT --frames 0", "--frames|0", "tofuse simulate: "),
+    ("simulate box --out REC", "REC", "tofuse: "),
+    ("demo --scene moon", "moon|room", "tofuse demo: "),
+    ("demo --scene peaks --out OUT --method magic", "magic|thesis", "tofuse: "),
+    ("demo --out REC --overwrite", "REC", "tofuse: "),
+    ("merge REC REC", "--out", "tofuse merge: "),
+    ("merge none --out OUT", "none|doesn't exist", "tofuse: "),
+    ("merge REC --out OUT", "REC|run.json", "tofuse: "),
+    (RUN + "--into none", "none|doesn't exist", "tofuse: "),
+    (RUN + "--into REC", "REC|run.json", "tofuse: "),
+    (RUN + "--into OUT", "--into|two folders", "tofuse: "),
+    (RUN + "--into REC --view", "--view|--into", "tofuse: "),
+    ("inspect none", "none", "tofuse: "),
+    ("evaluate none REC", "none", "tofuse: "),
+    ("evaluate REC REC", "trajectory.txt", "tofuse: "),
+    ("optimize none.g2o --out OUT", "none.g2o", "tofuse: "),
+    ("optimize none.g2o --out REC/camera.json", "REC/camera.json|--overwrite", "tofuse: "),
+    ("optimize none.g2o --out REC", "--out|is a folder", "tofuse: "),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", USAGE)
-def test_bad_usage_is_reported(name, recording, tmp_path, capfd, monkeypatch) -> None:
+@pytest.mark.parametrize(("words", "says", "prefix"), USAGE)
+def test_bad_usage_is_reported(
+    words, says, prefix, recording, tmp_path, capfd, monkeypatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.move(recording, tmp_path / "REC")
     before = listing(tmp_path)
-    words, says, prefix = USAGE[name]
-    refuses(capfd, *words, says=says, prefix=prefix)
+    refuses(capfd, *words.split(), says=tuple(says.split("|")), prefix=prefix)
     assert listing(tmp_path) == before
 
 
@@ -383,25 +321,6 @@ def test_bad_loop_files_are_rejected(text, says, recording, tmp_path, capfd) -> 
     assert not (tmp_path / "out").exists()
 
 
-GRAPHS = {
-    "empty": "",
-    "words": "hello\n",
-    "short vertex": "VERTEX_SE3:QUAT 0 0 0 0\n",
-    "nan": "VERTEX_SE3:QUAT 0 nan 0 0 0 0 0 1\n",
-    "edge to nowhere": "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nEDGE_SE3:QUAT 0 5 0 0 0 0 0 0 1 "
-    + " ".join(["1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"]),
-    "binary": "\x00\xff\x01",
-}
-
-
-@pytest.mark.parametrize("name", GRAPHS)
-def test_broken_graphs_are_rejected(name, tmp_path, capfd) -> None:
-    graph = tmp_path / "in.g2o"
-    graph.write_text(GRAPHS[name], encoding="latin-1")
-    refuses(capfd, "optimize", graph, "--out", tmp_path / "out.g2o", says=("in.g2o",))
-    assert not (tmp_path / "out.g2o").exists()
-
-
 def test_unmatched_trajectories_are_rejected(tmp_path, capfd) -> None:
     for name, start in (("a.txt", 0), ("b.txt", 1000)):
         lines = [f"{start + k} {k} 0 0 0 0 0 1" for k in range(5)]
@@ -412,11 +331,6 @@ def test_unmatched_trajectories_are_rejected(tmp_path, capfd) -> None:
     refuses(capfd, "evaluate", tmp_path / "c.txt", tmp_path / "a.txt", says=("c.txt",))
     (tmp_path / "d.txt").write_text("")
     refuses(capfd, "evaluate", tmp_path / "a.txt", tmp_path / "d.txt", says=("d.txt",))
-
-
-def test_inspect_rejects_unreadable_recording(recording, capfd) -> None:
-    truncate_all(recording)
-    refuses(capfd, "inspect", recording, says=("none of 4 frames",))
 
 
 def test_unexpected_errors_are_one_line(capfd, monkeypatch) -> None:

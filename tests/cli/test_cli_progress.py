@@ -12,9 +12,7 @@ import time
 
 import pytest
 
-from tofuse.apps.cli import progress as module
 from tofuse.apps.cli.progress import (
-    Health,
     JsonProgress,
     Pace,
     QuietProgress,
@@ -51,43 +49,6 @@ def test_pace_is_that_of_recent_steps() -> None:
     unknown.step()
     assert unknown.per_second == pytest.approx(1000)
     assert unknown.seconds_left is None
-
-
-def test_health_shows_newest_frame_and_lost_count() -> None:
-    health = Health()
-    assert health.markup == ""
-    seen = []
-    for status, share in (
-        ("tracked", 0.97),
-        ("tracked", 0.6),
-        ("lost", None),
-        ("lost", None),
-        ("tracked", 0.9),
-        ("predicted", 0.5),
-        ("skipped", None),
-        ("tracked", None),
-    ):
-        health.update(FrameRecord(0, 0.0, status, inlier_share=share))
-        seen.append(health.markup)
-    assert seen == [
-        "[green]97% inliers[/]",
-        "[yellow]60% inliers[/]",
-        "[red]lost for 1 frame[/]",
-        "[red]lost for 2 frames[/]",
-        "[green]90% inliers[/], 2 without a pose",
-        "[yellow]predicting[/], 2 without a pose",
-        "[yellow]unreadable[/], 3 without a pose",
-        "[green]tracking[/], 3 without a pose",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0.04, "0.0 s"), (9.94, "9.9 s"), (9.96, "10 s"), (59.4, "59 s"), (59.6, "1:00"),
-     (187, "3:07"), (3765, "1:02:45")],
-)  # fmt: skip
-def test_durations_are_short(seconds: float, words: str) -> None:
-    assert module._duration(seconds) == words
 
 
 def test_output_stream_selects_progress_type(monkeypatch) -> None:

@@ -9,40 +9,40 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tofuse.apps.cli.options import DEMO_SCENES
-from tofuse.apps.cli.parser import make_parser
 from tofuse.apps.cli.program import main
-from tofuse.apps.jobs import running as run_module
-from tofuse.apps.results.run_json import main_poses
 from tofuse.engine.errors import TofuseError
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.mapping.methods import from_method
-from tofuse.engine.mapping.reconstructing import reconstruct
-from tofuse.engine.parts import name_of
-from tofuse.engine.results.types import Component, Reason, Reconstruction
-from tofuse.engine.results.verdicts import ADVICE, REASONS
-from tofuse.formats.export.conversion import convert
+from tofuse.engine.results.verdicts import REASONS
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.formats.images.images import read_image
 from tofuse.formats.images.writing import write_png
 from tofuse.formats.poses.g2o import read_g2o
 from tofuse.formats.poses.trajectory import read_tum
-from tofuse.formats.recordings.open import open_recording
 from tofuse.lab import demo as demo_module
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
-from wrapped_depth import wrapping
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
 FILES = {*SAME, "report.html", "run.json"}
 LIGHT = {*SAME, "run.json"}  # with --no-report
+# Fields of run.json, of its frames and of its loops.
+RUN_KEYS = """
+schema version input seed threads config seconds verdict self_calibration accuracy reasons
+frames loops optimiser priors refinement filters findings warnings components sessions
+session_pairs changes T_up_world rig
+"""
+FRAME_KEYS = """
+index timestamp status reason valid_share inlier_share rms_m covariance unobservable
+component session
+"""
+LOOP_KEYS = """
+i j accepted reason overlap rms_m free_space_violation margin
+"""
 # Options of a quick run.
 QUICK = ("--every", "4", "--method", "thesis", "--no-report")
 
@@ -73,14 +73,6 @@ def run_json(folder: Path) -> dict:
 
 
 @pytest.fixture(scope="module")
-def plain_run(room_recording, tmp_path_factory) -> Path:
-    """The result of a run without options, with its report."""
-    out = tmp_path_factory.mktemp("plain") / "out"
-    assert main(["run", str(room_recording), "--out", str(out), "--threads", "2"]) == 0
-    return out
-
-
-@pytest.fixture(scope="module")
 def quick_run(room_recording, tmp_path_factory) -> Path:
     """The result of a quick run, without its report."""
     out = tmp_path_factory.mktemp("quick") / "out"
@@ -88,54 +80,28 @@ def quick_run(room_recording, tmp_path_factory) -> Path:
     return out
 
 
-def test_output_files_follow_contract(plain_run, room_recording) -> None:
-    assert {p.name for p in plain_run.iterdir()} == FILES
-    times, poses = read_tum(plain_run / "trajectory.txt")
+def test_output_files_follow_contract(room_result, room_recording) -> None:
+    assert {p.name for p in room_result.iterdir()} == FILES
+    times, poses = read_tum(room_result / "trajectory.txt")
     recorded, _ = read_tum(room_recording / "groundtruth.txt")
     np.testing.assert_allclose(times, recorded, atol=1e-6)
     np.testing.assert_array_equal(poses[0], np.eye(4))
-    graph = read_g2o(plain_run / "pose_graph.g2o")
+    graph = read_g2o(room_result / "pose_graph.g2o")
     np.testing.assert_allclose(graph.poses, poses, atol=1e-6)
     assert len(graph.edges) >= 7
     assert (np.linalg.eigvalsh(graph.information) > 0).all()
-    cloud = read_ply(plain_run / "cloud.ply")
+    cloud = read_ply(room_result / "cloud.ply")
     assert len(cloud) > 1000
     np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-4)
     assert np.ptp(cloud.color) > 100
-    report = (plain_run / "report.html").read_text()
+    report = (room_result / "report.html").read_text()
     assert report.lower().startswith("<!doctype html")
     assert not re.search(r"(src|href)=[\"']https?:", report)
 
 
-def test_run_json_follows_contract(plain_run, room_recording) -> None:
-    data = run_json(plain_run)
-    assert set(data) == {
-        "schema",
-        "version",
-        "input",
-        "seed",
-        "threads",
-        "config",
-        "seconds",
-        "verdict",
-        "self_calibration",
-        "accuracy",
-        "reasons",
-        "frames",
-        "loops",
-        "optimiser",
-        "priors",
-        "refinement",
-        "filters",
-        "findings",
-        "warnings",
-        "components",
-        "sessions",
-        "session_pairs",
-        "changes",
-        "T_up_world",
-        "rig",
-    }
+def test_run_json_follows_contract(room_result, room_recording) -> None:
+    data = run_json(room_result)
+    assert set(data) == set(RUN_KEYS.split())
     assert data["schema"] == 1
     opening = data["input"].pop("opening")
     assert data["input"] == {"path": str(room_recording), "format": "native", "frames": 8}
@@ -149,19 +115,7 @@ def test_run_json_follows_contract(plain_run, room_recording) -> None:
         assert len(reason["frames"]) == 2
     assert [f["index"] for f in data["frames"]] == list(range(8))
     for frame in data["frames"]:
-        assert set(frame) == {
-            "index",
-            "timestamp",
-            "status",
-            "reason",
-            "valid_share",
-            "inlier_share",
-            "rms_m",
-            "covariance",
-            "unobservable",
-            "component",
-            "session",
-        }
+        assert set(frame) == set(FRAME_KEYS.split())
         assert frame["status"] == "tracked"
         assert 0 < frame["valid_share"] <= 1
         if frame["index"]:
@@ -175,11 +129,11 @@ def test_run_json_follows_contract(plain_run, room_recording) -> None:
 
 
 @pytest.mark.slow
-def test_result_depends_on_neither_threads_nor_reference(recording, plain_run, tmp_path) -> None:
-    assert run_json(plain_run)["threads"] == 2
+def test_result_depends_on_neither_threads_nor_reference(recording, room_result, tmp_path) -> None:
+    assert run_json(room_result)["threads"] == 2
     (recording / "groundtruth.txt").write_text("0 5 5 5 0 0 0 1\n0.1 -5 5 5 0 0 0 1\n")
     run(recording, "--out", tmp_path / "out", "--threads", 1)
-    assert same(tmp_path / "out") == same(plain_run)
+    assert same(tmp_path / "out") == same(room_result)
 
 
 @pytest.mark.slow
@@ -219,31 +173,6 @@ def test_run_json_as_config_reproduces_result(recording, tmp_path) -> None:
     assert run_json(tmp_path / "c")["seed"] == 4
 
 
-def test_options_are_read_from_toml(room_recording, tmp_path) -> None:
-    file = tmp_path / "my.toml"
-    file.write_text('method = "thesis"\nfilters = []\n[fusion]\nvoxel_m = 0.1\n')
-    words = ["--config", file, "--guess", "identity", "--every", 4]
-    run(room_recording, "--out", tmp_path / "out", *words)
-    config = run_json(tmp_path / "out")["config"]
-    assert (config["method"], config["filters"]) == ("thesis", [])
-    assert (config["fusion"]["voxel_m"], config["odometry"]["guess"]) == (0.1, "identity")
-    assert len(read_ply(tmp_path / "out/cloud.ply")) < 5000
-
-
-def test_filters_from_options_come_first(room_recording, tmp_path) -> None:
-    run(room_recording, "--out", tmp_path / "a", "--min-depth", 1, *QUICK)
-    names = [f["part"] for f in run_json(tmp_path / "a")["config"]["filters"]]
-    assert names[0] == "distance"
-    assert names[1:] == [name_of(f) for f in from_method("thesis").filters]
-    run(room_recording, "--out", tmp_path / "c", "--object", "--max-depth", 2.5, *QUICK)
-    filters = run_json(tmp_path / "c")["config"]["filters"]
-    assert filters[0]["maximum"] == 2.5
-    assert run_json(tmp_path / "c")["filters"]["distance"]["removed"] > 0.1
-    # Nothing beyond the limit is in the model, as the camera hardly moves from its first pose.
-    first = read_ply(tmp_path / "c/cloud.ply").points
-    assert np.linalg.norm(first, axis=1).max() < 4
-
-
 @pytest.mark.slow
 def test_object_is_segmented_from_background(tmp_path, capsys) -> None:
     effects = Effects.none(shot_noise=True, scatter=0.02)
@@ -262,27 +191,6 @@ def test_object_is_segmented_from_background(tmp_path, capsys) -> None:
     again = ["--config", tmp_path / "out/run.json", "--threads", 1]
     run(tmp_path / "rec", "--out", tmp_path / "again", "--object", *again)
     assert same(tmp_path / "again") == same(tmp_path / "out")
-
-
-@pytest.mark.slow
-def test_ranges_beyond_period_are_unwrapped(room_recording, tmp_path) -> None:
-    frames, period = list(open_recording(room_recording))[::4], 2.8
-    source = ArraySource(wrapping(frames, period), metadata={"ambiguity_m": period})
-    convert(Recording.of(source, "wrapped", "test"), tmp_path / "rec")
-    farthest = {}
-    for name, options in (("near", []), ("far", ["--unwrap"])):
-        # Without unwrapping the run is rejected or wrong; the test does not distinguish these.
-        options = [*options, "--method", "thesis", "--no-report"]
-        words = ["run", str(tmp_path / "rec"), "--out", str(tmp_path / name), *options]
-        assert main(words) == 0 or name == "near"
-        made = run_json(tmp_path / name)
-        codes = {finding["code"] for finding in made["findings"]}
-        assert ("phase_wrap" in codes) == (name == "near")
-        points = read_ply(tmp_path / name / "cloud.ply").points
-        farthest[name] = np.quantile(np.linalg.norm(points, axis=1), 0.9)
-    true = np.quantile(frames[0].radial_range[frames[0].valid], 0.9)
-    assert farthest["near"] < 2.9
-    assert farthest["far"] == pytest.approx(true, rel=0.1)
 
 
 def test_unwrap_without_amplitude_is_rejected(recording, tmp_path, capsys) -> None:
@@ -321,69 +229,6 @@ def test_unreadable_frame_is_skipped_and_blank_one_lost(recording, tmp_path, cap
 
 
 @pytest.mark.slow
-def test_single_frame_run_succeeds(room_recording, tmp_path) -> None:
-    run(room_recording, "--out", tmp_path / "out", "--end", 1, report=True)
-    data = run_json(tmp_path / "out")
-    assert [r["code"] for r in data["reasons"]] == ["single_frame", "correction_left_out"]
-    # Nothing was registered, so the accuracy is unknown.
-    assert data["verdict"] == "degraded"
-    assert data["accuracy"] == {
-        "position_m": None,
-        "rotation_rad": None,
-        "relative": None,
-        "assessed": False,
-        "worst": None,
-        "unbounded": [],
-        "by_odometry": [],
-    }
-    assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
-    assert len(read_ply(tmp_path / "out/cloud.ply")) > 500
-    mesh = read_ply(tmp_path / "out/mesh.ply")
-    assert mesh.faces is not None
-    assert len(mesh.faces) > 1000
-
-
-@pytest.mark.slow
-def test_frame_selection(room_recording, tmp_path) -> None:
-    options = ["--start", 1, "--end", 7, "--every", 2, "--method", "thesis"]
-    run(room_recording, "--out", tmp_path / "out", *options)
-    data = run_json(tmp_path / "out")
-    assert [f["index"] for f in data["frames"]] == [1, 3, 5]
-    assert data["input"]["frames"] == 3
-    times, poses = read_tum(tmp_path / "out/trajectory.txt")
-    np.testing.assert_allclose(times, [f["timestamp"] for f in data["frames"]], atol=1e-6)
-    np.testing.assert_array_equal(poses[0], np.eye(4))
-
-
-@pytest.mark.slow
-def test_multiple_inputs_are_concatenated(recording, tmp_path) -> None:
-    both = tmp_path / "both"
-    both.mkdir()
-    for name in ("b", "a"):
-        shutil.copytree(recording, both / name)
-    options = ["--every", 5, "--method", "thesis"]
-    run(both / "a", both / "b", "--out", tmp_path / "listed", *options)
-    run(both, "--out", tmp_path / "folder", *options)
-    assert same(tmp_path / "listed") == same(tmp_path / "folder")
-    data = run_json(tmp_path / "listed")
-    assert [f["index"] for f in data["frames"]] == [0, 5, 10, 15]
-    times = [f["timestamp"] for f in data["frames"]]
-    assert sorted(times) == times
-    assert data["input"]["path"] == f"{both / 'a'} {both / 'b'}"
-
-
-def test_camera_option_replaces_intrinsics(recording, tmp_path) -> None:
-    camera = json.loads((recording / "camera.json").read_text())
-    wide = tmp_path / "wide.json"
-    wide.write_text(json.dumps(camera | {"fx": camera["fx"] / 2, "fy": camera["fy"] / 2}))
-    options = ["--end", 1, "--method", "thesis"]
-    run(recording, "--out", tmp_path / "own", *options)
-    run(recording, "--out", tmp_path / "wide", *options, "--camera", wide)
-    own, other = (read_ply(tmp_path / n / "cloud.ply").points for n in ("own", "wide"))
-    assert np.ptp(other[:, 0]) > 1.5 * np.ptp(own[:, 0])
-
-
-@pytest.mark.slow
 def test_loops_are_read_from_file(room_recording, tmp_path) -> None:
     loops = tmp_path / "loops.txt"
     T = read_tum(room_recording / "groundtruth.txt")[1][6]
@@ -391,25 +236,8 @@ def test_loops_are_read_from_file(room_recording, tmp_path) -> None:
     run(room_recording, "--out", tmp_path / "out", "--loops", loops, "--method", "thesis")
     (loop,) = run_json(tmp_path / "out")["loops"]
     assert (loop["i"], loop["j"], loop["accepted"]) == (0, 6, True)
-    assert set(loop) == {
-        "i",
-        "j",
-        "accepted",
-        "reason",
-        "overlap",
-        "rms_m",
-        "free_space_violation",
-        "margin",
-    }
+    assert set(loop) == set(LOOP_KEYS.split())
     assert len(read_g2o(tmp_path / "out/pose_graph.g2o").edges) == 8
-
-
-@pytest.mark.slow
-def test_odometry_file_is_used_as_guess(recording, quick_run, tmp_path) -> None:
-    shutil.copy(recording / "groundtruth.txt", recording / "odometry.txt")
-    run(recording, "--out", tmp_path / "out", *QUICK, "--guess", "odometry")
-    assert run_json(tmp_path / "out")["config"]["odometry"]["guess"] == "odometry"
-    assert same(tmp_path / "out") != same(quick_run)
 
 
 @pytest.mark.slow
@@ -442,65 +270,6 @@ def test_log_output_is_concise_and_notes_appear_once(recording, tmp_path, capfd)
     # Each reason, and its remedy.
     assert len(done.out.splitlines()) <= 4 + 2 * len(run_json(tmp_path / "out")["reasons"])
     assert "\x1b" not in done.out
-
-
-def two_components(recording, config, **_options) -> Reconstruction:
-    """Reconstruct the two halves of a recording as unconnected components."""
-    n = len(recording)
-    main_part = reconstruct(recording.select(0, n // 2), config)
-    other = reconstruct(recording.select(n // 2), config)
-    indices = recording.indices.tolist()
-    components = (
-        Component(((indices[0], indices[n // 2 - 1]),), np.eye(4), None),
-        Component(((indices[n // 2], indices[-1]),), None, None, other),
-    )
-    d = main_part.diagnostics
-    reason = Reason("disconnected", components[1].frames, "The recording consists of 2 parts.")
-    frames = (
-        *(replace(f, component=0) for f in d.frames),
-        *(replace(f, component=1) for f in other.diagnostics.frames),
-    )
-    missing = np.full((n - n // 2, 4, 4), np.nan)
-    return replace(
-        main_part,
-        trajectory=np.concatenate([main_part.trajectory, missing]),
-        timestamps=recording.timestamps,
-        diagnostics=replace(
-            d,
-            frames=frames,
-            sequential=np.concatenate([d.sequential, missing]),
-            reasons=(*d.reasons, reason),
-            verdict="degraded",
-        ),
-        components=components,
-    )
-
-
-@pytest.mark.slow
-def test_unconnected_component_has_own_result(room_recording, tmp_path, monkeypatch, capfd) -> None:
-    monkeypatch.setattr(run_module, "reconstruct", two_components)
-    out = tmp_path / "out"
-    words = (room_recording, "--out", out, "--every", 2, "--method", "thesis")
-    run(*words, status=3, report=True)
-    output = capfd.readouterr().out.splitlines()
-    assert "  degraded: The recording consists of 2 parts." in output
-    at = output.index("  degraded: The recording consists of 2 parts.")
-    assert output[at + 1].strip() == ADVICE["disconnected"]
-    assert output[-1] == f"and {out / 'component-1/report.html'}, for frames 4-6"
-    assert {p.name for p in out.iterdir()} == FILES | {"component-1"}
-    assert {p.name for p in (out / "component-1").iterdir()} == FILES
-    for folder, frames in ((out, [0, 2]), (out / "component-1", [4, 6])):
-        posed, poses = main_poses(folder, run_json(folder))
-        assert list(posed) == frames
-        np.testing.assert_allclose(poses[0], np.eye(4), atol=1e-12)
-    assert [f["component"] for f in run_json(out)["frames"]] == [0] * 2 + [1] * 2
-    assert [f["index"] for f in run_json(out / "component-1")["frames"]] == [4, 6]
-    report = (out / "component-1/report.html").read_text()
-    assert ", component 1 –" in report
-    assert "component-1/report.html" in (out / "report.html").read_text()
-    run(room_recording, "--out", out, *QUICK, "--overwrite", "--json", status=3)
-    last = json.loads(capfd.readouterr().out.splitlines()[-1])
-    assert last["reasons"] == run_json(out)["reasons"]
 
 
 @pytest.mark.slow
@@ -646,15 +415,6 @@ def test_module_runs_as_script() -> None:
     assert done.stdout.startswith("usage: tofuse")
 
 
-def test_argument_defaults_follow_contract() -> None:
-    arguments = make_parser().parse_args(["demo"])
-    assert arguments.scene == "room"
-    assert set(DEMO_SCENES) == {"room", "empty-room", "rail", "torso", "box", "peaks"}
-    arguments = make_parser().parse_args(["run", "a", "b", "--out", "c"])
-    assert arguments.inputs == ["a", "b"]
-    assert (arguments.start, arguments.end, arguments.every) == (0, None, 1)
-
-
 @pytest.mark.slow
 def test_closed_output_pipe_is_silent(room_recording) -> None:
     words = [sys.executable, "-m", "tofuse", "inspect", str(room_recording)]
@@ -672,40 +432,6 @@ def test_simulated_recording_is_readable_by_run(tmp_path, capsys) -> None:
     assert "2 frames" in capsys.readouterr().out
     run(tmp_path / "rec", "--out", tmp_path / "out", "--object", "--max-depth", 1.2)
     assert len(run_json(tmp_path / "out")["frames"]) == 2
-
-
-def test_interrupted_simulation_leaves_nothing(tmp_path, monkeypatch) -> None:
-    def interrupt(_self, _record=None) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("tofuse.apps.cli.progress.QuietProgress.advance", interrupt)
-    words = ["simulate", "box", "--out", str(tmp_path / "rec"), "--frames", "2"]
-    assert main([*words, "--without", "all"]) == 130
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_failure_demo_reports_degenerate_frames(tmp_path, capsys, monkeypatch) -> None:
-    out = tmp_path / "demo"
-    # A part of the corridor, without the effects that need many rays per pixel.
-    options = {"frames": 4, "without": ("wrap", "mixed_pixels", "multipath", "smear")}
-
-    def simulated(*words, **others):
-        assert others["without"] == ("wrap",)
-        return simulate_to(*words, **others | options)
-
-    simulate_to = demo_module.simulate_to
-    monkeypatch.setattr(demo_module, "simulate_to", simulated)
-    assert main(["demo", "--failure", "--out", str(out)]) == 0
-    assert "degraded" in capsys.readouterr().out
-    run = json.loads((out / "run.json").read_text())
-    reasons = {reason["code"]: reason for reason in run["reasons"]}
-    assert "unobserved_motion" in reasons
-    assert run["accuracy"]["position_m"] is None
-    assert reasons["unobserved_motion"]["ranges"] == [[1, 3]]
-    with pytest.raises(SystemExit) as stopped:
-        main(["demo", "--failure", "--scene", "torso", "--out", str(out)])
-    assert stopped.value.code == 2
 
 
 @pytest.mark.slow
@@ -741,8 +467,8 @@ def test_peaks_demo(tmp_path, capsys, monkeypatch) -> None:
     assert {p.name for p in out.iterdir()} == made
 
 
-def test_run_is_evaluated(plain_run, room_recording, capsys) -> None:
-    words = ["evaluate", str(plain_run), str(room_recording), "--recording", str(room_recording)]
+def test_run_is_evaluated(room_result, room_recording, capsys) -> None:
+    words = ["evaluate", str(room_result), str(room_recording), "--recording", str(room_recording)]
     assert main([*words, "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["ate_rms_m"] < 0.1
@@ -754,14 +480,14 @@ def test_run_is_evaluated(plain_run, room_recording, capsys) -> None:
         assert part in table
 
 
-def test_evaluate_uses_reference_of_recording(plain_run, room_recording, tmp_path, capsys):
+def test_evaluate_uses_reference_of_recording(room_result, room_recording, tmp_path, capsys):
     """In any format, not only the native one."""
     out = tmp_path / "tum"
     assert main(["convert", str(room_recording), "--out", str(out), "--to", "tum"]) == 0
-    words = ["evaluate", str(plain_run), "--json"]
-    assert main(["evaluate", str(plain_run), str(room_recording), "--json"]) == 0
+    words = ["evaluate", str(room_result), "--json"]
+    assert main(["evaluate", str(room_result), str(room_recording), "--json"]) == 0
     expected = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert main(["evaluate", str(plain_run), str(out), "--json"]) == 0
+    assert main(["evaluate", str(room_result), str(out), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["ate_rms_m"] == pytest.approx(expected["ate_rms_m"], abs=1e-5)
     bare = tmp_path / "bare"
@@ -773,13 +499,13 @@ def test_evaluate_uses_reference_of_recording(plain_run, room_recording, tmp_pat
     assert "none.txt: doesn't exist" in capsys.readouterr().err
 
 
-def test_optimize_command_keeps_refined_poses(plain_run, tmp_path, capsys) -> None:
+def test_optimize_command_keeps_refined_poses(room_result, tmp_path, capsys) -> None:
     out = tmp_path / "out.g2o"
-    assert main(["optimize", str(plain_run / "pose_graph.g2o"), "--out", str(out)]) == 0
+    assert main(["optimize", str(room_result / "pose_graph.g2o"), "--out", str(out)]) == 0
     output = capsys.readouterr().out
     assert re.match(r"8 poses, \d+ edges: squared error", output)
     # The edges are those of the refinement, so there is nothing to improve.
-    before, after = read_g2o(plain_run / "pose_graph.g2o"), read_g2o(out)
+    before, after = read_g2o(room_result / "pose_graph.g2o"), read_g2o(out)
     assert after.ids.tolist() == list(range(8))
     assert np.abs(after.poses - before.poses).max() < 2e-3
     assert main(["optimize", str(out), "--out", str(out)]) == 2
@@ -804,29 +530,3 @@ def test_optimize_reports_false_loops_and_components(tmp_path, capsys) -> None:
     assert re.search(r"part from vertex 0: 5 poses, 8 edges", output)
     assert re.search(r"part from vertex 9: 1 poses, 0 edges", output)
     assert read_g2o(tmp_path / "out.g2o").poses[4, 0, 3] == pytest.approx(4.0, abs=0.02)
-
-
-@pytest.mark.slow
-def test_faces_and_voxel_options_set_model_resolution(quick_run, room_recording, tmp_path) -> None:
-    whole = read_ply(quick_run / "mesh.ply")
-    assert len(whole.faces) > 2000
-    sizes = {}
-    for name, options in (("faces", ["--faces", "500"]), ("voxel", ["--voxel", "6cm"])):
-        out = tmp_path / name
-        run(room_recording, "--out", out, *QUICK, *options)
-        sizes[name] = len(read_ply(out / "mesh.ply").faces), len(read_ply(out / "cloud.ply"))
-    assert sizes["faces"][0] <= 500
-    assert sizes["faces"][1] == len(read_ply(quick_run / "cloud.ply"))
-    assert 0 < sizes["voxel"][0] < 0.5 * len(whole.faces)
-    fusion = run_json(tmp_path / "voxel")["config"]["fusion"]
-    assert fusion["voxel_m"] == 0.06
-
-
-@pytest.mark.parametrize(
-    "options", [["--faces", "0"], ["--faces", "x"], ["--voxel", "0"], ["--voxel", "-1mm"]]
-)
-def test_invalid_model_resolution_is_rejected(options, room_recording, tmp_path, capsys) -> None:
-    with pytest.raises(SystemExit) as stopped:
-        main(["run", str(room_recording), "--out", str(tmp_path / "out"), *options])
-    assert stopped.value.code == 2
-    assert options[0] in capsys.readouterr().err

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,9 @@ import pytest
 import made_arrays
 from camera_files import MAKERS
 from damaged_files import make_native, make_ply
-from made_recordings import CAMERA, make_7scenes, make_sr4000
+from made_recordings import make_sr4000
 from tofuse.apps.cli.program import main
-from tofuse.engine.cameras.cameras import Pinhole, RayTable
+from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import Recording
@@ -75,15 +74,6 @@ def test_every_camera(tmp_path: Path, name: str) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "scan"]
 
 
-def test_lens_of_each_frame_is_kept(tmp_path: Path) -> None:
-    MAKERS["3dscannerapp"][0](tmp_path / "scan")
-    before = open_recording(tmp_path / "scan")
-    convert(before, tmp_path / "out")
-    for a, b in zip(before, open_recording(tmp_path / "out"), strict=True):
-        assert isinstance(b.camera, Pinhole)
-        assert a.camera == b.camera
-
-
 def test_rays_of_each_frame(tmp_path: Path) -> None:
     make_sr4000(tmp_path / "scan")
     before = open_recording(tmp_path / "scan")
@@ -119,18 +109,6 @@ def test_correction_is_kept_with_raw_measurements(tmp_path: Path) -> None:
     assert before.source.correction is not None
 
 
-def test_unregistered_colour_stays_unregistered(tmp_path: Path) -> None:
-    make_7scenes(tmp_path / "scan")
-    convert(open_recording(tmp_path / "scan"), tmp_path / "out")
-    frame = open_recording(tmp_path / "out")[0]
-    assert not frame.color_registered
-    about = json.loads((tmp_path / "out" / "camera.json").read_text())
-    about["color_registered"] = "no"
-    (tmp_path / "out" / "camera.json").write_text(json.dumps(about))
-    with pytest.raises(InputError, match=r"color_registered: is 'no'; write true or false"):
-        open_recording(tmp_path / "out")
-
-
 def test_clouds(tmp_path: Path) -> None:
     make_ply(tmp_path / "scan")
     before = open_recording(tmp_path / "scan").select(end=1)
@@ -139,20 +117,6 @@ def test_clouds(tmp_path: Path) -> None:
     assert isinstance(b, CloudFrame)
     np.testing.assert_array_equal(a.points, b.points)
     np.testing.assert_allclose(a.normals, b.normals)
-
-
-def test_change_of_camera_between_sampled_frames_is_refused(tmp_path: Path) -> None:
-    from dataclasses import replace
-
-    from tofuse.engine.frames.recording import ArraySource
-
-    depth = np.ones((30, 40), np.float32)
-    frames = [RangeFrame(k, k / 10, CAMERA, depth) for k in range(100)]
-    frames[50] = replace(frames[50], camera=Pinhole(40, 30, 36.0, 36.0, 19.5, 14.5))
-    recording = Recording.of(ArraySource(frames), "mine", "mine")
-    with pytest.raises(InputError, match="mine: frame 50: has another camera"):
-        convert(recording, tmp_path / "out")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_convert_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,19 +15,14 @@ import cv2
 import numpy as np
 import pytest
 
-import made_dumps
-import made_phones
 from posed_results import BROWN, DISTANCE, NORMAL, POSED, POSES, SIZE, made_result, plane
 from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import export
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
-from tofuse.engine.errors import InputError, OutputError
-from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.errors import OutputError
 from tofuse.engine.geometry import se3
-from tofuse.formats.geometry.ply import read_ply, write_ply
-from tofuse.formats.poses.trajectory import write_tum
+from tofuse.formats.geometry.ply import read_ply
 from tofuse.formats.poses.trajectory_formats import read_poses
-from tofuse.formats.recordings.open import Opening
 
 PLAIN = Pinhole(*SIZE, 40.0, 41.0, 23.0, 18.0)
 BENT = BrownConrady(*SIZE, 40.0, 41.0, 23.0, 18.0, k1=-0.1, k2=0.02, k3=0.01)
@@ -143,27 +138,6 @@ def test_colmap_text_files(tmp_path: Path) -> None:
     ]
 
 
-def test_images_are_rectified_on_request(tmp_path: Path) -> None:
-    (folder,) = export(made_result(tmp_path, BROWN), ["colmap"], pinhole=True)
-    text = (folder / "sparse" / "0" / "cameras.txt").read_text()
-    assert " PINHOLE " in text
-    assert "OPENCV" not in text
-
-
-def test_amplitude_replaces_missing_colour(tmp_path: Path) -> None:
-    """The image is the albedo: equal at all distances, and masked without a measurement."""
-    (folder,) = export(made_result(tmp_path, PLAIN, color="amplitude"), ["nerfstudio"])
-    data = json.loads((folder / "transforms.json").read_text())
-    for frame in data["frames"]:
-        image, mask = (
-            cv2.imread(str(folder / frame[f"{kind}_path"]), cv2.IMREAD_UNCHANGED)
-            for kind in ("file", "mask")
-        )
-        np.testing.assert_array_equal(mask == 255, image.any(-1))
-        assert not mask[:4, :4].any()
-        assert (mask[4:] == 255).all()
-
-
 def test_corrected_camera_is_written(tmp_path: Path) -> None:
     config = {"corrections": [{"part": "camera-errors", "focal": 0.05, "offset_m": 0.1}]}
     (folder,) = export(made_result(tmp_path, PLAIN, config=config), ["nerfstudio"])
@@ -171,43 +145,6 @@ def test_corrected_camera_is_written(tmp_path: Path) -> None:
     assert data["fl_x"] == pytest.approx(40.0 / 1.05)
     z = cv2.imread(str(folder / data["frames"][0]["depth_file_path"]), cv2.IMREAD_UNCHANGED)
     assert z[18, 23] == pytest.approx(1000 * plane(PLAIN, 0)[18, 23] + 100, abs=1)
-
-
-def test_colour_of_phones_keeps_recorded_size(tmp_path: Path) -> None:
-    """Depth is unchanged; the lens is that of the image. A frame without colour has no image."""
-    recording = tmp_path / "scan"
-    made_dumps.make_polycam(recording)
-    (recording / "keyframes" / "images" / "5250000.jpg").unlink()
-    result = tmp_path / "result"
-    result.mkdir()
-    frames = [
-        {
-            "index": k,
-            "timestamp": 5 + 0.25 * k,
-            "status": "tracked",
-            "component": None,
-            "covariance": None,
-        }
-        for k in range(3)
-    ]
-    about = {"path": str(recording), "opening": Opening((recording,)).to_dict()}
-    run = {"schema": 1, "version": "0", "verdict": "good", "frames": frames, "input": about}
-    (result / "run.json").write_text(json.dumps(run | {"components": [], "config": {}}))
-    write_tum(result / "trajectory.txt", 5 + 0.25 * np.arange(3), POSES[:3])
-    write_ply(result / "cloud.ply", GeometryRecord(np.zeros((1, 3), np.float32)))
-    (folder,) = export(result, ["nerfstudio"])
-    data = json.loads((folder / "transforms.json").read_text())
-    names = [Path(frame["file_path"]).name for frame in data["frames"]]
-    assert names == ["frame_000000.png", "frame_000002.png"]
-    for k, frame in zip((0, 2), data["frames"], strict=True):
-        image = cv2.imread(str(folder / frame["file_path"]))
-        depth = cv2.imread(str(folder / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
-        assert image.shape[:2] == (frame["h"], frame["w"]) == (192, 256)
-        assert depth.shape == (24, 32)
-        # The lens is given for 1920 x 1440 pixels, from the centre of the first.
-        assert frame["fl_x"] == pytest.approx((made_phones.FX + k) * 256 / 1920)
-        assert frame["cx"] == pytest.approx((made_phones.CX + 0.5) * 256 / 1920)
-    assert read_ply(folder / "points.ply").color.tolist() == [[128, 128, 128]]
 
 
 def _gone(result: Path) -> None:
@@ -256,13 +193,6 @@ def test_impossible_exports_are_refused(
         assert len(error.strip().splitlines()) == 1
         assert not (result / name).exists()
     assert sorted(p.name for p in result.iterdir()) == ["cloud.ply", "run.json", "trajectory.txt"]
-
-
-def test_recording_without_colour_or_amplitude_is_refused(tmp_path: Path) -> None:
-    result = made_result(tmp_path, PLAIN, color="none")
-    with pytest.raises(InputError, match="neither colour nor amplitude"):
-        export(result, ["kitti", "nerfstudio"])
-    assert not (result / "trajectory.kitti.txt").exists()
 
 
 def test_only_own_folders_are_replaced(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -227,38 +226,6 @@ def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) ->
     np.testing.assert_allclose(found, light, atol=1e-4)
 
 
-def test_simplified_surfaces_keep_colours(result: Path) -> None:
-    """A texture preserves the colours between the few remaining vertices."""
-    trimesh = pytest.importorskip("trimesh")
-    n = 120
-    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
-    points = np.stack([x, y, np.full_like(x, 2.0)], -1).reshape(-1, 3)
-    color = np.zeros((n * n, 3), np.uint8)
-    color[:, 0] = np.round(127 + 120 * np.sin(6 * points[:, 0]))
-    color[:, 1] = np.round(127 + 120 * np.cos(6 * points[:, 1]))
-    a = (np.arange(n - 1) + n * np.arange(n - 1)[:, None]).ravel()
-    faces = np.concatenate([np.stack([a, a + n, a + 1], 1), np.stack([a + 1, a + n, a + n + 1], 1)])
-    normals = np.tile(np.float32([0, 0, -1]), (n * n, 1))
-    write_ply(
-        result / "mesh.ply", GeometryRecord(points, faces=faces, normals=normals, color=color)
-    )
-    write_tum(result / "trajectory.txt", TIMES, np.tile(np.eye(4), (3, 1, 1)))
-    glb, stl = export(result, ["glb", "stl"], faces=200)
-    (mesh,) = trimesh.load_scene(glb, process=False).geometry.values()
-    assert 50 < len(mesh.faces) <= 200
-    assert len(trimesh.load(stl).faces) <= 200
-    image = np.array(mesh.visual.material.baseColorTexture.convert("RGB")).astype(int)
-    # Points within triangles, between vertices, have the colours of the full mesh.
-    weights = np.random.default_rng(3).dirichlet([1, 1, 1], (20, len(mesh.faces)))
-    uv = np.einsum("kfi,fic->kfc", weights, mesh.visual.uv[mesh.faces]).reshape(-1, 2)
-    p = np.einsum("kfi,fic->kfc", weights, mesh.vertices[mesh.faces]).reshape(-1, 3)
-    p = p @ T_UP_WORLD[:3, :3]
-    found = sampled(image, uv * [1, -1] + [0, 1])
-    np.testing.assert_allclose(p[:, 2], 2, atol=1e-5)
-    assert np.abs(found[:, 0] - (127 + 120 * np.sin(6 * p[:, 0]))).max() < 20
-    assert np.abs(found[:, 1] - (127 + 120 * np.cos(6 * p[:, 1]))).max() < 20
-
-
 def test_laz_is_reproducible_and_written_in_blocks(result: Path, monkeypatch) -> None:
     laspy = pytest.importorskip("laspy")
     (path,) = export(result, ["laz"])
@@ -287,14 +254,6 @@ def test_log_tum_and_kitti_by_open3d(result: Path) -> None:
         np.testing.assert_allclose(found, POSES, atol=1e-9)
 
 
-def test_log_contains_frame_indices(result: Path) -> None:
-    (path,) = export(result, ["log"])
-    lines = path.read_text().splitlines()
-    assert [lines[k] for k in (0, 5, 10)] == ["1 1 2", "2 2 3", "5 5 6"]
-    block = np.array([line.split() for line in lines[6:10]], float)
-    np.testing.assert_allclose(block, POSES[1], atol=1e-15)
-
-
 def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
     assert ", ".join(FORMATS) in (Export.__doc__ or "")
     out = tmp_path / "new" / "files"
@@ -315,27 +274,6 @@ def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
     assert "use one of" in capsys.readouterr().err
 
 
-def test_missing_surface_and_package_are_reported(result: Path, monkeypatch) -> None:
-    (result / "mesh.ply").unlink()
-    with pytest.raises(InputError, match="clouds without a camera model have no surface"):
-        export(result, ["obj"])
-    monkeypatch.setitem(__import__("sys").modules, "pye57", None)
-    with pytest.raises(InputError, match=r"needs the package pye57; pip install 'tofuse\[scan\]'"):
-        export(result, ["e57"])
-    assert not (result / "cloud.e57").exists()
-
-
-def test_empty_cloud(result: Path) -> None:
-    write_ply(result / "cloud.ply", GeometryRecord(np.zeros((0, 3))))
-    laspy = pytest.importorskip("laspy")
-    pypcd4 = pytest.importorskip("pypcd4")
-    las, pcd = export(result, ["las", "pcd"])
-    assert len(laspy.read(las).points) == 0
-    assert pypcd4.PointCloud.from_path(pcd).points == 0
-    with pytest.raises(InputError, match="there are no points"):
-        export(result, ["e57"])
-
-
 def test_only_one_process_writes_to_a_result(result: Path, tmp_path: Path) -> None:
     with OutputFolder(result, overwrite=True):
         with pytest.raises(OutputError, match="is being written by another process"):
@@ -353,19 +291,6 @@ def test_only_one_process_writes_to_a_result(result: Path, tmp_path: Path) -> No
         export(result, ["log"])
     assert len(seen) == 1
     assert not list(result.parent.glob(".tofuse-*"))
-
-
-def test_component_uses_lock_of_its_result(result: Path) -> None:
-    """A run replaces its component folders as a whole, so they must contain no lock files."""
-    part = result / "component-1"
-    shutil.copytree(result, result.parent / "copy")
-    shutil.move(result.parent / "copy", part)
-    with OutputFolder(result, overwrite=True):
-        with pytest.raises(OutputError, match="is being written") as caught:
-            export(part, ["kitti"])
-        assert caught.value.where == str(result)
-    assert export(part, ["kitti"])[0].exists()
-    assert not list(part.glob(".tofuse-*"))
 
 
 def test_result_replaced_during_export_is_refused(result: Path, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tofuse.engine.errors import OutputError
-from tofuse.formats.files.atomic import make_folder, replacing, write_text
+from tofuse.formats.files.atomic import replacing, write_text
 
 
 def test_file_is_replaced_atomically(tmp_path: Path) -> None:
@@ -49,16 +49,3 @@ def test_write_errors_state_remedy(
         write_text(tmp_path / "a.txt", "x")
     assert str(tmp_path / "a.txt") in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_uncreatable_folder_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="file"):
-        make_folder(tmp_path / "file" / "inside")
-    with pytest.raises(OutputError, match="create its folder first"):
-        write_text(tmp_path / "missing" / "a.txt", "x")
-
-
-def test_line_endings_are_line_feeds(tmp_path: Path) -> None:
-    write_text(tmp_path / "a.txt", "a\nb\n")
-    assert (tmp_path / "a.txt").read_bytes() == b"a\nb\n"

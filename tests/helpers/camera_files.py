@@ -119,3 +119,15 @@ def read_through(
     """Read every frame; return the numbers of readable and unreadable ones, and of rejections."""
     read = read_frames(path, format_, camera)
     return len(read.frames), read.unread, int(read.refused)
+
+
+EVERY = MAKERS | OTHERS
+
+
+def made(name: str, folder: Path) -> tuple[Path, str]:
+    """Write the recording of a maker into `folder`; return its path there, and its format."""
+    make, file, format_ = EVERY[name]
+    path = folder / "freiburg1" / (file or ".")
+    (folder if file is None else path.parent).mkdir(parents=True, exist_ok=True)
+    make(path)
+    return path.relative_to(folder), format_

@@ -5,5 +5,4 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 BENCHMARKS = ROOT / "benchmarks"
 DOCS = ROOT / "docs"
-HELPERS = ROOT / "tests" / "helpers"
 SOURCE = ROOT / "src" / "tofuse"

@@ -11,24 +11,18 @@ import cv2
 import numpy as np
 import pytest
 
-import made_rooms
 import tofuse
-from coarse_steps import without_multipath
 from tofuse.apps.cli.program import main
-from tofuse.apps.inspection import channels
 from tofuse.apps.inspection.finding import CODES, Finding
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.apps.inspection.planar import Distortion
-from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.jobs.running import with_findings
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
-from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.errors import OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.results.types import SelfCalibration
-from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.native import RecordingWriter
 from wrapped_depth import wrapping
@@ -101,28 +95,6 @@ def test_facts_of_synthetic_frames() -> None:
     assert inspect_recording(of(numbered)).facts["duration"].startswith("unknown")
 
 
-def test_known_poses_are_counted() -> None:
-    poses = np.stack([np.eye(4)] * 3)
-    poses[1] = np.nan
-    facts = inspect_recording(
-        of([image(2.0, k) for k in range(3)], odometry=poses, reference=poses[:, :, :] + 0)
-    ).facts
-    assert facts["odometry"] == facts["reference poses"] == "for 2 frames"
-
-
-def test_facts_of_clouds(tmp_path) -> None:
-    rng = np.random.default_rng(0)
-    for k in range(3):
-        write_ply(
-            tmp_path / f"{k}.ply", GeometryRecord(rng.uniform(1, 2, (500, 3)).astype(np.float32))
-        )
-    facts = inspect_recording(tofuse.open(tmp_path)).facts
-    assert facts["views"] == "clouds of about 500 points"
-    assert facts["format"] == "ply"
-    assert facts["valid points"] == "100%"
-    assert "images" not in facts
-
-
 @pytest.mark.parametrize("z", [2000.0, 0.002])
 def test_wrong_unit_is_detected(z) -> None:
     for frame in (image(z), CloudFrame.of(image(z).points)):
@@ -131,14 +103,6 @@ def test_wrong_unit_is_detected(z) -> None:
         )
         assert "depth_unit_m" in warning
         assert f"{z:.2g}"[:1] in warning
-
-
-def test_millimetres_read_as_metres_are_reported(tmp_path, capsys) -> None:
-    folder = written(tmp_path / "rec", [image(2.0), image(2.0, 1)], depth_unit_m=1.0)
-    assert main(["inspect", str(folder)]) == 0
-    reported = capsys.readouterr().out
-    assert "severe: depth_unit: The median depth is" in reported
-    assert "Check depth_unit_m: it may be wrong by a factor of" in reported
 
 
 def test_few_and_no_valid_points_are_detected() -> None:
@@ -170,35 +134,6 @@ def test_warnings_of_the_reader_are_reported(tmp_path, capsys) -> None:
     reported = capsys.readouterr().out
     assert "colour[x]" in reported  # brackets are not interpreted as markup
     assert "\\" not in reported
-
-
-def test_long_recording_is_sampled() -> None:
-    class Counting(ArraySource):
-        def read(self, index):
-            requested.append(index)
-            return super().read(index)
-
-    requested: list[int] = []
-    frames = [image(2.0, k) for k in range(1000)]
-    inspect_recording(Recording.of(Counting(frames), "x", "frames"))
-    assert len(requested) <= 16
-    assert (requested[0], requested[-1]) == (0, 999)
-
-
-def test_recording_without_readable_frames_is_rejected() -> None:
-    class Broken(ArraySource):
-        def read(self, index):
-            raise tofuse.engine.errors.UnreadableFrameError("is broken", where=f"file {index}")
-
-    recording = Recording.of(Broken([image(2.0)]), "somewhere", "frames")
-    with pytest.raises(InputError, match="somewhere: no frame can be read; file 0: is broken"):
-        inspect_recording(recording)
-
-
-def test_channels_are_listed() -> None:
-    colour = np.zeros((30, 40, 3), np.uint8)
-    frame = replace(image(2.0), color_image=colour, amplitude_image=np.ones((30, 40), np.float32))
-    assert inspect_recording(of([frame])).facts["other images"] == "amplitude, colour"
 
 
 # What follows: each check has a recording that triggers it, and one that must not.
@@ -340,33 +275,6 @@ def test_faults_are_detected(code, few, turn) -> None:
     assert str(named) in found.warnings
 
 
-def test_unrelated_edges_are_not_reported_as_mirrored() -> None:
-    """Many depth edges on the left and colour edges on the right correlate when mirrored."""
-    camera = Pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
-    rng = np.random.default_rng(5)
-
-    def boxes(image, columns, value) -> None:
-        for _ in range(12):
-            x, y = rng.integers(*columns), rng.integers(0, 105)
-            image[y : y + rng.integers(6, 15), x : x + rng.integers(6, 15)] = value()
-
-    frames = []
-    for k in range(6):
-        depth = np.full((120, 160), 2.0, np.float32)
-        grey = np.full((120, 160), 60, np.uint8)
-        boxes(depth, (0, 45), lambda: rng.uniform(1.0, 1.8))
-        boxes(grey, (100, 145), lambda: rng.integers(90, 250))
-        frames.append(RangeFrame(k, k / 10, camera, depth, color_image=np.dstack([grey] * 3)))
-    assert "mirrored" not in codes(frames)
-    turned = [replace(f, depth=np.ascontiguousarray(f.depth[:, ::-1])) for f in frames]
-    same = [replace(f, color_image=_shades(f.depth)[:, ::-1]) for f in turned]
-    assert "mirrored" in codes(same)
-
-
-def _shades(depth):
-    return np.dstack([(depth * 100).astype(np.uint8)] * 3)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "factor"), [("range", 0.8), ("range", 1.25), ("z", 1.25)])
 def test_wrong_focal_length_is_estimated(kind, factor) -> None:
@@ -378,29 +286,6 @@ def test_wrong_focal_length_is_estimated(kind, factor) -> None:
     reported = tofuse.inspect(of(seen_by(frames, wrong)), quick=kind == "range").findings
     (found,) = [f for f in reported if f.code == "focal_length"]
     assert found.evidence["factor"] == pytest.approx(1 / factor, abs=0.09)
-
-
-@pytest.mark.parametrize("boxes", [False, True])
-def test_colour_shift_is_reported_only_if_unambiguous(boxes: bool) -> None:
-    """Parallel edges do not constrain a shift along themselves (aperture problem)."""
-    camera = Pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
-    rng = np.random.default_rng(61)
-    frames = []
-    for k in range(4):
-        depth = np.full((120, 160), 2.0, np.float32)
-        grey = np.full((120, 160), 60, np.uint8)
-        for at in rng.integers(15, 120, 4):
-            top, bottom = int(rng.integers(10, 60)), int(rng.integers(70, 110))
-            rows = slice(top, bottom) if boxes else slice(None)
-            depth[rows, at : at + 18] -= 0.3
-            grey[rows, at + 10 : at + 28] += 45  # shifted by 10 pixels
-        depth += rng.normal(0, 0.002, depth.shape).astype(np.float32)
-        color = np.repeat(grey[..., None], 3, -1)
-        frames.append(RangeFrame(k, k / 10, camera, depth, color_image=color))
-    found = list(channels.check_color(Sample.of(of(frames), 8)))
-    assert [f.code for f in found] == ["color_unregistered"] * boxes
-    if found:
-        assert found[0].evidence["shift_px"] == pytest.approx(10, abs=1.5)
 
 
 def test_folding_distortion_is_rejected() -> None:
@@ -441,14 +326,6 @@ def test_bare_wall_is_detected_and_curved_scene_gives_no_lens_findings() -> None
 
 
 @pytest.mark.slow
-def test_joined_recordings_are_not_unsorted(turn) -> None:
-    twice = stamped([*turn[:5], *turn[:5]], np.tile(TIMES[:5], 2))
-    parts = {"parts": [{"frames": 5}, {"frames": 5}]}
-    assert "time_unsorted" not in codes(twice, metadata=parts)
-    assert "time_unsorted" in codes(twice)
-
-
-@pytest.mark.slow
 def test_contact_sheet_is_saved(few, tmp_path, capsys) -> None:
     wrong = of(FAULTS["range_taken_for_z"](few))
     path = tofuse.inspect(wrong, quick=True).save_sheet(tmp_path / "a/sheet.png")
@@ -457,19 +334,6 @@ def test_contact_sheet_is_saved(few, tmp_path, capsys) -> None:
     assert picture[..., :3].std() > 20
     with pytest.raises(OutputError, match="can't be written"):
         tofuse.inspect(of(few[:2]), quick=True).save_sheet(path / "below.png")
-
-
-@pytest.mark.slow
-def test_run_reports_findings(turn, tmp_path, capfd) -> None:
-    folder = written(tmp_path / "rec", turn[:3], depth_unit_m=0.01)
-    main(["run", str(folder), "--out", str(tmp_path / "out")])
-    assert "note: The median depth is" in capfd.readouterr().err
-    data = json.loads((tmp_path / "out/run.json").read_text())
-    assert "depth_unit" in [f["code"] for f in data["findings"]]
-    assert data["verdict"] != "good"
-    assert "faulty_recording" in [r["code"] for r in data["reasons"]]
-    assert any("median depth" in w for w in data["warnings"])
-    assert "The median depth is" in (tmp_path / "out/report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -526,29 +390,6 @@ def test_corrected_intrinsics_do_not_affect_verdict(
     assert faults(severe)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("degrees", [6.0, 15.0])
-def test_rotating_object_is_distinguished_from_moving_camera(degrees) -> None:
-    """Its background is static, so a run without --object would estimate no motion."""
-    frames = []
-    for k in range(8):
-        thing = ((0.0, 0.3, 0.4), (0.5, 0.6, 0.15), np.radians(degrees) * k)
-        frames.append(made_rooms.seen(made_rooms.at(0, -1.2, 0), k, boxes=[thing]))
-    findings = inspect_recording(of(frames), quick=True).findings
-    hints = [str(f) for f in findings if "--object" in str(f)]
-    assert hints, [str(f) for f in findings]
-    remaining = inspect_recording(of(frames), turning=True, quick=True).findings
-    assert not any("--object" in str(f) for f in remaining)
-
-
-@pytest.mark.slow
-def test_depth_errors_are_not_attributed_to_lens(tmp_path) -> None:
-    """In a corridor few surfaces are visible, and depth errors bend them."""
-    recording = without_multipath(tmp_path, "corridor", "ifm-o3r", every=12)
-    found = tofuse.inspect(recording).findings
-    assert not {f.code for f in found if f.severity == "severe"}
-
-
 @pytest.mark.parametrize(
     ("unit", "found"),
     [(1.0, []), (30.0, []), (1e3, [1e3]), (1e6, [1e6]), (1e9, [1e9]), (1e-9, [1.0])],
@@ -558,12 +399,3 @@ def test_timestamps_in_another_unit_are_reported(unit, found) -> None:
     frames = [replace(image(1.0, k), timestamp=unit * k / 30) for k in range(8)]
     reported = tofuse.inspect(of(frames), quick=True).findings
     assert [f.evidence["factor"] for f in reported if f.code == "time_unit"] == found
-
-
-@pytest.mark.slow
-def test_focal_length_of_larger_images_is_estimated(turn) -> None:
-    factor, camera = 3.0, turn[0].camera
-    wrong = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
-    reported = tofuse.inspect(of(seen_by(turn, wrong))).findings
-    (found,) = [f for f in reported if f.code == "focal_length"]
-    assert found.evidence["factor"] * factor == pytest.approx(1, abs=0.1)

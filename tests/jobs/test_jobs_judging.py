@@ -11,20 +11,15 @@ import numpy as np
 import pytest
 
 import tofuse
-from made_phones import make_stray
 from tofuse.apps.cli.program import main
-from tofuse.apps.jobs.judging import device_sentence, poses_for, sentence, with_odometry
+from tofuse.apps.jobs.judging import device_sentence, poses_for
 from tofuse.apps.results.folders import FILES
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.quality.pose_accuracy import Accuracy
-from tofuse.engine.quality.pose_deviation import deviation
-from tofuse.engine.quality.trajectory_errors import align, displacement
-from tofuse.engine.refinement.refinement import NoRefinement
-from tofuse.engine.tracking.given import GivenPoses
+from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.formats.poses.trajectory import write_tum
 
 
@@ -84,20 +79,6 @@ def test_stated_error_of_wrong_poses_is_correct(of_bent, truth) -> None:
     assert of_bent.refined_consistency.rms_m < of_bent.consistency.rms_m
 
 
-def test_wrong_poses_deviate_more_from_measurements(recording, truth, of_truth, of_bent) -> None:
-    wrong, right = of_bent.deviation, of_truth.deviation
-    depth_m = wrong.fit.depth_m
-    aligned = align(bent(truth), truth, arm_m=depth_m) @ bent(truth)
-    x = se3.log(se3.inverse(truth) @ aligned) * [1, 1, 1, depth_m, depth_m, depth_m]
-    true = float(np.sqrt((x**2).sum(1).mean()))
-    assert right.estimate_m < 0.005 < wrong.at_least_m <= true < wrong.at_most_m
-    assert wrong.estimate_m == pytest.approx(true, rel=0.3)
-    assert wrong.ids[wrong.steps].tolist() == [[3, 4]]
-    # Other poses of the recording are compared without repeating registrations.
-    again = deviation(right.fit, bent(truth)[right.ids])
-    assert again.estimate_m == pytest.approx(wrong.estimate_m, rel=0.1)
-
-
 @pytest.mark.slow
 def test_tolerance_decides_verdict(recording, truth) -> None:
     recording, near = recording.select(every=2), truth[::2].copy()
@@ -122,27 +103,6 @@ def test_poses_of_another_place_are_contradicted_and_replaced(recording, truth) 
     assert "images_disagree" in [r.code for r in found.reasons]
 
 
-@pytest.mark.slow
-def test_frames_without_pose_stay_without(recording, truth) -> None:
-    some = truth.copy()
-    some[[2, 5]] = np.nan
-    found = tofuse.judge(recording, some)
-    assert found.verdict == "good"
-    assert ", poses of 6 of 8 frames; refined: " in sentence(found, "poses.txt")
-    assert np.flatnonzero(np.isnan(found.displacement_m)).tolist() == [2, 5]
-    assert found.to_dict()["frames"] == 6
-
-
-@pytest.mark.slow
-def test_given_poses_are_kept_without_refinement(recording, truth) -> None:
-    moved = bent(truth)
-    config = replace(from_method("default"), odometry=GivenPoses(), refinement=NoRefinement())
-    result = tofuse.reconstruct(with_odometry(recording, moved), config)
-    expected = se3.inverse(moved[0]) @ moved
-    np.testing.assert_allclose(result.diagnostics.sequential, expected, atol=1e-9)
-    assert [f.status for f in result.diagnostics.frames] == ["tracked"] * 8
-
-
 def test_unusable_poses_are_refused(recording, truth, tmp_path) -> None:
     with pytest.raises(InputError, match=r"pass \(8, 4, 4\)"):
         tofuse.judge(recording, truth[:5])
@@ -160,12 +120,6 @@ def test_unusable_poses_are_refused(recording, truth, tmp_path) -> None:
         tofuse_ply(tmp_path / f"scans/{k}.ply", points)
     with pytest.raises(InputError, match=r"takes .*range"):
         tofuse.judge(tofuse.open(tmp_path / "scans"), np.tile(np.eye(4), (3, 1, 1)))
-
-
-def test_poses_in_recording_of_phone_are_read(tmp_path) -> None:
-    make_stray(tmp_path)
-    phone = tofuse.open(tmp_path)
-    np.testing.assert_allclose(poses_for(phone, tmp_path), phone.reference)
 
 
 def tofuse_ply(path, points) -> None:

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import made_sessions
-from made_rooms import OTHER, seen
-from made_sessions import made_result, made_result_of, quick
+from made_sessions import quick
 from tofuse.apps.cli.program import main
 from tofuse.apps.jobs import merging
 from tofuse.apps.jobs import running as run_module
@@ -22,7 +21,6 @@ from tofuse.apps.jobs.sessions import read_sessions
 from tofuse.apps.report.session_words import session_sentences
 from tofuse.apps.results.folders import OutputFolder
 from tofuse.apps.results.output import write_result
-from tofuse.apps.results.run_json import read_run_json
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
@@ -33,23 +31,11 @@ from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.progress import Silent
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.formats.recordings.open import Opening
 from written_run_json import run_json
 
 HERE, THERE = made_sessions.HERE[::2], made_sessions.THERE[::2]
 N = len(HERE)
 TRUE = np.array([*HERE, *THERE])
-
-
-@pytest.fixture(scope="module")
-def results(tmp_path_factory) -> dict[str, Path]:
-    """Two sessions in a room, and one in a differently furnished flat of the same plan."""
-    base = tmp_path_factory.mktemp("sessions")
-    return {
-        "here": made_result(base / "here", HERE, 1),
-        "there": made_result(base / "there", THERE, 2),
-        "elsewhere": made_result(base / "elsewhere", THERE, 3, boxes=OTHER),
-    }
 
 
 def quick_merge(sessions, searches=6):
@@ -65,8 +51,8 @@ def merged(*folders, searches=6, **options):
 
 
 @pytest.fixture(scope="module")
-def both(results):
-    return merged(results["here"], results["there"])
+def both(session_results):
+    return merged(session_results["here"], session_results["there"])
 
 
 @pytest.fixture(scope="module")
@@ -97,14 +83,6 @@ def test_two_sessions_in_one_room_give_one_map(both) -> None:
     assert exit_status(both) == 0
 
 
-def test_first_session_defines_the_world(both) -> None:
-    np.testing.assert_array_equal(both.trajectory[0], np.eye(4))
-    first, second = both.sessions
-    np.testing.assert_array_equal(first.T_main_session, np.eye(4))
-    between = se3.inverse(TRUE[0]) @ THERE[0]
-    np.testing.assert_allclose(second.T_main_session, between, atol=0.005)
-
-
 def test_overlap_and_probability_are_reported(both) -> None:
     (pair,) = both.session_pairs
     assert (pair.a, pair.b, pair.joined, pair.before) == (0, 1, True, False)
@@ -117,18 +95,20 @@ def test_overlap_and_probability_are_reported(both) -> None:
     assert "probability" in text
 
 
-def test_run_json_states_session_of_each_frame(both, results) -> None:
+def test_run_json_states_session_of_each_frame(both, session_results) -> None:
     data = run_json(both)
     assert [frame["session"] for frame in data["frames"]] == [0] * N + [1] * N
     assert [s["name"] for s in data["sessions"]] == ["here", "there"]
-    assert [s["result"] for s in data["sessions"]] == [str(results[k]) for k in ("here", "there")]
+    assert [s["result"] for s in data["sessions"]] == [
+        str(session_results[k]) for k in ("here", "there")
+    ]
     assert [s["first"] for s in data["sessions"]] == [0, N]
     assert data["session_pairs"][0]["joined"]
 
 
 @pytest.mark.slow
-def test_flat_of_same_plan_is_not_joined(results) -> None:
-    found = merged(results["here"], results["elsewhere"], searches=4)
+def test_flat_of_same_plan_is_not_joined(session_results) -> None:
+    found = merged(session_results["here"], session_results["elsewhere"], searches=4)
     assert found.has_pose.tolist() == [True] * N + [False] * N
     (pair,) = found.session_pairs
     assert not pair.joined
@@ -144,27 +124,8 @@ def test_flat_of_same_plan_is_not_joined(results) -> None:
 
 
 @pytest.mark.slow
-def test_first_session_stays_main_if_others_are_larger(results, pair) -> None:
-    """And merged results can be merged again: joined sessions stay joined."""
-    found = merged(results["elsewhere"], pair, searches=3)
-    assert [s.name for s in found.sessions] == ["elsewhere", "here", "there"]
-    assert found.has_pose.tolist() == [True] * N + [False] * 2 * N
-    assert "few_poses" not in {reason.code for reason in found.diagnostics.reasons}
-    assert found.diagnostics.verdict == "degraded"
-    assert [s.T_main_session is None for s in found.sessions] == [False, True, True]
-    assert [(p.a, p.b, p.joined, p.before) for p in found.session_pairs] == [
-        (0, 1, False, False),
-        (0, 2, False, False),
-        (1, 2, True, True),
-    ]
-    (apart,) = [c.result for c in found.components if not c.connected]
-    off = se3.inverse(TRUE[0]) @ TRUE
-    assert np.linalg.norm(off[:, :3, 3] - apart.trajectory[:, :3, 3], axis=1).max() < 0.005
-
-
-@pytest.mark.slow
-def test_loops_of_earlier_merge_are_registered_again(both, results, pair) -> None:
-    sessions = read_sessions([results["elsewhere"], pair], 2, Silent())
+def test_loops_of_earlier_merge_are_registered_again(both, session_results, pair) -> None:
+    sessions = read_sessions([session_results["elsewhere"], pair], 2, Silent())
     across = [(p.i, p.j) for p in both.diagnostics.loops if p.accepted and p.i < N <= p.j]
     assert len(across) >= 2
     assert sessions[0].links == ()
@@ -181,8 +142,8 @@ def test_loops_of_earlier_merge_are_registered_again(both, results, pair) -> Non
 
 
 @pytest.mark.slow
-def test_result_is_independent_of_threads(both, results) -> None:
-    sessions = read_sessions([results["here"], results["there"]], 1, Silent())
+def test_result_is_independent_of_threads(both, session_results) -> None:
+    sessions = read_sessions([session_results["here"], session_results["there"]], 1, Silent())
     with threads(1):
         again = merge_sessions(sessions, quick_merge(sessions), threads=1)
     assert again.trajectory.tobytes() == both.trajectory.tobytes()
@@ -190,10 +151,16 @@ def test_result_is_independent_of_threads(both, results) -> None:
 
 
 @pytest.mark.slow
-def test_command_writes_result(results, tmp_path, monkeypatch, capsys) -> None:
+def test_command_writes_result(session_results, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(merging, "merged_config", quick_merge)
     out = tmp_path / "all"
-    words = ["merge", str(results["here"]), str(results["there"]), "--out", str(out)]
+    words = [
+        "merge",
+        str(session_results["here"]),
+        str(session_results["there"]),
+        "--out",
+        str(out),
+    ]
     painted = []
 
     def painting(mesh, views, poses, size):
@@ -225,8 +192,8 @@ def refused(folders, *parts) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_bad_input_is_refused_in_one_line(results, tmp_path) -> None:
-    here, there = results["here"], results["there"]
+def test_bad_input_is_refused_in_one_line(session_results, tmp_path) -> None:
+    here, there = session_results["here"], session_results["there"]
     refused([here], str(here), "single session")
     refused([], "single session")
     refused([here, there, there.parent / "there" / ".." / "here"], "given twice")
@@ -236,83 +203,60 @@ def test_bad_input_is_refused_in_one_line(results, tmp_path) -> None:
     refused([here, tmp_path / "out"], "same recording", f"{N} frames are in both")
 
 
-def test_missing_recording_is_named_with_remedy(results, tmp_path) -> None:
-    again = copied(results["there"], tmp_path)
+def test_missing_recording_is_named_with_remedy(session_results, tmp_path) -> None:
+    again = copied(session_results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
     run["input"]["opening"]["paths"] = [str(tmp_path / "was-here")]
     changed_run_json(again, input=run["input"])
-    refused([results["here"], again], str(tmp_path / "was-here"), "doesn't exist", "put it back")
+    refused(
+        [session_results["here"], again], str(tmp_path / "was-here"), "doesn't exist", "put it back"
+    )
 
 
-def test_changed_recording_is_refused(results, tmp_path) -> None:
-    again = copied(results["there"], tmp_path)
+def test_changed_recording_is_refused(session_results, tmp_path) -> None:
+    again = copied(session_results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
     frames = [{**f, "timestamp": f["timestamp"] + 1.0} for f in run["frames"]]
     changed_run_json(again, frames=frames)
     refused(
-        [results["here"], again],
+        [session_results["here"], again],
         "does not match the frames",
         "has changed",
         "run `tofuse run` again",
     )
 
 
-def test_results_of_clouds_are_refused(results, tmp_path) -> None:
+def test_results_of_clouds_are_refused(session_results, tmp_path) -> None:
     writer = RecordingWriter(tmp_path / "clouds", None, frame_rate_hz=10.0)
     points = np.random.default_rng(0).uniform(1, 2, (50, 3)).astype(np.float32)
     for k in range(N):
         writer.add(CloudFrame(k, k / 10, points))
     writer.finish()
-    again = copied(results["there"], tmp_path)
+    again = copied(session_results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
     run["input"]["opening"]["paths"] = [str(tmp_path / "clouds")]
     changed_run_json(again, input=run["input"])
-    refused([results["here"], again], "clouds", "pass their clouds together")
-
-
-def test_result_that_stores_only_the_path_of_its_recording(results, tmp_path) -> None:
-    """As results that are written from Python do."""
-    again = copied(results["there"], tmp_path)
-    run = json.loads((again / "run.json").read_text())
-    changed_run_json(again, input=run["input"] | {"opening": None})
-    _, session = read_sessions([results["here"], again], 1, Silent())
-    assert len(session.recording) == N
-    assert len(session.posed) == N
-
-
-@pytest.mark.slow
-def test_joined_and_selected_recordings_are_merged(results, tmp_path) -> None:
-    """The same frames are opened again: both recordings of a run, every other frame."""
-    paths = [Path(read_run_json(results[k] / "run.json")["input"]["path"]) for k in results][:2]
-    opening = Opening(tuple(paths), every=2, start=1)
-    recording = opening.open()
-    result = reconstruct(recording, quick(), threads=2)
-    of_both = {**result.recording, "opening": opening.to_dict()}
-    write_result(replace(result, recording=of_both), OutputFolder(tmp_path / "both"))
-    sessions = read_sessions([tmp_path / "both", results["elsewhere"]], 1, Silent())
-    assert sessions[0].recording.indices.tolist() == list(range(1, 2 * N, 2))
-    joined, firsts = merging.joined_recording(sessions)
-    assert firsts == [0, 2 * N]
-    assert [part["frames"] for part in joined.metadata["parts"]] == [N, N, N]
-    assert joined.indices.tolist() == [*range(1, 2 * N, 2), *range(2 * N, 3 * N)]
+    refused([session_results["here"], again], "clouds", "pass their clouds together")
 
 
 @pytest.mark.parametrize(
     "changes", [{"frames": [{}]}, {"frames": 3}, {"input": {}}, {"components": [1]}]
 )
-def test_damaged_result_is_refused(results, tmp_path, changes) -> None:
-    again = copied(results["there"], tmp_path)
+def test_damaged_result_is_refused(session_results, tmp_path, changes) -> None:
+    again = copied(session_results["there"], tmp_path)
     changed_run_json(again, **changes)
-    refused([results["here"], again], "damaged")
+    refused([session_results["here"], again], "damaged")
 
 
 @pytest.mark.slow
-def test_recording_is_added_to_map(results, tmp_path, monkeypatch, capsys) -> None:
+def test_recording_is_added_to_map(session_results, tmp_path, monkeypatch, capsys) -> None:
     """And one that cannot be located in the map leaves it unchanged."""
     monkeypatch.setattr(merging, "merged_config", quick_merge)
     monkeypatch.setattr(merging, "_report", lambda result, folder: None)
-    into = copied(results["here"], tmp_path)
-    (session, _) = read_sessions([results["there"], results["elsewhere"]], 1, Silent())
+    into = copied(session_results["here"], tmp_path)
+    (session, _) = read_sessions(
+        [session_results["there"], session_results["elsewhere"]], 1, Silent()
+    )
     shortened = reconstruct(session.recording.select(end=2), quick())
 
     def runs_to(folder: Path) -> None:
@@ -321,52 +265,16 @@ def test_recording_is_added_to_map(results, tmp_path, monkeypatch, capsys) -> No
         shutil.copytree(folder, tmp_path / "new")
         monkeypatch.setattr(run_module, "run", lambda *_: shortened)
 
-    runs_to(results["there"])
+    runs_to(session_results["there"])
     words = ["run", "recording", "--out", str(tmp_path / "new"), "--into", str(into)]
     assert main(words) == 0
     data = json.loads((into / "run.json").read_text())
     assert [s["name"] for s in data["sessions"]] == ["out", "new"]
     before = (into / "run.json").read_bytes()
-    runs_to(results["elsewhere"])
+    runs_to(session_results["elsewhere"])
     assert main(words) == 3
     assert (into / "run.json").read_bytes() == before
     assert "is not joined" in capsys.readouterr().out
     assert main([*words[:-1], str(tmp_path / "new")]) == 2
     assert "same folder as --out" in capsys.readouterr().err
     assert main([*words[:-1], str(tmp_path / "nothing")]) == 2
-
-
-@pytest.mark.slow
-def test_separate_parts_of_result_stay_separate_or_are_joined(results, tmp_path) -> None:
-    """A recording that continues elsewhere after a dark frame, and a session of that place."""
-    first, second = made_sessions.HERE[5:], made_sessions.THERE[5:]
-    frames = [
-        *(seen(T, 400 + k) for k, T in enumerate(first)),
-        *(seen(T, 420 + k, boxes=OTHER) for k, T in enumerate(second)),
-    ]
-    dark = replace(frames[0], depth=np.zeros_like(frames[0].depth))
-    mixed = made_result_of(tmp_path / "mixed", [*frames[:7], dark, *frames[7:]])
-    assert (mixed / "component-1").is_dir()
-    assert run_status(mixed) == ["tracked"] * 7 + ["lost"] + ["tracked"] * 7
-
-    found = merged(results["there"], mixed, searches=4)
-    assert found.has_pose.tolist() == [True] * (N + 7) + [False] * 8
-    lost = found.diagnostics.frames[N + 7]
-    assert lost.status == "lost"
-    assert "valid points" in lost.reason
-    off = se3.inverse(THERE[0]) @ np.array([*THERE, *first])
-    error = np.linalg.norm(off[:, :3, 3] - found.trajectory[: N + 7, :3, 3], axis=1)
-    assert error.max() < 0.005
-    assert found.sessions[1].T_main_session is not None
-    (apart,) = [c for c in found.components if not c.connected]
-    assert apart.frames == ((N + 8, N + 14),)
-
-    found = merged(results["elsewhere"], mixed, searches=4)
-    assert found.has_pose.tolist() == [True] * N + [False] * 8 + [True] * 7
-    off = se3.inverse(THERE[0]) @ np.array([*THERE, *second])
-    error = np.linalg.norm(off[:, :3, 3] - found.trajectory[found.has_pose, :3, 3], axis=1)
-    assert error.max() < 0.005
-
-
-def run_status(folder: Path) -> list[str]:
-    return [frame["status"] for frame in json.loads((folder / "run.json").read_text())["frames"]]

@@ -18,9 +18,8 @@ from tofuse.apps.jobs import running as run
 from tofuse.apps.jobs import tracked_file
 from tofuse.apps.jobs.tracked_file import LoggingTracker, ReplayingTracker, TrackedFile
 from tofuse.apps.results.folders import TRACKED
-from tofuse.engine.errors import Ended, InputError, OutputError
+from tofuse.engine.errors import Ended
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.fusion.cloud import as_cloud
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.loops.joining import Joining
 from tofuse.engine.mapping import reconstructing as reconstruct
@@ -62,11 +61,6 @@ def moving_scene() -> Recording:
         T = at(0.0, 0.02 * k - 0.6, 0.02 * k) if k < 9 else at(0.4, 0.3, 2.4 + 0.05 * k)
         frames.append(seen(T, k, boxes=(*BOXES, box)))
     frames[8] = replace(frames[8], depth=np.zeros_like(frames[8].depth))
-    return Recording.of(ArraySource(frames), "made", "test")
-
-
-def turning_clouds() -> Recording:
-    frames = [as_cloud(seen(at(0, 0, 0.1 * k), k), 2000) for k in range(4)]
     return Recording.of(ArraySource(frames), "made", "test")
 
 
@@ -124,19 +118,6 @@ def test_reconstruction_is_repeated_exactly(tmp_path: Path, monkeypatch) -> None
     assert any(e.moving_fraction > 0 for e in kept[0].entries)
     assert {step.status for step in first} >= {"tracked", "lost"}
     assert len({step.component for step in first}) > 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["default", "thesis"])
-def test_clouds_are_repeated_exactly(method: str, tmp_path: Path) -> None:
-    config = replace(from_method(method, "cloud"), filters=())
-    results = []
-    for _ in range(2):
-        file = TrackedFile(tmp_path / TRACKED, "key", lambda _text: None)
-        results.append(
-            comparable(reconstruct.reconstruct(turning_clouds(), config, tracked_file=file))
-        )
-    assert results[0] == results[1]
 
 
 def interrupted_at(stage: str, error: BaseException, words: Sequence[str]) -> int:
@@ -244,25 +225,6 @@ def test_invalid_file_is_never_fatal(data: bytes | str, tmp_path: Path) -> None:
     assert not path.exists()
 
 
-def test_other_readable_frames_are_refused(tmp_path: Path) -> None:
-    stored(tmp_path / TRACKED, [])
-    for count in (2, 4):
-        with pytest.raises(InputError, match="other frames can be read than before"):
-            stored(tmp_path / TRACKED, [], count)
-
-
-def test_file_is_kept_if_repeating_may_succeed(tmp_path: Path) -> None:
-    for error, stays in (
-        (OutputError("is full"), True),
-        (MemoryError(), True),
-        (KeyboardInterrupt(), True),
-        (InputError("is bad"), False),
-        (ZeroDivisionError(), False),
-    ):
-        stored(tmp_path / TRACKED, []).keep_after(error)
-        assert (tmp_path / TRACKED).exists() == stays
-
-
 def test_full_disk_does_not_stop_run(tmp_path: Path, monkeypatch) -> None:
     def full(*_args: object, **_options: object) -> None:
         raise OSError(28, "No space left on device")
@@ -271,10 +233,4 @@ def test_full_disk_does_not_stop_run(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(np, "savez", full)
     stored(tmp_path / TRACKED, notes)
     assert "no space left" in notes[0].lower()
-    assert os.listdir(tmp_path) == []
-
-
-def test_short_tracking_is_not_stored(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(tracked_file, "_MIN_TRACKING_S", 10.0)
-    stored(tmp_path / TRACKED, [])
     assert os.listdir(tmp_path) == []

@@ -12,7 +12,6 @@ import pytest
 
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters.base import apply_filters
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.lab.methods.filters_amplitude import Amplitude
 from tofuse.lab.methods.filters_box import Box
@@ -20,7 +19,6 @@ from tofuse.lab.methods.filters_mask import Mask
 from tofuse.lab.methods.filters_median import Median, local_median
 from tofuse.lab.methods.filters_neighbour_distance import NeighbourDistance
 from tofuse.lab.methods.filters_temporal import TemporalDeviation, z_deviation
-from tofuse.lab.methods.window_median_kernels import window_median
 
 NAN = float("nan")
 
@@ -32,12 +30,6 @@ def frame(z: Any, **images: Any) -> RangeFrame:
     return RangeFrame(0, 0.0, camera, z, **images)
 
 
-def test_amplitude_filter_keeps_views_without_amplitude() -> None:
-    assert Amplitude(100.0, 200.0).mask(frame(np.ones((2, 3))), ()).all()
-    kept = Amplitude(100.0, 200.0).mask(CloudFrame.of(np.ones((5, 3))), ())
-    assert kept.tolist() == [True] * 5
-
-
 def test_amplitude_window_and_saturation() -> None:
     counts = np.array([[0, 99, 100, 150], [200, 201, 65534, 65535]], np.float32)
     f = frame(np.ones((2, 4)), amplitude_image=counts)
@@ -45,11 +37,6 @@ def test_amplitude_window_and_saturation() -> None:
     assert np.array_equal(Amplitude().mask(f, ()), counts < 65535)
     counts[0, 0] = np.nan
     assert not Amplitude().mask(f, ())[0, 0]
-
-
-def test_amplitude_of_a_cloud() -> None:
-    cloud = CloudFrame(0, 0.0, np.ones((3, 3), np.float32), amplitude=np.float32([1, 5, 65535]))
-    assert Amplitude(2).mask(cloud, ()).tolist() == [False, True, False]
 
 
 def test_box_keeps_or_removes_inside() -> None:
@@ -100,13 +87,6 @@ def test_local_median_uses_valid_pixels(size: int) -> None:
     assert np.array_equal(local_median(z, size), median_twin(z, size))
 
 
-def test_window_median_writes_only_its_rows() -> None:
-    z = np.float32([[1, 2, 3], [4, 0, 6], [7, 8, 9]])
-    out = np.full((3, 3), -1, np.float32)
-    window_median(z, 1, 1, 2, out)
-    assert out.tolist() == [[-1, -1, -1], [4, 5, 6], [-1, -1, -1]]
-
-
 def test_median_removes_outliers_and_keeps_steps() -> None:
     z = np.full((20, 20), 2.0)
     z[:, 10:] = 3.0
@@ -124,16 +104,6 @@ def test_neighbour_distance_removes_outliers() -> None:
     assert keep.tolist() == [True] * 4 + [False]
 
 
-def test_image_masks_follow_pixels() -> None:
-    z = np.full((12, 12), 1.0)
-    z[0, :] = 0
-    z[6, 6] = 2.0
-    keep = NeighbourDistance(0.05, 3).mask(frame(z), ())
-    assert keep.shape == (12, 12)
-    assert not keep[6, 6]
-    assert keep[1:].sum() == 11 * 12 - 1
-
-
 def test_temporal_deviation_is_sample_deviation_of_z() -> None:
     z = np.zeros((3, 2, 2), np.float32)
     z[:, 0, 0] = [1.0, 1.02, 1.04]  # 20 mm
@@ -144,31 +114,6 @@ def test_temporal_deviation_is_sample_deviation_of_z() -> None:
     frames = [frame(image) for image in z]
     part = TemporalDeviation(0.025, 3)
     assert part.mask(frames[-1], frames[:-1]).tolist() == [[True, False], [True, True]]
-
-
-def test_temporal_uses_z_not_range() -> None:
-    camera = Pinhole(2, 2, 0.1, 0.1, 0.0, 0.0)  # off the axis z is a tenth of the range
-    frames = [
-        RangeFrame(0, 0.0, camera, np.full((2, 2), r, np.float32), "range") for r in (1.0, 1.1)
-    ]
-    keep = TemporalDeviation(0.025, 2).mask(frames[1], frames[:1])
-    assert keep.tolist() == [[False, True], [True, True]]
-
-
-def test_temporal_without_history_keeps_all() -> None:
-    f = frame(np.random.default_rng(0).uniform(1, 5, (6, 6)))
-    other_size = frame(np.ones((4, 4)))
-    assert TemporalDeviation().mask(f, ()).all()
-    assert TemporalDeviation().mask(f, [other_size]).all()
-
-
-def test_history_is_limited_to_window() -> None:
-    frames = [frame(np.full((3, 3), z)) for z in (9.0, 1.0, 1.0)]
-    left, _ = apply_filters([TemporalDeviation(0.025, 2)], frames[2], frames[:2])
-    assert left.valid.all()
-    left, removals = apply_filters([TemporalDeviation(0.025, 3)], frames[2], frames[:2])
-    assert not left.valid.any()
-    assert removals[0].removed == 9
 
 
 def test_temporal_removes_edges_and_keeps_surfaces() -> None:
@@ -185,29 +130,3 @@ def test_temporal_removes_edges_and_keeps_surfaces() -> None:
     assert not keep[8:22, 22].any()
     keep[8:22, 22] = True
     assert keep.all()
-
-
-@pytest.mark.parametrize(
-    ("cls", "options"),
-    [
-        (Amplitude, {"minimum": NAN}),
-        (Amplitude, {"minimum": 5.0, "maximum": 5.0}),
-        (Amplitude, {"maximum": float("inf")}),
-        (Box, {"lower": (0.0, 0.0, 0.0), "upper": (1.0, 0.0, 1.0)}),
-        (Box, {"lower": (0.0, 0.0, NAN), "upper": (1.0, 1.0, 1.0)}),
-        (Box, {"lower": (0.0, 0.0), "upper": (1.0, 1.0)}),
-        (Box, {"lower": (0.0,) * 3, "upper": (1.0,) * 3, "remove": "all"}),
-        (Median, {"size": 4}),
-        (Median, {"size": 33}),
-        (Median, {"size": 3.0}),
-        (Median, {"threshold": 0.0}),
-        (Median, {"threshold": float("inf")}),
-        (NeighbourDistance, {"threshold": NAN}),
-        (NeighbourDistance, {"k": 0}),
-        (TemporalDeviation, {"frames": 1}),
-        (TemporalDeviation, {"threshold": -0.025}),
-    ],
-)
-def test_invalid_options_are_rejected(cls: type, options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"must|lower"):
-        cls(**options)

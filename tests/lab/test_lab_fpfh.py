@@ -8,7 +8,6 @@ import pytest
 import tofuse
 from registration_scenes import rng, stone, turn
 from searched_pair import TRUE, A, B, seen
-from tofuse.engine.errors import RegistrationError
 from tofuse.engine.geometry import se3
 from tofuse.lab.methods.fpfh import Fpfh
 
@@ -63,20 +62,3 @@ def test_cube_has_no_margin():
     found = tofuse.register(cube(1), cube(0), method=Fpfh(refine=False))
     body = tofuse.register(stone(3000, 1), stone(3000, 0), method=Fpfh(refine=False))
     assert found.margin < 0.1 < 0.25 < body.margin
-
-
-def test_too_few_points_or_matches_are_refused(corners):
-    source, target = corners
-    with pytest.raises(RegistrationError, match=r"agree|too few"):
-        tofuse.register(source[:12], target, method=Fpfh())
-    noise = rng(4).uniform(-1, 1, (400, 3))
-    with pytest.raises(RegistrationError, match=r"agree|too few"):
-        tofuse.register(noise, target, method=Fpfh(inliers=40))
-
-
-@pytest.mark.parametrize(
-    "options", [{"points": 10}, {"reach": 0.5}, {"neighbours": 3}, {"inliers": 2}]
-)
-def test_options_are_checked(options):
-    with pytest.raises(ValueError, match=next(iter(options))):
-        Fpfh(**options)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.compute.thread_pool import chunk_bounds
 from tofuse.lab.world import bvh_kernels as bvh
 
 
@@ -65,17 +64,6 @@ def test_hits_match_brute_force():
     w = np.column_stack([1 - weights[hit].sum(1), weights[hit]])
     points = origins[hit] + distance[hit, None] * directions[hit]
     np.testing.assert_allclose((w[..., None] * corners).sum(1), points, atol=1e-9)
-
-
-def test_common_origin_and_axis_directions():
-    triangles = soup(200, seed=5)
-    directions = np.concatenate(
-        [np.eye(3), -np.eye(3), unit(np.random.default_rng(3).normal(size=(500, 3)))]
-    )
-    origin = np.array([0.1, -0.2, 0.3])
-    wanted, _ = brute_force_cast(triangles, origin, directions)
-    distance, _, _ = cast(triangles, origin, directions)
-    np.testing.assert_allclose(distance, wanted, atol=1e-9)
 
 
 def test_each_triangle_is_in_one_leaf_inside_its_ancestors():
@@ -142,24 +130,6 @@ def test_distance_limit_is_respected():
     distance, face, _ = cast(triangles, [0, 0, 0], ray, limit=4.0)
     assert distance[0] == 4.0
     assert face[0] == -1
-
-
-@pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_distances_scale_with_scene(scale):
-    triangles = soup(200, seed=7)
-    directions = unit(np.random.default_rng([8, 13]).normal(size=(600, 3)))
-    plain, face, _ = cast(triangles, [0, 0, 0], directions)
-    scaled, scaled_face, _ = cast(triangles * scale, [0, 0, 0], directions)
-    np.testing.assert_allclose(scaled, plain * scale, rtol=1e-12)
-    np.testing.assert_array_equal(face, scaled_face)
-
-
-def test_chunked_rays_give_same_bits():
-    triangles = soup(300, seed=9)
-    directions = unit(np.random.default_rng([9, 14]).normal(size=(1000, 3)))
-    whole = cast(triangles, [0, 0, 0], directions)[0]
-    parts = [cast(triangles, [0, 0, 0], directions[a:b])[0] for a, b in chunk_bounds(1000, 7)]
-    assert whole.tobytes() == np.concatenate(parts).tobytes()
 
 
 def test_non_finite_rays_hit_nothing():

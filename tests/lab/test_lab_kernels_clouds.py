@@ -8,9 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.lab.methods.cloud_search_kernels import grid_search
 from tofuse.lab.methods.featured_tree import FeaturedKdTree
 from tofuse.lab.methods.symmetric_kernels import symmetric_sums
 
@@ -71,26 +69,3 @@ def test_nearest_featured_matches_brute_force(seed, n, k, tolerance, limit, shar
         else:
             assert index[q] == np.argmin(total)
             assert squared[q] == pytest.approx(d[index[q]])
-
-
-def test_grid_search_descends_from_pixel():
-    grid = np.arange(400).reshape(20, 20)
-    grid[5, 5] = -1
-    v, u = np.divmod(np.arange(400), 20)
-    points = np.column_stack([u, v, np.zeros(400)]).astype(float)
-    moved = np.array([[7.2, 3.1, 1], [5, 5, 0], [3, 3, 0], [0, 0, 0], [9, 9, 0.0]])
-    pixels = np.array([[1, 1], [5, 5], [np.nan, 3], [-1e300, 0], [-2, 9.0]])
-    index, squared = np.empty(5, np.int64), np.empty(5)
-    grid_search(grid, points, moved, pixels, 2, index, squared)
-    # Six pixels away, with steps of two; a pixel without a point; behind the camera; outside.
-    assert index[0] == 3 * 20 + 7
-    assert squared[0] == pytest.approx(0.04 + 0.01 + 1)
-    assert squared[1] == 1
-    assert list(index[2:]) == [-1, -1, 9 * 20 + 9]
-    grid_search(grid, points, moved, pixels, 0, index, squared)
-    assert list(index) == [21, -1, -1, -1, -1]
-
-
-def test_search_rejects_wrong_shape():
-    with pytest.raises(InputError, match="shape"):
-        FeaturedKdTree(np.zeros((3, 3))).moments(np.zeros((3, 2)), 1.0)

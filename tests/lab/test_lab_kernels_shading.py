@@ -39,12 +39,6 @@ def fractal_twin(table, points):
     return 1.3 * (total + 0.5 * noise_twin(table, 4.31 * p + (7.9, 53.9, 19.3)))
 
 
-def patterns(material, points, seed=0):
-    row = parameter_rows([material], seed)[0]
-    table = noise_tables(seed)
-    return np.array([kernels.pattern_at(*table, row, *p) for p in points])
-
-
 def test_noise_matches_twin():
     table = noise_tables(3)
     points = np.random.default_rng([0, 1]).uniform(-400, 400, (500, 3))
@@ -114,42 +108,3 @@ def test_lattice_values_are_those_of_table_with_unit_variance():
     assert table[1].std() == pytest.approx(1.0, abs=0.01)
     value = kernels.value_noise(*table, 3.0, -7.0, 11.0)
     assert np.abs(table[1] - value).min() < 1e-12
-
-
-@pytest.mark.parametrize("pattern", ["noise", "wood", "tiles", "print", "speckle"])
-def test_contrast_is_approximately_standard_deviation(pattern):
-    material = Material("any", 0.5, 0.2, pattern, (0.3, 0.3, 0.3))
-    spread = []
-    for seed in range(4):
-        points = np.random.default_rng([seed, 2]).uniform(-20, 20, (1500, 3))
-        values = patterns(material, points, seed)
-        assert abs(values.mean()) < 0.35
-        spread.append(values.std())
-    assert 0.6 < np.mean(spread) < 1.4
-
-
-@pytest.mark.parametrize("pattern", ["noise", "wood", "tiles", "print", "speckle"])
-def test_patterns_are_continuous(pattern):
-    material = Material("any", 0.5, 0.2, pattern, (0.3, 0.3, 0.3))
-    along = np.linspace(0, 2, 20001)
-    line = np.stack([along, np.full_like(along, 0.7), np.full_like(along, 1.3)], -1)
-    steps = np.abs(np.diff(patterns(material, line)))
-    # 0.1 mm is 1 / 3000 of a blotch.
-    assert steps.max() < 0.05
-    assert steps.max() > 1e-5
-
-
-def test_pattern_depends_on_seed_and_list_position():
-    material = Material("any", 0.5, 0.2, "noise", (0.3, 0.3, 0.3))
-    assert (parameter_rows([material], 5) == parameter_rows([material], 5)).all()
-    assert (parameter_rows([material], 5) != parameter_rows([material], 6)).any()
-    rows = parameter_rows([material, material], 5)
-    assert (rows[0] != rows[1]).any()
-    for a, b in zip(noise_tables(5), noise_tables(5), strict=True):
-        assert (a == b).all()
-
-
-def test_plain_surface_has_no_pattern():
-    row = parameter_rows([Material("any", 0.5, 0.4, "plain")], 0)[0]
-    assert row[kernels.CONTRAST] == 0.0
-    assert kernels.pattern_at(*noise_tables(0), row, 0.3, 0.2, 0.1) == 0.0

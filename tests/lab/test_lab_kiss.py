@@ -9,7 +9,7 @@ from registration_scenes import box_walls, rng
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp.icp_kernels import transform_points
-from tofuse.lab.methods.kiss import AdaptiveThreshold, Kiss, first_of_voxels
+from tofuse.lab.methods.kiss import AdaptiveThreshold, Kiss
 
 
 def room(n, seed):
@@ -82,30 +82,3 @@ def test_correspondences_are_within_three_sigma():
         found = steps[1].registration
         assert found is not None
         assert found.correspondences == pairs
-
-
-def test_empty_and_unrelated_frames_are_lost():
-    poses = path(4)
-    given = frames(poses)
-    empty = CloudFrame(2, 2.0, np.zeros((0, 3), np.float32))
-    far = CloudFrame(3, 3.0, given[3].points + np.float32(100))
-    tracker = Kiss().start(0)
-    steps = [tracker.push(f) for f in (given[0], given[1], empty, far, given[3])]
-    assert [s.status for s in steps] == ["tracked", "tracked", "lost", "lost", "tracked"]
-    assert "needed" in steps[2].reason
-    assert "registered" in steps[3].reason
-
-
-def test_one_point_is_kept_per_voxel():
-    p = rng(0).uniform(-1, 1, (9000, 3))
-    kept = first_of_voxels(p, 0.25)
-    cells = np.floor(kept / 0.25).astype(int)
-    assert len(np.unique(cells, axis=0)) == len(kept) == 8**3
-    assert {tuple(x) for x in kept} <= {tuple(x) for x in p}
-
-
-def test_options_are_checked():
-    with pytest.raises(ValueError, match="voxel"):
-        Kiss(voxel=0.0)
-    with pytest.raises(ValueError, match="minimum_points"):
-        Kiss(minimum_points=1)

@@ -10,7 +10,6 @@ from scipy.spatial.distance import cdist
 
 from registration_scenes import bumpy_ball, directions, error, relief, rng, stone, turn, view
 from tofuse.engine import parts
-from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp.icp import Icp
@@ -23,7 +22,7 @@ from tofuse.lab.methods.implicit import Implicit
 from tofuse.lab.methods.least_squares_matching import LeastSquaresMatching
 from tofuse.lab.methods.ndt import Ndt
 from tofuse.lab.methods.neighbourhoods import neighbourhood
-from tofuse.lab.methods.robust_metrics import Adaptive, Graduated, estimate_shape
+from tofuse.lab.methods.robust_metrics import Graduated, estimate_shape
 from tofuse.lab.methods.squared_distance import SquaredDistance, approximant
 
 EVERY = [Cicp(0.03), LeastSquaresMatching(0.03), Ndt(0.03)]
@@ -66,20 +65,6 @@ def test_small_motion_is_recovered(method):
         assert error(found, T)[0] < 0.02
         assert error(found, T)[1] < most
         assert np.linalg.eigvalsh(found.information).min() > 0
-
-
-@pytest.mark.parametrize("method", EVERY, ids=parts.name_of)
-def test_same_seed_gives_same_pose(method):
-    source, target = view(stone(2000, 1), small(0)), view(stone(2000, 0))
-    one, other = (method.register(source, target, np.eye(4), rng(3)) for _ in range(2))
-    np.testing.assert_array_equal(one.T_target_source, other.T_target_source)
-
-
-@pytest.mark.parametrize("method", [LeastSquaresMatching(0.03), Ndt(0.03)], ids=parts.name_of)
-def test_distant_views_are_rejected(method):
-    far = view(stone(2000, 1) + np.array([50, 0, 0]))
-    with pytest.raises(RegistrationError, match="points"):
-        method.register(far, view(stone(2000, 0)), np.eye(4), rng())
 
 
 def test_comprehensive_pairs_match_full_lookup_matrix():
@@ -129,18 +114,6 @@ def test_ls3d_estimates_free_scale_and_its_precision():
         assert free.scale == pytest.approx(scale, abs=max(5 * free.precision[6], 0.002))
         assert free.precision[6] < 0.002
         assert free.rms_m < 0.5 * rigid.rms_m
-
-
-def test_ls3d_rejects_outliers_of_template():
-    """Outliers of the template are rejected by their residuals (section 2.3)."""
-    T = small(2, 4)
-    target = view(relief(4000, 0))
-    wrong = relief(400, 2) + np.array([0, 0, 0.08])  # a second sheet, all on one side
-    source = view(np.vstack([relief(4000, 1), wrong]), T)
-    kept = LeastSquaresMatching(0.02).register(source, target, np.eye(4), rng())
-    every = LeastSquaresMatching(0.02, outlier=1e6).register(source, target, np.eye(4), rng())
-    assert error(kept, T)[0] < 0.002
-    assert error(every, T)[0] > 2 * error(kept, T)[0]
 
 
 def test_ls3d_with_intensity_does_not_slide_along_wall():
@@ -258,15 +231,6 @@ def test_imls_is_nearer_to_surface_than_plane_of_nearest_point():
     assert np.isnan(Implicit().distance(true + 5, alignment)).all()
 
 
-def test_imls_registration_is_accurate():
-    for k in range(3):
-        T = small(k, 3, 0.01)
-        source = view(relief(3000, 10 + k, noise=0.004), T)
-        target = view(relief(3000, 20 + k, noise=0.004))
-        found = icp(Implicit(), 5.0, 60, 0.015).register(source, target, np.eye(4), rng())
-        assert error(found, T)[0] < 0.004
-
-
 def test_gnc_is_robust_to_75_percent_outliers():
     """Yang et al. 2020: robust to 70 to 80 % of outlier correspondences."""
     cloud = bumpy_ball(400, 0)
@@ -285,16 +249,6 @@ def test_gnc_is_robust_to_75_percent_outliers():
     assert np.linalg.eigvalsh(information).min() > 0
 
 
-def test_gnc_without_outliers_is_least_squares():
-    cloud = bumpy_ball(300, 0)
-    alignment = alignment_of(cloud + rng(1).normal(0, 0.001, cloud.shape), cloud)
-    n = np.arange(300)
-    matches = Matches(n, n, np.zeros(300))
-    np.testing.assert_array_equal(
-        Graduated().motion(matches, alignment), PointToPoint().motion(matches, alignment)
-    )
-
-
 def test_adaptive_loss_shape_follows_residuals():
     normal = rng(0).normal(size=20000)
     cauchy = rng(1).standard_cauchy(20000)
@@ -302,28 +256,3 @@ def test_adaptive_loss_shape_follows_residuals():
     assert estimate_shape(normal) == 2
     assert -0.75 <= estimate_shape(cauchy * np.sqrt(2)) <= 0.75
     assert estimate_shape(contaminated) < estimate_shape(normal)
-
-
-def test_adaptive_loss_matches_least_squares_and_is_robust():
-    T = small(1, 3, 0.01)
-    for outliers, factor in ((0, 1.3), (1500, 0.5)):
-        source = view(relief(3000, 1, outliers=outliers), T)
-        target = view(relief(3000, 0))
-        plain, adaptive = (
-            error(icp(m, 10.0, 60, 0.02).register(source, target, np.eye(4), rng()), T)[0]
-            for m in (PointToPlane(), Adaptive())
-        )
-        assert adaptive < max(factor * plain, 0.001)
-
-
-def test_options_are_checked():
-    for cls, options in (
-        (LeastSquaresMatching, {"outlier": 0.0}),
-        (LeastSquaresMatching, {"scale_sigma": -1.0}),
-        (LeastSquaresMatching, {"max_iterations": 0}),
-        (Ndt, {"finest": 0.0}),
-        (Implicit, {"width": 0.0}),
-        (Graduated, {"inlier": 0.0}),
-    ):
-        with pytest.raises(ValueError, match=next(iter(options))):
-            replace(cls(), **options)

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 import tofuse
 from searched_pair import TRUE, A, B, error, seen
-from tofuse.engine.errors import RegistrationError
-from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.plane_detection import detect_planes
 from tofuse.engine.views.prepared_view import prepare_view
@@ -73,24 +70,3 @@ def test_single_floor_is_degenerate_in_three_directions():
     assert np.abs(along).max() < 0.03
     gap = se3.log(se3.inverse(guess) @ found.T_target_source)
     assert abs(gap[3:] @ floor[:3]) < 0.02
-
-
-def test_same_seed_gives_same_result():
-    views = seen(B, seed=1), seen(A, seed=2)
-    a, b = (tofuse.register(*views, method=PlaneSets(), seed=4) for _ in range(2))
-    np.testing.assert_array_equal(a.T_target_source, b.T_target_source)
-
-
-def test_views_without_planes_are_rejected():
-    rough = seen(A, sigma=0.4, seed=1)
-    with pytest.raises(RegistrationError, match=r"no plane|contradicts"):
-        tofuse.register(rough, rough, method=PlaneSets(min_fraction=0.3))
-    cloud = CloudFrame(0, 0.0, rough.points)
-    with pytest.raises(RegistrationError, match="is not an image"):
-        tofuse.register(cloud, cloud, method=PlaneSets())
-
-
-@pytest.mark.parametrize("options", [{"planes": 0}, {"angle": 0.0}, {"min_fraction": -1}])
-def test_options_are_checked(options):
-    with pytest.raises(ValueError, match=next(iter(options))):
-        PlaneSets(**options)

@@ -139,32 +139,3 @@ def test_branches_of_loop_move_with_it():
     moved = (Elch().optimise(branch).graph.poses - branch.poses)[:, 0, 3]
     expected = [0, 0, 0, 0.1, 0.2, 0.3, 0.4, 0.4, 0.4, 0.4, 0.2]
     np.testing.assert_allclose(moved, expected, atol=1e-12)
-
-
-def test_later_loops_use_closed_loops_as_shortcuts():
-    """A closed loop is a shortcut: poses beside it are not moved again."""
-    relative = np.tile(se3.exp([1.0, 0, 0, 0, 0, 0]), (19, 1, 1))
-    first = Measured(0, 10, se3.exp([10.0, 0, 0, 0, 0, 0]), np.eye(6) * 1e6)
-    second = Measured(0, 19, se3.exp([19.9, 0, 0, 0, 0, 0]), np.eye(6))
-    moved = Elch().optimise(chain(relative, [first, second])).graph.poses[:, 0, 3] - np.arange(20)
-    assert abs(moved[10]) < 1e-5
-    np.testing.assert_allclose(moved[10:], np.linspace(0, 0.9, 10), atol=1e-5)
-
-
-def test_loops_between_unconnected_components_are_skipped():
-    poses = np.tile(np.eye(4), (4, 1, 1))
-    T = se3.exp([1.0, 0, 0, 0, 0, 0])
-    graph = build_graph(
-        range(4),
-        poses,
-        [Measured(0, 1, T, np.eye(6)), Measured(2, 3, T, np.eye(6))],
-        [Measured(0, 3, T, np.eye(6))],
-    )
-    np.testing.assert_allclose(Elch().optimise(graph).graph.poses, poses)
-
-
-@pytest.mark.parametrize("optimiser", [Elch(), LuMilios()])
-def test_trivial_graphs_are_unchanged(optimiser):
-    for graph in (PoseGraph.empty(), chain(np.zeros((0, 4, 4)))):
-        done = optimiser.optimise(graph)
-        np.testing.assert_array_equal(done.graph.poses, graph.poses)

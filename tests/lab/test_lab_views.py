@@ -8,15 +8,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from registration_scenes import MIDDLE, directions, relief, rng, turn, view
+from registration_scenes import MIDDLE, directions, rng, turn, view
 from tofuse.engine import parts
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp.icp_kernels import transform_points
-from tofuse.engine.refinement.refinement import RefinementMethod
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.engine.views.prepared_view import PreparedView
 from tofuse.lab.methods.bergevin import Bergevin
-from tofuse.lab.methods.multiview import Cloud, Pairs, relax_poses
+from tofuse.lab.methods.multiview import Pairs
 from tofuse.lab.methods.pulli import Pulli, distribute_errors
 from tofuse.lab.methods.simultaneous import SmallAngles, WilliamsBennamoun, solve_correspondences
 
@@ -98,38 +97,6 @@ def test_refinement_corrects_drift(method):
     assert errors_of(found.poses, T).max() < 0.25 * errors_of(start, T).max()
 
 
-@pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
-def test_views_without_overlap_are_unchanged(method):
-    refiner = method.start(ViewStore[PreparedView](Spacing()))
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[1, 0, 3] = 50.0
-    for k in range(2):
-        refiner.push(view(relief(500, k), index=k), poses[k])
-    found = refiner.finish([0, 1], poses)
-    assert not found.kept
-    np.testing.assert_array_equal(found.poses, poses)
-    alone = method.start(ViewStore[PreparedView](Spacing())).finish([0], poses[:1])
-    assert not alone.kept
-
-
-@pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
-def test_methods_are_registered_as_refinements(method):
-    assert parts.registered("refinement")[parts.name_of(method)] is type(method)
-    assert parts.from_dict(RefinementMethod, parts.to_dict(method), where="test") == method
-
-
-def test_bergevin_is_independent_of_view_order():
-    """All increments come from the same poses, so the views may be numbered in any way."""
-    T, clouds = ring()
-    start = drifted(T)
-    ready = [Cloud.of(c) for c in clouds]
-    method = Bergevin(points=2000, rounds=5)
-    order = np.array([0, 5, 2, 7, 4, 1, 6, 3])
-    plain = relax_poses(method, ready, start)
-    shuffled = relax_poses(method, [ready[k] for k in order], start[order])
-    np.testing.assert_allclose(shuffled, plain[order], atol=1e-6)
-
-
 def test_pulli_distributes_misfit_evenly_over_ring():
     """Section 4: a ring of pairwise alignments, all exact except one, ends with equal gaps."""
     n = 6
@@ -171,32 +138,3 @@ def test_williams_bennamoun_decreases_monotonically_to_truth():
     for p in pairs:
         gaps = se3.transform(found[p.i], p.p_i) - se3.transform(found[p.j], p.p_j)
         assert np.abs(gaps).max() < 1e-4
-
-
-def test_williams_bennamoun_solves_unconnected_components_separately():
-    poses, pairs = motions(3, 0)
-    apart = [*pairs, *(replace(p, i=p.i + 3, j=p.j + 3) for p in pairs)]
-    both = np.concatenate([poses, poses])
-    both[3:] = turn([0, 0, 1], 90) @ both[3:]
-    start = both.copy()
-    start[[1, 2, 4, 5]] = start[[1, 2, 4, 5]] @ se3.exp([0.1, 0.2, 0, 0.1, 0, 0.2])
-    np.testing.assert_allclose(solve_correspondences(start, apart, 200)[0], both, atol=1e-5)
-
-
-def test_small_angles_is_second_order_accurate():
-    """One linear system: an error ten times smaller leaves a hundredth."""
-    poses, pairs = motions(5, 1)
-    left = []
-    for size in (0.1, 0.01):
-        slips = [np.eye(4)] + [se3.exp(size * rng(5, k).normal(size=6)) for k in range(4)]
-        found = SmallAngles().relax(poses @ np.array(slips), pairs, [_cloud(p) for p in _points(5)])
-        left.append(np.abs(found - poses).max())
-    assert left[1] < 0.03 * left[0]
-
-
-def _points(n):
-    return [rng(k).normal(size=(50, 3)) for k in range(n)]
-
-
-def _cloud(p):
-    return Cloud.of(view(p))

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import os
-import shutil
 import threading
 import time
 from pathlib import Path
@@ -16,7 +14,6 @@ from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.geometry.ply import write_ply
-from tofuse.formats.images.writing import write_png
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording, readers
 
@@ -32,11 +29,6 @@ def write(folder: Path, depths: list[float], *, poses: bool = False) -> Path:
 
 def depths(recording: Recording) -> list[float]:
     return [round(float(f.points[0, 2]), 3) for f in recording]
-
-
-def test_every_format_has_a_reader() -> None:
-    names = {"7scenes", "native", "pcd", "ply", "redwood", "slam6d", "sr4000", "tum", "xyz"}
-    assert names <= set(readers())
 
 
 def test_several_paths_are_joined_in_given_order(tmp_path: Path) -> None:
@@ -171,22 +163,6 @@ def test_unreadable_first_frame(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.skipif(
-    os.name == "nt" or (hasattr(os, "geteuid") and os.geteuid() == 0),
-    reason="permissions don't hold back this user",
-)
-def test_permissions(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a", [1])
-    for path in (folder / "camera.json", folder / "depth", folder):
-        mode = path.stat().st_mode
-        path.chmod(0)
-        try:
-            with pytest.raises(InputError, match="permission"):
-                open_recording(folder)
-        finally:
-            path.chmod(mode)
-
-
 def test_permission_denied_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As above, for users to whom permissions do not apply."""
     folder = write(tmp_path / "a", [1, 2])
@@ -234,14 +210,6 @@ def test_frames_come_in_order_with_errors_in_place() -> None:
     assert reader_threads() == []
 
 
-def test_work_is_done_in_reader_thread() -> None:
-    _, recording = counting(6, 3)
-    found = list(recording.read_with(lambda f: (f.index, threading.current_thread().name), first=1))
-    assert [work and work[0] for _, work in found] == [1, 2, None, 4, 5]
-    assert str(found[2][0]) == "frame 3: is bad"
-    assert all(work is None or work[1].startswith("tofuse-reader") for _, work in found)
-
-
 def test_iteration_raises_at_unreadable_frame() -> None:
     _, recording = counting(5, 3)
     iterator = iter(recording)
@@ -268,21 +236,6 @@ def test_other_errors_are_raised_from_thread() -> None:
     with pytest.raises(InputError, match="breaks down"):
         list(Recording.of(source, "memory", "array").read_all())
     assert reader_threads() == []
-
-
-def test_wrong_dtype_of_all_frames(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a", [1])
-    write_png(folder / "depth" / "000000.png", np.ones((30, 40), np.uint8))
-    with pytest.raises(InputError, match="store one channel of uint16"):
-        open_recording(folder)
-
-
-def test_opening_leaves_recording_unchanged(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a", [1, 2])
-    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
-    list(open_recording(folder))
-    files = sorted(p.relative_to(folder) for p in folder.rglob("*"))
-    assert files == sorted(p.relative_to(copy) for p in copy.rglob("*"))
 
 
 def test_two_readers_keep_the_order() -> None:

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.noise.model import NoiseModel, RangeLaw, noise_model_for
-from tofuse.formats.images.images import read_image
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.formats.recordings.still import (
     average_of,
@@ -182,12 +178,6 @@ def test_outliers_and_rarely_valid_pixels() -> None:
     assert (frame.sigma_image[0, [1, 3]] == 0).all()
 
 
-def test_noise_above_model_is_averaged_too() -> None:
-    frames = [shot(k, scene(), 5 * SIGMA) for k in range(16)]
-    error = average_of(frames, MODEL).radial_range - scene()
-    assert error.std() == pytest.approx(5 * SIGMA / 4, rel=0.15)
-
-
 def test_identical_frames_do_not_reduce_sigma() -> None:
     first, second = shot(0, scene()), shot(1, scene())
     frame = average_of([first, first, second, second, second], MODEL)
@@ -237,23 +227,6 @@ def test_simulated_rotation_is_not_stationary() -> None:
 
 
 @pytest.mark.slow
-def test_run_averages_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    writer = RecordingWriter(tmp_path / "rec", CAMERA, depth_unit_m=0.0001)
-    for k, shift in enumerate([0, 0, 0, 0.03, 0.03, 0.03]):
-        writer.add(shot(k, scene(shift), 0.003))
-    writer.finish()
-    options = ["run", str(tmp_path / "rec"), "--method", "thesis", "--threads", "1", "--no-report"]
-    main([*options, "--out", str(tmp_path / "plain")])
-    main([*options, "--out", str(tmp_path / "averaged"), "--average-still"])
-    plain, averaged = (
-        json.loads((tmp_path / name / "run.json").read_text()) for name in ("plain", "averaged")
-    )
-    assert len(plain["frames"]) == 6
-    assert [f["timestamp"] for f in averaged["frames"]] == [0.1, 0.4]
-    assert all(f["status"] == "tracked" for f in averaged["frames"])
-
-
-@pytest.mark.slow
 def test_sr4000_corridor(shared_data: Path) -> None:
     recording = open_recording(shared_data / "sr4000_corridor")
     assert stationary_intervals(recording) == [(0, 4), (4, 8)]
@@ -271,14 +244,3 @@ def test_sr4000_corridor(shared_data: Path) -> None:
     model = noise_model_for(recording)
     ratio = frame.sigma_image[both] / model.sigma(first)[both]
     assert np.median(ratio) == pytest.approx(0.5, abs=0.03)
-
-
-def test_pico_zense_is_stationary_throughout(shared_data: Path) -> None:
-    """Its noise is correlated between neighbours, and dark surfaces flicker."""
-    camera = Pinhole(640, 480, 456.636, 456.226, 342.983, 233.82)
-    files = sorted((shared_data / "pico_zense_static").glob("depth_*.png"))
-    frames = [
-        RangeFrame(k, k / 30, camera, read_image(f, dtype="uint16").astype(np.float32) / 1000)
-        for k, f in enumerate(files)
-    ]
-    assert stationary_intervals(recording_of(frames)) == [(0, 10)]

@@ -17,8 +17,7 @@ import tofuse
 from made_recordings import make_sr4000
 from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError
-from tofuse.formats.files.npz import read_npz
-from tofuse.formats.files.stamps import stamp, stamps_in
+from tofuse.formats.files.stamps import stamps_in
 from tofuse.formats.poses.g2o import read_g2o
 from tofuse.formats.poses.given_loops import read_loops
 from tofuse.formats.poses.pose import read_pose
@@ -77,11 +76,6 @@ def test_special_file_as_recording_is_refused_at_once(tmp_path, capfd) -> None:
         assert "is neither a file nor a folder" in capfd.readouterr().err
 
 
-def test_stamp_of_broken_link_is_its_own(tmp_path) -> None:
-    (tmp_path / "a").symlink_to("nowhere")
-    assert stamp(tmp_path / "a")[1] == len("nowhere")
-
-
 def test_links_out_of_recording_are_read(recording, tmp_path) -> None:
     """Users choose the folder; data sets on other disks are linked."""
     image = recording / "depth" / "000002.png"
@@ -113,17 +107,6 @@ def test_implausible_numbers_are_refused(field, value, recording, tmp_path, capf
     assert message.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["a = " + "[" * 5000, "a = " + "[" * 900 + "]" * 900, "a." * 10**6 + "a = 1"],
-)
-def test_nested_tables(text, recording, tmp_path, capfd) -> None:
-    (tmp_path / "a.toml").write_text(text)
-    words = ["run", str(recording), "--out", str(tmp_path / "out")]
-    assert main([*words, "--config", str(tmp_path / "a.toml")]) == 2
-    assert capfd.readouterr().err.count("\n") == 1
-
-
 LONG = "1e300 0 0 1"  # a quaternion whose squared norm overflows
 
 
@@ -143,13 +126,6 @@ def test_non_normalised_quaternions_are_refused(name, text, read, tmp_path) -> N
         warnings.simplefilter("error")
         with pytest.raises(InputError):
             read(path)
-
-
-def test_quoted_content_is_truncated(tmp_path) -> None:
-    assert len(str(InputError("is " + "x" * 10**6, where="a", remedy="b"))) < 700
-    (tmp_path / "a.npz").write_bytes(b"x")
-    with pytest.raises(InputError, match="can't be read as"):
-        read_npz(tmp_path / "a.npz")
 
 
 def test_absurd_numbers_beside_images_cause_no_numpy_warnings(recording) -> None:

@@ -162,7 +162,8 @@ def test_longest_loop_uses_consecutive_views_only():
 @pytest.mark.nightly
 def test_kinect_loop_raises_alarm(shared_data):
     """Its intrinsics are wrong by 5 %, as box corners of 87 degrees confirm."""
-    from tofuse.engine.mapping.config import changed, from_method
+    from tofuse.engine.mapping.config import changed
+    from tofuse.engine.mapping.methods import from_method
     from tofuse.engine.mapping.reconstructing import reconstruct
     from tofuse.engine.mapping.self_calibration import self_calibrated
     from tofuse.engine.progress import Silent

@@ -14,26 +14,20 @@ import numpy as np
 import pytest
 
 from report_results import lonely, make_room
-from tofuse.apps.report import plots, thumbnails
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.fields import fields
 from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import (
     MAX_FACES,
-    PITCH,
-    YAW,
-    Scene,
     make_scene,
-    opening_yaw,
     packed,
-    render_thumbnail,
 )
 from tofuse.apps.report.sections import write_report
 from tofuse.apps.report.subject import Subject
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.fusion.cloud import NO_COLOR, Cloud, display_colors, empty_cloud
+from tofuse.engine.fusion.cloud import Cloud, display_colors, empty_cloud
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.pose_errors import UNKNOWN_M
 from tofuse.engine.geometry import se3
@@ -188,36 +182,6 @@ def test_errors_are_relative_to_reference(shown):
     assert f"most at frame {worst}." in shown.sections["error"]
 
 
-@pytest.fixture(scope="module")
-def without_truth(tmp_path_factory):
-    result, extras = room()
-    extras = replace(extras, reference=None, truth_points=None)
-    return page(tmp_path_factory.mktemp("bare"), result, extras)
-
-
-def test_displacement_is_shown_without_reference(without_truth):
-    result, got = room()[0], without_truth
-    assert "Displacement from the first camera" in got.sections["error"]
-    moved = np.abs(result.trajectory[-1, 0, 3] - result.trajectory[0, 0, 3])
-    number, unit = got.row("After, last frame")[1].split()
-    assert float(number) * {"mm": 1e-3, "m": 1}[unit] == pytest.approx(moved, rel=0.06)
-
-
-@pytest.mark.slow
-def test_true_and_measured_sizes(shown, without_truth):
-    result = room()[0]
-    row = shown.row("width")
-    low, high = np.percentile(result.cloud.points[:, 0], [0.25, 99.75])
-    assert row[1:3] == ["6.00 m", f"{high - low:.2f} m"]
-    assert shown.row("height")[1] == "2.50 m"
-    assert shown.row("depth")[1] == "3.20 m"
-    bare = without_truth
-    number, unit = bare.row("width")[1].split()
-    assert unit == "m"
-    assert float(number) == pytest.approx(high - low, abs=0.05)
-    assert "true outline" not in bare.sections["views"]
-
-
 @pytest.mark.parametrize("exact", [True, False])
 def test_rotated_model_is_measured_along_its_own_sides(exact, tmp_path):
     rng = np.random.default_rng(2)
@@ -235,24 +199,6 @@ def test_rotated_model_is_measured_along_its_own_sides(exact, tmp_path):
     for name, size in (("width", 0.3), ("height", 0.4), ("depth", 0.6)):
         for cell in got.row(name)[1:3]:
             assert float(cell.split()[0]) == pytest.approx(size, abs=0.011)
-
-
-def test_small_motion_is_drawn_in_millimetres():
-    points = np.random.default_rng(2).uniform(-1, 1, (500, 3))
-    for size, unit in ((3.0, "m"), (0.01, "mm")):
-        drawn = plots.model(size * points, np.zeros((1, 3)), None, "above", measured=None, label="")
-        assert f"forward, {unit}<" in drawn
-
-
-def test_reasons_of_one_kind_are_grouped(tmp_path):
-    reasons = tuple(Reason("loop_gap", ((k, 90),), f"Loop {k}-90 drifted.") for k in range(7))
-    reasons = (Reason("single_frame", ((0, 0),), "Only one."), *reasons)
-    text = page(tmp_path, lonely(verdict="degraded", reasons=reasons), ReportExtras("x"))
-    text_of_verdict = " ".join(text.sections["verdict"].split())
-    assert text_of_verdict.count("Distances across the loop may be distorted") == 1
-    assert all(r.text in text_of_verdict for r in reasons)
-    # The gravest reason comes first, wherever it was.
-    assert text_of_verdict.index("Only one.") > text_of_verdict.rindex("drifted.")
 
 
 def test_reasons_name_their_frames(tmp_path):
@@ -304,15 +250,6 @@ def test_components_are_listed_with_their_own_models(tmp_path):
     assert not any("component" in t for t in plain.titles)
 
 
-def test_filters_show_fractions_of_recording_and_frame(shown):
-    result, extras = room()
-    (_, raw), (_, first), (_, second) = extras.filter_steps
-    here = [1 - len(first) / len(raw), 1 - len(second) / len(first)]
-    for name, part in zip(("confidence", "neighbours"), here, strict=True):
-        whole = result.diagnostics.removed[name]
-        assert shown.row(name) == [name, f"{100 * whole:.1f} %", f"{100 * part:.1f} %"]
-
-
 def test_lost_frames_state_their_reason(shown):
     assert len([t for t in shown.titles if t.startswith("Frame ")]) == 24
     assert any(
@@ -320,17 +257,6 @@ def test_lost_frames_state_their_reason(shown):
     )
     assert shown.row("frames 9–10")[1:] == ["2", "lost", "too few correspondences: 31 of 1000"]
     assert shown.row("frame 15")[2:] == ["skipped", "depth/000015.png: is truncated"]
-
-
-def test_loops_timings_and_objective(shown):
-    assert shown.row("0 and 23")[1:] == ["✓ accepted", "–", "62.0 %", "14 mm", "1.0 %", "–"]
-    assert shown.row("2 and 22")[1:3] == ["✗ rejected", "overlap is below 25 %"]
-    assert shown.row("odometry")[1] == "2.4 s"
-    assert shown.row("total")[1] == "4.7 s"
-    objective = room()[0].diagnostics.objective
-    assert f"From {objective[0]:.4g} to {objective[-1]:.4g} in 13" in shown.sections["objective"]
-    assert '"minimum": 4' in shown.sections["settings"]
-    assert "no timestamps.txt" in shown.sections["settings"]
 
 
 def test_packed_arrays_round_trip():
@@ -374,27 +300,6 @@ def test_viewer_mesh_is_simplified():
     assert triangles.max() == len(shown) - 1
     assert len(unpack(model["colors"], "u1", 3)) == len(shown) == data["count"]
     assert packed(make_scene(result, rows))["model"]["faces"] is None
-
-
-def test_initial_view_shows_most_of_the_surface():
-    scene = make_scene(room()[0], {})
-    for k in (0, 2, 5):
-        yaw = YAW + k * np.pi / 4
-        facing = -thumbnails.view_rotation(yaw, PITCH)[2]
-        normals = np.tile(facing, (len(scene.points), 1))
-        found = opening_yaw(replace(scene, normals=normals))
-        assert np.cos(found - yaw) == pytest.approx(1)
-    # A model without a preferred side has the default view.
-    normals = np.random.default_rng(0).normal(0, 1, (len(scene.points), 3))
-    assert opening_yaw(replace(scene, normals=normals)) == YAW
-    assert opening_yaw(replace(scene, normals=None)) == YAW
-
-
-def test_points_without_colour_are_not_black():
-    colors = np.array([[0, 0, 0], [0, 0, 1], [200, 10, 5]], np.uint8)
-    shown = display_colors(colors)
-    assert shown[0].tolist() == list(NO_COLOR)
-    np.testing.assert_array_equal(shown[1:], colors[1:])
 
 
 def test_viewer_contains_model_cameras_and_loops(shown):
@@ -451,18 +356,6 @@ def test_model_can_be_coloured_by_attributes_of_points():
     # Cameras are coloured by the same bar.
     wider = fields(make_scene(lonely(cloud=cloud), {}), np.array([0.05, np.nan]))[0]
     assert wider.high == pytest.approx(0.05)
-
-
-@pytest.mark.slow
-def test_viewer_thins_large_model(tmp_path):
-    points = np.random.default_rng(1).uniform(-2, 2, (200_000, 3)).astype(np.float32)
-    cloud = Cloud(points, None, None, np.ones(len(points), np.int32), np.array([100.0, 0, 0]))
-    got = page(tmp_path, lonely(cloud=cloud), ReportExtras("large"))
-    scene = json.loads(got.scripts[0])
-    assert scene["count"] == len(unpack(scene["model"]["points"], "<u2", 3)) == 150_000
-    assert scene["model"]["normals"] is None
-    assert scene["center"][0] == pytest.approx(100, abs=0.1)  # includes the offset
-    assert "150,000 of 200,000 points are shown" in got.sections["model"]
 
 
 @pytest.mark.slow
@@ -619,20 +512,6 @@ def test_poor_results_give_complete_report(name, tmp_path):
     assert f"{verdict}:" in got.sections["verdict"]
 
 
-def test_poor_results_state_what_is_missing(tmp_path):
-    got = page(tmp_path, *POOR["one cloud"])
-    assert "Nothing was optimised" in got.sections["objective"]
-    assert "No loop closure was found" in got.sections["loops"]
-    assert "Every frame was tracked." in got.sections["frames"]
-    assert "Good: the only frame has a pose" in got.sections["verdict"]
-    (tmp_path / "report.html").unlink()
-    got = page(tmp_path, *POOR["all lost"])
-    text_of_verdict = " ".join(got.sections["verdict"].split())
-    assert "Failed: do not rely on this model." in text_of_verdict
-    assert "No frame has a pose." in text_of_verdict
-    assert "There is nothing to show" in got.sections["model"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("title", [os.fsdecode(b"caf\xe9 'q' \"") + '\u202e\u062e\u0631<b>"x"', ""])
 def test_any_file_name_is_shown(title, tmp_path):
@@ -647,13 +526,6 @@ def test_any_file_name_is_shown(title, tmp_path):
     got = page(tmp_path, result, replace(extras, title=title))
     shown = re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", title)
     assert any(f"Frame 9: lost – {shown}" in t or not title for t in got.titles)
-
-
-def test_reasons_link_to_their_frames(shown):
-    text = re.findall(r'class="where" href="#frames" data-ranges="(.*?)">(.*?)<', shown.text)
-    assert ("[[9, 10]]", "Show frames 9–10") in text
-    assert ("[[9, 10]]", "frames 9–10") in text  # the table of problems
-    assert ("[[0, 0], [23, 23]]", "0 and 23") in text  # a loop closure
 
 
 def test_unwritable_path_leaves_no_file(tmp_path):
@@ -680,34 +552,3 @@ def test_long_recording_of_large_images_stays_below_size_limit(tmp_path):
     detailed = replace(result, diagnostics=replace(result.diagnostics, samples=kept))
     write_report(detailed, tmp_path / "r.html", extras)
     assert (tmp_path / "r.html").stat().st_size < 20e6
-
-
-SIZE = (160, 100)
-
-
-def model_scene(points: np.ndarray) -> Scene:
-    none = np.zeros((0, 4, 4))
-    camera = np.eye(4)[None].copy()
-    camera[0, 2, 3] = -3.0
-    loops = np.zeros((0, 2, 3))
-    white = np.full((len(points), 3), 255, np.uint8)
-    return Scene(points, white, None, len(points), 0.01, none, camera, none, loops)
-
-
-@pytest.mark.parametrize("scale", [0.01, 1.0, 300.0])
-def test_model_fills_the_thumbnail(scale: float) -> None:
-    rng = np.random.default_rng(3)
-    shape = np.array([1.0, 0.6, 0.4])
-    points = scale * (rng.uniform(-1, 1, (20_000, 3)) * shape + [40.0, -7.0, 3.0])
-    image = render_thumbnail(model_scene(points), SIZE)
-    assert image.shape == (100, 160, 3)
-    rows, columns = np.nonzero((image != thumbnails.BACKGROUND).any(2))
-    reach = np.array([np.ptp(columns) / SIZE[0], np.ptp(rows) / SIZE[1]])
-    assert 0.6 < reach.max() <= 1
-    assert abs(np.mean([rows.min(), rows.max()]) - 50) < 15
-    assert abs(np.mean([columns.min(), columns.max()]) - 80) < 15
-
-
-def test_empty_model_has_a_thumbnail() -> None:
-    assert render_thumbnail(model_scene(np.zeros((0, 3))), SIZE).shape == (100, 160, 3)
-    assert render_thumbnail(model_scene(np.ones((1, 3))), SIZE).shape == (100, 160, 3)

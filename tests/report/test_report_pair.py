@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from registration_scenes import relief, view
-from tofuse.apps.pairs.page import MAX_POINTS, PairScene, distance_colors, distances, packed, still
+from tofuse.apps.pairs.page import PairScene, distances, packed, still
 from tofuse.apps.pairs.result import LocalView, PairResult
 from tofuse.apps.report import thumbnails
 from tofuse.engine.alignment.base import Registration
@@ -46,13 +46,6 @@ def test_distances_are_between_surfaces_not_noise() -> None:
     assert np.isinf(distances(ours[:9], theirs, np.arange(9))).all()
 
 
-def test_colors_saturate_at_end_of_bar_and_turn_grey() -> None:
-    colors = distance_colors(np.array([0, 0.005, 0.01, 0.03, 0.05, np.inf]), 0.01)
-    assert len(np.unique(colors[:3], axis=0)) == 3
-    assert (colors[3] == colors[2]).all()
-    assert (colors[4:] == thumbnails.NO_MEASUREMENT).all()
-
-
 def decoded(data: dict, mode: str, which: str) -> np.ndarray:
     (layer,) = (x for x in data["layers"] if (x["mode"], x["view"]) == (mode, which))
     steps = unpack(data["arrays"][layer["points"]], "<u2", 3)
@@ -88,24 +81,6 @@ def test_wrong_pose_is_visible() -> None:
     filled = (still(right) != thumbnails.BACKGROUND).any(-1)
     assert 0.1 < filled.mean() < 0.95
     assert not filled[[0, -1]].all(1).any()
-
-
-def test_distant_start_has_its_own_frame() -> None:
-    points = relief(500, 1)
-    far = se3.exp([50.0, 0, 0, 0, 0, 0])
-    data = packed(PairScene.of(pair(points, points, pose=np.eye(4), start=far)))
-    before, after = (np.ptp(data["outlines"][mode], axis=0) for mode in ("before", "after"))
-    assert before[0] > 40
-    assert after[0] < 2
-
-
-@pytest.mark.slow
-def test_large_views_are_thinned() -> None:
-    many = relief(MAX_POINTS + 5000, 1)
-    scene = PairScene.of(pair(many, many[:1000], pose=np.eye(4)))
-    shown = len(scene.points["source"]) + len(scene.points["target"])
-    assert (shown, scene.total) == (MAX_POINTS + 1000, MAX_POINTS + 6000)
-    assert sum(len(text) for text in packed(scene)["arrays"].values()) < 2.5e6
 
 
 @pytest.mark.parametrize(

@@ -18,13 +18,12 @@ from tofuse.apps.results import output
 from tofuse.apps.results.folders import OutputFolder, component_number, is_result
 from tofuse.apps.results.loading import load_result
 from tofuse.apps.results.output import write_result
-from tofuse.apps.results.run_json import frames_in_main_model, plain, read_run_json
+from tofuse.apps.results.run_json import frames_in_main_model, read_run_json
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.results.types import FrameRecord
 from tofuse.formats.files.staging import beside
 from tofuse.formats.geometry.pcd import read_pcd
 from wavy_surface import waves
-from written_run_json import run_json
 
 FILES = {"trajectory.txt", "pose_graph.g2o", "cloud.ply", "run.json"}
 
@@ -35,15 +34,6 @@ def test_new_folder_and_its_parents_are_made(tmp_path) -> None:
     assert set(contents(out)) == FILES | {"report.html"}
     assert [p.name for p in out.iterdir() if p.is_dir()] == []
     assert is_result(out)
-
-
-def test_new_folders_are_removed_if_nothing_is_written(tmp_path) -> None:
-    OutputFolder(tmp_path / "a" / "b").discard()
-    assert list(tmp_path.iterdir()) == []
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    OutputFolder(mine).discard()
-    assert mine.is_dir()  # existed before
 
 
 def test_earlier_result_is_replaced_only_on_request(tmp_path) -> None:
@@ -291,31 +281,6 @@ def test_folder_with_foreign_files_is_kept(tmp_path, name, when) -> None:
             torn(seed=1), OutputFolder(out, overwrite=True) if when == "before" else folder
         )
     assert contents(out) == before
-
-
-def test_error_in_component_names_its_file(tmp_path, monkeypatch) -> None:
-    def report(_result, folder) -> None:
-        raise OutputError("can't be written", where=folder / "report.html")
-
-    with pytest.raises(OutputError) as caught:
-        write_result(torn(), OutputFolder(tmp_path / "out"), report)
-    assert caught.value.where == str(tmp_path / "out/component-2/report.html")
-    assert not (tmp_path / "out").exists()
-
-
-def test_only_frames_with_pose_are_written(tmp_path) -> None:
-    write_result(result(), OutputFolder(tmp_path))
-    lines = (tmp_path / "trajectory.txt").read_text().splitlines()
-    values = [line.split() for line in lines if not line.startswith("#")]
-    assert [[float(v) for v in line] for line in values] == [[0, 0, 0, 0, 0, 0, 0, 1]]
-
-
-def test_plain_values() -> None:
-    assert plain({"1": (np.int64(2), np.float32(0.5), np.nan, -np.inf, None, True, "x")}) == {
-        "1": [2, 0.5, None, None, None, True, "x"]
-    }
-    assert plain(np.array([[1.0, np.nan]])) == [[1.0, None]]
-    json.dumps(run_json(replace(result(), seed=3)), allow_nan=False)
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,8 @@ from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
 from tofuse.apps.cli.program import main
 from tofuse.apps.report.scene import CAMERA_COLORS
-from tofuse.apps.report.section_parts import upright
 from tofuse.apps.rigs.calibrating import Calibration, calibrate_cameras, moves
-from tofuse.apps.rigs.inputs import Camera, unique_names
+from tofuse.apps.rigs.inputs import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
@@ -76,13 +75,6 @@ def test_camera_without_overlap_is_named() -> None:
     assert found.rig.unplaced["cam2"]
 
 
-@pytest.mark.slow
-def test_images_of_static_scene_are_averaged() -> None:
-    cameras = [camera(k, images(k, 6)) for k in range(2)]
-    assert not moves(cameras, "auto")
-    assert calibrate_cameras(cameras, ["a", "b"]).how == "one instant"
-
-
 def test_static_camera_beside_moving_camera_is_refused() -> None:
     rng = np.random.default_rng(0)
     turned = [camera_ring((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + 0.12 * i)[0] for i in range(8)]
@@ -92,11 +84,6 @@ def test_static_camera_beside_moving_camera_is_refused() -> None:
     ]
     with pytest.raises(InputError, match="cam0 stood still while other cameras moved"):
         moves([camera(0, images(0, 8)), camera(1, frames)], "auto")
-
-
-def test_names_distinguish_cameras() -> None:
-    assert unique_names([Path("/a/left"), Path("/a/right")]) == ["left", "right"]
-    assert unique_names([Path("/a/x/depth"), Path("/a/y/depth")]) == ["x/depth", "y/depth"]
 
 
 @pytest.mark.slow
@@ -179,23 +166,3 @@ def test_rig_that_contradicts_images_is_reported(tmp_path: Path) -> None:
     (text,) = (r["text"] for r in reasons if r["code"] == "rig_changed")
     assert "cam1 by" in text
     assert "cam2" not in text
-
-
-def test_rig_folder_with_missing_camera_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = written(tmp_path / "rig", 1)
-    rows = [RigCamera(f"cam{k}", "", np.eye(4), np.zeros((6, 6))) for k in (0, 1)]
-    rows.append(RigCamera("top", "", np.eye(4), np.zeros((6, 6))))
-    write_rig(folder / "rig.json", Rig(tuple(rows)))
-    with pytest.raises(InputError, match="no recording of the camera 'top'"):
-        open_recording(folder)
-
-
-def test_ring_is_drawn_upright() -> None:
-    poses = upright(np.stack(relative(camera_ring((0.4, 0, 0.5), 1.6, 0.5, 6))))
-    heights = poses[:, 1, 3]
-    assert np.ptp(heights) < 1e-9  # though the first camera looks down on the others
-    # The first still looks forward, not sideways.
-    assert abs(poses[0, 0, 2]) < 1e-9
-    assert poses[0, 2, 2] > 0.7

@@ -195,7 +195,8 @@ def test_new_component_continues_motion() -> None:
 @pytest.mark.nightly
 def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
     """Steps of 26 cm: a wall fits anywhere, and the objects before it are out of reach."""
-    from tofuse.engine.mapping.config import changed, from_method
+    from tofuse.engine.mapping.config import changed
+    from tofuse.engine.mapping.methods import from_method
     from tofuse.engine.mapping.reconstructing import reconstruct
     from tofuse.engine.quality.trajectory_errors import displacement
 
@@ -212,7 +213,8 @@ def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
 @pytest.mark.nightly
 def test_starts_along_corridor_correct_short_prediction(tmp_path) -> None:
     """Steps of 14, 37 and 46 cm: the walls fit anywhere, and the prediction is too short."""
-    from tofuse.engine.mapping.config import changed, from_method
+    from tofuse.engine.mapping.config import changed
+    from tofuse.engine.mapping.methods import from_method
     from tofuse.engine.mapping.reconstructing import reconstruct
     from tofuse.engine.quality.trajectory_errors import displacement
 

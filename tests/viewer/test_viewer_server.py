@@ -8,7 +8,7 @@ import socket
 import pytest
 
 from tofuse.apps.report.policy import script_hashes, secured
-from tofuse.apps.viewer.server import HOST, is_same_origin, page_headers
+from tofuse.apps.viewer.server import HOST, is_same_origin
 
 HOSTS: dict[str, tuple[list[str], list[str], bool]] = {
     "our own page": (["127.0.0.1:8080"], ["http://127.0.0.1:8080"], True),
@@ -106,9 +106,3 @@ def test_page_policy_lists_its_own_scripts_only() -> None:
     assert "default-src 'none'" in page
     assert "script-src 'none'" in secured('<meta charset="utf-8">')
     assert script_hashes("<script>a\r\nb</script>") == script_hashes("<script>a\nb</script>")
-
-
-def test_only_pages_have_a_policy() -> None:
-    assert "Content-Security-Policy" not in page_headers({"Content-Type": "font/woff2"}, b"")
-    found = page_headers({"Content-Type": "text/html"}, PAGE.encode())
-    assert "default-src 'self'" in found["Content-Security-Policy"]

@@ -212,8 +212,13 @@ def _wait() -> None:
 
 def register(arguments: cli.Register) -> int:
     """``tofuse register``."""
-    from tofuse.apps.pairs import PairOptions, decision, pair_exit_status, pair_json, register_files
-    from tofuse.apps.report import lines
+    from tofuse.apps.pairs import (
+        PairOptions,
+        pair_exit_status,
+        pair_json,
+        pair_words,
+        register_files,
+    )
 
     _check_overwrite(arguments)
     options = from_arguments(PairOptions, arguments)
@@ -223,10 +228,10 @@ def register(arguments: cli.Register) -> int:
         emit({**pair_json(result), "out": None if options.out is None else str(options.out)})
         return pair_exit_status(result)
     console = make_console()
-    head, tail = decision(result)
+    head, tail = pair_words.decision(result)
     color = _STATUS_COLORS[result.registration.believed]
     console.print(f"[bold {color}]{head.lower()}[/]" + (f": {escaped(tail)}" if tail else ""))
-    found = lines(result)
+    found = pair_words.lines(result)
     width = max(_NAME_WIDTH, *(len(name) for name, _ in found))
     for name, value in found:
         first, *others = value.split("\n")

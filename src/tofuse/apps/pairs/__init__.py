@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
+    from tofuse.apps.pairs import pair_words
     from tofuse.apps.pairs.job import PairOptions, pair_exit_status, register_files
-    from tofuse.apps.pairs.pair_words import decision
     from tofuse.apps.pairs.result import pair_json
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

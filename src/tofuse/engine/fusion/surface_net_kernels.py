@@ -2,8 +2,8 @@
 
 Each cell of eight adjacent voxels that the surface passes through has one vertex, the mean of the
 points where the surface crosses the cell's edges; the four cells around a crossed edge make two
-triangles. Blocks are those of `tofuse.engine.fusion.tsdf_kernels`; cells extend into the adjacent blocks, so that
-there are no seams.
+triangles. Blocks are those of `tsdf_kernels`; cells extend into the adjacent blocks, so that there
+are no seams.
 """
 
 from __future__ import annotations

@@ -137,7 +137,8 @@ def _bound_change(before: float, after: float) -> str:
     """Describe the change of the bound."""
     if not np.isfinite([before, after]).all():
         return ""
-    return f" The bound of the pose error is {accuracy_card.length(after)} (95 %) instead of {accuracy_card.length(before)}."
+    new, old = accuracy_card.length(after), accuracy_card.length(before)
+    return f" The bound of the pose error is {new} (95 %) instead of {old}."
 
 
 def _support(result: Reconstruction) -> float:

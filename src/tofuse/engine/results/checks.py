@@ -219,15 +219,15 @@ def _connections(e: Evidence) -> Iterator[Reason]:
         # If all pose errors are bounded, later measurements connect both sides.
         if bridged and (e.accuracy.unbounded or not e.accuracy.assessed):
             text = (
-                f"{_sentence(bridged)} {'is' if frame_ranges.is_single(bridged) else 'are'} connected to the "
-                f"rest by {motion} only."
+                f"{_sentence(bridged)} {'is' if frame_ranges.is_single(bridged) else 'are'} "
+                f"connected to the rest by {motion} only."
             )
             yield Reason("bridged_gap", bridged, text)
     single_link = e.runs_of(e.single_link_frames)
     if single_link:
         text = (
-            f"{_sentence(single_link)} {'is' if frame_ranges.is_single(single_link) else 'are'} connected to "
-            "the rest by a single registration, which no other view confirms."
+            f"{_sentence(single_link)} {'is' if frame_ranges.is_single(single_link) else 'are'} "
+            "connected to the rest by a single registration, which no other view confirms."
         )
         yield Reason("single_link", single_link, text)
 
@@ -264,14 +264,16 @@ def _motion(e: Evidence) -> Iterator[Reason]:
         text = (
             f"The pose of {frame_ranges.in_words(jumped)} jumps: {deviation}."
             if frame_ranges.is_single(jumped)
-            else f"The poses of {frame_ranges.in_words(jumped)} jump; that of frame {frames[0]} is {deviation}."
+            else f"The poses of {frame_ranges.in_words(jumped)} jump; "
+            f"that of frame {frames[0]} is {deviation}."
         )
         yield Reason("jumped", jumped, text)
     repeated = e.runs_of(e.repeated)
     if repeated:
         n = sum(record.index in e.repeated for record in e.records)
         subject = "1 image repeats" if n == 1 else f"{n} images repeat"
-        text = f"{subject} the one before ({frame_ranges.in_words(repeated)}): nothing new was measured."
+        where = frame_ranges.in_words(repeated)
+        text = f"{subject} the one before ({where}): nothing new was measured."
         yield Reason("repeated_images", repeated, text)
     T = e.optimisation.graph.poses
     moved = se3.inverse(T[:1]) @ T
@@ -317,8 +319,8 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
     weak = e.runs_of({index for index, r in pairs if r.inlier_ratio < WEAK_INLIER_FRACTION})
     if weak:
         text = (
-            f"Fewer than {_percent(WEAK_INLIER_FRACTION)} of the points of {frame_ranges.in_words(weak)} have a "
-            "correspondence."
+            f"Fewer than {_percent(WEAK_INLIER_FRACTION)} of the points of "
+            f"{frame_ranges.in_words(weak)} have a correspondence."
         )
         yield Reason("weak_registration", weak, text)
     if e.has_covariances:
@@ -602,7 +604,8 @@ def _sentence(ranges: Sequence[frame_ranges.Range]) -> str:
 
 def _poses_of(ranges: Sequence[frame_ranges.Range]) -> str:
     single = frame_ranges.is_single(ranges)
-    return f"{'The pose' if single else 'Poses'} of {frame_ranges.in_words(ranges)} {'is' if single else 'are'}"
+    subject, verb = ("The pose", "is") if single else ("Poses", "are")
+    return f"{subject} of {frame_ranges.in_words(ranges)} {verb}"
 
 
 def _percent(fraction: float) -> str:

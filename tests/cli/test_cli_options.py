@@ -1,0 +1,99 @@
+"""From the words of a command line to options and a configuration, without running anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cli_calls import call, refuses
+from tofuse.apps.cli.commands import run_options
+from tofuse.apps.cli.parser import make_parser
+from tofuse.apps.jobs.run_options import Options, resolve, seed_of
+from tofuse.engine.mapping.methods import from_method
+from tofuse.engine.parts import name_of
+
+
+def options_of(*words: object) -> Options:
+    return run_options(make_parser().parse_args(["run", "rec", "--out", "out", *map(str, words)]))
+
+
+def config_of(*words: object) -> dict[str, Any]:
+    return resolve(options_of(*words)).to_dict()
+
+
+def test_defaults() -> None:
+    options = options_of()
+    assert options == Options(out=Path("out"))
+    assert seed_of(options) == 0
+    assert resolve(options) == from_method("default")
+
+
+@pytest.mark.parametrize(
+    ("words", "changed"),
+    [
+        ("--start 1 --end 7 --every 2", {"start": 1, "end": 7, "every": 2}),
+        ("--seed 5 --threads 2", {"seed": 5, "threads": 2}),
+        ("--min-depth 1 --max-depth 2.5", {"min_depth": 1.0, "max_depth": 2.5}),
+        ("--tolerance 5mm --voxel 10cm --faces 5000",
+         {"tolerance": 0.005, "voxel": 0.1, "faces": 5000}),
+        ("--camera c.json --loops l.txt --config r.toml",
+         {"camera": Path("c.json"), "loops": Path("l.txt"), "config": Path("r.toml")}),
+        ("--guess odometry --method thesis", {"guess": "odometry", "method": "thesis"}),
+        ("--memory 2GB", {"memory": 2 * 10**9}),
+        ("--object --unwrap --overwrite --no-report --texture",
+         dict.fromkeys(("object", "unwrap", "overwrite", "no_report", "texture"), True)),
+        ("--format tum", {"format": "tum"}),
+    ],
+)  # fmt: skip
+def test_words_become_options(words: str, changed: dict[str, Any]) -> None:
+    assert options_of(*words.split()) == Options(out=Path("out"), **changed)
+
+
+def test_options_become_configuration(tmp_path: Path) -> None:
+    assert config_of("--guess", "identity")["odometry"]["guess"] == "identity"
+    assert config_of("--tolerance", "5mm")["tolerance_m"] == 0.005
+    fusion = config_of("--voxel", "10cm", "--faces", 5000)["fusion"]
+    assert (fusion["voxel_m"], fusion["faces"]) == (0.1, 5000)
+    assert config_of("--memory", "2GB")["memory_mb"] == 2000
+    assert config_of("--unwrap")["corrections"][0]["part"] == "unwrap"
+
+
+def test_filters_from_options_come_first() -> None:
+    own = [name_of(f) for f in from_method("thesis").filters]
+    for words, first in (
+        (("--min-depth", 1), "distance"),
+        (("--object", "--max-depth", 2.5), "distance"),
+        (("--object",), "background"),
+    ):
+        filters = config_of("--method", "thesis", *words)["filters"]
+        assert [f["part"] for f in filters] == [first, *own]
+    corrections = [c["part"] for c in config_of("--object")["corrections"]]
+    assert corrections[-2:] == ["scattering", "multipath"]
+    assert config_of("--object")["priors"] == []
+
+
+def test_options_override_those_of_file(tmp_path: Path) -> None:
+    file = tmp_path / "my.toml"
+    file.write_text('method = "thesis"\nfilters = []\n[fusion]\nvoxel_m = 0.1\n')
+    config = config_of("--config", file, "--guess", "identity")
+    assert (config["method"], config["filters"]) == ("thesis", [])
+    assert (config["fusion"]["voxel_m"], config["odometry"]["guess"]) == (0.1, "identity")
+    assert config_of("--config", file, "--voxel", "5cm")["fusion"]["voxel_m"] == 0.05
+
+
+@pytest.mark.parametrize(
+    "words", ["--faces 0", "--faces x", "--voxel 0mm", "--voxel 3 miles", "--tolerance -1mm"]
+)
+def test_invalid_numbers_name_their_option(words: str, capfd) -> None:
+    option, value = words.split(maxsplit=1)
+    refuses(
+        capfd, "run", "rec", "--out", "out", option, value, says=(option,), prefix="tofuse run: "
+    )
+
+
+@pytest.mark.parametrize("words", [("--help",), ("run", "--help"), ("rig", "--help")])
+def test_help_is_printed(words: tuple[str, ...], capfd) -> None:
+    assert call(*words) == 0
+    assert capfd.readouterr().out.startswith("usage: tofuse")

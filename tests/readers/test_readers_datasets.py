@@ -1,0 +1,345 @@
+"""Each reader on small generated recordings with known ground truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from made_recordings import (
+    CAMERA,
+    COUNTS,
+    POSES,
+    make_7scenes,
+    make_redwood,
+    make_sr4000,
+    make_tum,
+    pcd_bytes,
+    pcd_points,
+)
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
+from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.geometry.se3 import exp
+from tofuse.engine.noise.model import family_of
+from tofuse.formats.geometry.ply import write_ply
+from tofuse.formats.poses.trajectory import write_tum
+from tofuse.formats.recordings.open import open_recording
+
+
+def test_sr4000_points_equal_stored_vectors(tmp_path: Path) -> None:
+    z, rays = make_sr4000(tmp_path / "Y1")
+    recording = open_recording(tmp_path / "Y1")
+    assert recording.format == "sr4000"
+    np.testing.assert_allclose(recording.timestamps, [0, 0.03125, 0.0625])
+    for k in range(3):
+        frame = recording[k]
+        assert isinstance(frame.camera, RayTable)
+        truth = np.concatenate([rays * (z[k] + 0.01)[..., None], z[k][..., None]], -1)
+        assert not frame.valid[3, 3]
+        assert frame.valid.sum() == 12 * 16 - 1
+        np.testing.assert_allclose(frame.points, truth[frame.valid], atol=6e-5)
+        np.testing.assert_array_equal(frame.amplitude_image.ravel(), np.arange(192))
+        assert frame.confidence_image is not None
+        assert (frame.confidence_image == 5).all()
+
+
+def test_sr4000_stations_are_joined_in_name_order(tmp_path: Path) -> None:
+    z2, _ = make_sr4000(tmp_path / "Y2", 2)
+    make_sr4000(tmp_path / "Y1", 3)
+    recording = open_recording(tmp_path)
+    assert len(recording) == 5
+    assert (np.diff(recording.timestamps) > 0).all()
+    assert "Y2: timestamps start again" in recording.warnings[0]
+    frame = recording[3]
+    assert frame.index == 3
+    assert frame.timestamp == recording.timestamps[3]
+    np.testing.assert_allclose(frame.z[frame.valid], z2[0][frame.valid], atol=1e-6)
+
+
+def test_tum(tmp_path: Path) -> None:
+    folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
+    make_tum(folder)
+    recording = open_recording(folder)
+    assert recording.format == "tum"
+    frame = recording[1]
+    # The colour camera's lens, not the infrared one's: depth is registered to colour.
+    assert isinstance(frame.camera, BrownConrady)
+    assert (frame.camera.fx, frame.camera.k1) == (517.306408, 0.262383)
+    np.testing.assert_allclose(frame.depth[1:], COUNTS[1][1:] / 5000, rtol=1e-6)
+    assert frame.depth[0, :2].tolist() == [0, 0]
+    assert frame.color_image is not None
+    assert frame.color_registered
+    assert (frame.color_image == 1).all()
+    np.testing.assert_allclose(recording.reference, POSES, atol=1e-12)
+    assert recording.odometry is None
+    third = open_recording(folder.rename(tmp_path / "fr3_office"))[0]
+    assert third.camera == BrownConrady(640, 480, 535.4, 539.2, 320.1, 247.6)
+
+
+def test_tum_with_unknown_name_requires_camera(tmp_path: Path) -> None:
+    make_tum(tmp_path / "living_room")
+    with pytest.raises(InputError, match="--camera"):
+        open_recording(tmp_path / "living_room")
+    camera = {"schema": 1, "model": "pinhole", "width": 640, "height": 480}
+    camera |= {"fx": 481.2, "fy": 480.0, "cx": 319.5, "cy": 239.5}
+    camera |= {"depth_unit_m": 0.0002, "depth_kind": "range"}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    frame = open_recording(tmp_path / "living_room", camera=tmp_path / "camera.json")[0]
+    assert frame.camera == Pinhole(640, 480, 481.2, 480.0, 319.5, 239.5)
+    assert frame.depth_kind == "range"
+    camera |= {"sensor": "ifm O3R222"}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    recording = open_recording(tmp_path / "living_room", camera=tmp_path / "camera.json")
+    assert family_of(recording, frame) == "ifm-o3r"
+
+
+def test_7scenes(tmp_path: Path) -> None:
+    make_7scenes(tmp_path / "seq-01")
+    recording = open_recording(tmp_path / "seq-01")
+    assert recording.format == "7scenes"
+    frame = recording[2]
+    assert frame.camera == Pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
+    np.testing.assert_allclose(frame.depth[1:], COUNTS[2][1:] / 1000, rtol=1e-6)
+    assert frame.color_image is not None
+    assert not frame.color_registered
+    np.testing.assert_allclose(recording.timestamps, [0, 2 / 30, 4 / 30])
+    np.testing.assert_allclose(recording.reference, POSES, atol=1e-12)
+    (tmp_path / "seq-01" / "camera-intrinsics.txt").write_text("500 0 320\n0 510 240\n0 0 1\n")
+    (tmp_path / "seq-01" / "frame-000002.pose.txt").write_text("-1.#IND 0 0 0\n")
+    assert any("frame-000002.pose.txt" in w for w in open_recording(tmp_path / "seq-01").warnings)
+    np.savetxt(tmp_path / "seq-01" / "frame-000002.pose.txt", np.full((4, 4), np.inf))
+    (tmp_path / "seq-01" / "frame-000004.color.png").unlink()
+    recording = open_recording(tmp_path / "seq-01")
+    assert np.isnan(recording.reference[1]).all()
+    frame = recording[0]
+    assert frame.camera == Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0)
+    assert frame.color_image is None
+    assert "only 2 of 3 frames have colour" in recording.warnings[0]
+
+
+@pytest.mark.parametrize("color", ["color", "image", "rgb"])
+def test_redwood(tmp_path: Path, color: str) -> None:
+    make_redwood(tmp_path, color)
+    recording = open_recording(tmp_path)
+    assert recording.format == "redwood"
+    assert any("PrimeSense default" in w for w in recording.warnings)
+    frame = recording[1]
+    assert frame.camera == Pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
+    np.testing.assert_allclose(frame.depth[1:], COUNTS[1][1:] / 1000, rtol=1e-6)
+    np.testing.assert_allclose(recording.timestamps, [0, 0.033369, 0.066738])
+    np.testing.assert_allclose(recording.reference, POSES, atol=1e-12)
+    # Open3D stores the matrix column by column.
+    matrix = [500.0, 0, 0, 0, 510.0, 0, 321.0, 241.0, 1]
+    about = {"width": 640, "height": 480, "intrinsic_matrix": matrix}
+    (tmp_path / "camera_primesense.json").write_text(json.dumps(about))
+    recording = open_recording(tmp_path)
+    assert recording.warnings == []
+    frame = recording[0]
+    assert frame.camera == Pinhole(640, 480, 500.0, 510.0, 321.0, 241.0)
+
+
+def test_redwood_with_partial_colour_or_other_names(tmp_path: Path) -> None:
+    make_redwood(tmp_path)
+    (tmp_path / "color" / "000001.png").unlink()
+    recording = open_recording(tmp_path, format="redwood")
+    colors = [frame.color_image for frame in recording]
+    assert colors[0] is None
+    for k, image in enumerate(colors[1:], 1):
+        assert image is not None
+        assert (image == k).all()
+    count = len(colors)
+    assert f"only {count - 1} of {count} frames have colour" in recording.warnings
+    for path in (tmp_path / "color").iterdir():
+        path.rename(path.with_name(f"photo {path.name}"))
+    recording = open_recording(tmp_path, format="redwood")
+    assert any("their names don't show which belong together" in w for w in recording.warnings)
+
+
+def test_redwood_without_camera_is_ambiguous(tmp_path: Path) -> None:
+    make_redwood(tmp_path)
+    (tmp_path / "trajectory.log").unlink()
+    with pytest.raises(InputError, match="--format redwood"):
+        open_recording(tmp_path)
+    assert len(open_recording(tmp_path, format="redwood")) == 3
+
+
+def test_organised_pcd_becomes_image(tmp_path: Path) -> None:
+    truth = [pcd_points(CAMERA, k) for k in range(3)]
+    for k, points in enumerate(truth):
+        intensity = np.arange(1200.0)
+        (tmp_path / f"cloud_{k}.pcd").write_bytes(pcd_bytes(points, intensity=intensity))
+    half = np.sqrt(0.5)
+    (tmp_path / "poses.txt").write_text(f"2 1 2 3 {half} {half} 0 0\n0 0 0 0 1 0 0 0\n")
+    recording = open_recording(tmp_path)
+    assert recording.format == "pcd"
+    for k in range(3):
+        frame = recording[k]
+        assert isinstance(frame.camera, Pinhole)
+        assert frame.camera.fx == pytest.approx(35, abs=1e-3)
+        measured = np.isfinite(truth[k]).all(-1)
+        np.testing.assert_array_equal(frame.valid, measured)
+        np.testing.assert_allclose(frame.points, truth[k][measured], atol=1e-4)
+        np.testing.assert_array_equal(frame.amplitude, np.flatnonzero(measured))
+    np.testing.assert_array_equal(recording.reference[0], np.eye(4))
+    assert np.isnan(recording.reference[1]).all()
+    np.testing.assert_allclose(recording.reference[2][:3, 1], [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(recording.reference[2][:3, 3], [1, 2, 3])
+
+
+def test_organised_pcd_with_distortion_has_ray_table(tmp_path: Path) -> None:
+    lens = BrownConrady(40, 30, 35.0, 36.0, 19.5, 14.5, -0.1, 0.02)
+    truth = pcd_points(lens, 1)
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(truth))
+    # A second file has pixels that the first lacks.
+    (tmp_path / "b.pcd").write_bytes(pcd_bytes(pcd_points(lens, 2)))
+    frame = open_recording(tmp_path)[0]
+    assert isinstance(frame.camera, RayTable)
+    measured = np.isfinite(truth).all(-1)
+    np.testing.assert_allclose(frame.points, truth[measured], atol=1e-5)
+    assert np.isfinite(frame.camera.rays()).all(-1).mean() > 0.85
+
+
+def test_unorganised_pcd_stays_cloud(tmp_path: Path) -> None:
+    points = np.random.default_rng(3).normal(size=(30, 40, 3))
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(points))
+    frame = open_recording(tmp_path / "a.pcd")[0]
+    assert isinstance(frame, CloudFrame)
+    np.testing.assert_allclose(frame.points, points.reshape(-1, 3), rtol=1e-6)
+    row = pcd_bytes(points.reshape(1, -1, 3)).replace(b"VIEWPOINT 0 0 0", b"VIEWPOINT 1 2 3")
+    (tmp_path / "a.pcd").write_bytes(row)
+    frame = open_recording(tmp_path / "a.pcd")[0]
+    assert isinstance(frame, CloudFrame)
+    assert frame.origin.tolist() == [1, 2, 3]
+
+
+def test_pcd_with_width_and_height_exchanged_is_refused(tmp_path: Path) -> None:
+    right = pcd_bytes(pcd_points(CAMERA, 1))
+    wrong = right.replace(b"WIDTH 40", b"WIDTH 30").replace(b"HEIGHT 30", b"HEIGHT 40")
+    (tmp_path / "a.pcd").write_bytes(wrong)
+    with pytest.raises(InputError, match="has WIDTH 30 and HEIGHT 40, but rows of 40 points") as e:
+        open_recording(tmp_path)
+    assert e.value.remedy == "swap WIDTH and HEIGHT"
+
+
+def test_pcd_of_another_camera_is_unreadable(tmp_path: Path) -> None:
+    for k in range(12):
+        (tmp_path / f"{k}.pcd").write_bytes(pcd_bytes(pcd_points(CAMERA, k)))
+    # Not among the files that are inspected first.
+    other = Pinhole(40, 30, 60.0, 60.0, 19.5, 14.5)
+    (tmp_path / "11.pcd").write_bytes(pcd_bytes(pcd_points(other, 11)))
+    recording = open_recording(tmp_path)
+    assert isinstance(recording[10], RangeFrame)
+    with pytest.raises(UnreadableFrameError, match="off the rays"):
+        recording[11]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [3e38, -3e38, 1e20, 1e-40, 0.0, np.inf])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_absurd_numbers_in_organised_pcd(tmp_path: Path, value: float, axis: int) -> None:
+    for count in (1, 1200):
+        points = pcd_points(CAMERA, 1)
+        points.reshape(-1, 3)[:count, axis] = value
+        (tmp_path / "a.pcd").write_bytes(pcd_bytes(points))
+        frame = open_recording(tmp_path / "a.pcd")[0]
+        assert (np.abs(frame.points) < 1e9).all()
+
+
+def test_ply_folder(tmp_path: Path) -> None:
+    points = [np.random.default_rng(k).normal(size=(20, 3)).astype(np.float32) for k in range(3)]
+    for k in (10, 9, 1):
+        write_ply(
+            tmp_path / f"scan{k}.ply",
+            GeometryRecord(
+                points[(10, 9, 1).index(k)], scalars={"intensity": np.full(20, k, np.float32)}
+            ),
+        )
+    (tmp_path / "timestamps.txt").write_text("0.5\n1.5\n2.5\n")
+    recording = open_recording(tmp_path)
+    assert recording.format == "ply"
+    assert recording.timestamps.tolist() == [0.5, 1.5, 2.5]
+    for k, seed in enumerate((2, 1, 0)):
+        np.testing.assert_array_equal(recording[k].points, points[seed])
+    assert recording[2].amplitude[0] == 10
+    (tmp_path / "timestamps.txt").write_text("0.5\n")
+    with pytest.raises(InputError, match=r"timestamps\.txt"):
+        open_recording(tmp_path)
+
+
+def test_xyz(tmp_path: Path) -> None:
+    points = np.random.default_rng(4).normal(size=(20, 3))
+    unit = points / np.linalg.norm(points, axis=1, keepdims=True)
+    files = {
+        "a.xyz": points,
+        "b.xyz": np.c_[points, np.arange(20)],
+        "c.xyz": np.c_[points, unit],
+        "d.xyz": np.c_[points, np.tile([10, 20, 30], (20, 1))],
+        "e.xyzrgb": np.c_[points, np.full((20, 3), 0.2)],
+    }
+    for name, table in files.items():
+        np.savetxt(tmp_path / name, table)
+    recording = open_recording(tmp_path)
+    assert recording.format == "xyz"
+    frames = list(recording)
+    for frame in frames:
+        np.testing.assert_allclose(frame.points, points, rtol=1e-6)
+    assert frames[0].amplitude is None
+    np.testing.assert_array_equal(frames[1].amplitude, np.arange(20))
+    np.testing.assert_allclose(frames[2].normals, unit, rtol=1e-6)
+    assert frames[3].color[0].tolist() == [10, 20, 30]
+    assert frames[4].color[0].tolist() == [51, 51, 51]
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz"])
+def test_map_coordinates_keep_millimetre_precision(tmp_path: Path, suffix: str) -> None:
+    """All clouds of a folder, and their poses, are shifted by the same whole kilometres."""
+    rng = np.random.default_rng(5)
+    clouds = np.array([500_000.123, 4_000_000.456, 3]) + rng.uniform(-3, 3, (2, 40, 3))
+    for k, points in enumerate(clouds):
+        path = tmp_path / f"{k}{suffix}"
+        rows = "\n".join(" ".join(f"{v:.6f}" for v in row) for row in points) + "\n"
+        head = ""
+        if suffix == ".ply":
+            head = "ply\nformat ascii 1.0\nelement vertex 40\n"
+            head += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+        elif suffix == ".pcd":
+            head = "VERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 40\n"
+            head += "HEIGHT 1\nVIEWPOINT 500001 4000002 7 1 0 0 0\nPOINTS 40\nDATA ascii\n"
+        path.write_text(head + rows)
+    T = exp([1, 2, 3, 0.1, 0.2, 0.3])
+    write_tum(tmp_path / "groundtruth.txt", [0, 1], np.stack([np.eye(4), T]))
+    recording = open_recording(tmp_path)
+    assert recording.metadata["shift_m"] == [500_000, 4_000_000, 0]
+    assert any("minus (500000, 4000000, 0) m" in line for line in recording.warnings)
+    for k, frame in enumerate(recording):
+        assert isinstance(frame, CloudFrame)
+        local = frame.points.astype(float) + recording.metadata["shift_m"]
+        np.testing.assert_allclose(local, clouds[k], rtol=0, atol=1e-5)
+        if suffix == ".pcd":
+            np.testing.assert_allclose(frame.origin, [1, 2, 7])
+    np.testing.assert_allclose(
+        recording.reference[1] @ [1, 2, 3, 1], T @ [500_001, 4_000_002, 3, 1], atol=1e-6
+    )
+
+
+def test_slam6d_axes_units_and_poses(tmp_path: Path) -> None:
+    """A left-handed world in cm: x right, y up, z forward."""
+    (tmp_path / "scan000.3d").write_text("3\n100 200 300\n0 0 0\n-50 0 10\n")
+    (tmp_path / "scan000.pose").write_text("0 0 0\n0 0 0\n")
+    (tmp_path / "scan001.3d").write_text("100 200 300 7\n-50 0 10 8\n")
+    (tmp_path / "scan001.pose").write_text("100 50 -200\n0 90 0\n")
+    recording = open_recording(tmp_path)
+    assert recording.format == "slam6d"
+    np.testing.assert_allclose(recording[0].points, [[1, -2, 3], [-0.5, 0, 0.1]], rtol=1e-6)
+    np.testing.assert_array_equal(recording[1].amplitude, [7, 8])
+    np.testing.assert_array_equal(recording.odometry[0], np.eye(4))
+    T = recording.odometry[1]
+    np.testing.assert_allclose(T[:3, 3], [1, -0.5, -2])
+    # 3DTK rotates z forward to x right at +90 degrees about y.
+    np.testing.assert_allclose(T[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-15)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    assert "not ground truth" in recording.warnings[0]
