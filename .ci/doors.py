@@ -10,7 +10,6 @@ import ast
 import importlib.util
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from grimp import ImportGraph
 from importlinter import Contract, ContractCheck, output

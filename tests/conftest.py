@@ -86,9 +86,8 @@ def session_results(cabinet: Cabinet) -> dict[str, Path]:
 @pytest.fixture(scope="session")
 def posed_views(room_recording: Path) -> tuple[list[Any], Any]:
     """Prepared views of the room with their true poses, and these poses (N, 4, 4)."""
-    from tofuse.engine.views import SurfaceOptions
-
     from tofuse.engine.stored_views.view_store import PosedView
+    from tofuse.engine.views import SurfaceOptions
     from tofuse.engine.views.prepared_view import prepare_view
     from tofuse.formats.recordings.open import open_recording
 

@@ -229,8 +229,8 @@ def _small() -> dict[str, Subject]:
     from tofuse.apps.jobs.run_options import read_changes
     from tofuse.apps.jobs.tracked_file import TrackedFile
     from tofuse.engine.mapping.config import changed
-    from tofuse.engine.mapping.methods import from_method
     from tofuse.engine.mapping.frame_log import FrameLog
+    from tofuse.engine.mapping.methods import from_method
     from tofuse.engine.noise.model import NoiseModel, RangeLaw
     from tofuse.engine.results.types import FrameRecord
     from tofuse.engine.tracking.base import Step

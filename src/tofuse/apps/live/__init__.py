@@ -10,10 +10,10 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.apps.live.device import (
+        TIMEOUT_S,
         DeviceError,
         Settings,
         Stream,
-        TIMEOUT_S,
         device_named,
         is_installed,
         known_devices,

@@ -12,7 +12,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.alignment import projective, step_kernels
-    from tofuse.engine.alignment.base import Link, PROBABLE, Registrar, Registration
+    from tofuse.engine.alignment.base import PROBABLE, Link, Registrar, Registration
     from tofuse.engine.alignment.projective import ViewOptions
     from tofuse.engine.alignment.uncertainty import UncertaintyOptions, bounded_below, covariance
 

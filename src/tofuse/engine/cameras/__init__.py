@@ -12,11 +12,11 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.cameras import depth_conversion, projection_kernels
     from tofuse.engine.cameras.cameras import (
+        DISTORTION_ORDER,
+        MODELS,
         BrownConrady,
         Camera,
-        DISTORTION_ORDER,
         Fisheye,
-        MODELS,
         Pinhole,
         Rational,
         RayTable,

@@ -12,17 +12,17 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.frames import depth_counts, frame_ranges
     from tofuse.engine.frames.frames import (
+        SATURATED_AMPLITUDE,
         AmplitudeKind,
         CloudFrame,
         DepthKind,
         Frame,
         RangeFrame,
-        SATURATED_AMPLITUDE,
     )
     from tofuse.engine.frames.recording import (
-        ArraySource,
         NOISE_MODEL,
         POSES_BY,
+        ArraySource,
         Recording,
         Source,
         evenly_spaced,

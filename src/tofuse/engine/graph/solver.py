@@ -2,7 +2,7 @@
 
 The objective is the sum over all edges of ``e^T Omega e`` with ``e = log(Z^-1 T_i^-1 T_j)``, with
 an optional robust kernel on loop edges (`robust`), and of the errors of gravity at single poses.
- Poses are perturbed on the right. With ``E = exp(e)``::
+Poses are perturbed on the right. With ``E = exp(e)``::
 
     log(E exp(xi)) = e + J_r^-1(e) xi,    xi = d_j - Ad(T_j_i) d_i
 

@@ -12,8 +12,8 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.mapping import adaptation, reconstructing, texturing
     from tofuse.engine.mapping.config import (
-        Config,
         MIN_MEMORY_MB,
+        Config,
         ViewKind,
         changed,
         check_views,

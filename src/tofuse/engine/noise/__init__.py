@@ -11,10 +11,10 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.noise.model import (
+        NOISE,
         AmplitudeLaw,
         ConfidenceLaw,
         Law,
-        NOISE,
         NoiseModel,
         RangeLaw,
         family_of,

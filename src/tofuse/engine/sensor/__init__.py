@@ -12,7 +12,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.sensor.base import Correction, Corrector, Noise
-    from tofuse.engine.sensor.camera_errors import CameraErrors, DepthCorrection, ERROR_OPTIONS
+    from tofuse.engine.sensor.camera_errors import ERROR_OPTIONS, CameraErrors, DepthCorrection
     from tofuse.engine.sensor.frequencies import DISAGREEMENT, SPEED_OF_LIGHT, combined
     from tofuse.engine.sensor.multipath_correction import Multipath
     from tofuse.engine.sensor.raw_amplitude import range_and_amplitude

@@ -20,6 +20,6 @@ if TYPE_CHECKING:
         write_log,
         write_tum,
     )
-    from tofuse.formats.poses.trajectory_formats import Clock, OPENGL, TimedPoses, read_poses
+    from tofuse.formats.poses.trajectory_formats import OPENGL, Clock, TimedPoses, read_poses
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)
