@@ -1,4 +1,4 @@
-"""A contract of import-linter: rooms are entered by their faces, and no files import each other in a circle.
+"""A contract of import-linter: rooms are entered by their faces; no circles of files.
 
 A room is a folder of modules. Modules of other rooms import from its `__init__` alone, whose names,
 listed under ``if TYPE_CHECKING``, are at most 15. Single files directly in a building have no face.
