@@ -294,7 +294,7 @@ def _outline(axes: Axes, flat: Float64) -> None:
     # Cells wide enough for a few samples in each, so that surfaces have no holes.
     cell = max(extent.max() / 160, 1.5 * np.sqrt(extent[0] * extent[1] / len(flat)))
     edges = [a + cell * np.arange(-4, int(n) + 6) for a, n in zip(low, extent / cell, strict=True)]
-    counts, x, y = np.histogram2d(*flat.T, bins=edges)
+    counts, x, y = np.histogram2d(flat[:, 0], flat[:, 1], bins=edges)
     mask = ndimage.binary_fill_holes(ndimage.binary_closing(counts > 0, iterations=3))
     # Half a cell inside the cells' rim, which is half a cell outside the surface.
     x, y = x[:-1] + cell / 2, y[:-1] + cell / 2

@@ -157,7 +157,7 @@ class PreparedView:
             return self._subsampled[step]
         first = step // 2
         pixels = (slice(first, None, step),) * 2
-        images = {
+        images: dict[str, Any] = {
             name: np.ascontiguousarray(image[pixels])
             for name in ("z", "sigma", "planes", "plane_variance", "albedo", "pixel_variance")
             if (image := getattr(self, name)) is not None

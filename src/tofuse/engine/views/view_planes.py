@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ from tofuse.engine.views.projection import Projection
 from tofuse.engine.views.view_planes_kernels import fit_planes
 
 # Neighbours along the rows, and along the columns.
-_NEIGHBOURS = ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1]))
+_NEIGHBOURS: tuple[tuple[Any, Any], ...] = ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1]))
 # Rows of a chunk: many, as chunks cost synchronisation and their windows overlap; fixed, so that
 # the result does not depend on the number of threads.
 _CHUNK_ROWS = 60

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import Camera, depth_conversion
@@ -21,7 +22,10 @@ KEYS = ("range_m", "bias_m", "pixel_bias_m")
 
 def write_correction(path: str | Path, correction: DepthCorrection) -> None:
     """Write an .npz with the keys range_m, bias_m and, where known, pixel_bias_m."""
-    arrays = {"range_m": correction.range_m, "bias_m": correction.bias_m}
+    arrays: dict[str, NDArray[np.floating]] = {
+        "range_m": correction.range_m,
+        "bias_m": correction.bias_m,
+    }
     if correction.pixel_bias_m is not None:
         arrays["pixel_bias_m"] = correction.pixel_bias_m
     with atomic.replacing(path) as part, part.open("wb") as file:
