@@ -14,23 +14,23 @@ from tofuse.engine.results import FrameRecord
 
 
 class Progress(Protocol):
-    """Receives the progress of a long job."""
+    """Receives the progress of a long job; what a receiver does not override, it ignores."""
 
     def stage(self, name: str, total: int | None = None) -> None:
         """Begin a stage of `total` steps (None: unknown)."""
-        ...
+        return
 
     def advance(self, record: FrameRecord | None = None) -> None:
         """Finish one step of the stage; with the record of the frame, if the step is a frame."""
-        ...
+        return
 
     def note(self, text: str) -> None:
         """Show a message to the user."""
-        ...
+        return
 
     def placed(self, frame: Frame, T_world_camera: Float64) -> None:
         """Show a frame of the model at its current pose (4, 4)."""
-        ...
+        return
 
 
 class Silent(Progress):

@@ -77,9 +77,9 @@ def run(arguments: cli.Run) -> int:
         if arguments.rig is not None:
             arguments.inputs = [str(path) for path in recordings_of(arguments.rig).values()]
     if arguments.rig is not None:
-        return _run_rig(arguments, options)
+        return _run_rig(arguments.rig, arguments, options)
     if arguments.into is not None:
-        return _run_into(arguments, options)
+        return _run_into(arguments.into, arguments, options)
     if arguments.view:
         return _run_live(arguments, options)
     for is_set, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
@@ -105,13 +105,12 @@ def run_options(arguments: cli.Run) -> Options:
     return from_arguments(Options, arguments)
 
 
-def _run_into(arguments: cli.Run, options: Options) -> int:
+def _run_into(into: Path, arguments: cli.Run, options: Options) -> int:
     """Run, then merge the result into an earlier one, which stays unchanged if that fails."""
     from tofuse.apps.jobs import merging
     from tofuse.apps.jobs import run as run_pipeline
     from tofuse.engine.errors import InputError
 
-    into = arguments.into
     if arguments.view:
         raise InputError(
             "can't be combined with --into", where="--view", remedy="view the result afterwards"
@@ -135,7 +134,7 @@ def _run_into(arguments: cli.Run, options: Options) -> int:
     return _finished(merged, into, arguments)
 
 
-def _run_rig(arguments: cli.Run, options: Options) -> int:
+def _run_rig(rig: Path, arguments: cli.Run, options: Options) -> int:
     """``tofuse run --rig``."""
     from tofuse.apps.rigs import run_rig
     from tofuse.engine.errors import InputError
@@ -145,7 +144,7 @@ def _run_rig(arguments: cli.Run, options: Options) -> int:
             option = f"--{name.replace('_', '-')}"
             raise InputError("can't be used with a rig", where=option, remedy="leave it out")
     with progress_for(as_json=arguments.json) as progress:
-        rig_result = run_rig(arguments.rig, arguments.inputs, options, progress=progress)
+        rig_result = run_rig(rig, arguments.inputs, options, progress=progress)
     return _finished(rig_result.result, arguments.out, arguments)
 
 

@@ -6,7 +6,7 @@ import argparse
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib import import_module
@@ -186,7 +186,7 @@ def _add_options(parser: argparse.ArgumentParser, command: type[Command]) -> Non
             container.add_argument(option, help=help_text, **settings)
 
 
-def _settings(name: str, hint: Any, defaults: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+def _settings(name: str, hint: Any, defaults: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Return the name and the settings of an argument or option, from its field."""
     option = f"--{name.replace('_', '-')}" if name in defaults else name
     default = defaults.get(name)

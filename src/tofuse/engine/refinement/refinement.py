@@ -122,7 +122,7 @@ class Refiner(Protocol):
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """Add the next frame that has a pose, if `needs_points` is set."""
-        ...
+        return
 
     def finish(
         self,

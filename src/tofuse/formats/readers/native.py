@@ -56,6 +56,8 @@ class NativeSource(FileSource):
 
     concurrent = True
 
+    camera: Camera | None  # type: ignore[assignment]  # None for clouds
+
     def __init__(self, folder: Path, camera_path: Path | None = None) -> None:
         self.folder = folder
         self.is_clouds = not reading.is_folder(folder / "depth") and reading.is_folder(

@@ -89,9 +89,9 @@ class Record3DSource(FileSource):
         """See `FileSource.load`."""
         number = self.store.numbers[index]
         depth = self.store.depth(number, self.size)
-        color = self.store.color(number)
-        if color is not None:
-            color = pixels.resized(as_color(parse_image(*color)), self.size, color[1])
+        stored, color = self.store.color(number), None
+        if stored is not None:
+            color = pixels.resized(as_color(parse_image(*stored)), self.size, stored[1])
         confidence = self.store.confidence(number, self.size)
         return self.image(index, depth, confidence_image=confidence, color_image=color)
 

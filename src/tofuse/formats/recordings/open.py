@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -325,6 +325,7 @@ def read_reference(path: str | Path) -> TimedPoses:
     """
     path = Path(path)
     poses_file = path / "groundtruth.txt" if path.is_dir() else path
+    readers_of_poses: list[Callable[[], TimedPoses | Recording]]
     readers_of_poses = [lambda: read_poses(poses_file), lambda: open_recording(path)]
     if not poses_file.is_file():  # else the images are not needed
         readers_of_poses = [lambda: open_recording(path), lambda: read_poses(path)]
