@@ -92,7 +92,7 @@ def test_saved_result_round_trips(result, tmp_path):
 
 def test_save_rejects_foreign_folder(result, tmp_path):
     (tmp_path / "diary.txt").write_text("dear")
-    with pytest.raises(tofuse.OutputError, match="contains no earlier result"):
+    with pytest.raises(tofuse.OutputError, match="no earlier result"):
         result.save(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["diary.txt"]
 

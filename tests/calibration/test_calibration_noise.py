@@ -184,7 +184,7 @@ def test_noise_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert NoiseModel.from_dict(printed["model"]).amplitude == read_noise(out).amplitude
     out.write_text('{"schema": 1, "name": "x", "range": {"a": 20, "b": 0}}')
     with pytest.raises(InputError, match="a must be 0 to 5"):
-        noise_model_for(recording)
+        open_recording(tmp_path / "rec")
 
 
 @pytest.mark.parametrize("gain", [0.01, 30.0])

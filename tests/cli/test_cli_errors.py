@@ -344,5 +344,6 @@ def test_unexpected_errors_are_one_line(capfd, monkeypatch) -> None:
     def too_much(*_args: object, **_options: object) -> None:
         raise MemoryError
 
+    monkeypatch.undo()
     monkeypatch.setattr("tofuse.apps.jobs.evaluating.read_poses", too_much)
     refuses(capfd, "evaluate", "a", "b", says=("out of memory", "--every"))

@@ -17,8 +17,8 @@ def test_listed_kernels_exist() -> None:
     listed = ahead.signatures()
     for name, _ in listed:
         module, function = name.rsplit(".", 1)
-        __import__(f"tofuse.engine.compute.{module}")
-        assert hasattr(sys.modules[f"tofuse.engine.compute.{module}"], function)
+        __import__(f"tofuse.{module}")
+        assert hasattr(sys.modules[f"tofuse.{module}"], function)
     assert len(listed) == len(set(listed)) > 50
 
 
@@ -40,7 +40,7 @@ def test_run_uses_listed_signatures(room_recording: Path) -> None:
         tofuse.reconstruct(tofuse.open(sys.argv[1]).select(end=3))
         for name, types in ahead.signatures():
             module, function = name.rsplit(".", 1)
-            module = sys.modules.get(f"tofuse.engine.compute.{module}")
+            module = sys.modules.get(f"tofuse.{module}")
             if module is not None and types in getattr(module, function).overloads:
                 print(name)
         """

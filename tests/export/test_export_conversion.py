@@ -18,7 +18,9 @@ from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import Recording
+from tofuse.engine.noise import NOISE
 from tofuse.engine.noise.model import family_of
+from tofuse.formats.cameras import read_noise, write_noise
 from tofuse.formats.export.conversion import convert
 from tofuse.formats.readers.native import NativeSource
 from tofuse.formats.recordings.open import open_recording
@@ -92,7 +94,7 @@ def test_rays_of_each_frame(tmp_path: Path) -> None:
 
 def test_correction_is_kept_with_raw_measurements(tmp_path: Path) -> None:
     make_native(tmp_path / "scan")
-    (tmp_path / "scan" / "noise.json").write_text("{}")
+    write_noise(tmp_path / "scan" / "noise.json", NOISE["sr4000"])
     before = open_recording(tmp_path / "scan")
     convert(before.select(every=2), tmp_path / "out")
     after = open_recording(tmp_path / "out")
@@ -103,7 +105,7 @@ def test_correction_is_kept_with_raw_measurements(tmp_path: Path) -> None:
     assert isinstance(source, NativeSource)
     assert source.imu["t"].tolist() == [0, 1, 2, 3]
     assert source.frame_columns["temperature_c"].tolist() == [0, 2]
-    assert (tmp_path / "out" / "noise.json").read_text() == "{}"
+    assert read_noise(tmp_path / "out" / "noise.json") == NOISE["sr4000"]
     # The given recording still applies its correction.
     assert isinstance(before.source, NativeSource)
     assert before.source.correction is not None
@@ -147,7 +149,7 @@ def test_failed_conversion_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Mo
         convert(recording, tmp_path / "out", stop)
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
     (tmp_path / "file").write_text("x")
-    with pytest.raises(OutputError, match="isn't empty"):
+    with pytest.raises(OutputError, match="is a file"):
         convert(recording, tmp_path / "file")
     shutil.rmtree(tmp_path / "out", ignore_errors=True)
     (tmp_path / "out").mkdir()

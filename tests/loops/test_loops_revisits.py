@@ -16,6 +16,7 @@ from tofuse.engine.loops import revisits
 from tofuse.engine.loops.candidates import InformationGain, revisited
 from tofuse.engine.loops.loops import PriorLoop
 from tofuse.engine.loops.revisits import Revisits
+from tofuse.engine.search import verification
 from tofuse.engine.search.pose_probability import ACCEPTED
 from tofuse.engine.search.verification import FitQuality
 from tofuse.engine.stored_views.view_store import SampledView, ViewStore
@@ -171,7 +172,7 @@ def test_searched_loops_are_accepted_or_agree(turn, monkeypatch, probable, wrong
     monkeypatch.setattr(revisits, "register_pair", scripted)
     # Nothing fits from the drifted pose, so that only the search can succeed.
     monkeypatch.setattr(
-        revisits.FitStatistics,
+        verification.FitStatistics,
         "assess",
         lambda *_: FitQuality("conflicting", np.inf, "does not fit"),
     )

@@ -8,6 +8,7 @@ import numpy as np
 
 import tofuse
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames import NOISE_MODEL
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import with_recording_defaults
@@ -15,7 +16,6 @@ from tofuse.engine.mapping.config import changed
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.noise.model import NOISE, AmplitudeLaw, NoiseModel, RangeLaw
 from tofuse.engine.sensor.base import Noise
-from tofuse.formats.cameras.noise_file import write_noise
 
 CAMERA = Pinhole(60, 50, 60.0, 60.0, 29.5, 24.5)
 MINE = NoiseModel("mine", RangeLaw(0.004, 0.003), AmplitudeLaw(0.0, 1.5))
@@ -59,12 +59,13 @@ def test_stated_sigma_and_clouds_are_unchanged():
 
 
 def test_default_method_uses_noise_model_of_recording(tmp_path):
-    write_noise(tmp_path / "noise.json", MINE)
-    config = with_recording_defaults(from_method("default"), recording(tmp_path))
+    stored = recording(tmp_path)
+    stored.source.metadata[NOISE_MODEL] = MINE
+    config = with_recording_defaults(from_method("default"), stored)
     assert model_of(config) == MINE
     # It is preserved by run.json.
     assert model_of(changed(config, {}, where="test")) == MINE
-    result = tofuse.reconstruct(recording(tmp_path))
+    result = tofuse.reconstruct(stored)
     assert result.config["corrections"][0]["model"]["range"] == {"a": 0.004, "b": 0.003}
 
 

@@ -11,8 +11,8 @@ import pytest
 from coarse_steps import without_multipath
 from made_rooms import CAMERA, at, seen
 from tofuse.engine.geometry import se3
+from tofuse.engine.search import pair_agreement
 from tofuse.engine.search.verification import FitQuality, FitStatistics
-from tofuse.engine.tracking import selection
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.tracking.motion import FrameTime, MotionModel
 from tofuse.engine.tracking.selection import Selection
@@ -99,13 +99,13 @@ class Alignments(list):
     ],
 )
 def test_cases_of_fit_and_motion(monkeypatch, fit, predicted, agreement, confirmed, accepted):
-    monkeypatch.setattr(selection, "agreement", lambda view, *_: SimpleNamespace(score=view))
+    monkeypatch.setattr(pair_agreement, "agreement", lambda view, *_: SimpleNamespace(score=view))
     alignments = Alignments([(fit, predicted, agreement)], confirmed=confirmed)
     assert Selection(alignments).best() is (alignments[0] if accepted else None)
 
 
 def test_conflict_is_explained_by_objects_or_rivals(monkeypatch) -> None:
-    monkeypatch.setattr(selection, "agreement", lambda view, *_: SimpleNamespace(score=view))
+    monkeypatch.setattr(pair_agreement, "agreement", lambda view, *_: SimpleNamespace(score=view))
     for rival, chosen in ((0.5, 1), (0.9, None)):
         alignments = Alignments([("conflicting", True, rival), ("usual", True, 0.5)])
         assert Selection(alignments).best() is (None if chosen is None else alignments[chosen])
