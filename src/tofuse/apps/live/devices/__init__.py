@@ -1,1 +1,1 @@
-"""."""
+"""Connected cameras, one module each, by their makers' packages."""
