@@ -49,9 +49,9 @@ def test_run_uses_listed_signatures(room_recording: Path) -> None:
     done = subprocess.run(words, check=True, capture_output=True, text=True)
     called = done.stdout.split()
     for name in (
-        "steps.iterate_level",
-        "view_planes.fit_planes",
-        "pair_equations.target_equations",
+        "engine.alignment.step_kernels.iterate_level",
+        "engine.views.view_planes_kernels.fit_planes",
+        "engine.stored_views.pair_equation_kernels.target_equations",
     ):
         assert name in called
     assert len(called) > 40

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -66,28 +65,32 @@ def test_writable_cache_is_kept_and_reused(tmp_path) -> None:
     assert {p: p.stat().st_mtime_ns for p in Path(folder).rglob("*.nb*")} == stamps  # reused
 
 
-@pytest.mark.slow
-def test_cache_key_changes_with_any_kernel(tmp_path) -> None:
-    package = tmp_path / "kernels"
-    shutil.copytree(Path(jit.__file__).parent, package, ignore=shutil.ignore_patterns("__pyc*"))
-    code = (
-        "import importlib.util as u, sys;"
-        f"s = u.spec_from_file_location('copy', r'{package / 'jit.py'}');"
-        "m = u.module_from_spec(s); s.loader.exec_module(m); print(m.source_hash())"
-    )
-    assert _run({}, code) == [jit.source_hash()]
-    with (package / "lzf.py").open("a") as file:
-        file.write("# changed\n")
-    changed = _run({}, code)
-    assert changed != [jit.source_hash()]
-    (package / "lzf.py").rename(package / "renamed.py")
-    assert _run({}, code) != changed
+def test_cache_key_changes_with_any_kernel(tmp_path: Path) -> None:
+    """Also with one in another folder, which may be a callee."""
+    package = Path(jit.__file__).parents[2]
+    files = jit.kernel_files()
+    assert {f.parent.parent.name for f in files} >= {"engine", "lab"}
+
+    def hash_of_copy(name: str, *, changed: str = "", renamed: str = "") -> str:
+        copy = tmp_path / name
+        for file in files:
+            relative = file.relative_to(package)
+            target = copy / (
+                relative.with_name("x_kernels.py") if file.name == renamed else relative
+            )
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(file.read_bytes() + (b"# changed" if file.name == changed else b""))
+        return jit.source_hash(copy)
+
+    same = hash_of_copy("same")
+    assert same == jit.source_hash()
+    changed = hash_of_copy("changed", changed="tukey_kernels.py")
+    renamed = hash_of_copy("renamed", renamed="tukey_kernels.py")
+    assert len({same, changed, renamed}) == 3
 
 
-def test_kernels_of_the_laboratory_depend_on_both_packages(tmp_path: Path) -> None:
-    from tofuse.lab import simulation as kernels
-
-    folder = Path(kernels.__file__).parent
-    assert jit.source_hash(folder) != jit.source_hash()
-    (tmp_path / "more.py").write_text("")
-    assert jit.source_hash(tmp_path) not in (jit.source_hash(), jit.source_hash(folder))
+def test_kernels_are_in_files_that_the_cache_key_covers() -> None:
+    package = Path(jit.__file__).parents[2]
+    for file in package.rglob("*.py"):
+        if "\n@kernel\n" in file.read_text("utf-8"):
+            assert file in jit.kernel_files()

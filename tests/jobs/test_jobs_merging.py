@@ -14,7 +14,6 @@ import made_sessions
 from made_sessions import quick
 from tofuse.apps.cli.program import main
 from tofuse.apps.jobs import merging
-from tofuse.apps.jobs import running as run_module
 from tofuse.apps.jobs.merging import merge_sessions, merged_config
 from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.jobs.sessions import read_sessions
@@ -24,9 +23,9 @@ from tofuse.apps.results.output import write_result
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.fusion import texture
 from tofuse.engine.fusion.texture import textured
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping import texturing as paint
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.progress import Silent
 from tofuse.formats.poses.trajectory import read_tum
@@ -167,7 +166,7 @@ def test_command_writes_result(session_results, tmp_path, monkeypatch, capsys) -
         painted.append(len(views))
         return textured(mesh, views, poses, size // 8)  # a small texture
 
-    monkeypatch.setattr(paint, "textured", painting)
+    monkeypatch.setattr(texture, "textured", painting)
     assert main([*words, "--threads", "2", "--texture"]) == 0
     assert "here and there overlap" in capsys.readouterr().out
     assert painted == [2 * N]  # views of both
@@ -263,7 +262,7 @@ def test_recording_is_added_to_map(session_results, tmp_path, monkeypatch, capsy
         """Every run returns this result, whatever the arguments."""
         shutil.rmtree(tmp_path / "new", ignore_errors=True)
         shutil.copytree(folder, tmp_path / "new")
-        monkeypatch.setattr(run_module, "run", lambda *_: shortened)
+        monkeypatch.setattr("tofuse.apps.jobs.run", lambda *_: shortened)
 
     runs_to(session_results["there"])
     words = ["run", "recording", "--out", str(tmp_path / "new"), "--into", str(into)]

@@ -106,7 +106,7 @@ def test_reconstruction_is_repeated_exactly(tmp_path: Path, monkeypatch) -> None
     for threads in (2, 1):
         file = TrackedFile(tmp_path / TRACKED, "key", lambda _text: None)
         results.append(
-            reconstruct.reconstruct(recording, CONFIG, threads=threads, tracked_file=file)
+            reconstruct.reconstruct(recording, CONFIG, threads=threads, tracked_frames=file)
         )
         assert isinstance(file._tracker, LoggingTracker if threads == 2 else ReplayingTracker)
     whole, again = (replace(result, threads=1) for result in results)

@@ -70,6 +70,7 @@ class Claim:
         self._path = path
         self._lock = FileLock(path, blocking=False, thread_local=False)
         try:
+            path.open("ab").close()  # filelock takes any failure for a lock of another process
             self._lock.acquire()
         except Timeout:
             raise OutputError(
