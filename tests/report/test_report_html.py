@@ -18,7 +18,6 @@ from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.fields import fields
 from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import (
-    MAX_FACES,
     make_scene,
     packed,
 )
@@ -289,8 +288,8 @@ def test_viewer_mesh_is_simplified():
     )
     result, rows = room()[0], {}
     scene = make_scene(replace(result, mesh=mesh), rows)
-    assert len(scene.mesh.faces) <= MAX_FACES
-    assert len(scene.mesh.faces) > MAX_FACES / 4
+    assert len(scene.mesh.faces) <= 250_000
+    assert len(scene.mesh.faces) > 60_000
     data = packed(scene)
     model = data["model"]
     shown = unpack(model["points"], "<u2", 3) / 65535 * data["extent"] + data["low"]

@@ -6,6 +6,7 @@ Edge collapse by quadric error (Garland and Heckbert 1997), by fast-simplificati
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from threading import Lock
 
 import numpy as np
@@ -96,6 +97,8 @@ def with_distinct_corners(faces: Intp) -> Int32:
     return faces[(a != b) & (b != c) & (c != a)].astype(np.int32)
 
 
+# Of an overview: 8 MB as glTF, with 32 bytes a vertex and 12 a triangle.
+OVERVIEW_FACES, OVERVIEW_VERTICES = 250_000, 155_000
 # Damping of a merged vertex towards the centroid, relative to the planes around it.
 _DAMPING = 0.02
 # Maximum number of triangles from which the mean size is estimated.
@@ -302,6 +305,18 @@ class Mesh(Exportable):
                 return self._merged(group, count, remaining, cell)
             # A larger step than a flat surface would need.
             cell *= float(np.clip((len(remaining) / faces) ** 0.6, 1.02, 2.0))
+
+    @cached_property
+    def overview(self) -> Mesh:
+        """The surface, clustered until a browser on a phone can show it.
+
+        At most `OVERVIEW_FACES` triangles and `OVERVIEW_VERTICES` vertices: 8 MB as glTF.
+        """
+        faces, shown = OVERVIEW_FACES, self.clustered(OVERVIEW_FACES)
+        while len(shown) > OVERVIEW_VERTICES:
+            faces = int(0.8 * faces)
+            shown = self.clustered(faces)
+        return shown
 
     def simplified(self, cell_m: float) -> Mesh:
         """Return the mesh simplified by clustering vertices in the cells of a grid.
