@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, Intp, UInt8
+from tofuse.engine.compute import ProcessLock
 from tofuse.engine.fusion.cloud import Cloud, has_color
 from tofuse.engine.fusion.clustering_kernels import (
     flatten_groups,
@@ -34,7 +34,7 @@ _UNITS_PER_SPACING = 200.0
 _UNIT_FACTOR, _MIN_REMOVED = 100.0, 0.1
 
 # The library's state is global.
-_LOCK = Lock()
+_LOCK = ProcessLock()
 
 
 def collapse_edges(

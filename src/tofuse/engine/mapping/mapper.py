@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.compute import serial_chunks, thread_count, threads, trim_memory
+from tofuse.engine.compute import thread_count, threads, trim_memory
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.loops import PriorLoop
@@ -123,7 +123,7 @@ class Mapper:
             self._log.repeated.append(frame.index)
         # Chunks run serially while other threads prepare frames; else relocalization uses all.
         busy = prepared is not None and prepared.filtered is not None
-        with threads(self.threads), serial_chunks(busy):
+        with threads(self.threads, serial=busy):
             filtered = self._prepare(frame, history, prepared)
             step = self._track(filtered, T_odometry, repeated)
             self._store(filtered, step, T_odometry, gravity)
