@@ -15,6 +15,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.clouds.cloud_pair import follow_clouds, register_clouds, with_cloud_information
 from tofuse.engine.clouds.fpfh import candidates
+from tofuse.engine.clouds.near_origin import NearOrigin
 from tofuse.engine.clouds.viewpoint import as_image, viewpoint_of
 from tofuse.engine.compute import one_blas_thread
 from tofuse.engine.errors import InputError, RegistrationError
@@ -23,9 +24,6 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number, part
 from tofuse.engine.search import follow, register_pair, verification
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
-
-# Clouds with a larger distance are in different frames.
-_MAX_FRAME_DISTANCE_M = 1e4
 
 MIN_POINTS = 10
 # For recorded views with a wide baseline, which multipath distorts individually.
@@ -192,10 +190,10 @@ def register(
     """
     check_number(seed, Bounds(0), "seed", whole=True)
     start = None if guess is None else se3.check_pose(guess, where="guess")
+    near = NearOrigin.of(_view(source, "source"), _view(target, "target"), start)
     rng = np.random.default_rng([seed, 0])
-    if isinstance(source, RangeFrame | CloudFrame) or isinstance(target, RangeFrame | CloudFrame):
-        return _registered(_view(source, "source"), _view(target, "target"), start, method, rng)
-    return _register_arrays(_cloud(source, "source"), _cloud(target, "target"), start, method, rng)
+    registration = _registered(near.source, near.target, near.guess, method, rng)
+    return near.in_files(registration)
 
 
 def _registered(
@@ -209,35 +207,6 @@ def _registered(
         if method is None:
             return AnyPair().register(source, target, guess, rng)
         return method.register(source, target, np.eye(4) if guess is None else guess, rng)
-
-
-def _register_arrays(
-    source: Float64,
-    target: Float64,
-    guess: Float64 | None,
-    method: Registrar | None,
-    rng: np.random.Generator,
-) -> Registration:
-    """Register about the target's median: map coordinates exceed the precision of float32.
-
-    A distant source, in a frame of its own, is shifted to its own median.
-    """
-    source_centre, target_centre = np.median(source, 0), np.median(target, 0)
-    source_centre = (
-        source_centre
-        if np.linalg.norm(source_centre - target_centre) > _MAX_FRAME_DISTANCE_M
-        else target_centre
-    )
-    data, model = (
-        CloudFrame(index, 0.0, (points - centre).astype(np.float32), origin=-centre)
-        for index, points, centre in ((1, source, source_centre), (0, target, target_centre))
-    )
-    T_target_model, T_source_data = np.eye(4), np.eye(4)
-    T_target_model[:3, 3], T_source_data[:3, 3] = target_centre, source_centre
-    T_data_source, T_model_target = se3.inverse(T_source_data), se3.inverse(T_target_model)
-    start = None if guess is None else T_model_target @ guess @ T_source_data
-    registration = _registered(data, model, start, method, rng)
-    return registration.between(T_target_model, T_data_source)
 
 
 def _view(view: Frame | ArrayLike, name: str) -> Frame:
