@@ -15,7 +15,7 @@ from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, Ray
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import AmplitudeKind, DepthKind
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import json_data, reading
+from tofuse.formats.files import json_data, npz, reading
 
 # Limits for any camera: a frame per month to a million per second; ambiguity ranges of modulation
 # at 15 GHz to 1.5 kHz.
@@ -238,33 +238,21 @@ def check_size(image: NDArray[Any], camera: Camera, where: str | Path) -> None:
 
 def read_rays(path: Path) -> RayTable:
     """Read a rays.npy: (H, W, 2) float32 of x/z and y/z."""
-    try:
-        # Mapped first, so that a damaged header can't cause an allocation larger than the file.
-        table = np.load(path, mmap_mode="r", allow_pickle=False)
-        if not isinstance(table, np.ndarray) or table.dtype.kind != "f":
-            raise ValueError("not an array of floats")
-        if table.ndim != 3 or table.shape[2] != 2:
-            raise ValueError(f"shape {table.shape}, not (H, W, 2)")
-        rays = np.array(table, float)
-        finite = np.isfinite(rays)
+    table = npz.read_npy(path)
+    if table.dtype.kind != "f" or table.ndim != 3 or table.shape[2] != 2:
+        problem = f"is not a table of rays ({table.dtype} of shape {table.shape})"
+        raise InputError(problem, where=path, remedy="save (H, W, 2) float32")
+    rays = np.array(table, float)
+    finite = np.isfinite(rays)
+    directions = rays[finite.all(2)]
+    with reading.named(path, "save (H, W, 2) float32"):
         if (np.abs(rays[finite]) > MAX_SLOPE).any():
-            raise ValueError("rays at 90 degrees from the optical axis or more")
-        directions = rays[finite.all(2)]
+            raise InputError("contains rays at 90 degrees from the optical axis or more")
         if not len(directions):
-            raise ValueError("no pixel has a ray")
+            raise InputError("has no pixel with a ray")
         if len(directions) > 1 and not np.ptp(directions, axis=0).any():
-            raise ValueError("all rays are the same")
+            raise InputError("has the same ray for all pixels")
         return RayTable(np.where(finite, rays, np.nan).astype(np.float32))
-    except OSError as error:
-        raise reading.input_error(error, path) from error
-    except InputError as error:
-        raise InputError(error.problem, where=path, remedy=error.remedy) from error
-    except Exception as error:  # NumPy evaluates the header as Python, which can raise anything
-        raise InputError(
-            f"is not a table of rays ({error})",
-            where=path,
-            remedy="save (H, W, 2) float32",
-        ) from error
 
 
 def camera_fields(camera: Camera) -> dict[str, Any]:
@@ -408,12 +396,8 @@ def checked_lens(
             raise InputError(
                 f"is {value}", where=f"{where}: {name}", remedy=f"use {low:g} to 1000000"
             )
-    try:
+    with reading.prefixed(where):
         return cls(size[0], size[1], **values)
-    except InputError as error:
-        raise InputError(
-            error.problem, where=f"{where}: {error.where}", remedy=error.remedy
-        ) from error
 
 
 def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pinhole:
@@ -448,11 +432,9 @@ def _color(get: _Fields) -> ColorCamera | None:
     if camera is None:
         raise get.error("color.intrinsics.model", "is 'rays'", "use a lens model")
     field = "color.T_color_depth"
-    try:
-        matrix = np.array(data.get("T_color_depth"), float)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise get.error(field, "is not a 4x4 matrix", "use four rows of four numbers") from error
-    return ColorCamera(camera, se3.check_pose(matrix, where=f"{get.where}: {field}"))
+    where = f"{get.where}: {field}"
+    matrix = json_data.matrix_of(data.get("T_color_depth"), where, "use four rows of four numbers")
+    return ColorCamera(camera, se3.check_pose(matrix, where=where))
 
 
 # Columns of frames.csv that give each frame its own lens.

@@ -72,6 +72,17 @@ def number_in(
         raise InputError("is too large", where=f"{where}: {name}", remedy=remedy) from error
 
 
+def matrix_of(data: object, where: str | Path, remedy: str | None = None) -> Float64:
+    """Return the (4, 4) matrix in JSON data; InputError naming `where` if it is anything else."""
+    try:
+        matrix = np.array(data, float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError("is not a 4x4 list of numbers", where=where, remedy=remedy) from error
+    if matrix.shape != (4, 4):
+        raise InputError(f"has shape {matrix.shape}, not (4, 4)", where=where, remedy=remedy)
+    return matrix
+
+
 def numbers_in(
     data: Mapping[str, Any],
     name: str,

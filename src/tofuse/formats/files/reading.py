@@ -294,6 +294,28 @@ def named(where: str | Path, remedy: str | None = None) -> Iterator[None]:
 
 
 @contextmanager
+def prefixed(where: str | Path) -> Iterator[None]:
+    """Put the file before the place, such as a field, in InputErrors of a block."""
+    try:
+        yield
+    except InputError as error:
+        where = f"{where}: {error.where}"
+        raise InputError(error.problem, where=where, remedy=error.remedy) from error
+
+
+@contextmanager
+def about(where: str | Path, remedy: str | None = None) -> Iterator[None]:
+    """Complete the InputErrors of a block that state no place, or no remedy."""
+    try:
+        yield
+    except InputError as error:
+        if error.where and (error.remedy or not remedy):
+            raise
+        where, remedy = error.where or where, error.remedy or remedy
+        raise InputError(error.problem, where=where, remedy=remedy) from error
+
+
+@contextmanager
 def library_errors(where: str | Path, remedy: str = "copy the file again") -> Iterator[None]:
     """Turn any exception of a library that reads a damaged file into an InputError."""
     try:

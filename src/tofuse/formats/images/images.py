@@ -25,6 +25,7 @@ MAX_IMAGE_BYTES = 1 << 29
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
+_COPY_AGAIN = "copy the file again"
 _NOT_SOF = {0xC4, 0xC8, 0xCC}
 
 
@@ -51,55 +52,52 @@ def read_header(path: str | Path) -> ImageHeader:
         If it is neither, is cut off within its header, or declares an absurd size.
     """
     head = reading.read_head(path, 64)
-    return _header(
-        head if head.startswith(_PNG) else reading.read_bytes(path, limit=MAX_IMAGE_BYTES), path
-    )
+    with reading.about(path, _COPY_AGAIN):
+        return _header(
+            head if head.startswith(_PNG) else reading.read_bytes(path, limit=MAX_IMAGE_BYTES)
+        )
 
 
-def _header(data: bytes, path: str | Path) -> ImageHeader:
+def _header(data: bytes) -> ImageHeader:
     if data.startswith(_PNG):
-        header = _png_header(data, path)
+        header = _png_header(data)
     elif data.startswith(b"\xff\xd8"):
-        header = _jpeg_header(data, path)
+        header = _jpeg_header(data)
     else:
         problem = "is empty" if not data else "is neither a PNG nor a JPEG image"
-        raise InputError(problem, where=path, remedy="check the file")
-    check_pixels(header.width, header.height, path)
+        raise InputError(problem)
+    check_pixels(header.width, header.height)
     return header
 
 
-def check_pixels(width: int, height: int, path: str | Path) -> None:
-    """Raise InputError, naming `path`, unless an image may have this size."""
+def check_pixels(width: int, height: int) -> None:
+    """Raise InputError unless an image may have this size."""
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
         raise InputError(
             f"declares {width} x {height} pixels",
-            where=path,
             remedy=f"use an image of 1 to {MAX_PIXELS} pixels",
         )
 
 
-def check_camera_size(
-    width: int, height: int, size: tuple[int, int] | None, path: str | Path
-) -> None:
-    """Raise InputError, naming `path`, unless an image has the size of its camera, if known."""
+def check_camera_size(width: int, height: int, size: tuple[int, int] | None) -> None:
+    """Raise InputError unless an image has the size of its camera, if known."""
     if size is not None and (width, height) != size:
         raise InputError(
             f"is {width} x {height} pixels, the camera {size[0]} x {size[1]}",
-            where=path,
             remedy="use the camera description of these images",
         )
 
 
-def _png_header(data: bytes, path: str | Path) -> ImageHeader:
+def _png_header(data: bytes) -> ImageHeader:
     if len(data) < 33 or data[12:16] != b"IHDR":
-        raise InputError("is cut off within its header", where=path, remedy="copy the file again")
+        raise InputError("is cut off within its header")
     width, height, bits, color = struct.unpack(">IIBB", data[16:26])
     if color not in _PNG_CHANNELS:
-        raise InputError("is a damaged PNG (no such colour type)", where=path)
+        raise InputError("is a damaged PNG (no such colour type)")
     return ImageHeader("png", width, height, _PNG_CHANNELS[color], bits)
 
 
-def _jpeg_header(data: bytes, path: str | Path) -> ImageHeader:
+def _jpeg_header(data: bytes) -> ImageHeader:
     offset = 2
     while offset + 9 < len(data):
         if data[offset] != 0xFF:
@@ -113,10 +111,10 @@ def _jpeg_header(data: bytes, path: str | Path) -> ImageHeader:
             bits, height, width, channels = struct.unpack(">BHHB", data[offset + 4 : offset + 10])
             return ImageHeader("jpeg", width, height, channels, bits)
         offset += 2 + length
-    raise InputError("is a damaged or cut off JPEG", where=path, remedy="copy the file again")
+    raise InputError("is a damaged or cut off JPEG")
 
 
-def _check_complete(data: bytes, path: str | Path) -> None:
+def _check_complete(data: bytes) -> None:
     """Raise InputError unless a PNG has all its chunks, each with its checksum."""
     view = memoryview(data)
     offset = len(_PNG)
@@ -127,11 +125,11 @@ def _check_complete(data: bytes, path: str | Path) -> None:
             break
         (checksum,) = struct.unpack_from(">I", data, end - 4)
         if zlib.crc32(view[offset + 4 : end - 4]) != checksum:
-            raise InputError("is damaged (wrong checksum of a PNG chunk)", where=path)
+            raise InputError("is damaged (wrong checksum of a PNG chunk)")
         if data[offset + 4 : offset + 8] == b"IEND":
             return
         offset = end
-    raise InputError("is cut off before its end", where=path, remedy="copy the file again")
+    raise InputError("is cut off before its end")
 
 
 def check_first_size(files: Sequence[Path], size: tuple[int, int], where: str, remedy: str) -> None:
@@ -201,22 +199,26 @@ def parse_image(
     dtype: str | None = None,
 ) -> NDArray[Any]:
     """Decode a PNG or JPEG in memory; `path` names it in errors. See `read_image`."""
-    header = _header(data, path)
-    check_camera_size(header.width, header.height, size, path)
+    with reading.about(path, _COPY_AGAIN):
+        return _parsed(data, size, dtype)
+
+
+def _parsed(data: bytes, size: tuple[int, int] | None, dtype: str | None) -> NDArray[Any]:
+    header = _header(data)
+    check_camera_size(header.width, header.height, size)
     if dtype is not None and (header.channels != 1 or f"uint{header.bits}" != dtype):
         raise InputError(
             f"has {header.channels} channels of {header.bits} bits",
-            where=path,
             remedy=f"store one channel of {dtype}",
         )
     if header.format == "png":
-        _check_complete(data, path)
+        _check_complete(data)
     elif data.rfind(b"\xff\xd9") < 0:
-        raise InputError("is cut off before its end", where=path, remedy="copy the file again")
-    return _decode(data, header, path)
+        raise InputError("is cut off before its end")
+    return _decode(data, header)
 
 
-def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
+def _decode(data: bytes, header: ImageHeader) -> NDArray[Any]:
     import cv2
 
     grey = header.channels < 3
@@ -226,17 +228,17 @@ def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
         if grey
         else cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     )
-    image = decoded(data, flags, (header.height, header.width), path)
+    image = decoded(data, flags, (header.height, header.width))
     return image if grey else np.ascontiguousarray(image[..., ::-1])
 
 
-def decoded(data: bytes, flags: int, shape: tuple[int, int], path: str | Path) -> NDArray[Any]:
+def decoded(data: bytes, flags: int, shape: tuple[int, int]) -> NDArray[Any]:
     """Decode an image by OpenCV with its `flags`.
 
     Raises
     ------
     InputError
-        Naming `path`, if that fails, or the image has another (height, width).
+        If that fails, or the image has another (height, width).
     """
     import cv2
 
@@ -245,7 +247,7 @@ def decoded(data: bytes, flags: int, shape: tuple[int, int], path: str | Path) -
     except cv2.error:
         image = None
     if image is None or image.shape[:2] != shape:
-        raise InputError("can't be decoded", where=path, remedy="copy the file again")
+        raise InputError("can't be decoded")
     return image
 
 

@@ -37,15 +37,16 @@ def read_tiff(path: str | Path, size: tuple[int, int] | None = None) -> NDArray[
     import cv2
 
     data = reading.read_bytes(path, limit=MAX_IMAGE_BYTES)
-    width, height = tiff_size(data, path)
-    check_camera_size(width, height, size, path)
-    image = decoded(data, cv2.IMREAD_UNCHANGED, (height, width), path)
-    if image.ndim != 2 or image.dtype.kind not in "uf":
-        raise InputError("can't be decoded", where=path, remedy="store one channel as TIFF")
+    with reading.about(path, "copy the file again"):
+        width, height = tiff_size(data)
+        check_camera_size(width, height, size)
+        image = decoded(data, cv2.IMREAD_UNCHANGED, (height, width))
+        if image.ndim != 2 or image.dtype.kind not in "uf":
+            raise InputError("can't be decoded", remedy="store one channel as TIFF")
     return image
 
 
-def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
+def tiff_size(data: bytes) -> tuple[int, int]:
     """Return width and height of the first image, after checking that its data is complete.
 
     Raises
@@ -56,7 +57,7 @@ def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if order is None:
         problem = "is empty" if not data else "is not a TIFF image"
-        raise InputError(problem, where=path, remedy="check the file")
+        raise InputError(problem)
     try:
         tags = _tags(data, order)
         width, height = tags[_WIDTH][0], tags[_HEIGHT][0]
@@ -68,12 +69,12 @@ def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
             for starts, sizes in pieces
         )
     except (struct.error, KeyError, IndexError, ValueError) as error:
-        raise InputError("is a damaged TIFF", where=path, remedy="copy the file again") from error
+        raise InputError("is a damaged TIFF") from error
     check_pixels(width, height, path)
     if channels != 1:
-        raise InputError(f"has {channels} channels", where=path, remedy="store one channel")
+        raise InputError(f"has {channels} channels", remedy="store one channel")
     if not complete:
-        raise InputError("is cut off before its end", where=path, remedy="copy the file again")
+        raise InputError("is cut off before its end")
     return width, height
 
 

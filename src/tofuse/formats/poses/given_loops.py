@@ -31,36 +31,33 @@ def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[
         words = line.split("#", 1)[0].split()
         if not words:
             continue
-        where = f"{path}, line {number}"
-        loop = _loop(words, where)
-        for index in (loop.i, loop.j):
-            if frames is not None and index not in frames:
-                raise InputError(
-                    f"there is no frame {index}", where=where, remedy="use indices of frames"
-                )
-        if (loop.i, loop.j) in loops:
-            raise InputError(f"the loop {loop.i} {loop.j} is given twice", where=where)
+        with reading.about(f"{path}, line {number}"):
+            loop = _loop(words)
+            for index in (loop.i, loop.j):
+                if frames is not None and index not in frames:
+                    raise InputError(f"there is no frame {index}", remedy="use indices of frames")
+            if (loop.i, loop.j) in loops:
+                raise InputError(f"the loop {loop.i} {loop.j} is given twice")
         loops[loop.i, loop.j] = loop
     return list(loops.values())
 
 
-def _loop(words: list[str], where: str) -> PriorLoop:
+def _loop(words: list[str]) -> PriorLoop:
     form = "write 'i j' or 'i j tx ty tz qx qy qz qw'"
     if len(words) not in (2, 9):
-        raise InputError(f"has {len(words)} values", where=where, remedy=form)
+        raise InputError(f"has {len(words)} values", remedy=form)
     try:
         i, j = (int(word) for word in words[:2])
         values = np.array([float(word) for word in words[2:]])
     except ValueError as error:
-        raise InputError(f"is not understood ({error})", where=where, remedy=form) from error
+        raise InputError(f"is not understood ({error})", remedy=form) from error
     if i < 0 or j < 0 or i == j:
-        raise InputError(f"joins frames {i} and {j}", where=where, remedy="use two frames")
+        raise InputError(f"joins frames {i} and {j}", remedy="use two frames")
     if len(values) == 0:
         return PriorLoop(min(i, j), max(i, j))
     if not np.isfinite(values).all() or abs(quaternion.length(values[3:]) - 1) > _UNIT:
         raise InputError(
             "is not a rigid motion",
-            where=where,
             remedy="use finite numbers and a quaternion qx qy qz qw of length 1",
         )
     T = quaternion.to_pose(values[3:], values[:3])

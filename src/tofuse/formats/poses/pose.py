@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.formats.files import reading, tables
+from tofuse.formats.files import json_data, reading, tables
 
 FIELD = "T_target_source"
 _REMEDY = (
@@ -34,12 +34,13 @@ def read_pose(path: str | Path) -> Float64:
         Naming file and field, if it can't be read or is not a rigid motion.
     """
     text = reading.read_text(path, limit=_MAX_BYTES)
-    if text.lstrip()[:1] in ("{", "["):
-        matrix, where = _from_json(text, path)
-    else:
-        matrix, where = _from_numbers(text, path), str(path)
-    with reading.named(where, _REMEDY):
-        return se3.check_pose(matrix, where=where)
+    with reading.about(path, _REMEDY):
+        if text.lstrip()[:1] in ("{", "["):
+            matrix, where = _from_json(text, path)
+        else:
+            matrix, where = _from_numbers(text, path), str(path)
+        with reading.named(where, _REMEDY):
+            return se3.check_pose(matrix, where=where)
 
 
 def pose_text(T: ArrayLike) -> str:
@@ -50,19 +51,10 @@ def pose_text(T: ArrayLike) -> str:
 
 def _from_json(text: str, path: str | Path) -> tuple[Float64, str]:
     data = reading.parsed(json.loads, text, where=path, format_name="JSON", remedy=_REMEDY)
-    where = str(path)
-    if isinstance(data, dict):
-        where = f"{path}: {FIELD}"
-        if FIELD not in data:
-            raise InputError("is missing", where=where, remedy=_REMEDY)
-        data = data[FIELD]
-    try:
-        matrix = np.array(data, float)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError("is not a 4x4 list of numbers", where=where, remedy=_REMEDY) from error
-    if matrix.shape != (4, 4):
-        raise InputError(f"has shape {matrix.shape}", where=where, remedy=_REMEDY)
-    return matrix, where
+    where = f"{path}: {FIELD}" if isinstance(data, dict) else str(path)
+    if isinstance(data, dict) and FIELD not in data:
+        raise InputError("is missing", where=where)
+    return json_data.matrix_of(data[FIELD] if isinstance(data, dict) else data, where), where
 
 
 def _from_numbers(text: str, path: str | Path) -> Float64:
@@ -73,17 +65,16 @@ def _from_numbers(text: str, path: str | Path) -> Float64:
             try:
                 numbers.append(float(cell))
             except ValueError as error:
-                raise InputError(
-                    f"{cell[:40]!r} is not a number", where=f"{path}, line {number}", remedy=_REMEDY
-                ) from error
+                where = f"{path}, line {number}"
+                raise InputError(f"{cell[:40]!r} is not a number", where=where) from error
             if not math.isfinite(numbers[-1]):
-                raise InputError(f"contains {cell}", where=f"{path}, line {number}", remedy=_REMEDY)
+                raise InputError(f"contains {cell}", where=f"{path}, line {number}")
     if len(numbers) == 16:
         return np.array(numbers).reshape(4, 4)
     if len(numbers) not in (7, 8):
-        raise InputError(f"contains {len(numbers)} numbers", where=path, remedy=_REMEDY)
+        raise InputError(f"contains {len(numbers)} numbers")
     row = np.array(numbers[-7:])
     norm = float(quaternion.length(row[3:]))
     if abs(norm - 1) > 0.1:
-        raise InputError(f"its quaternion has length {norm:.3g}, not 1", where=path, remedy=_REMEDY)
+        raise InputError(f"its quaternion has length {norm:.3g}, not 1")
     return quaternion.to_pose(row[3:], row[:3])

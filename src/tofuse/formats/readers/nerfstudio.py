@@ -15,7 +15,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
-from tofuse.formats.files import json_data, reading
+from tofuse.formats.files import json_data, npz, reading
 from tofuse.formats.images import read_color, read_image
 from tofuse.formats.poses import OPENGL
 from tofuse.formats.sources import (
@@ -170,13 +170,11 @@ class _Frame:
 
     def pose(self) -> Float64:
         where = f"{self.where}: transform_matrix"
-        try:
-            table = np.array(self.entry.get("transform_matrix"), float)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InputError("isn't made of numbers", where=where, remedy=_REMEDY) from error
-        if table.shape == (3, 4):
-            table = np.concatenate([table, [[0, 0, 0, 1]]])
-        return per_frame.read_matrix_pose(np.atleast_2d(table), where) @ OPENGL
+        rows = self.entry.get("transform_matrix")
+        if isinstance(rows, list) and len(rows) == 3:
+            rows = [*rows, [0, 0, 0, 1]]
+        table = json_data.matrix_of(rows, where, _REMEDY)
+        return per_frame.read_matrix_pose(table, where) @ OPENGL
 
     def number_of(self, name: str, default: float | None = None) -> float:
         if name in self.entry:
@@ -257,10 +255,7 @@ def _unit(document: dict[str, Any], file: Path, nerfstudio: bool) -> float:
 
 def _array(path: Path) -> Float32:
     """Depth (H, W) of a .npy file."""
-    try:
-        table = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # NumPy evaluates the header as Python: any exception
-        raise InputError("is not an array", where=path, remedy="write it by numpy.save") from error
+    table = npz.read_npy(path)
     if table.ndim == 3 and table.shape[2] == 1:
         table = table[..., 0]
     if table.ndim != 2 or table.dtype.kind not in "fiu" or min(table.shape) < 2:
