@@ -28,20 +28,6 @@ AMPLITUDE_KINDS = ("raw", "range_compensated", "ir")
 
 _METRES = "the metres of one count, such as 0.001"
 _LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
-_KEYS = (
-    "schema",
-    *_LENS,
-    "depth_unit_m",
-    "depth_kind",
-    "frame_rate_hz",
-    "ambiguity_m",
-    "confidence_max",
-    "amplitude_kind",
-    "sigma_unit_m",
-    "sensor",
-    "color_registered",
-    "color",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +90,9 @@ class CameraFile:
         return {name: value for name, value in values.items() if value is not None}
 
 
+_KEYS = {field.name for field in fields(CameraFile)} - {"camera", "size", "unknown"}
+
+
 def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     """Read and check a camera.json.
 
@@ -121,13 +110,8 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     """
     data = json_data.read_json(path)
     get = _Fields(data, str(path))
-    schema = data.get("schema")
-    if schema != SCHEMA or isinstance(schema, bool):
-        raise get.error(
-            "schema",
-            f"is {schema!r}" if "schema" in data else "is missing",
-            f"write {SCHEMA}, the only version",
-        )
+    with reading.about(path):
+        json_data.check_schema(data, SCHEMA)
     camera = size = None
     color = None
     unit = 0.001
@@ -152,7 +136,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
         get.text("sensor"),
         get.flag("color_registered", default=True),
         color,
-        tuple(key for key in data if key not in _KEYS),
+        tuple(key for key in data if key not in {"schema", *_LENS, *_KEYS}),
     )
 
 

@@ -72,6 +72,24 @@ def number_in(
         raise InputError("is too large", where=f"{where}: {name}", remedy=remedy) from error
 
 
+def check_schema(data: Mapping[str, Any], version: int) -> None:
+    """Raise InputError unless JSON data has this `schema`."""
+    schema = data.get("schema")
+    if schema != version or isinstance(schema, bool):
+        problem = f"schema is {schema!r}" if "schema" in data else "schema is missing"
+        raise InputError(problem, remedy=f"write {version}, the only version")
+
+
+def rows_in(
+    data: Mapping[str, Any], name: str, where: str | Path, default: object = None
+) -> list[dict[str, Any]]:
+    """Return a list of objects in JSON data; InputError if it is anything else."""
+    rows = data.get(name, default)
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise InputError("is not a list of objects", where=f"{where}: {name}")
+    return rows
+
+
 def matrix_of(data: object, where: str | Path, remedy: str | None = None) -> Float64:
     """Return the (4, 4) matrix in JSON data; InputError naming `where` if it is anything else."""
     try:

@@ -166,7 +166,7 @@ def _truncated(element: _Element) -> InputError:
 
 
 def _lists(element: _Element, rows: Iterable[_Take]) -> _Columns:
-    """Read lists of any lengths, by the functions that take values of each row; others are skipped."""
+    """Read lists of any lengths, by functions that take values of each row; skip other columns."""
     triangles: dict[str, list[Int32]] = {p.name: [] for p in element.properties if p.count_dtype}
     for take in rows:
         for p in element.properties:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import reading
+from tofuse.formats.files import atomic, reading
 
 MAX_PIXELS = 1 << 26  # 8192 x 8192: far beyond any depth camera, and 400 MB of colour
 MAX_IMAGE_BYTES = 1 << 29
@@ -293,3 +293,133 @@ def read_raw(path: str | Path, dtype: str, size: tuple[int, int], remedy: str) -
             remedy=remedy,
         )
     return np.frombuffer(data, pixel).reshape(height, width, *pixel.shape)
+
+
+# Tags of the TIFF 6.0 specification.
+_WIDTH, _HEIGHT, _SAMPLES = 256, 257, 277
+_PIECES = ((273, 279), (324, 325))  # offsets and sizes of strips, or of tiles
+_CODES = {1: "B", 3: "H", 4: "I"}  # of the integer types
+_MAX_TAGS = 256
+
+
+def read_tiff(path: str | Path, size: tuple[int, int] | None = None) -> NDArray[Any]:
+    """Read the first image of a TIFF file: (H, W) of uint8, uint16, float32 or float64.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size
+        Expected (width, height).
+
+    Raises
+    ------
+    InputError
+        If it is not a TIFF of one channel, is cut off or damaged, or of another size.
+    """
+    import cv2
+
+    data = reading.read_bytes(path, limit=MAX_IMAGE_BYTES)
+    with reading.about(path, "copy the file again"):
+        width, height = tiff_size(data)
+        check_camera_size(width, height, size)
+        image = decoded(data, cv2.IMREAD_UNCHANGED, (height, width))
+        if image.ndim != 2 or image.dtype.kind not in "uf":
+            raise InputError("can't be decoded", remedy="store one channel as TIFF")
+    return image
+
+
+def tiff_size(data: bytes) -> tuple[int, int]:
+    """Return width and height of the first image, after checking that its data is complete.
+
+    Raises
+    ------
+    InputError
+        See `read_tiff`.
+    """
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    if order is None:
+        problem = "is empty" if not data else "is not a TIFF image"
+        raise InputError(problem)
+    try:
+        tags = _tags(data, order)
+        width, height = tags[_WIDTH][0], tags[_HEIGHT][0]
+        channels = tags.get(_SAMPLES, [1])[0]
+        pieces = [(tags[a], tags[b]) for a, b in _PIECES if a in tags and b in tags]
+        complete = bool(pieces) and all(
+            len(starts) == len(sizes)
+            and all(start + count <= len(data) for start, count in zip(starts, sizes, strict=True))
+            for starts, sizes in pieces
+        )
+    except (struct.error, KeyError, IndexError, ValueError) as error:
+        raise InputError("is a damaged TIFF") from error
+    check_pixels(width, height)
+    if channels != 1:
+        raise InputError(f"has {channels} channels", remedy="store one channel")
+    if not complete:
+        raise InputError("is cut off before its end")
+    return width, height
+
+
+def _tags(data: bytes, order: str) -> dict[int, list[int]]:
+    """The integer values of the tags of the first directory."""
+    (directory,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, directory)
+    if count > _MAX_TAGS:
+        raise ValueError(count)
+    tags = {}
+    for k in range(count):
+        tag, kind, number = struct.unpack_from(order + "HHI", data, directory + 2 + 12 * k)
+        if kind not in _CODES:
+            continue
+        start = directory + 2 + 12 * k + 8
+        size = struct.calcsize(order + _CODES[kind]) * number
+        if size > 4:
+            (start,) = struct.unpack_from(order + "I", data, start)
+        if start + size > len(data):
+            raise ValueError(number)
+        tags[tag] = list(struct.unpack_from(f"{order}{number}{_CODES[kind]}", data, start))
+    return tags
+
+
+def png_bytes(image: NDArray[np.generic]) -> bytes:
+    """Encode (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB, as PNG."""
+    import cv2
+
+    image = np.asarray(image)
+    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
+        raise InputError(
+            f"is an array of shape {image.shape} and type {image.dtype}",
+            where="image",
+            remedy="pass (H, W) uint8 or uint16, or (H, W, 3) uint8",
+        )
+    if image.ndim == 3:
+        image = np.ascontiguousarray(image[..., ::-1])
+    pixels: NDArray[Any] = image
+    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not ok:
+        raise InputError(f"of shape {image.shape} can't be encoded as PNG", where="image")
+    return bytes(data)
+
+
+def jpeg_bytes(image: UInt8, quality: int = 92) -> bytes:
+    """Encode (H, W, 3) uint8 RGB as JPEG."""
+    import cv2
+
+    pixels: NDArray[Any] = np.ascontiguousarray(np.asarray(image, np.uint8)[..., ::-1])
+    ok, data = cv2.imencode(
+        ".jpg",
+        pixels,
+        [
+            *(cv2.IMWRITE_JPEG_QUALITY, quality),
+            *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+        ],
+    )
+    if not ok:
+        raise InputError(f"of shape {image.shape} can't be encoded as JPEG", where="image")
+    return bytes(data)
+
+
+def write_png(path: str | Path, image: NDArray[np.generic]) -> None:
+    """Write (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB; see `replacing` for errors."""
+    atomic.write_bytes(path, png_bytes(image))
