@@ -14,7 +14,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import DepthKind
 from tofuse.engine.noise import NoiseModel
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.files import atomic, json_data, npz, reading
+from tofuse.formats.files import atomic, npz, reading
 
 _MAX_BYTES = 1 << 30
 
@@ -63,4 +63,4 @@ def write_noise(path: str | Path, model: NoiseModel) -> None:
 
 def read_noise(path: str | Path) -> NoiseModel:
     """Read a noise.json; raise InputError if it can't be read, or is invalid."""
-    return NoiseModel.from_dict(json_data.read_json(path), where=str(path))
+    return NoiseModel.from_dict(reading.read_json(path), where=str(path))

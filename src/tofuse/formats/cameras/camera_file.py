@@ -15,7 +15,7 @@ from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, Ray
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import AmplitudeKind, DepthKind
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import json_data, npz, reading
+from tofuse.formats.files import npz, reading
 
 # Limits for any camera: a frame per month to a million per second; ambiguity ranges of modulation
 # at 15 GHz to 1.5 kHz.
@@ -108,10 +108,10 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     InputError
         Naming file and field, with a remedy.
     """
-    data = json_data.read_json(path)
+    data = reading.read_json(path)
     get = _Fields(data, str(path))
     with reading.about(path):
-        json_data.check_schema(data, SCHEMA)
+        reading.check_schema(data, SCHEMA)
     camera = size = None
     color = None
     unit = 0.001
@@ -268,7 +268,7 @@ class _Fields:
     def number(self, field: str, *, required: bool = False, hint: str = "a number") -> float | None:
         if self.data.get(field) is None and not required:
             return None
-        value = json_data.number_in(self.data, field, self.where, remedy=f"use {hint}")
+        value = reading.number_in(self.data, field, self.where, remedy=f"use {hint}")
         if not math.isfinite(value):
             raise self.error(field, f"is {value}", f"use a finite {hint.removeprefix('a ')}")
         return value
@@ -417,7 +417,7 @@ def _color(get: _Fields) -> ColorCamera | None:
         raise get.error("color.intrinsics.model", "is 'rays'", "use a lens model")
     field = "color.T_color_depth"
     where = f"{get.where}: {field}"
-    matrix = json_data.matrix_of(data.get("T_color_depth"), where, "use four rows of four numbers")
+    matrix = reading.matrix_of(data.get("T_color_depth"), where, "use four rows of four numbers")
     return ColorCamera(camera, se3.check_pose(matrix, where=where))
 
 

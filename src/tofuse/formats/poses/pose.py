@@ -14,7 +14,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.loops import PriorLoop
-from tofuse.formats.files import json_data, reading, tables
+from tofuse.formats.files import reading, tables
 
 FIELD = "T_target_source"
 _REMEDY = (
@@ -56,7 +56,7 @@ def _from_json(text: str, path: str | Path) -> tuple[Float64, str]:
     where = f"{path}: {FIELD}" if isinstance(data, dict) else str(path)
     if isinstance(data, dict) and FIELD not in data:
         raise InputError("is missing", where=where)
-    return json_data.matrix_of(data[FIELD] if isinstance(data, dict) else data, where), where
+    return reading.matrix_of(data[FIELD] if isinstance(data, dict) else data, where), where
 
 
 def _from_numbers(text: str, path: str | Path) -> Float64:

@@ -19,7 +19,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import json_data, npz, reading
+from tofuse.formats.files import npz, reading
 from tofuse.formats.poses.trajectory import associated_poses, poses_of_rows, read_tum, rows_of
 
 # Files with the poses in a folder; the first that exists is used.
@@ -246,7 +246,7 @@ def _transforms(text: str, path: Path) -> TimedPoses:
         if not isinstance(frame, dict):
             raise InputError(f"frame {k} is not an object")
         where = f"{path}, frame {k}: transform_matrix"
-        T = json_data.matrix_of(frame.get("transform_matrix"), where)
+        T = reading.matrix_of(frame.get("transform_matrix"), where)
         poses.append(_rigid(T, where) @ OPENGL)
         names.append(str(frame.get("file_path", k)))
     return _known(poses, frames=_frame_numbers(names))

@@ -13,7 +13,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import atomic, json_data, reading
+from tofuse.formats.files import atomic, reading
 
 SCHEMA = 1
 FILE_NAME = "rig.json"
@@ -126,12 +126,12 @@ def read_rig(path: str | Path) -> Rig:
     InputError
         Naming the invalid field.
     """
-    data = json_data.read_json(path)
+    data = reading.read_json(path)
     with reading.about(path, _REMEDY):
-        json_data.check_schema(data, SCHEMA)
+        reading.check_schema(data, SCHEMA)
         cameras = tuple(
             _camera(row, f"{path}: cameras[{k}]")
-            for k, row in enumerate(json_data.rows_in(data, "cameras", path))
+            for k, row in enumerate(reading.rows_in(data, "cameras", path))
         )
         names = [camera.name for camera in cameras]
         twice = [name for k, name in enumerate(names) if name in names[:k]]
@@ -141,11 +141,11 @@ def read_rig(path: str | Path) -> Rig:
             raise InputError(f"the first camera, {names[0]!r}, is not the identity")
         pairs = tuple(
             _disagreement(row, names, f"{path}: disagreement[{k}]")
-            for k, row in enumerate(json_data.rows_in(data, "disagreement", path, []))
+            for k, row in enumerate(reading.rows_in(data, "disagreement", path, []))
         )
         unplaced = {
             str(row.get("name", "")): str(row.get("reason", ""))
-            for row in json_data.rows_in(data, "unplaced", path, [])
+            for row in reading.rows_in(data, "unplaced", path, [])
         }
     return Rig(cameras, pairs, unplaced)
 
@@ -175,7 +175,7 @@ def _camera(row: dict[str, Any], where: str) -> RigCamera:
             )
         if not isinstance(recording, str):
             raise InputError("recording is not a path")
-    matrix = json_data.numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY)
+    matrix = reading.numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY)
     random = None
     if row.get("random_covariance") is not None:
         random = _covariance(row, "random_covariance", where)
@@ -191,7 +191,7 @@ def _camera(row: dict[str, Any], where: str) -> RigCamera:
 
 
 def _covariance(row: dict[str, Any], name: str, where: str) -> Float64:
-    C = json_data.numbers_in(row, name, where, (6, 6), _REMEDY)
+    C = reading.numbers_in(row, name, where, (6, 6), _REMEDY)
     min_eigenvalue = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
     tolerance = 1e-6 * max(np.abs(C).max(), 1e-9)
     if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or min_eigenvalue < -tolerance:
@@ -209,7 +209,7 @@ def _disagreement(row: dict[str, Any], names: list[str], where: str) -> Disagree
 def _number(
     row: dict[str, Any], name: str, limit: float, where: str, default: float | None = None
 ) -> float:
-    value = json_data.number_in(row, name, where, default, _REMEDY)
+    value = reading.number_in(row, name, where, default, _REMEDY)
     if not abs(value) <= limit:
         raise InputError(f"is {value:g}, not at most {limit:g}", where=f"{where}: {name}")
     return value
