@@ -86,7 +86,7 @@ def _write_model(result: Reconstruction, folder: Path, texture: texture.Textured
     if len(result.cloud) > MAX_PLY_POINTS:
         result.cloud.save(folder / "cloud.laz")
     else:
-        write_ply(folder / "cloud.ply", result.cloud.local_record())
+        write_ply(folder / "cloud.ply", result.cloud.record())
     if result.mesh is not None:
         _write_mesh(result.mesh, result, folder, texture)
     if result.changes:
@@ -115,7 +115,7 @@ def _write_mesh(
 
     `mesh.glb` is an overview of at most `OVERVIEW_BYTES`, or has a texture.
     """
-    write_ply(folder / "mesh.ply", mesh.local_record())
+    write_ply(folder / "mesh.ply", mesh.record())
     upright: dict[str, Any] = {"T_scene_node": result.T_up_world}
     generator = f"tofuse {__version__}"
     if texture is None:
