@@ -101,10 +101,8 @@ def _registered(
     )
     seconds = perf_counter() - start_s
     name = None if options.guess is None else str(options.guess)
-    source_view, target_view = (
-        replace(views[0], frame=near.source),
-        replace(views[1], frame=near.target),
-    )
+    near_source = replace(views[0], frame=near.source)
+    near_target = replace(views[1], frame=near.target)
     T_start = np.eye(4) if near.guess is None else near.guess
     return PairResult(near_source, near_target, registration, T_start, name, seconds)
 

@@ -189,7 +189,7 @@ def make_scene(
     """
     cloud = result.cloud
     sampled = random_subset(len(cloud), MAX_POINTS)
-    points = cloud.points[sampled].astype(float) + cloud.offset
+    points = cloud.points[sampled].astype(float)
     finite = np.isfinite(points).all(1)
     points, sampled = points[finite], sampled[finite]
     ends = [

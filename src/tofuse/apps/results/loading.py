@@ -197,7 +197,6 @@ def _cloud(folder: Path) -> Cloud:
         record.normals,
         record.color,
         np.asarray(record.scalars["views"], np.int32),
-        np.zeros(3),
         None if sigma is None else np.asarray(sigma, np.float32),
     )
 

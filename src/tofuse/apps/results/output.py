@@ -87,9 +87,9 @@ def _write_model(result: Reconstruction, folder: Path) -> None:
     if len(result.cloud) > MAX_PLY_POINTS:
         result.cloud.save(folder / "cloud.laz")
     else:
-        write_ply(folder / "cloud.ply", result.cloud.local_record())
+        write_ply(folder / "cloud.ply", result.cloud.record())
     if result.mesh is not None:
-        write_ply(folder / "mesh.ply", result.mesh.local_record())
+        write_ply(folder / "mesh.ply", result.mesh.record())
     if result.changes:
         _write_changes(result, folder / "changes.ply")
 

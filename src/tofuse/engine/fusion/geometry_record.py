@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Float64, Int32, UInt8
+from tofuse.engine.arrays import Float32, Int32, UInt8
 from tofuse.engine.errors import InputError
 
 _AMPLITUDES = (
@@ -108,16 +108,9 @@ _WRITERS = "tofuse.formats.export"
 class Exportable:
     """Geometry that can be saved, and converted to the types of other packages."""
 
-    offset: Float64
-
-    def local_record(self) -> GeometryRecord:
-        """Return points relative to `offset`, float32, with faces and columns."""
-        raise NotImplementedError
-
     def record(self) -> GeometryRecord:
-        """Return points in the world frame, float64, with faces and columns."""
-        local = self.local_record()
-        return replace(local, points=local.points.astype(np.float64) + self.offset)
+        """Return points in the world frame, with faces and columns."""
+        raise NotImplementedError
 
     def save(self, path: str | Path) -> None:
         """Write a file in the format of its suffix.
