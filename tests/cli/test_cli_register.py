@@ -12,8 +12,8 @@ import pytest
 
 from cli_calls import call, listing, refuses
 from registration_scenes import bumpy_ball, stone, turn
-from tofuse.apps.pairs import job as pair_module
 from tofuse.engine.alignment.base import Registration
+from tofuse.engine.clouds import AnyPair
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.formats.geometry.las import write_las
@@ -118,7 +118,7 @@ def write_cloud(path: Path, points: np.ndarray) -> None:
     """Write (N, 3) points in double precision, in the format of the suffix."""
     rows = "".join(" ".join(f"{v:.6f}" for v in row) + "\n" for row in points)
     if path.suffix == ".ply":
-        write_ply(path, GeometryRecord(points), double=True)
+        write_ply(path, GeometryRecord(points))
     elif path.suffix == ".xyz":
         path.write_text(rows)
     elif path.suffix == ".pcd":
@@ -209,11 +209,11 @@ def test_guess_is_passed_to_registration(clouds, tmp_path, capfd, monkeypatch) -
     """Registration receives the guess, or none."""
     seen = []
 
-    def spy(source, target, *, guess=None):
+    def spy(_, source, target, guess, rng):
         seen.append(guess)
         return made(np.eye(4) if guess is None else guess)
 
-    monkeypatch.setattr(pair_module, "register", spy)
+    monkeypatch.setattr(AnyPair, "register", spy)
     T = se3.exp([0.1, 0.2, 0.3, 0.4, -0.2, 1.0])
     (tmp_path / "guess.txt").write_text(GUESSES["tum"](T))
     _, output = register_json(capfd, *clouds, "--guess", tmp_path / "guess.txt")
@@ -321,7 +321,7 @@ def test_overwrite_without_out_is_rejected(clouds, capfd) -> None:
 
 def test_foreign_output_folder_is_rejected(clouds, tmp_path, capfd, monkeypatch) -> None:
     monkeypatch.setattr(
-        pair_module, "register", lambda *a, **k: pytest.fail("registration was started")
+        AnyPair, "register", lambda *a, **k: pytest.fail("registration was started")
     )
     for name, content in (("photo.jpg", "mine"), ("run.json", "{}"), ("registration.json", "{}")):
         out = tmp_path / f"for {name}"
@@ -395,7 +395,7 @@ def test_verification_sets_exit_status(
     more, status, says, clouds, tmp_path, capfd, monkeypatch, light_page
 ) -> None:
     """Even if all optional fields are missing."""
-    monkeypatch.setattr(pair_module, "register", lambda *a, **k: made(T_SMALL, **more))
+    monkeypatch.setattr(AnyPair, "register", lambda *a, **k: made(T_SMALL, **more))
     assert call("register", *clouds, "--out", tmp_path / "out") == status
     assert capfd.readouterr().out.splitlines()[0] == says
     assert {p.name for p in (tmp_path / "out").iterdir()} == FILES

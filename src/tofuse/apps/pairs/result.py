@@ -15,7 +15,6 @@ from tofuse.apps.results import folders, run_json
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds import NearOrigin
-from tofuse.engine.frames import MAP_COORDINATES_M
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.formats.geometry import write_ply
@@ -236,5 +235,4 @@ def write_aligned(result: PairResult, path: Path) -> None:
             color=frame.color,
             scalars={} if frame.amplitude is None else {"intensity": frame.amplitude},
         ),
-        double=bool(np.abs(points).max(initial=0) > MAP_COORDINATES_M),
     )

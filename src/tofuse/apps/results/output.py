@@ -14,7 +14,9 @@ from tofuse.apps.results.run_json import write_run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import job_pool
 from tofuse.engine.fusion import GeometryRecord, Mesh, display_colors, texture
+from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
+from tofuse.formats.export import exchange
 from tofuse.formats.geometry import write_glb, write_obj, write_ply
 from tofuse.formats.images import png_bytes
 from tofuse.formats.poses import write_g2o, write_tum
@@ -71,7 +73,8 @@ def _write_files(
     with job_pool(1, "tofuse-writer") as background:
         model = background.submit(_write_model, result, folder)
         posed = result.has_pose
-        write_tum(folder / "trajectory.txt", result.timestamps[posed], result.trajectory[posed])
+        poses = se3.about(result.shift, result.trajectory[posed])
+        write_tum(folder / "trajectory.txt", result.timestamps[posed], poses)
         write_g2o(folder / "pose_graph.g2o", result.graph)
         if report is not None:
             report(result, folder)
@@ -84,10 +87,12 @@ def _write_files(
 
 def _write_model(result: Reconstruction, folder: Path) -> None:
     """Write cloud and surface, in the world frame."""
+    # In the coordinates of the input's files, also where float32 doesn't hold them.
+    cloud = result.cloud.record().shifted(result.shift)
     if len(result.cloud) > MAX_PLY_POINTS:
-        result.cloud.save(folder / "cloud.laz")
+        exchange.save(cloud, folder / "cloud.laz")
     else:
-        write_ply(folder / "cloud.ply", result.cloud.record())
+        write_ply(folder / "cloud.ply", cloud)
     if result.mesh is not None:
         write_ply(folder / "mesh.ply", result.mesh.record())
     if result.changes:

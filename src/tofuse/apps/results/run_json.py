@@ -85,6 +85,7 @@ def _content(result: Reconstruction) -> dict[str, Any]:
         "reasons": reasons_json(d.reasons),
         "frames": (_frame(f, result) for f in d.frames),
         "T_up_world": result.T_up_world,
+        "shift_m": result.shift,
         "rig": result.recording.get("rig"),
         "components": [
             _fields(c, "frames", "T_main_component", "joined") for c in result.components
@@ -260,6 +261,8 @@ def frame_covariance(frame: Mapping[str, Any]) -> Float64 | None:
 def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
     """Return the frame indices and poses (N, 4, 4) T_world_camera of the main model of a result.
 
+    Relative to its `shift_of`.
+
     Parameters
     ----------
     folder
@@ -281,7 +284,15 @@ def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
             where=folder / "run.json",
             remedy="copy the whole folder, or run again",
         )
-    return indices, poses
+    return indices, se3.about(-shift_of(run, folder / "run.json"), poses)
+
+
+def shift_of(run: dict[str, Any], where: Path) -> Float64:
+    """Return the shift (3,) in m of a result's clouds; see `Reconstruction.shift`."""
+    shift = np.asarray(run.get("shift_m", (0, 0, 0)))
+    if shift.shape != (3,) or shift.dtype.kind not in "fi" or not np.isfinite(shift).all():
+        raise InputError("shift_m is not three numbers", where=where, remedy="run again")
+    return shift.astype(np.float64)
 
 
 def frames_in_main_model(run: dict[str, Any]) -> list[dict[str, Any]]:

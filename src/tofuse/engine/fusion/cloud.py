@@ -80,13 +80,18 @@ class Cloud(Exportable):
         return float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self) else 0.0
 
 
+# Percentiles that bound a cloud, whatever stray points it has.
+_EXTENT = (0.5, 99.5)
+
+
 def choose_voxel(frame: CloudFrame) -> float:
     """Return a voxel edge in m for the point spacing of a cloud: 2 mm to 10 cm."""
     points = frame.points
     if len(points) == 0:
         return 0.01
     # The spacing of N points on a surface is about the root of the area over N.
-    extent = np.sort(np.ptp(points.astype(float), axis=0))
+    low, high = np.percentile(points.astype(float), _EXTENT, axis=0)
+    extent = np.sort(high - low)
     size = float(np.sqrt(max(extent[2] * extent[1], 1e-6) / len(points)))
     return float(f"{np.clip(size, 0.002, 0.1):.2g}")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Int32, UInt8
+from tofuse.engine.arrays import Float32, Float64, Int32, UInt8
 from tofuse.engine.errors import InputError
+from tofuse.engine.frames import MAP_COORDINATES_M
 
 _AMPLITUDES = (
     "amplitude",
@@ -99,6 +100,18 @@ class GeometryRecord:
                 where=path,
                 remedy="pass (M, 3) vertex indices",
             )
+
+    def written_points(self) -> NDArray[np.floating]:
+        """Return the points as files hold them: "<f8" for map coordinates in float64, or "<f4"."""
+        far = np.abs(self.points).max(initial=0) > MAP_COORDINATES_M
+        double = self.points.dtype == np.float64 and far
+        return np.asarray(self.points, "<f8" if double else "<f4")
+
+    def shifted(self, shift: Float64) -> GeometryRecord:
+        """Return the record with points plus a shift (3,) in m: float64, unless it is zero."""
+        if not shift.any():
+            return self
+        return replace(self, points=self.points.astype(np.float64) + shift)
 
 
 # Imported by name on use: nothing else of the engine knows a file format.

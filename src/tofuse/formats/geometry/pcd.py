@@ -223,7 +223,8 @@ _COLUMNS = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed
 def write_pcd(path: str | Path, cloud: GeometryRecord) -> None:
     """Write an unorganised cloud, version 0.7, binary; see `replacing` for errors.
 
-    Points and normals are written as float32, colours as PCL does (packed into the bits of a float
+    Points are written as float, and as double where they are map coordinates in float64; normals as
+    float, colours as PCL does (packed into the bits of a float
     called rgb), integer scalars with 32 bits, and other scalars as float32.
 
     Raises
@@ -233,10 +234,10 @@ def write_pcd(path: str | Path, cloud: GeometryRecord) -> None:
     """
     cloud.check(path)
     columns: dict[str, NDArray[Any]] = {}
-    for names, values in ((("x", "y", "z"), cloud.points), (_NORMALS, cloud.normals)):
+    normals = None if cloud.normals is None else np.asarray(cloud.normals, "<f4")
+    for names, values in ((("x", "y", "z"), cloud.written_points()), (_NORMALS, normals)):
         if values is not None:
-            table = np.asarray(values, "<f4")
-            columns |= {name: table[:, k] for k, name in enumerate(names)}
+            columns |= {name: values[:, k] for k, name in enumerate(names)}
     if cloud.color is not None:
         r, g, b = np.asarray(cloud.color, np.uint32).T
         columns["rgb"] = (r << 16 | g << 8 | b).astype("<u4").view("<f4")
@@ -251,7 +252,7 @@ def write_pcd(path: str | Path, cloud: GeometryRecord) -> None:
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
         f"FIELDS {' '.join(columns)}",
-        f"SIZE {' '.join('4' for _ in columns)}",
+        f"SIZE {' '.join(str(column.dtype.itemsize) for column in columns.values())}",
         f"TYPE {' '.join(kinds)}",
         f"COUNT {' '.join('1' for _ in columns)}",
         f"WIDTH {count}",

@@ -280,9 +280,10 @@ def _fans(polygons: NDArray[np.generic]) -> Int32:
     return np.clip(triangles.reshape(-1, 3), -1, 2**31 - 1).astype(np.int32)
 
 
-def write_ply(path: str | Path, record: GeometryRecord, *, double: bool = False) -> None:
+def write_ply(path: str | Path, record: GeometryRecord) -> None:
     """Write a cloud or a mesh, binary little-endian, without its texture.
 
+    Points are written as float, and as double where they are map coordinates in float64.
     Normals are written as float nx ny nz, colours as uchar red green blue, scalars in their own
     type (64-bit integers as int, booleans as uchar).
 
@@ -292,8 +293,6 @@ def write_ply(path: str | Path, record: GeometryRecord, *, double: bool = False)
         The file; see `replacing` for errors.
     record
         The cloud or mesh.
-    double
-        Whether to write the points as float64 instead of float32, as map coordinates require.
 
     Raises
     ------
@@ -301,10 +300,10 @@ def write_ply(path: str | Path, record: GeometryRecord, *, double: bool = False)
         If the shapes disagree.
     """
     record.check(path)
-    points = np.asarray(record.points, np.float64 if double else np.float32)
+    points = record.written_points()
     columns: dict[str, tuple[NDArray[Any], str]] = {}
     groups: list[tuple[NDArray[Any] | None, str, tuple[str, ...]]] = [
-        (points, "<f8" if double else "<f4", _POINTS),
+        (points, points.dtype.str, _POINTS),
         (record.normals, "<f4", _NORMALS),
         (record.color, "u1", _COLORS[0]),
     ]
