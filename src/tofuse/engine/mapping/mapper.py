@@ -283,6 +283,8 @@ class Mapper:
             self._shift = frame.shift
             if self._method is not None and kind == "cloud":
                 self.config = from_method(self._method, kind)
+            if kind == "cloud":
+                self._prior_loops = tuple(p.about(-self._shift) for p in self._prior_loops)
                 self._start_method()
             check_views(self.config, kind)
         self._sequence.accept(frame.index, kind)
