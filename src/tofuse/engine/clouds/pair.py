@@ -21,7 +21,7 @@ from tofuse.engine.compute import one_blas_thread
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.parts import check_number, part
+from tofuse.engine.parts import check_number, part, registered
 from tofuse.engine.search import follow, register_pair, verification
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
@@ -145,7 +145,7 @@ def register(
     target: Frame | ArrayLike,
     *,
     guess: ArrayLike | None = None,
-    method: Registrar | None = None,
+    method: Registrar | str | None = None,
     seed: int = 0,
 ) -> Registration:
     """Register two views, or two (N, 3) clouds in m.
@@ -166,7 +166,7 @@ def register(
         (4, 4) T_target_source to start from; the identity unless given. Of ambiguous poses of two
         images the one at the guess is returned.
     method
-        Registration method; the above unless given.
+        Registration method, or the name of one ("icp", "coarse-to-fine"); the above unless given.
     seed
         Seed of the random selection of points, for methods that use one.
 
@@ -182,8 +182,8 @@ def register(
     Raises
     ------
     InputError
-        If an array has the wrong shape or fewer than ten finite points, or the guess is no rigid
-        motion.
+        If an array has the wrong shape or fewer than ten finite points, the guess is no rigid
+        motion, or there is no such method.
     RegistrationError
         If too few points correspond, an image is empty, or the median depths of two images differ
         more than fourfold.
@@ -192,21 +192,36 @@ def register(
     start = None if guess is None else se3.check_pose(guess, where="guess")
     near = NearOrigin.of(_view(source, "source"), _view(target, "target"), start)
     rng = np.random.default_rng([seed, 0])
-    registration = _registered(near.source, near.target, near.guess, method, rng)
+    registrar = _registrar(method)
+    registration = _registered(near.source, near.target, near.guess, registrar, rng)
     return near.in_files(registration)
+
+
+def _registrar(method: Registrar | str | None) -> Registrar:
+    if method is None:
+        return AnyPair()
+    named = registered("registration")
+    if isinstance(method, str) and method in named:
+        found: Registrar = named[method]()
+        return found
+    if isinstance(method, type | str) or not hasattr(method, "register"):
+        raise InputError(
+            f"is {method!r}", where="method", remedy=f"use one of {', '.join(sorted(named))}"
+        )
+    return method
 
 
 def _registered(
     source: Frame,
     target: Frame,
     guess: Float64 | None,
-    method: Registrar | None,
+    registrar: Registrar,
     rng: np.random.Generator,
 ) -> Registration:
     with one_blas_thread():
-        if method is None:
-            return AnyPair().register(source, target, guess, rng)
-        return method.register(source, target, np.eye(4) if guess is None else guess, rng)
+        if guess is None and not isinstance(registrar, AnyPair):
+            guess = np.eye(4)
+        return registrar.register(source, target, guess, rng)
 
 
 def _view(view: Frame | ArrayLike, name: str) -> Frame:
