@@ -406,6 +406,8 @@ class RigOptions(Json, Threads):
         input format, if not recognised
     """
 
+    home = "tofuse.apps.cli.rigging"
+
     motion: Literal["auto", "still", "moving"] = "auto"
     format: str | None = None
 
@@ -662,6 +664,8 @@ class Calibrate(Json, Seed, Selection):
         take depth unit and kind from this recording
     """
 
+    home = "tofuse.apps.cli.calibrating"
+
     subject: Literal["lens", "depth", "import"]
     inputs: list[str]
     out: Path | None = None
@@ -688,6 +692,8 @@ class Noise(Json, Source):
     name : NAME
         name of the camera
     """
+
+    home = "tofuse.apps.cli.calibrating"
 
     inputs: list[str]
     out: Path | None = None

@@ -18,7 +18,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from tofuse.apps.rigs.joint import JointOptions, RigView, refined_poses
+from tofuse.apps.rigs.joint import RigView, refined_poses
 from tofuse.engine.alignment import PROBABLE
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_all
@@ -52,7 +52,7 @@ _SIDE_BY_SIDE = SearchOptions(mode="full")
 # Minimum difference between distinct poses, as a fraction of the depth.
 _DISTINCT = 0.04
 _POINTS = 1500
-_REFINEMENT = JointOptions(offset_sigma_m=1e-4)
+_OFFSET_SIGMA_M = 1e-4  # depth offsets are not estimated yet
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +247,7 @@ class _Placer:
         views = [
             replace(v, camera=row[v.camera]) for v in self._refinement_views if v.camera in row
         ]
-        refined = refined_poses(views, np.stack([poses[c] for c in order]), _REFINEMENT)
+        refined = refined_poses(views, np.stack([poses[c] for c in order]), _OFFSET_SIGMA_M)
         return dict(zip(order, refined, strict=True))
 
     def _score(self, poses: Mapping[int, Float64]) -> float:
