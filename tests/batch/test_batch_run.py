@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import errno
 import json
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import replace
@@ -19,7 +18,7 @@ from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.table import COLUMNS, write_table
 from tofuse.apps.batch.work import Task
-from tofuse.apps.batch.workers import LocalWorkers, Workers
+from tofuse.apps.batch.workers import Workers
 from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError, OutputError
 
@@ -61,10 +60,7 @@ class Scripted(Workers):
         self.gone: InputError | None = None
         self.busy = False
 
-    def check(self, job: Job) -> None:
-        pass
-
-    def accepts(self, task: Task) -> bool:
+    def accepts(self) -> bool:
         return not self.busy
 
     def start(self, task: Task) -> Future[Record]:
@@ -141,7 +137,7 @@ def test_degraded_job_sets_exit_status(folder: BatchFolder) -> None:
 
 def test_batch_resumes_after_lost_workers(folder: BatchFolder, monkeypatch) -> None:
     workers = Scripted({"b": [cancelled], "c": [cancelled]})
-    monkeypatch.setattr(workers, "accepts", lambda _: True)  # all at once
+    monkeypatch.setattr(workers, "accepts", lambda: True)  # all at once
     workers.gone = InputError("the scheduler went away")
     with pytest.raises(InputError, match="went away"):
         run(folder, workers)
@@ -231,40 +227,6 @@ def test_full_disk_is_reported(folder: BatchFolder, monkeypatch) -> None:
         run(folder, Scripted())
 
 
-def test_memory_limits_concurrent_jobs(monkeypatch) -> None:
-    go_on = threading.Event()
-
-    def wait(task: Task, _: object) -> Record:
-        go_on.wait(60)
-        return failed(task)
-
-    monkeypatch.setattr("tofuse.apps.batch.workers.machine_memory", lambda: 100)
-    monkeypatch.setattr("tofuse.apps.batch.workers.work", wait)
-    half = Task(replace(JOBS[0], memory=50), "/out", 1)
-    unstated = Task(JOBS[0], "/out", 1)
-    workers = LocalWorkers(4)
-    try:
-        with pytest.raises(InputError, match="needs 101 bytes, but this machine has 100"):
-            workers.check(replace(JOBS[0], memory=101))
-        running = []
-        for _ in range(2):
-            assert workers.accepts(half)
-            running.append(workers.start(half))
-        assert not workers.accepts(half)
-        # Jobs that state no memory are limited by their number only.
-        for _ in range(2):
-            assert workers.accepts(unstated)
-            running.append(workers.start(unstated))
-        assert not workers.accepts(unstated)
-        go_on.set()
-        for future in running:
-            future.result(60)
-        assert workers.accepts(half)
-    finally:
-        go_on.set()
-        workers.close()
-
-
 class Remote:
     """A future of Dask."""
 
@@ -315,7 +277,6 @@ def test_dask_outcomes_are_translated() -> None:
     [
         (["--workers", "0"], "'0' is not 1 or more"),
         (["--workers", "1", "--scheduler", "x"], "not allowed with"),
-        (["--memory", "much"], "not an amount of memory"),
         (["--only", "b"], "there is no job b"),
         (["--wrkers=2"], "unknown option --wrkers (did you mean --workers?)"),
     ],

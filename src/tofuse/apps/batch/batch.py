@@ -77,12 +77,10 @@ def run_batch(
     Raises
     ------
     InputError
-        If the workers are lost or can't run the jobs; finished jobs are in the table.
+        If the workers are lost; finished jobs are in the table.
     OutputError
         If a record or the table can't be written.
     """
-    for job in remaining:
-        workers.check(job)
     for job in remaining:  # earlier outcomes no longer count
         record = folder.record(job)
         if record is not None and record.ended:
@@ -93,7 +91,7 @@ def run_batch(
     killed: Counter[str] = Counter()
     idle_since = monotonic()
     while queue or running:
-        while queue and workers.accepts(queue[0]):
+        while queue and workers.accepts():
             task = queue.popleft()
             running[workers.start(task)] = task
         if running:

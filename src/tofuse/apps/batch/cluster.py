@@ -10,7 +10,6 @@ from typing import Any
 from uuid import uuid4
 
 from tofuse.apps.batch.folder import Record
-from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.work import Task, work
 from tofuse.apps.batch.workers import Workers
 from tofuse.engine.errors import InputError
@@ -41,20 +40,7 @@ class DaskWorkers(Workers):
         self._worker_infos: list[dict[str, Any]] = []
         self._polled_at = -_POLL_S
 
-    def check(self, job: Job) -> None:
-        """See `Workers`. A cluster without workers may get some later."""
-        if job.memory is None:
-            return
-        declared = [w["resources"].get("memory", 0) for w in self._workers()]
-        if declared and max(declared) < job.memory:
-            raise InputError(
-                f"{job.name} needs {job.memory} bytes, but none of the {len(declared)} workers "
-                f"declares more than {max(declared):.0f}",
-                where=self._address,
-                remedy=f'start them with --resources "memory={job.memory}"',
-            )
-
-    def accepts(self, task: Task) -> bool:
+    def accepts(self) -> bool:
         """See `Workers`. No more tasks are submitted than workers can do at a time.
 
         Dask counts a queued task as failed whenever its worker dies, even if it had not started.
@@ -62,18 +48,12 @@ class DaskWorkers(Workers):
         self._running = {f for f in self._running if not f.done()}
         if monotonic() - self._polled_at >= _POLL_S:
             self._worker_infos, self._polled_at = self._workers(), monotonic()
-        return len(self._running) < sum(_slots(worker, task.job) for worker in self._worker_infos)
+        return len(self._running) < sum(int(w["nthreads"]) for w in self._worker_infos)
 
     def start(self, task: Task) -> Future[Record]:
         """See `Workers`."""
-        memory = task.job.memory
-        remote = self._client.submit(
-            work,
-            task,
-            key=f"{task.job.name}-{uuid4().hex}",
-            pure=False,
-            resources={} if memory is None else {"memory": memory},
-        )
+        key = f"{task.job.name}-{uuid4().hex}"
+        remote = self._client.submit(work, task, key=key, pure=False)
         future: Future[Record] = Future()
         remote.add_done_callback(lambda done: self._transfer(done, future))
         self._running.add(future)
@@ -129,14 +109,6 @@ class DaskWorkers(Workers):
         else:
             future.cancel()
             future.set_running_or_notify_cancel()
-
-
-def _slots(worker: dict[str, Any], job: Job) -> int:
-    """The number of such jobs that a worker can run at a time."""
-    threads = int(worker["nthreads"])
-    if job.memory is None:
-        return threads
-    return min(threads, int(worker["resources"].get("memory", 0) // job.memory))
 
 
 def _connect(address: str) -> Any:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 from typing import Protocol
 
 from tofuse.apps.batch.folder import Record
-from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.work import Task, work
 from tofuse.engine.errors import InputError
 
@@ -18,12 +14,8 @@ from tofuse.engine.errors import InputError
 class Workers(Protocol):
     """Runs tasks, several at a time."""
 
-    def check(self, job: Job) -> None:
-        """Raise an `InputError` if no worker could ever run this job."""
-        ...
-
-    def accepts(self, task: Task) -> bool:
-        """Whether the task would be started at once."""
+    def accepts(self) -> bool:
+        """Whether a task would be started at once."""
         ...
 
     def start(self, task: Task) -> Future[Record]:
@@ -47,34 +39,22 @@ class LocalWorkers(Workers):
     """Processes of this machine."""
 
     def __init__(self, count: int) -> None:
-        """Run up to `count` jobs at a time, as long as the memory that they need is available."""
+        """Run up to `count` jobs at a time."""
         self._count = count
-        self._memory = machine_memory()
         self._pool = ThreadPoolExecutor(count, thread_name_prefix="tofuse-batch")
-        self._running: dict[Future[Record], int] = {}
+        self._running: set[Future[Record]] = set()
         self._processes: list[subprocess.Popen[bytes]] = []
         self._closed = False
 
-    def check(self, job: Job) -> None:
+    def accepts(self) -> bool:
         """See `Workers`."""
-        if self._memory is not None and (job.memory or 0) > self._memory:
-            raise InputError(
-                f"{job.name} needs {job.memory} bytes, but this machine has {self._memory}",
-                where="--memory",
-                remedy="state less, or use a larger machine",
-            )
-
-    def accepts(self, task: Task) -> bool:
-        """See `Workers`."""
-        self._running = {f: m for f, m in self._running.items() if not f.done()}
-        needed = sum(self._running.values()) + (task.job.memory or 0)
-        fits = self._memory is None or needed <= self._memory
-        return len(self._running) < self._count and fits
+        self._running = {f for f in self._running if not f.done()}
+        return len(self._running) < self._count
 
     def start(self, task: Task) -> Future[Record]:
         """See `Workers`."""
         future = self._pool.submit(work, task, self._register_process)
-        self._running[future] = task.job.memory or 0
+        self._running.add(future)
         return future
 
     def lost(self) -> None:
@@ -93,14 +73,3 @@ class LocalWorkers(Workers):
         self._processes.append(process)
         if self._closed:
             process.kill()
-
-
-def machine_memory() -> int | None:
-    """Return the memory limit of this process in bytes; None if unknown."""
-    if sys.platform == "win32":
-        return None
-    physical = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    try:  # of a container
-        return min(physical, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
-    except (OSError, ValueError):
-        return physical

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from tofuse.apps.calibration.board import Board, board_image, find_corners
-from tofuse.apps.calibration.board_pose import board_pose, pose_of
+from tofuse.apps.calibration.board_pose import board_pose
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Fisheye, Pinhole
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording, evenly_spaced
 from tofuse.engine.geometry import se3
@@ -298,24 +298,18 @@ def _rms(values: Float64) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-_NO_RATIONAL = cv2.CALIB_FIX_K4 | cv2.CALIB_FIX_K5 | cv2.CALIB_FIX_K6
-# Flags that fix coefficients to 0, and the names of the free ones; the last variant is the full
-# one.
-_VARIANTS: dict[str, tuple[tuple[int, tuple[str, ...]], ...]] = {
-    "pinhole": (
-        (
-            cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
-            (),
-        ),
-    ),
+# The free coefficients of each variant of a model, the full one last; the others are 0.
+_VARIANTS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "pinhole": ((),),
     "brown": (
-        (cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST, ("k1",)),
-        (cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST, ("k1", "k2")),
-        (cv2.CALIB_FIX_K3, ("k1", "k2", "p1", "p2")),
-        (cv2.CALIB_ZERO_TANGENT_DIST, ("k1", "k2", "k3")),
-        (0, ("k1", "k2", "p1", "p2", "k3")),
+        ("k1",),
+        ("k1", "k2"),
+        ("k1", "k2", "p1", "p2"),
+        ("k1", "k2", "k3"),
+        ("k1", "k2", "p1", "p2", "k3"),
     ),
-    "rational": ((cv2.CALIB_RATIONAL_MODEL, DISTORTION_ORDER["rational"]),),
+    "rational": (DISTORTION_ORDER["rational"],),
+    "fisheye": (DISTORTION_ORDER["fisheye"],),
 }
 
 
@@ -324,17 +318,16 @@ def _fit_lens(
 ) -> _Fit:
     """Fit a lens to views, selecting the variant with the smallest information criterion."""
     try:
-        if model == "fisheye":
-            return _fit_fisheye(views, board, size)
+        start = _initial_fit(views, board, size)
         count = 2 * sum(len(view.corners) for view in views)
         best: tuple[float, _Fit] | None = None
-        for flags, names in _VARIANTS[model]:
-            fit = _fit_opencv(model, flags, names, views, board, size)
+        for names in _VARIANTS[model]:
+            fit = _least_squares(MODELS[model], names, start, views, board)
             parameters = len(_INTRINSIC) + len(names) + 6 * len(views)
             score = count * np.log(fit.squares / count) + parameters * np.log(count)
             if best is None or score < best[0]:
                 best = score, fit
-    except (cv2.error, InputError, np.linalg.LinAlgError) as error:
+    except (cv2.error, InputError, np.linalg.LinAlgError, ValueError) as error:
         raise InputError(
             f"shows the board from {len(views)} viewpoints that no {model} lens fits",
             where=path,
@@ -344,96 +337,53 @@ def _fit_lens(
     return best[1]
 
 
-def _fit_opencv(
-    model: str,
-    flags: int,
+def _initial_fit(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> _Fit:
+    """Return a fit with one radial coefficient, from which all models converge."""
+    corners = [view.corners.astype(np.float32) for view in views]
+    points = [board.points] * len(views)
+    K = cv2.initCameraMatrix2D(points, corners, size)
+    camera = Pinhole(*size, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+    poses = [board_pose(camera, view.corners, board) for view in views]
+    if any(pose is None for pose in poses):
+        raise ValueError("a view has no pose")
+    start = _Fit(camera, {}, [pose[0] for pose in poses if pose is not None], np.zeros(0), 0.0)
+    return _least_squares(MODELS["brown"], ("k1",), start, views, board)
+
+
+def _least_squares(
+    model: type[Pinhole],
     names: tuple[str, ...],
-    views: Sequence[BoardView],
-    board: Board,
-    size: tuple[int, int],
-) -> _Fit:
-    all_flags = flags if model == "rational" else flags | _NO_RATIONAL
-    out = cv2.calibrateCameraExtended(
-        [board.points] * len(views),
-        [view.corners.astype(np.float32) for view in views],
-        size,
-        np.eye(3),
-        np.zeros(8),
-        flags=all_flags,
-    )
-    K, distortion, rvecs, tvecs, deviations = out[1], out[2].ravel(), out[3], out[4], out[5].ravel()
-    order = DISTORTION_ORDER["rational"]
-    values = {n: float(v) for n, v in zip(order, distortion, strict=False) if n in names}
-    camera = MODELS[model](
-        size[0], size[1], float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), **values
-    )
-    deviation = dict(zip((*_INTRINSIC, *order), deviations.tolist(), strict=False))
-    sigma = {name: deviation[name] for name in (*_INTRINSIC, *names)}
-    poses = [pose_of(r, t) for r, t in zip(rvecs, tvecs, strict=True)]
-    return _evaluate(camera, sigma, poses, views, board)
-
-
-def _evaluate(
-    camera: Pinhole,
-    sigma: dict[str, float],
-    poses: list[Float64],
+    start: _Fit,
     views: Sequence[BoardView],
     board: Board,
 ) -> _Fit:
-    errors = [_reprojection_errors(camera, T, v, board) for T, v in zip(poses, views, strict=True)]
-    squares = np.array([(m**2).sum() for m in errors])
-    return _Fit(camera, sigma, poses, np.sqrt(squares / len(board.points)), float(squares.sum()))
+    """Fit the named coefficients, intrinsics and all poses, from other intrinsics and poses."""
+    free = (*_INTRINSIC, *names)
+    width, height = start.camera.width, start.camera.height
+    lens = np.array([*(getattr(start.camera, n) for n in _INTRINSIC), *[0.0] * len(names)])
+    # Parameters are scaled to steps of similar effect: ratios, radians.
+    scale = np.array([*lens[:2], *lens[:2], *[1.0] * len(names)])
+    first_poses, points = np.array(start.poses), board.points.astype(float)
 
-
-def _reprojection_errors(camera: Pinhole, T: Float64, view: BoardView, board: Board) -> Float64:
-    return camera.project(se3.transform(T, board.points.astype(float))) - view.corners
-
-
-def _fit_fisheye(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> _Fit:
-    """Run least squares over lens and poses, initialised by a lens with one radial coefficient.
-
-    OpenCV's function needs a good initial value, and returns no standard deviations.
-    """
-    flags, names = _VARIANTS["brown"][1]
-    start = _fit_opencv("brown", flags, names, views, board, size)
-    order = names_of("fisheye")
-    lens = np.array([*(getattr(start.camera, n) for n in _INTRINSIC), 0.0, 0.0, 0.0, 0.0])
-    # Parameters are scaled to steps of similar effect: pixels, ratios, radians.
-    scale = np.array([*lens[:2], *lens[:2], 1.0, 1.0, 1.0, 1.0])
-
-    def camera_of(x: Float64) -> Fisheye:
-        return Fisheye(*size, *(float(v) for v in lens + x[:8] * scale))
-
-    def poses_of(x: Float64) -> list[Float64]:
-        steps = x[8:].reshape(-1, 6)
-        return [T @ se3.exp(step) for T, step in zip(start.poses, steps, strict=True)]
+    def unpacked(x: Float64) -> tuple[Pinhole, Float64]:
+        values = (lens + x[: len(free)] * scale).tolist()
+        camera = model(width, height, **dict(zip(free, values, strict=True)))
+        return camera, first_poses @ se3.exp(x[len(free) :].reshape(-1, 6))
 
     def errors(x: Float64) -> Float64:
-        camera = camera_of(x)
-        parts = [
-            _reprojection_errors(camera, T, v, board)
-            for T, v in zip(poses_of(x), views, strict=True)
-        ]
-        return np.concatenate(parts).ravel()
+        camera, poses = unpacked(x)
+        seen = camera.project(np.concatenate([se3.transform(T, points) for T in poses]))
+        return (seen - np.concatenate([view.corners for view in views])).ravel()
 
-    def jacobian(x: Float64) -> Float64:
-        base, step = errors(x), 1e-6
-        J = np.zeros((base.size, x.size))
-        for k in range(8):
-            J[:, k] = (errors(x + step * np.eye(x.size)[k]) - base) / step
-        rows = 2 * len(board.points)
-        # A pose affects the corners of its own view only, so all poses are perturbed at once.
-        for axis in range(6):
-            perturbed = x.copy()
-            perturbed[8 + axis :: 6] += step
-            derivatives = ((errors(perturbed) - base) / step).reshape(-1, rows)
-            for view in range(len(views)):
-                J[view * rows : (view + 1) * rows, 8 + 6 * view + axis] = derivatives[view]
-        return J
-
-    solution = least_squares(errors, np.zeros(8 + 6 * len(views)), jac=jacobian, method="lm")
+    # A pose affects the corners of its own view only.
+    by_pose = np.kron(np.eye(len(views)), np.ones((2 * len(points), 6)))
+    sparsity = np.hstack([np.ones((len(by_pose), len(free))), by_pose])
+    solution = least_squares(errors, np.zeros(sparsity.shape[1]), jac_sparsity=sparsity)
     freedom = max(solution.fun.size - solution.x.size, 1)
-    covariance = np.linalg.inv(solution.jac.T @ solution.jac)[:8, :8] * 2 * solution.cost / freedom
-    deviations = np.sqrt(np.diag(covariance)) * scale
-    sigma = dict(zip(order, deviations.tolist(), strict=True))
-    return _evaluate(camera_of(solution.x), sigma, poses_of(solution.x), views, board)
+    information = (solution.jac.T @ solution.jac).toarray()
+    covariance = np.linalg.inv(information) * 2 * solution.cost / freedom
+    deviations = np.sqrt(np.diag(covariance)[: len(free)]) * scale
+    camera, poses = unpacked(solution.x)
+    squares = (solution.fun**2).reshape(len(views), -1).sum(1)
+    sigma = dict(zip(free, deviations.tolist(), strict=True))
+    return _Fit(camera, sigma, list(poses), np.sqrt(squares / len(points)), float(squares.sum()))

@@ -6,8 +6,7 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from difflib import get_close_matches
+from dataclasses import asdict
 
 from tofuse.apps.batch import (
     BatchFolder,
@@ -35,7 +34,6 @@ _MAX_LISTED = 10  # recordings without a result that the summary names
 def batch(arguments: Batch) -> int:
     """Do all pending jobs, and print a summary."""
     jobs = read_jobs(arguments.recordings, run_arguments)
-    jobs = tuple(replace(j, memory=j.memory or arguments.memory) for j in jobs)
     selected = _selected(jobs, arguments)
     folder = BatchFolder(arguments.out.absolute())
     remaining = pending(selected, folder, overwrite=arguments.overwrite)
@@ -67,15 +65,8 @@ def _selected(jobs: Sequence[Job], arguments: Batch) -> list[Job]:
     """The jobs of --only, or all."""
     if arguments.only is None:
         return list(jobs)
-    names = [job.name for job in jobs]
-    for name in arguments.only:
-        if name not in names:
-            suggestions = get_close_matches(name, names, 1)
-            raise InputError(
-                f"there is no job {name}",
-                where="--only",
-                remedy=f"did you mean {suggestions[0]}?" if suggestions else "see --print-jobs",
-            )
+    for name in set(arguments.only) - {job.name for job in jobs}:
+        raise InputError(f"there is no job {name}", where="--only", remedy="see --print-jobs")
     return [job for job in jobs if job.name in arguments.only]
 
 

@@ -234,7 +234,7 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
 class Batch(Command):
     """Reconstruct many recordings, each as a separate job.
 
-    A list is a text file with one path or glob per line, or a table (.csv, .toml) with a column
+    A list is a text file with one path or glob per line, or a table (.csv) with a column
     `recording` and further columns for options of `tofuse run`; see docs/batch.md. Run the same
     command again to resume.
 
@@ -261,8 +261,6 @@ class Batch(Command):
         Dask scheduler: tcp://HOST:8786, or its scheduler file
     threads : N
         threads per job (default: all cores shared by the jobs; on Dask: 1)
-    memory : SIZE
-        memory per job, e.g. 4GB (not limited)
     retries : N
         how often a job whose process was killed is restarted (3)
 
@@ -285,7 +283,6 @@ class Batch(Command):
     workers: Count | None = None
     scheduler: str | None = None
     threads: Count | None = None
-    memory: Size | None = None
     retries: NonNegative | None = None
 
 
