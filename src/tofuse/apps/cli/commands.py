@@ -39,7 +39,7 @@ _SEVERITY_COLORS = {"severe": "red", "warning": "yellow", "note": "cyan"}
 _NAME_WIDTH = 14  # width of the column of names
 _STATUS_COLORS = {True: "green", False: "red", None: "yellow"}
 _NOT_WITH_RIG = (
-    *("view", "into", "loops", "guess", "object"),
+    *("view", "loops", "guess", "object"),
     *("average_still", "camera", "topic", "no_report"),
 )
 VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
@@ -98,8 +98,6 @@ def run(arguments: cli.Run) -> int:
             arguments.inputs = [str(path) for path in recordings_of(arguments.rig).values()]
     if arguments.rig is not None:
         return _run_rig(arguments.rig, arguments, options)
-    if arguments.into is not None:
-        return _run_into(arguments.into, arguments, options)
     if arguments.view:
         return _run_live(arguments, options)
     for is_set, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
@@ -123,34 +121,6 @@ def run_options(arguments: cli.Run) -> Options:
     from tofuse.apps.jobs import Options
 
     return from_arguments(Options, arguments)
-
-
-def _run_into(into: Path, arguments: cli.Run, options: Options) -> int:
-    """Run, then merge the result into an earlier one, which stays unchanged if that fails."""
-    from tofuse.apps.jobs import merging
-    from tofuse.apps.jobs import run as run_pipeline
-
-    if arguments.view:
-        raise InputError(
-            "can't be combined with --into", where="--view", remedy="view the result afterwards"
-        )
-    if into.resolve() == options.out.resolve():
-        raise InputError("is the same folder as --out", where="--into", remedy="use two folders")
-    merging.check_result(into)  # before hours of work
-    with progress_for(as_json=arguments.json) as progress:
-        result = run_pipeline(arguments.inputs, options, progress)
-    print_result(result, options.out, as_json=arguments.json)
-    map_options = from_arguments(
-        merging.MergeOptions,
-        arguments,
-        out=into,
-        overwrite=True,
-        seed=options.seed or 0,
-        only_joined=True,
-    )
-    with progress_for(as_json=arguments.json) as progress:
-        merged = merging.merge_files([into, options.out], map_options, progress)
-    return _finished(merged, into, arguments)
 
 
 def _run_rig(rig: Path, arguments: cli.Run, options: Options) -> int:

@@ -149,8 +149,6 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
         folder for the result
     overwrite
         replace an existing result in --out
-    into : RESULT
-        merge the recording into the map of an existing result, if they overlap
     no_report
         don't draw report.html, which takes up to half of a short run
     texture
@@ -210,7 +208,6 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     inputs: list[str]
     out: Path = REQUIRED
     overwrite: bool = False
-    into: Path | None = None
     no_report: bool = False
     texture: bool = False
     faces: Count | None = None

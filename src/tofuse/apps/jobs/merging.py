@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.apps.jobs.run_options import ModelOptions
 from tofuse.apps.jobs.session_pairs import SessionModel, session_changes, session_pairs
-from tofuse.apps.jobs.sessions import Session, read_sessions, sessions_of
+from tofuse.apps.jobs.sessions import Session, read_sessions
 from tofuse.apps.report import session_words
 from tofuse.apps.results import folders, write_result
 from tofuse.engine.arrays import Float64
@@ -45,19 +45,12 @@ _MIN_PROBABILITY = 0.99
 
 @dataclass(frozen=True)
 class MergeOptions(ModelOptions):
-    """The options of ``tofuse merge``; see its ``--help``.
-
-    Attributes
-    ----------
-    only_joined
-        Whether nothing is written if the last session can't be joined to the first.
-    """
+    """The options of ``tofuse merge``; see its ``--help``."""
 
     out: Path
     overwrite: bool = False
     seed: int = 0
     threads: int | None = None
-    only_joined: bool = False
 
 
 def merge(
@@ -282,11 +275,6 @@ def _covers_most(result: Reconstruction) -> bool:
     return 2 * sum(in_main_model(f, result.components) for f in frames) >= len(frames)
 
 
-def check_result(folder: Path) -> None:
-    """Raise InputError if a result can't be merged with a later one; see `merge`."""
-    sessions_of(folder, 0, None, Silent())
-
-
 def merge_files(
     results: Sequence[str | Path], options: MergeOptions, progress: Progress | None = None
 ) -> Reconstruction:
@@ -299,35 +287,24 @@ def merge_files(
     OutputError
         If the result can't be written; an existing folder is then unchanged.
     """
+    progress = progress or Silent()
     # Claimed before the results are read: it may be one of them.
     with folders.OutputFolder(options.out, overwrite=options.overwrite) as folder:
-        return _merge_into(folder, results, options, progress or Silent())
-
-
-def _merge_into(
-    folder: folders.OutputFolder,
-    results: Sequence[str | Path],
-    options: MergeOptions,
-    progress: Progress,
-) -> Reconstruction:
-    progress.stage("opening")
-    sessions = read_sessions(results, options.threads, progress)
-    config = options.applied(merged_config(sessions))
-    result = merge_sessions(
-        sessions, config, seed=options.seed, threads=options.threads, progress=progress
-    )
-    if options.only_joined and result.sessions[-1].T_main_session is None:
-        progress.note(f"{options.out} is left as it was")
-        return result
-    texture = None
-    if config.fusion.texture:
-        recording, _ = joined_recording(sessions)
-        texture = texturing.make_texture(
-            recording, result, config.fusion.texture, options.threads, progress
+        progress.stage("opening")
+        sessions = read_sessions(results, options.threads, progress)
+        config = options.applied(merged_config(sessions))
+        result = merge_sessions(
+            sessions, config, seed=options.seed, threads=options.threads, progress=progress
         )
-    progress.stage("writing")
-    with threadpool_limits(1):
-        write_result(result, folder, _report, texture)
+        texture = None
+        if config.fusion.texture:
+            recording, _ = joined_recording(sessions)
+            texture = texturing.make_texture(
+                recording, result, config.fusion.texture, options.threads, progress
+            )
+        progress.stage("writing")
+        with threadpool_limits(1):
+            write_result(result, folder, _report, texture)
     return result
 
 
