@@ -155,7 +155,7 @@ def test_split_half_reveals_systematic_errors() -> None:
     def tracks(by: np.ndarray) -> dict[int, Track]:
         return {0: Track(times, world), 1: Track(times, world @ mounted() @ se3.exp(by))}
 
-    together = _JointViews({}, {})
+    together = _JointViews({})
     together._halves = [(tracks(error), tracks(-error))]
     found = together.systematic(1, fit)
     np.testing.assert_allclose(found, np.outer(error, error), atol=1e-7)

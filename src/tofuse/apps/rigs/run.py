@@ -14,7 +14,7 @@ from tofuse.apps.results import folders, write_result
 from tofuse.apps.rigs.calibrating import cameras_of, disagreement_rows, moves
 from tofuse.apps.rigs.checking import CameraMotion, compare
 from tofuse.apps.rigs.inputs import Camera
-from tofuse.apps.rigs.joint import RigView, disagreements, refine_together
+from tofuse.apps.rigs.joint import RigView, SurfaceDistances, disagreements, refine_together
 from tofuse.apps.rigs.rig_trajectory import track_rig
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.compute import threads as using_threads
@@ -152,6 +152,8 @@ def reconstruct_rig(
         displaced, distances = _check_calibration(rig, cameras, recording)
     instant = np.searchsorted(instants, source.instant[recording.indices])
     frame_poses = poses[instant] @ T_rig_frame
+    is_moving = bool(measured or tracked)
+    edges = _calibration_edges(rig, source, recording, instant, frame_poses, follow=not is_moving)
     fusion_config = replace(
         config,
         odometry=given.GivenPoses(),
@@ -160,28 +162,21 @@ def reconstruct_rig(
         priors=(),
         self_calibration=False,
     )
-    is_moving = bool(measured or tracked)
-    calibration_edges = _calibration_edges(
-        rig, source, recording, instant, frame_poses, follow=not is_moving
-    )
-    refined_config = replace(
-        fusion_config, refinement=AlreadyRefined(measured, (*tracked, *calibration_edges))
-    )
     result = reconstructing.reconstruct(
         adaptation.with_odometry(recording, frame_poses),
-        refined_config,
+        replace(fusion_config, refinement=AlreadyRefined(measured, (*tracked, *edges))),
         seed=seed,
         progress=progress,
     )
     names = [camera.name for camera in rig.cameras]
     rig_fields = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}
     result = replace(
-        _without_tracking_diagnostics(result, names, source.camera, moves=is_moving),
+        _with_reasons_of_rig(result, names, source.camera, displaced, moves=is_moving),
         config=fusion_config.to_dict(),
         recording={**result.recording, "rig": rig_fields},
     )
     measured_rig = replace(rig, disagreement=disagreement_rows(names, distances))
-    return RigResult(_with_rig_reason(result, displaced), times, poses, measured_rig)
+    return RigResult(result, times, poses, measured_rig)
 
 
 def _calibration_edges(
@@ -223,23 +218,35 @@ def _calibration_edges(
     return edges
 
 
-def _without_tracking_diagnostics(
-    result: Reconstruction, names: Sequence[str], cameras: Intp, *, moves: bool
+def _with_reasons_of_rig(
+    result: Reconstruction,
+    names: Sequence[str],
+    cameras: Intp,
+    displaced: Sequence[CameraMotion],
+    *,
+    moves: bool,
 ) -> Reconstruction:
-    """Return the result without diagnostics that apply only to single-camera tracking.
+    """Return the result with reasons for a rig instead of a single camera.
 
-    `cameras` (F,) are the cameras of all frames, as indices into `names`.
+    `cameras` (F,) are the cameras of all frames, as indices into `names`; `displaced` those that
+    differ from the calibration.
     """
     d = result.diagnostics
-    reasons = verdicts.ranked([r for r in d.reasons if r.code not in _TRACKING_REASONS])
+    reasons = [r for r in d.reasons if r.code not in _TRACKING_REASONS]
     worst = d.accuracy.worst
     if not moves and worst is not None:
         name = names[cameras[worst.frame]]
-        reasons = verdicts.ranked([_calibration_reason(r, worst.frame, name) for r in reasons])
-    d = replace(
-        d, reasons=reasons, verdict=verdicts.verdict_of(reasons), refinement=None, cloud_before=None
-    )
-    return replace(result, diagnostics=d)
+        reasons = [_calibration_reason(r, worst.frame, name) for r in reasons]
+    if displaced:
+        changes = ", ".join(
+            f"{m.name} by {1000 * m.distance_m:.0f} mm and {np.degrees(m.angle_rad):.1f} degrees"
+            for m in displaced
+        )
+        text = f"Camera poses differ from those of the rig: {changes}."
+        reasons.append(Reason("rig_changed", ((d.frames[0].index, d.frames[-1].index),), text))
+    ranked = verdicts.ranked(reasons)
+    d = replace(d, reasons=ranked, verdict=verdicts.verdict_of(ranked))
+    return replace(result, diagnostics=replace(d, refinement=None, cloud_before=None))
 
 
 def _calibration_reason(reason: Reason, worst: int, name: str) -> Reason:
@@ -249,17 +256,17 @@ def _calibration_reason(reason: Reason, worst: int, name: str) -> Reason:
     """
     if reason.code != "uncertain_poses":
         return reason
-    text = reason.text.replace(f"Frame {worst} is", f"Camera {name!r} is")
-    text += (
-        " The bound follows from the covariances in rig.json, which include systematic errors such "
-        "as multipath."
+    text = (
+        reason.text.replace(f"Frame {worst} is", f"Camera {name!r} is")
+        + " The bound follows from the covariances in rig.json, which include systematic errors "
+        "such as multipath."
     )
     return replace(reason, code="uncertain_rig", text=text)
 
 
 def _check_calibration(
     rig: Rig, cameras: Sequence[Camera], recording: Recording
-) -> tuple[list[CameraMotion], dict[tuple[int, int], tuple[float, int]]]:
+) -> tuple[list[CameraMotion], SurfaceDistances]:
     """Return the cameras that differ from the calibration, after aligning their views.
 
     Also the distances between the surfaces of each pair at the calibrated poses, see `JointPoses`.
@@ -281,22 +288,6 @@ def _check_calibration(
     )
     displaced = [motion for motion in compare(rig, Rig(recalibrated)) if motion.moved]
     return displaced, disagreements(views, calibrated)
-
-
-def _with_rig_reason(result: Reconstruction, displaced: Sequence[CameraMotion]) -> Reconstruction:
-    """Return the result with a reason for the cameras that differ from the calibration."""
-    if not displaced:
-        return result
-    d = result.diagnostics
-    changes = ", ".join(
-        f"{m.name} by {1000 * m.distance_m:.0f} mm and {np.degrees(m.angle_rad):.1f} degrees"
-        for m in displaced
-    )
-    text = f"Camera poses differ from those of the rig: {changes}."
-    all_frames = ((d.frames[0].index, d.frames[-1].index),)
-    reasons = verdicts.ranked((*d.reasons, Reason("rig_changed", all_frames, text)))
-    verdict = verdicts.verdict_of(reasons)
-    return replace(result, diagnostics=replace(d, reasons=reasons, verdict=verdict))
 
 
 def _write(rig_result: RigResult, recording: Recording, folder: folders.OutputFolder) -> None:
