@@ -7,9 +7,9 @@ import pytest
 
 from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
-from tofuse.apps.rigs.calibrating import Calibration, calibrate_cameras
+from tofuse.apps.rigs.calibrating import calibrate_cameras
 from tofuse.apps.rigs.hand_eye import HandEye, Track, hand_eye
-from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.inputs import Calibration, Camera
 from tofuse.apps.rigs.moving_rig import _initial_offset, _JointViews, _too_uncertain
 from tofuse.apps.rigs.rig_trajectory import refined
 from tofuse.apps.rigs.run import reconstruct_rig
@@ -64,7 +64,7 @@ def cameras() -> tuple[Camera, Camera]:
 
 @cache
 def calibrated() -> Calibration:
-    return calibrate_cameras(cameras(), ["a", "b"])
+    return calibrate_cameras(cameras())
 
 
 @pytest.mark.slow

@@ -2,43 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.apps.rigs.checking import CameraMotion, compare_in_scene
-from tofuse.apps.rigs.inputs import Camera, open_cameras
-from tofuse.apps.rigs.moving_rig import MovingRig, calibrate_moving
-from tofuse.apps.rigs.static_rig import StaticRig, calibrate_static, is_static
+from tofuse.apps.rigs.inputs import Calibration, Camera, open_cameras
+from tofuse.apps.rigs.moving_rig import calibrate_moving
+from tofuse.apps.rigs.static_rig import calibrate_static, is_static
 from tofuse.engine.compute import threads as using_threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.progress import Progress, Silent
-from tofuse.formats.rigs import Disagreement, Rig, RigCamera
+from tofuse.formats.rigs import Rig
 
 Motion = Literal["auto", "still", "moving"]
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """The result of a rig calibration.
-
-    Attributes
-    ----------
-    rig
-        The placed cameras; those that could not be placed are in its `unplaced`.
-    how
-        "one instant", "n instants", or "a walk".
-    notes
-        Notes for the user.
-    """
-
-    rig: Rig
-    how: str
-    notes: tuple[str, ...] = ()
 
 
 def calibrate(
@@ -70,22 +50,16 @@ def calibrate(
         If a recording can't be used, or no camera can be placed relative to the first one.
     """
     with using_threads(threads), threadpool_limits(1):
-        cameras = open_cameras(recordings, format)
-        return calibrate_cameras(cameras, recordings, motion, progress or Silent())
+        return calibrate_cameras(open_cameras(recordings, format), motion, progress)
 
 
 def calibrate_cameras(
-    cameras: Sequence[Camera],
-    paths: Sequence[str | Path],
-    motion: Motion = "auto",
-    progress: Progress | None = None,
+    cameras: Sequence[Camera], motion: Motion = "auto", progress: Progress | None = None
 ) -> Calibration:
     """Calibrate opened cameras; see `calibrate`."""
     progress = progress or Silent()
     progress.stage("opening")
-    if not moves(cameras, motion):
-        return _from_static(cameras, paths, calibrate_static(cameras, progress))
-    return _from_moving(cameras, paths, calibrate_moving(cameras, progress))
+    return (calibrate_moving if moves(cameras, motion) else calibrate_static)(cameras, progress)
 
 
 def check(
@@ -106,7 +80,7 @@ def check(
     """
     with using_threads(threads), threadpool_limits(1):
         cameras = cameras_of([c.name for c in rig.cameras], recordings, format)
-        calibration = calibrate_cameras(cameras, recordings, motion, progress or Silent())
+        calibration = calibrate_cameras(cameras, motion, progress)
     return calibration, compare_in_scene(rig, calibration.rig)
 
 
@@ -153,50 +127,3 @@ def moves(cameras: Sequence[Camera], motion: Motion) -> bool:
             "with --motion still or --motion moving",
         )
     return not all(static)
-
-
-def disagreement_rows(
-    names: Sequence[str], distances: Mapping[tuple[int, int], tuple[float, int]]
-) -> tuple[Disagreement, ...]:
-    """Return the distances between the surfaces of pairs of cameras with their names, in order."""
-    return tuple(
-        Disagreement(names[a], names[b], median, pixels)
-        for (a, b), (median, pixels) in sorted(distances.items())
-    )
-
-
-def _from_static(
-    cameras: Sequence[Camera], paths: Sequence[str | Path], estimate: StaticRig
-) -> Calibration:
-    names = [camera.name for camera in cameras]
-    refined = estimate.refined
-    rows = tuple(
-        RigCamera(
-            names[c],
-            str(paths[c]),
-            refined.poses[k],
-            refined.covariance[k][:6, :6],
-            float(estimate.time_offsets[c]),
-            -float(refined.offsets[k]),
-            refined.random_covariance[k][:6, :6],
-        )
-        for k, c in enumerate(estimate.cameras)
-    )
-    pairs = disagreement_rows([names[c] for c in estimate.cameras], refined.disagreement)
-    unplaced = {names[c]: reason for c, reason in sorted(estimate.placement.reasons.items())}
-    how = "one instant" if estimate.instants == 1 else f"{estimate.instants} instants"
-    return Calibration(Rig(rows, pairs, unplaced), how, estimate.notes)
-
-
-def _from_moving(
-    cameras: Sequence[Camera], paths: Sequence[str | Path], estimate: MovingRig
-) -> Calibration:
-    names = [camera.name for camera in cameras]
-    rows = [RigCamera(names[0], str(paths[0]), np.eye(4), np.zeros((6, 6)))]
-    rows += [
-        RigCamera(names[k], str(paths[k]), fit.T_a_b, fit.covariance, fit.time_offset_s)
-        for k, fit in sorted(estimate.fits.items())
-    ]
-    pairs = disagreement_rows(names, estimate.disagreement)
-    unplaced = {names[k]: reason for k, reason in sorted(estimate.reasons.items())}
-    return Calibration(Rig(tuple(rows), pairs, unplaced), "a walk", estimate.notes)

@@ -1,8 +1,8 @@
-"""The recordings of a rig's cameras: named, checked, and prepared for comparison."""
+"""The recordings of a rig's cameras, checked and prepared for comparison; a calibration of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +13,7 @@ from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.mapping import Config, adaptation, from_method
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 from tofuse.formats.recordings import open_recording
+from tofuse.formats.rigs import Disagreement, Rig
 
 _MAX_CAMERAS = 64
 
@@ -112,3 +113,32 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     return [f"camera {k}" for k in range(len(paths))]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The result of a rig calibration.
+
+    Attributes
+    ----------
+    rig
+        The placed cameras; those that could not be placed are in its `unplaced`.
+    how
+        "one instant", "n instants", or "a walk".
+    notes
+        Notes for the user.
+    """
+
+    rig: Rig
+    how: str
+    notes: tuple[str, ...] = ()
+
+
+def disagreement_rows(
+    names: Sequence[str], distances: Mapping[tuple[int, int], tuple[float, int]]
+) -> tuple[Disagreement, ...]:
+    """Return the distances between the surfaces of pairs of cameras with their names, in order."""
+    return tuple(
+        Disagreement(names[a], names[b], median, pixels)
+        for (a, b), (median, pixels) in sorted(distances.items())
+    )

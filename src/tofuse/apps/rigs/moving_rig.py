@@ -7,12 +7,12 @@ a joint refinement of all views, once the trajectories are in one world frame.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from tofuse.apps.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
-from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.inputs import Calibration, Camera, disagreement_rows
 from tofuse.apps.rigs.joint import SurfaceDistances, disagreements_of
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, RegistrationError
@@ -22,6 +22,7 @@ from tofuse.engine.mapping import reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import Priors, joint_alignment, propagate_poses, refined_by_halves
 from tofuse.engine.stored_views import SampledView, pair_equations
+from tofuse.formats.rigs import Rig, RigCamera
 
 # Number of views of each camera that are refined jointly, and of their points.
 _VIEWS, _POINTS = 70, 1500
@@ -32,29 +33,7 @@ _MAX_SIGMA_FRACTION, _MAX_SIGMA_RAD = 0.05, float(np.radians(4.0))
 _OPTIONS = pair_equations.RefineOptions(neighbours=16)
 
 
-@dataclass(frozen=True, eq=False)
-class MovingRig:
-    """The calibration of a moving rig.
-
-    Attributes
-    ----------
-    fits
-        Calibration of each camera but the first relative to the first, by camera.
-    reasons
-        Why a camera is not placed, by camera.
-    disagreement
-        Distances between the surfaces of pairs of cameras, at any time.
-    notes
-        Messages for the user.
-    """
-
-    fits: dict[int, HandEye]
-    reasons: dict[int, str]
-    disagreement: SurfaceDistances
-    notes: tuple[str, ...]
-
-
-def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig:
+def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> Calibration:
     """Track each camera, fit the trajectories to each other, and refine all views jointly.
 
     Raises
@@ -99,13 +78,22 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig
         if reason:
             reasons[k] = reason
             del fits[k]
+    rows = [RigCamera(cameras[0].name, cameras[0].recording.path, np.eye(4), np.zeros((6, 6)))]
+    rows += [
+        RigCamera(
+            cameras[k].name,
+            cameras[k].recording.path,
+            fit.T_a_b,
+            fit.covariance,
+            fit.time_offset_s,
+        )
+        for k, fit in sorted(fits.items())
+    ]
     placed = {0, *fits}
-    return MovingRig(
-        fits,
-        reasons,
-        {ends: distance for ends, distance in joint.disagreement().items() if set(ends) <= placed},
-        tuple(notes),
-    )
+    distances = {ends: d for ends, d in joint.disagreement().items() if set(ends) <= placed}
+    pairs = disagreement_rows([camera.name for camera in cameras], distances)
+    unplaced = {cameras[k].name: reason for k, reason in sorted(reasons.items())}
+    return Calibration(Rig(tuple(rows), pairs, unplaced), "a walk", tuple(notes))
 
 
 def _initial_offset(
@@ -248,5 +236,5 @@ class _JointViews:
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, np.float64)
 
     def disagreement(self) -> SurfaceDistances:
-        """See `MovingRig`."""
+        """Return the distances between the surfaces of pairs of cameras, at any time."""
         return disagreements_of(self._views, self._camera, self._poses, self._pairs)

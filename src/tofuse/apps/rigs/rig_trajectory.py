@@ -47,7 +47,7 @@ class RigTrajectory:
         (F, 4, 4) pose of each image in the rig's frame at its instant: the pose of its camera, and
         the motion since then, as free-running cameras take images at different times.
     disagreement
-        See `MovingRig`.
+        Distances between the surfaces of pairs of cameras, at any time.
     measured
         Relative poses of view pairs, by the index of their frames.
     tracked

@@ -11,9 +11,9 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.apps.jobs import Options, resolve
 from tofuse.apps.results import folders, write_result
-from tofuse.apps.rigs.calibrating import cameras_of, disagreement_rows, moves
+from tofuse.apps.rigs.calibrating import cameras_of, moves
 from tofuse.apps.rigs.checking import CameraMotion, compare
-from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.inputs import Camera, disagreement_rows
 from tofuse.apps.rigs.joint import RigView, SurfaceDistances, disagreements, refine_together
 from tofuse.apps.rigs.rig_trajectory import track_rig
 from tofuse.engine.arrays import Float64, Intp

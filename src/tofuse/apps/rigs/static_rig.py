@@ -7,21 +7,20 @@ moving objects at each instant, and all instants are used jointly.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import ttest_1samp
 
 from tofuse.apps.rigs.clocks import lag_between
-from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.inputs import Calibration, Camera, disagreement_rows
 from tofuse.apps.rigs.joint import (
-    JointPoses,
     RigView,
     distances_between,
     refine_together,
     refined_poses,
 )
-from tofuse.apps.rigs.placing import Placement, place
+from tofuse.apps.rigs.placing import place
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters import BackgroundSurface, background_surface
@@ -33,6 +32,7 @@ from tofuse.engine.progress import Progress
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.views import PreparedView
 from tofuse.formats.recordings import still
+from tofuse.formats.rigs import Rig, RigCamera
 
 # A camera is static if this fraction of its pixels measure the same surface in this fraction of the
 # sampled frames.
@@ -51,34 +51,6 @@ _MAX_LAG, _COMPARED_INSTANTS, _MAX_DISTANCE = 6, 10, 0.03
 # Minimum number of instants to compare two lags, and the significance level: about a dozen lags
 # are compared with the best one.
 _MIN_INSTANTS, _SIGNIFICANCE = 5, 0.001
-
-
-@dataclass(frozen=True, eq=False)
-class StaticRig:
-    """The calibration of static cameras.
-
-    Attributes
-    ----------
-    placement
-        The placed cameras, and why others are not.
-    refined
-        Refined poses of the placed cameras, in the order of `cameras`.
-    cameras
-        (M,) the placed cameras, ascending.
-    time_offsets
-        (K,) of all cameras, s.
-    instants
-        Number of instants.
-    notes
-        Notes for the user.
-    """
-
-    placement: Placement
-    refined: JointPoses
-    cameras: tuple[int, ...]
-    time_offsets: Float64
-    instants: int
-    notes: tuple[str, ...]
 
 
 def is_static(camera: Camera) -> bool:
@@ -103,7 +75,7 @@ def _static_fraction(frames: Sequence[RangeFrame]) -> float:
     )
 
 
-def calibrate_static(cameras: Sequence[Camera], progress: Progress) -> StaticRig:
+def calibrate_static(cameras: Sequence[Camera], progress: Progress) -> Calibration:
     """Place and refine static cameras relative to each other."""
     notes: list[str] = []
     progress.stage("instants")
@@ -127,7 +99,22 @@ def calibrate_static(cameras: Sequence[Camera], progress: Progress) -> StaticRig
         C = _clock_covariance(cameras, order, refined.poses, offsets, instants, times)
         random = refined.random_covariance + C
         refined = replace(refined, covariance=refined.covariance + C, random_covariance=random)
-    return StaticRig(placement, refined, order, offsets, count, tuple(notes))
+    rows = tuple(
+        RigCamera(
+            cameras[c].name,
+            cameras[c].recording.path,
+            refined.poses[k],
+            refined.covariance[k][:6, :6],
+            float(offsets[c]),
+            -float(refined.offsets[k]),
+            refined.random_covariance[k][:6, :6],
+        )
+        for k, c in enumerate(order)
+    )
+    pairs = disagreement_rows([row.name for row in rows], refined.disagreement)
+    unplaced = {cameras[c].name: reason for c, reason in sorted(placement.reasons.items())}
+    how = "one instant" if count == 1 else f"{count} instants"
+    return Calibration(Rig(rows, pairs, unplaced), how, tuple(notes))
 
 
 def _clock_covariance(
