@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, count
 from pathlib import Path
 from typing import Any, get_args
 
@@ -229,13 +229,11 @@ def _check_different(first: Session, second: Session) -> None:
 def _uniquely_named(sessions: list[Session]) -> list[Session]:
     """Return the sessions with unique names."""
     names = [session.name for session in sessions]
-    taken: set[str] = set()
-    out = []
-    for session, name in zip(sessions, names, strict=True):
-        unique, number = name, 1
-        while unique in taken or (number > 1 and unique in names):
-            number += 1
-            unique = f"{name} ({number})"
-        taken.add(unique)
+    out: list[Session] = []
+    for session in sessions:
+        taken = {*names[len(out) :], *(earlier.name for earlier in out)}
+        numbered = (f"{session.name} ({number})" for number in count(2))
+        is_first = session.name not in names[: len(out)]
+        unique = session.name if is_first else next(n for n in numbered if n not in taken)
         out.append(replace(session, name=unique))
     return out
