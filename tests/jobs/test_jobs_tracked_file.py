@@ -211,8 +211,8 @@ def test_invalid_file_is_never_fatal(data: bytes | str, tmp_path: Path) -> None:
         "empty": {},
         "no steps": {name: a for name, a in arrays.items() if name != "steps"},
         "other steps": arrays | {"steps": np.frombuffer(b"[[1, 2], null, 3]", np.uint8)},
-        "short": arrays | {"poses": arrays["poses"][:-1]},
-        "objects": arrays | {"poses": np.array([{}], object)},
+        "short": arrays | {"steps": arrays["steps"][:-9]},
+        "objects": arrays | {"steps": np.array([{}], object)},
     }
     if isinstance(data, bytes):
         path.write_bytes(data)

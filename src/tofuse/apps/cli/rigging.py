@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from rich.table import Table
 
@@ -10,7 +12,7 @@ from tofuse.apps.cli.commands import progress_unless_json, show, warning_lines
 from tofuse.apps.cli.options import RigCalibrate, RigCheck
 from tofuse.apps.cli.progress import escaped
 from tofuse.apps.results import run_json
-from tofuse.apps.rigs import CameraMotion, calibrate, check
+from tofuse.apps.rigs import Calibration, CameraMotion, calibrate, compare_in_scene
 from tofuse.engine.geometry import se3
 from tofuse.formats.rigs import Rig, read_rig, write_rig
 
@@ -21,17 +23,24 @@ _CHECKED = (
 )
 
 
-def rig_calibrate(arguments: RigCalibrate) -> int:
-    """``tofuse rig calibrate``."""
-    check_new(arguments.out, overwrite=arguments.overwrite)
+def _calibrated(
+    arguments: RigCalibrate | RigCheck, names: Sequence[str] | None = None
+) -> Calibration:
     with progress_unless_json(arguments) as progress:
-        calibration = calibrate(
+        return calibrate(
             arguments.inputs,
+            names=names,
             motion=arguments.motion,
             format=arguments.format,
             threads=arguments.threads,
             progress=progress,
         )
+
+
+def rig_calibrate(arguments: RigCalibrate) -> int:
+    """``tofuse rig calibrate``."""
+    check_new(arguments.out, overwrite=arguments.overwrite)
+    calibration = _calibrated(arguments)
     rig, notes = calibration.rig, calibration.notes
     write_rig(arguments.out, rig)
     return show(
@@ -48,15 +57,8 @@ def rig_calibrate(arguments: RigCalibrate) -> int:
 def rig_check(arguments: RigCheck) -> int:
     """``tofuse rig check``."""
     rig = read_rig(arguments.rig)
-    with progress_unless_json(arguments) as progress:
-        calibration, cameras = check(
-            rig,
-            arguments.inputs,
-            motion=arguments.motion,
-            format=arguments.format,
-            threads=arguments.threads,
-            progress=progress,
-        )
+    calibration = _calibrated(arguments, [camera.name for camera in rig.cameras])
+    cameras = compare_in_scene(rig, calibration.rig)
     rows = [
         {"name": c.name, "checked": not c.reason} | {name: getattr(c, name) for name in _CHECKED}
         for c in cameras

@@ -25,11 +25,13 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.apps.results import folders, run_json, write_result
 from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, Recording, evenly_spaced, frame_ranges
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Config, adaptation, check_views, from_method, reconstructing
+from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import (
     cross_view_agreement,
@@ -149,6 +151,8 @@ def judge(
         If fewer than two frames have a pose, or the recording contains clouds.
     """
     progress = progress or Silent()
+    if tolerance_m is not None:
+        check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
     poses = poses_for(recording, trajectory)
     kind = reconstructing.view_kind(recording)
     # External sensors do not measure these poses, and images are compared with the stated camera.

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.rigs.checking import CameraMotion, compare_in_scene
 from tofuse.apps.rigs.inputs import Calibration, Camera, open_cameras
 from tofuse.apps.rigs.moving_rig import calibrate_moving
 from tofuse.apps.rigs.static_rig import calibrate_static, is_static
 from tofuse.engine.compute import threads as using_threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.progress import Progress, Silent
-from tofuse.formats.rigs import Rig
 
 Motion = Literal["auto", "still", "moving"]
 
@@ -24,6 +21,7 @@ Motion = Literal["auto", "still", "moving"]
 def calibrate(
     recordings: Sequence[str | Path],
     *,
+    names: Sequence[str] | None = None,
     motion: Motion = "auto",
     format: str | None = None,  # noqa: A002
     threads: int | None = None,
@@ -35,6 +33,8 @@ def calibrate(
     ----------
     recordings
         One recording per camera; the first camera defines the frame of the rig.
+    names
+        Names of the cameras; those of the files or folders by default.
     motion
         Whether the rig moves; "auto" detects it.
     format
@@ -50,7 +50,7 @@ def calibrate(
         If a recording can't be used, or no camera can be placed relative to the first one.
     """
     with using_threads(threads), threadpool_limits(1):
-        return calibrate_cameras(open_cameras(recordings, format), motion, progress)
+        return calibrate_cameras(open_cameras(recordings, format, names), motion, progress)
 
 
 def calibrate_cameras(
@@ -60,51 +60,6 @@ def calibrate_cameras(
     progress = progress or Silent()
     progress.stage("opening")
     return (calibrate_moving if moves(cameras, motion) else calibrate_static)(cameras, progress)
-
-
-def check(
-    rig: Rig,
-    recordings: Sequence[str | Path],
-    *,
-    motion: Motion = "auto",
-    format: str | None = None,  # noqa: A002
-    threads: int | None = None,
-    progress: Progress | None = None,
-) -> tuple[Calibration, list[CameraMotion]]:
-    """Recalibrate a rig, from one recording of each camera in the rig's order, and compare.
-
-    Raises
-    ------
-    InputError
-        If a recording can't be used, or their number differs from that of the cameras.
-    """
-    with using_threads(threads), threadpool_limits(1):
-        cameras = cameras_of([c.name for c in rig.cameras], recordings, format)
-        calibration = calibrate_cameras(cameras, motion, progress)
-    return calibration, compare_in_scene(rig, calibration.rig)
-
-
-def cameras_of(
-    names: Sequence[str],
-    recordings: Sequence[str | Path],
-    format: str | None = None,  # noqa: A002
-) -> list[Camera]:
-    """Open the recordings of a rig's cameras, given in the order of their names.
-
-    Raises
-    ------
-    InputError
-        If their number differs from that of the cameras, or one can't be opened.
-    """
-    if len(recordings) != len(names):
-        raise InputError(
-            f"has {len(names)} cameras ({', '.join(names)}), "
-            f"and {len(recordings)} recordings are given",
-            where="the rig",
-            remedy="pass one recording for each, in this order",
-        )
-    opened = open_cameras(recordings, format)
-    return [replace(camera, name=name) for camera, name in zip(opened, names, strict=True)]
 
 
 def moves(cameras: Sequence[Camera], motion: Motion) -> bool:

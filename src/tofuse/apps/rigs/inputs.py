@@ -81,28 +81,36 @@ def measured_image(recording: Recording, k: int) -> RangeFrame | None:
     return frame if frame is not None and len(frame) else None
 
 
-def open_cameras(paths: Sequence[str | Path], format: str | None = None) -> list[Camera]:  # noqa: A002
-    """Open the recordings of a rig's cameras, each named after its file or folder.
+def open_cameras(
+    paths: Sequence[str | Path],
+    format: str | None = None,  # noqa: A002
+    names: Sequence[str] | None = None,
+) -> list[Camera]:
+    """Open the recordings of a rig's cameras, by default named after their files or folders.
 
     Raises
     ------
     InputError
-        If there are fewer than two or too many, one can't be opened, or one is given twice.
+        If there are fewer than two, too many, or not as many as names; if one can't be opened, or
+        is given twice.
     """
-    if len(paths) < 2:
-        raise InputError("is one camera", where="a rig", remedy="pass two recordings or more")
-    if len(paths) > _MAX_CAMERAS:
+    if names is not None and len(paths) != len(names):
         raise InputError(
-            f"has {len(paths)} cameras", where="a rig", remedy=f"pass at most {_MAX_CAMERAS}"
+            f"has {len(names)} cameras ({', '.join(names)}), and {len(paths)} recordings are given",
+            where="the rig",
+            remedy="pass one recording for each, in this order",
+        )
+    if not 2 <= len(paths) <= _MAX_CAMERAS:
+        raise InputError(
+            f"has {len(paths)} cameras", where="a rig", remedy=f"pass 2 to {_MAX_CAMERAS}"
         )
     resolved = [Path(path).resolve() for path in paths]
     for k, path in enumerate(resolved):
         if path in resolved[:k]:
             raise InputError("is given twice", where=paths[k], remedy="pass each camera once")
-    names = unique_names(resolved)
     return [
         Camera(name, open_recording(path, format=format))
-        for name, path in zip(names, paths, strict=True)
+        for name, path in zip(names or unique_names(resolved), paths, strict=True)
     ]
 
 

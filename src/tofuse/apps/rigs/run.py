@@ -11,9 +11,9 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.apps.jobs import Options, resolve
 from tofuse.apps.results import folders, write_result
-from tofuse.apps.rigs.calibrating import cameras_of, moves
+from tofuse.apps.rigs.calibrating import moves
 from tofuse.apps.rigs.checking import CameraMotion, compare
-from tofuse.apps.rigs.inputs import Camera, disagreement_rows
+from tofuse.apps.rigs.inputs import Camera, disagreement_rows, open_cameras
 from tofuse.apps.rigs.joint import RigView, SurfaceDistances, disagreements, refine_together
 from tofuse.apps.rigs.rig_trajectory import track_rig
 from tofuse.engine.arrays import Float64, Intp
@@ -81,10 +81,9 @@ def run_rig(
         If the result can't be written.
     """
     progress = progress or Silent()
-    names = list(recordings_of(rig_file))
     with using_threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
-        cameras = cameras_of(names, inputs, options.format)
+        cameras = open_cameras(inputs, options.format, list(recordings_of(rig_file)))
         recordings = [camera.recording for camera in cameras]
         rig = read_rig(rig_file)
         source = RigSource(rig, recordings)
