@@ -69,7 +69,7 @@ def test_standard_deviations_bound_errors() -> None:
     not_estimated = {"k1", "k2", "p1", "p2", "k3"} - found.sigma.keys()
     assert all(getattr(found.camera, name) == 0 for name in not_estimated)
     assert found.rms_px < 0.1
-    assert found.before_px == pytest.approx(found.rms_px, abs=0.02)
+    assert found.rms_px_before == pytest.approx(found.rms_px, abs=0.02)
 
 
 def test_corners_follow_pixel_centre_convention() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from concurrent.futures import Future
 from time import monotonic
@@ -13,7 +12,6 @@ from tofuse.apps.batch.folder import Record
 from tofuse.apps.batch.work import Task, work
 from tofuse.apps.batch.workers import Workers
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import reading
 
 _TIMEOUT_S = 10.0  # of requests to a scheduler
 _POLL_S = 1.0  # interval at which the workers are counted
@@ -99,7 +97,7 @@ class DaskWorkers(Workers):
             elif _cannot_deserialize(error):
                 future.set_exception(
                     InputError(
-                        f"can't load the jobs of this version ({_first_line(error)})",
+                        f"can't load the jobs of this version ({str(error).partition(chr(10))[0]})",
                         where=self._address,
                         remedy="install this version of tofuse on its scheduler and its workers",
                     )
@@ -115,20 +113,23 @@ def _connect(address: str) -> Any:
     """Return a client of the scheduler at an address, or of the one that wrote a file."""
     try:
         import dask
-    except ImportError as error:
-        raise _not_installed() from error
-    # Dask would log errors that are reported here. It reads this when distributed is imported.
-    levels = {"distributed": "critical", "distributed.client": "critical"}
-    with dask.config.set({"logging": levels}):
-        try:
+
+        # Dask would log errors that are reported here; it reads this when it is imported.
+        levels = {"distributed": "critical", "distributed.client": "critical"}
+        with dask.config.set({"logging": levels}):
             import distributed
-        except ImportError as error:
-            raise _not_installed() from error
+    except ImportError as error:
+        raise InputError(
+            "needs Dask distributed",
+            where="--scheduler",
+            remedy="pip install 'tofuse[dask]', or use --workers to stay on this machine",
+        ) from error
+    # A file that a scheduler wrote, or its address.
+    target = {"scheduler_file" if os.path.isfile(address) else "address": address}
     client: Any = distributed.Client
-    target = _from_file(address) if os.path.isfile(address) else address
     try:
-        return client(target, timeout=_TIMEOUT_S, set_as_default=False, name="tofuse")
-    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        return client(**target, timeout=_TIMEOUT_S, set_as_default=False, name="tofuse")
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise InputError(
             "no Dask scheduler answers",
             where=address,
@@ -139,28 +140,3 @@ def _connect(address: str) -> Any:
 def _cannot_deserialize(error: BaseException) -> bool:
     """Whether a scheduler or worker could not load the objects of a task."""
     return isinstance(error, ImportError | AttributeError) or "deserializ" in str(error)
-
-
-def _first_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or its type."""
-    return next(iter(str(error).splitlines()), type(error).__name__)
-
-
-def _from_file(path: str) -> str:
-    """The address in a file that a scheduler wrote."""
-    try:
-        return str(json.loads(reading.read_text(path))["address"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            "is not a file of a Dask scheduler",
-            where=path,
-            remedy="pass the address that it prints",
-        ) from error
-
-
-def _not_installed() -> InputError:
-    return InputError(
-        "needs Dask distributed",
-        where="--scheduler",
-        remedy="pip install 'tofuse[dask]', or use --workers to stay on this machine",
-    )

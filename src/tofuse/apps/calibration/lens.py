@@ -59,7 +59,7 @@ class LensFit:
         Standard deviation of each parameter by name, without those fixed to 0.
     rms_px
         Rms reprojection error of the corners.
-    before_px
+    rms_px_before
         The same for the recording's original lens.
     views, rms_by_view_px
         Frames that were used, and the rms reprojection error of each.
@@ -74,7 +74,7 @@ class LensFit:
     camera: Pinhole
     sigma: dict[str, float]
     rms_px: float
-    before_px: float
+    rms_px_before: float
     views: tuple[int, ...]
     rms_by_view_px: tuple[float, ...]
     left_out: tuple[tuple[int, str], ...]
@@ -83,20 +83,12 @@ class LensFit:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        lens = {name: getattr(self.camera, name) for name in names_of(self.camera.model)}
+        camera = self.camera
         return {
-            "model": self.camera.model,
-            "width": self.camera.width,
-            "height": self.camera.height,
-            "lens": lens,
-            "sigma": dict(self.sigma),
-            "rms_px": self.rms_px,
-            "rms_px_before": self.before_px,
-            "views": list(self.views),
-            "rms_by_view_px": list(self.rms_by_view_px),
+            **{name: getattr(camera, name) for name in ("model", "width", "height")},
+            "lens": {name: getattr(camera, name) for name in names_of(camera.model)},
+            **{name: value for name, value in vars(self).items() if name != "camera"},
             "left_out": [{"frame": k, "reason": reason} for k, reason in self.left_out],
-            "covered": self.covered,
-            "warnings": list(self.warnings),
         }
 
 

@@ -73,7 +73,7 @@ class NoiseFit:
         Numbers of frames in static segments, of segments, and of pixels in all segments.
     rms_log_error
         Rms, over the bins, of the log ratio of predicted to measured sigma: 0.1 is about 10 %.
-    before
+    rms_log_error_before
         The same of the model that is used without a fit.
     bins
         Of the law that applies.
@@ -87,23 +87,14 @@ class NoiseFit:
     stretches: int
     pixels: int
     rms_log_error: float
-    before: float
+    rms_log_error_before: float
     bins: tuple[NoiseBin, ...] = field(repr=False)
     warnings: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        return {
-            "model": self.model.to_dict(),
-            "law": self.law,
-            "frames": self.frames,
-            "stretches": self.stretches,
-            "pixels": self.pixels,
-            "rms_log_error": self.rms_log_error,
-            "rms_log_error_before": self.before,
-            "bins": [vars(item) for item in self.bins],
-            "warnings": list(self.warnings),
-        }
+        bins = [vars(item) for item in self.bins]
+        return {**vars(self), "model": self.model.to_dict(), "bins": bins}
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,7 +68,8 @@ def noise(arguments: Noise) -> int:
         table,
         f"{escaped(fit.model.name)}, {fit.frames} frames in {fit.stretches} static "
         f"segment{'' if fit.stretches == 1 else 's'}: the noise model over {fit.law} deviates by "
-        f"{100 * fit.rms_log_error:.0f} % rms (built-in model: {100 * fit.before:.0f} %)",
+        f"{100 * fit.rms_log_error:.0f} % rms "
+        f"(built-in model: {100 * fit.rms_log_error_before:.0f} %)",
         *warning_lines(fit.warnings),
     )
 
@@ -81,14 +82,14 @@ def _lens(arguments: Calibrate) -> Summary:
     lines = [_number(fit.camera, name, fit.sigma.get(name)) for name in fit.to_dict()["lens"]]
     lines.append(
         f"{len(fit.views)} views, reprojection error {fit.rms_px:.3f} px rms (with the recording's "
-        f"own intrinsics: {fit.before_px:.3f})"
+        f"own intrinsics: {fit.rms_px_before:.3f})"
     )
     lines += [f"left out: frame {frame} {reason}" for frame, reason in fit.left_out[:_MAX_LISTED]]
     if len(fit.left_out) > _MAX_LISTED:
         lines.append(f"left out: {len(fit.left_out) - _MAX_LISTED} more frames (--json lists all)")
     if arguments.out is not None:
         metadata = recording_fields(recording)
-        write_camera_json(arguments.out, fit.camera, metadata, overwrite=arguments.overwrite)
+        write_camera_json(arguments.out, fit.camera, metadata)
         lines.append(f"written to {arguments.out}")
     return fit.to_dict(), lines, list(fit.warnings)
 
@@ -162,10 +163,8 @@ def _import_lens(arguments: Calibrate) -> Summary:
     lines = [f"{name} {value}" for name, value in fields.items()]
     lines.append(f"read as a file of {lens_file.format}")
     if arguments.out is not None:
-        written = write_camera_json(
-            arguments.out, lens_file.camera, metadata, overwrite=arguments.overwrite
-        )
-        lines += [f"written to {path}" for path in written]
+        write_camera_json(arguments.out, lens_file.camera, metadata)
+        lines.append(f"written to {arguments.out}")
     return {"format": lens_file.format, "warnings": warnings} | fields, lines, warnings
 
 
