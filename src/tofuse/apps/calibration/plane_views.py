@@ -198,8 +198,6 @@ def _plane_views(
     sigma = noise.sigma(frame).astype(float)
     rays = frame.camera.rays().astype(float)
     pixels = np.flatnonzero(mask & (sigma > 0) & np.isfinite(rays).all(-1))
-    if len(pixels) < _MIN_PIXELS:
-        return []
     homogeneous = np.concatenate([rays.reshape(-1, 2)[pixels], np.ones((len(pixels), 1))], 1)
     directions = homogeneous / ray_lengths(frame.camera).ravel()[pixels, None]
     frontal = directions @ plane > _MIN_COSINE * np.linalg.norm(plane)

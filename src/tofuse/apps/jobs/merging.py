@@ -131,12 +131,22 @@ def merge_sessions(
     """Join, refine and fuse sessions; see `merge`."""
     progress = progress or Silent()
     recording, offsets = joined_recording(sessions)
-    links = _earlier_links(sessions, offsets)
+    # The loops that earlier merges closed between sessions, to be registered again: the loop search
+    # selects the pairs with the largest overlap, which need not connect all sessions.
+    links = [
+        PriorLoop(i + offset, j + offset, by_user=False)
+        for session, offset in zip(sessions, offsets, strict=True)
+        for i, j in session.links
+    ]
     mapper = Mapper(config, seed=seed, threads=threads, loops=links, progress=progress)
     progress.stage("reading sessions", len(recording))
     with threadpool_limits(1):
         for session, offset in zip(sessions, offsets, strict=True):
-            mapper.interrupt(_config_of(session, offset))
+            odometry = session.config.odometry
+            assert isinstance(odometry, given.GivenPoses)
+            stated = {k + offset: pose for k, pose in session.stated.items()}
+            with_poses = given.StatedPoses(stated, odometry)
+            mapper.interrupt(replace(session.config, odometry=with_poses))
             session_recording = replace(recording, indices=session.recording.indices + offset)
             reconstructing.push_frames(mapper, session_recording, session.config.window)
         result = mapper.finish()
@@ -165,26 +175,6 @@ def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]
     path = " ".join(s.recording.path for s in sessions)
     joined = JoinedSource(sources, names)
     return Recording(joined, path, "+".join(formats), np.concatenate(indices)), offsets
-
-
-def _earlier_links(sessions: Sequence[Session], offsets: Sequence[int]) -> list[PriorLoop]:
-    """Return the loops that earlier merges closed between sessions, to be registered again.
-
-    The loop search selects the pairs with the largest overlap, which need not connect all sessions.
-    """
-    return [
-        PriorLoop(i + offset, j + offset, by_user=False)
-        for session, offset in zip(sessions, offsets, strict=True)
-        for i, j in session.links
-    ]
-
-
-def _config_of(session: Session, offset: int) -> Config:
-    """Return the configuration of a session, with its stated poses as odometry."""
-    odometry = session.config.odometry
-    assert isinstance(odometry, given.GivenPoses)
-    stated = {k + offset: pose for k, pose in session.stated.items()}
-    return replace(session.config, odometry=given.StatedPoses(stated, odometry))
 
 
 def _with_sessions(
