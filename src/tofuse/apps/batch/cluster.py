@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import Future
-from time import monotonic
 from typing import Any
 from uuid import uuid4
 
@@ -14,7 +13,6 @@ from tofuse.apps.batch.workers import Workers
 from tofuse.engine.errors import InputError
 
 _TIMEOUT_S = 10.0  # of requests to a scheduler
-_POLL_S = 1.0  # interval at which the workers are counted
 
 
 class DaskWorkers(Workers):
@@ -34,19 +32,6 @@ class DaskWorkers(Workers):
         """
         self._address = address
         self._client: Any = _connect(address)
-        self._running: set[Future[Record]] = set()
-        self._worker_infos: list[dict[str, Any]] = []
-        self._polled_at = -_POLL_S
-
-    def accepts(self) -> bool:
-        """See `Workers`. No more tasks are submitted than workers can do at a time.
-
-        Dask counts a queued task as failed whenever its worker dies, even if it had not started.
-        """
-        self._running = {f for f in self._running if not f.done()}
-        if monotonic() - self._polled_at >= _POLL_S:
-            self._worker_infos, self._polled_at = self._workers(), monotonic()
-        return len(self._running) < sum(int(w["nthreads"]) for w in self._worker_infos)
 
     def start(self, task: Task) -> Future[Record]:
         """See `Workers`."""
@@ -54,7 +39,6 @@ class DaskWorkers(Workers):
         remote = self._client.submit(work, task, key=key, pure=False)
         future: Future[Record] = Future()
         remote.add_done_callback(lambda done: self._transfer(done, future))
-        self._running.add(future)
         return future
 
     def lost(self) -> InputError | None:
@@ -70,12 +54,6 @@ class DaskWorkers(Workers):
     def close(self) -> None:
         """See `Workers`. Workers finish jobs that they have started, and write their records."""
         self._client.close(timeout=_TIMEOUT_S)
-
-    def _workers(self) -> list[dict[str, Any]]:
-        try:
-            return list(self._client.scheduler_info(n_workers=-1)["workers"].values())
-        except OSError:  # `lost` reports it
-            return []
 
     def _transfer(self, remote: Any, future: Future[Record]) -> None:
         """Copy the outcome of a remote future to a local one."""

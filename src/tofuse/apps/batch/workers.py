@@ -12,14 +12,10 @@ from tofuse.engine.errors import InputError
 
 
 class Workers(Protocol):
-    """Runs tasks, several at a time."""
-
-    def accepts(self) -> bool:
-        """Whether a task would be started at once."""
-        ...
+    """Runs tasks, several at a time, in the order in which they are started."""
 
     def start(self, task: Task) -> Future[Record]:
-        """Start a task.
+        """Start a task as soon as possible.
 
         The future is cancelled if the workers are lost; else it returns the record of the job,
         `killed` if its worker was.
@@ -40,22 +36,13 @@ class LocalWorkers(Workers):
 
     def __init__(self, count: int) -> None:
         """Run up to `count` jobs at a time."""
-        self._count = count
         self._pool = ThreadPoolExecutor(count, thread_name_prefix="tofuse-batch")
-        self._running: set[Future[Record]] = set()
         self._processes: list[subprocess.Popen[bytes]] = []
         self._closed = False
 
-    def accepts(self) -> bool:
-        """See `Workers`."""
-        self._running = {f for f in self._running if not f.done()}
-        return len(self._running) < self._count
-
     def start(self, task: Task) -> Future[Record]:
         """See `Workers`."""
-        future = self._pool.submit(work, task, self._register_process)
-        self._running.add(future)
-        return future
+        return self._pool.submit(work, task, self._register_process)
 
     def lost(self) -> None:
         """See `Workers`."""

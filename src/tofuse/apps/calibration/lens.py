@@ -27,7 +27,7 @@ _MIN_OUTLIER_PX = 0.3
 _MIN_SPREAD = np.radians(6)  # of the board's normals
 _MAX_SIGMA = 0.01  # of the focal length
 _MIN_COVERED = 0.5
-_CELLS = 8
+_CELLS = 64
 _INTRINSIC = ("fx", "fy", "cx", "cy")
 
 
@@ -262,13 +262,12 @@ def _check_spread(recording: Recording, fit: _Fit) -> None:
 
 def _covered(views: Sequence[BoardView], size: tuple[int, int]) -> float:
     """Return the fraction of a grid's cells that lie within the corners of a view."""
-    covered = np.zeros((_CELLS, _CELLS), bool)
-    v, u = (np.mgrid[0:_CELLS, 0:_CELLS] + 0.5) / _CELLS
+    covered = np.zeros((_CELLS, _CELLS), np.uint8)
     for view in views:
-        hull = cv2.convexHull(view.corners.astype(np.float32))
-        for i, j in np.ndindex(covered.shape):
-            at = (float(u[i, j] * size[0]), float(v[i, j] * size[1]))
-            covered[i, j] |= cv2.pointPolygonTest(hull, at, False) >= 0
+        cells = cv2.convexHull(
+            ((view.corners + 0.5) / size * _CELLS - 0.5).round().astype(np.int32)
+        )
+        cv2.fillConvexPoly(covered, cells, 1)
     return float(covered.mean())
 
 
