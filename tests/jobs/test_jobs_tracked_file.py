@@ -230,7 +230,7 @@ def test_full_disk_does_not_stop_run(tmp_path: Path, monkeypatch) -> None:
         raise OSError(28, "No space left on device")
 
     notes: list[str] = []
-    monkeypatch.setattr(np, "savez", full)
+    monkeypatch.setattr(np, "savez_compressed", full)
     stored(tmp_path / TRACKED, notes)
     assert "no space left" in notes[0].lower()
     assert os.listdir(tmp_path) == []

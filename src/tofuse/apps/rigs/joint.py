@@ -16,13 +16,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from tofuse.apps.rigs import rig_residual_kernels as kernels
 from tofuse.engine.alignment import bounded_below, projective
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import SampledView, pair_equations, shared_error
+from tofuse.engine.views import residual_kernels
 
 K = TypeVar("K", bound=tuple[int, int])
 # Median distance between the surfaces of two cameras, m, and number of pixels, by pair a < b.
@@ -45,6 +46,9 @@ _OVERLAP = 0.04
 # Prior standard deviation of a camera's depth offset. Data sheets specify about a centimetre.
 _OFFSET_SIGMA_M = 0.01
 _PAIRS_PER_CHUNK = 8
+# Columns of a target's pixels and of a source's points.
+_PLANE = slice(residual_kernels.PLANE, residual_kernels.PLANE + 3)
+_NORMAL = slice(residual_kernels.NORMAL, residual_kernels.NORMAL + 3)
 # Median of chi-square with one degree of freedom; limits of the noise scale of a pair of cameras.
 _MEDIAN_OF_SQUARES = 0.455
 _MIN_SCALE, _MAX_SCALE = 0.7, 30.0
@@ -142,7 +146,7 @@ def distances_between(
 ) -> Float64:
     """Return the (N,) distances in m between the surfaces visible in both views."""
     limit_m = _MAX_DISTANCE * target.depth
-    return np.abs(_residual_rows(target, source, T_target_source, limit_m)[:, kernels.RESIDUAL])
+    return np.abs(_residuals(target, source, T_target_source, limit_m).r)
 
 
 def _grouped(parts: Iterable[tuple[K, Float64]]) -> dict[K, Float64]:
@@ -159,22 +163,68 @@ def _medians(distances: Iterable[tuple[tuple[int, int], Float64]]) -> SurfaceDis
     return {ends: (float(np.median(d)), len(d)) for ends, d in by_pair.items() if len(d)}
 
 
-def _residual_rows(
+@dataclass(frozen=True, eq=False)
+class _Residuals:
+    """Signed distances (N,) of a view's points from the planes of another one, and derivatives.
+
+    Attributes
+    ----------
+    r, variance
+        (N,) the distance in m, and its variance.
+    p, m, s
+        (N, 3) corrected source points, and in their frame the target's and the source's normals.
+    by_source, by_target
+        (N,) derivatives of the distance by the range offsets of source and target.
+    """
+
+    r: Float64
+    variance: Float64
+    p: Float64
+    m: Float64
+    s: Float64
+    by_source: Float64
+    by_target: Float64
+
+    def __len__(self) -> int:
+        return len(self.r)
+
+
+def _residuals(
     target: SampledView,
     source: SampledView,
     T_target_source: Float64,
     limit_m: float,
     offsets: tuple[float, float] = (0.0, 0.0),
-) -> Float64:
-    """Return the residual rows of corresponding points: larger distances are of other surfaces.
+) -> _Residuals:
+    """Compare points with the planes of the pixels that they project to, as `pair_equations` do.
 
-    `offsets` are those of the source and of the target.
+    Distances above the limit are those of other surfaces. `offsets` are to be added to the ranges
+    of the source and of the target.
     """
-    rows = np.empty((len(source.points), kernels.ROW))
-    T = np.ascontiguousarray(T_target_source)
-    kernels.residuals(source.points, target.target_image, T, *offsets, _MIN_COSINE, rows)
-    near = np.abs(rows[:, kernels.RESIDUAL]) < limit_m
-    return np.asarray(rows[(rows[:, kernels.RESIDUAL_VARIANCE] > 0) & near], np.float64)
+    image, lookup, frame = target.target_image
+    points = np.asarray(source.points, np.float64)
+    rays = points[:, :3] / np.linalg.norm(points[:, :3], axis=1, keepdims=True)
+    p = points[:, :3] + offsets[0] * rays
+    q = se3.transform(T_target_source, p)
+    ahead = q[:, 2] > projection_kernels.MIN_DEPTH
+    x, y = (q[:, :2] / np.where(ahead, q[:, 2], 1.0)[:, None]).T.astype(np.float32)
+    u, v = np.empty((2, len(q)))
+    projection_kernels.project_rays(x, y, lookup, frame, u, v)
+    rows, columns = image.shape[:2]
+    seen = ahead & (u > -0.5) & (v > -0.5) & (u < columns - 0.5) & (v < rows - 0.5)
+    points, rays, p, q = points[seen], rays[seen], p[seen], q[seen]
+    pixels = image[(v[seen] + 0.5).astype(int), (u[seen] + 0.5).astype(int)].astype(np.float64)
+    n, distance = pixels[:, _PLANE], pixels[:, residual_kernels.DISTANCE]
+    m, s = n @ T_target_source[:3, :3], points[:, _NORMAL]
+    height = (n * q).sum(1)
+    # The target's offset moves its plane along the ray of the pixel.
+    by_target = -height / np.linalg.norm(q, axis=1)
+    r = height - distance + offsets[1] * by_target
+    sigma = (m * p).sum(1) * points[:, residual_kernels.SIGMA]
+    variance = sigma**2 + pixels[:, residual_kernels.VARIANCE]
+    near = (distance != 0) & (np.abs(r) < limit_m) & ((s * m).sum(1) >= _MIN_COSINE)
+    parts = (r, variance, p, m, s, (m * rays).sum(1), by_target)
+    return _Residuals(*(part[near & (variance > 0)] for part in parts))
 
 
 def _optimised(views: Sequence[RigView], poses: Float64, offset_sigma_m: float) -> _System:
@@ -198,15 +248,16 @@ class _System:
         self.depth = float(np.median([v.sampled.depth for v in views])) if views else 1.0
         self.prior = np.tile([*[0.0] * 6, (0.01 / offset_sigma_m) ** 2], len(poses))
 
-    def compare(self) -> list[Float64]:
-        """Return the residual rows of each pair, and update the noise scales of the cameras."""
-        rows: list[Float64] = [np.zeros((0, kernels.ROW))] * len(self.pairs)
+    def compare(self) -> list[_Residuals]:
+        """Return the residuals of each pair, and update the noise scales of the cameras."""
+        none = _Residuals(*np.zeros((7, 0)))
+        rows = [none] * len(self.pairs)
         inverse = se3.inverse(self.poses)
 
         def work(first: int, last: int) -> None:
             for k in range(first, last):
                 (target, source), (a, b) = self.pairs[k], self.ends[k]
-                compared = _residual_rows(
+                compared = _residuals(
                     target.sampled,
                     source.sampled,
                     inverse[a] @ self.poses[b],
@@ -217,35 +268,35 @@ class _System:
                     rows[k] = compared
 
         run_chunks(work, len(self.pairs), -(-len(self.pairs) // _PAIRS_PER_CHUNK))
-        for ends, found in _grouped(zip(self.ends, rows, strict=True)).items():
-            if len(found) >= _MIN_COMPARED:
-                squares = found[:, kernels.RESIDUAL] ** 2 / found[:, kernels.RESIDUAL_VARIANCE]
+        ratios = [row.r**2 / row.variance for row in rows]
+        for ends, squares in _grouped(zip(self.ends, ratios, strict=True)).items():
+            if len(squares) >= _MIN_COMPARED:
                 scale = np.sqrt(np.median(squares) / _MEDIAN_OF_SQUARES)
                 self.scale[ends] = float(np.clip(scale, _MIN_SCALE, _MAX_SCALE))
         return rows
 
-    def jacobian(self, k: int, row: Float64, normals: Float64) -> tuple[Float64, Intp]:
+    def jacobian(self, k: int, row: _Residuals, normals: Float64) -> tuple[Float64, Intp]:
         """Return the (N, 14) derivatives of a pair by its cameras' unknowns, and their indices."""
         target, source = self.ends[k]
         T_source_target = se3.inverse(self.poses[source]) @ self.poses[target]
-        J = np.concatenate([normals, np.cross(_points(row), normals)], 1)
+        J = np.concatenate([normals, np.cross(row.p, normals)], 1)
         by_offset = np.zeros((len(J), 1))
         J = np.concatenate([J, by_offset, -J @ se3.adjoint(T_source_target), by_offset], 1)
         unknowns = [_SIZE * camera + np.arange(_SIZE) for camera in (source, target)]
         return J * np.tile(_UNITS, 2), np.concatenate(unknowns)
 
-    def by_mean(self, k: int, row: Float64) -> tuple[Float64, Intp]:
+    def by_mean(self, k: int, row: _Residuals) -> tuple[Float64, Intp]:
         """Return the derivatives with the mean of both normals, and those by the offsets."""
-        J, at = self.jacobian(k, row, _normals(row, 1.0))
-        J[:, 6] = row[:, kernels.BY_SOURCE_OFFSET] * _UNITS[6]
-        J[:, 13] = row[:, kernels.BY_TARGET_OFFSET] * _UNITS[6]
+        J, at = self.jacobian(k, row, 0.5 * (row.m + row.s))
+        J[:, 6] = row.by_source * _UNITS[6]
+        J[:, 13] = row.by_target * _UNITS[6]
         return J, at
 
-    def weights(self, k: int, row: Float64, inflation_m: float) -> tuple[Float64, Float64]:
+    def weights(self, k: int, row: _Residuals, inflation_m: float) -> tuple[Float64, Float64]:
         """Return Tukey's weights over the variance, and the derivative of the influence."""
-        variance = row[:, kernels.RESIDUAL_VARIANCE] * self.scale[self.ends[k]] ** 2
+        variance = row.variance * self.scale[self.ends[k]] ** 2
         variance += inflation_m**2
-        e2 = row[:, kernels.RESIDUAL] ** 2 / (variance * _ROBUST**2)
+        e2 = row.r**2 / (variance * _ROBUST**2)
         return tukey.weights(e2) / variance, tukey.slopes(e2) / variance
 
     def step(self, inflation_m: float) -> float:
@@ -258,7 +309,7 @@ class _System:
                 J, at = self.by_mean(k, row)
                 w, _ = self.weights(k, row, inflation_m)
                 H[np.ix_(at, at)] += _weighted(J, w)
-                g[at] += J.T @ (w * row[:, kernels.RESIDUAL])
+                g[at] += J.T @ (w * row.r)
         H[np.diag_indices(len(H))] *= 1 + 1e-6
         step = -np.linalg.solve(H[_SIZE:, _SIZE:], g[_SIZE:])
         change = step.reshape(-1, _SIZE) * _UNITS
@@ -276,17 +327,16 @@ class _System:
             if not len(row):
                 continue
             J, at = self.by_mean(k, row)
-            D, _ = self.jacobian(k, row, _normals(row, -1.0))
+            D, _ = self.jacobian(k, row, 0.5 * (row.m - row.s))
             w, slope = self.weights(k, row, 0.0)
-            r = row[:, kernels.RESIDUAL]
             block = np.ix_(at, at)
             plain[block] += _weighted(J, w) - _weighted(D, w)
             cross[block] += _weighted(J, slope) - _weighted(D, slope)
-            noise[block] += _redundancy(self.pairs[k][1].sampled) * _weighted(J, (w * r) ** 2)
+            noise[block] += _redundancy(self.pairs[k][1].sampled) * _weighted(J, (w * row.r) ** 2)
             weighted = np.zeros((len(row), size))
             weighted[:, at] = J * w[:, None]
-            positions = se3.transform(self.poses[self.ends[k][1]], _points(row)) / self.depth
-            cell, gradient = _sums(np.floor(positions / _REGION), weighted * r[:, None])
+            positions = se3.transform(self.poses[self.ends[k][1]], row.p) / self.depth
+            cell, gradient = _sums(np.floor(positions / _REGION), weighted * row.r[:, None])
             cells.append(cell)
             gradients.append(gradient)
             self._add_responses(k, row, weighted, responses)
@@ -305,7 +355,9 @@ class _System:
             self.disagreement(rows),
         )
 
-    def _add_responses(self, k: int, row: Float64, weighted: Float64, responses: Float64) -> None:
+    def _add_responses(
+        self, k: int, row: _Residuals, weighted: Float64, responses: Float64
+    ) -> None:
         """Add a pair's response of the gradient to relative range errors, by camera and patch.
 
         Parameters
@@ -318,11 +370,9 @@ class _System:
             (K, PATCHES, 7 K) sums, updated in place.
         """
         (target, source), (a, b) = self.pairs[k], self.ends[k]
-        p = _points(row)
-        q = se3.transform(se3.inverse(self.poses[a]) @ self.poses[b], p)
-        ends = (source, p, kernels.BY_SOURCE_OFFSET), (target, q, kernels.BY_TARGET_OFFSET)
-        for view, points, column in ends:
-            by_error = row[:, column] * np.linalg.norm(points, axis=1)
+        q = se3.transform(se3.inverse(self.poses[a]) @ self.poses[b], row.p)
+        for view, points, by_offset in ((source, row.p, row.by_source), (target, q, row.by_target)):
+            by_error = by_offset * np.linalg.norm(points, axis=1)
             patch = shared_error.patches_of(points, view.sampled.projection)
             np.add.at(responses[view.camera], patch, weighted * by_error[:, None])
 
@@ -342,21 +392,10 @@ class _System:
             blocks[c] = 0.5 * (C[block, block] + C[block, block].T) * np.outer(_UNITS, _UNITS)
         return blocks
 
-    def disagreement(self, rows: Sequence[Float64]) -> SurfaceDistances:
+    def disagreement(self, rows: Sequence[_Residuals]) -> SurfaceDistances:
         """See `disagreements`."""
-        distances = [np.abs(row[:, kernels.RESIDUAL]) for row in rows]
+        distances = [np.abs(row.r) for row in rows]
         return _medians(zip(self.ends, distances, strict=True))
-
-
-def _points(row: Float64) -> Float64:
-    """Return the (N, 3) source points of residual rows."""
-    return row[:, kernels.SOURCE_POINT : kernels.SOURCE_POINT + 3]
-
-
-def _normals(row: Float64, sign: float) -> Float64:
-    """Return half the sum of target's and source's normals (N, 3), or half their difference."""
-    target = row[:, kernels.TARGET_NORMAL : kernels.TARGET_NORMAL + 3]
-    return 0.5 * (target + sign * row[:, kernels.SOURCE_NORMAL : kernels.SOURCE_NORMAL + 3])
 
 
 def _weighted(J: Float64, w: Float64) -> Float64:
