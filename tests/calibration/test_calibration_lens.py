@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from tofuse.apps.calibration import lens
-from tofuse.apps.calibration.board import Board, find_corners
-from tofuse.apps.calibration.board_pose import board_pose
+from tofuse.apps.calibration.board import Board, board_pose, find_corners
 from tofuse.apps.calibration.lens import BoardView, LensFit, calibrate_lens
 from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Camera, Fisheye, Pinhole, Rational

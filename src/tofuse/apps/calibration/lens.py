@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from tofuse.apps.calibration.board import Board, board_image, find_corners
-from tofuse.apps.calibration.board_pose import board_pose
+from tofuse.apps.calibration.board import Board, board_pose, search_board
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole
 from tofuse.engine.errors import InputError
@@ -100,16 +99,7 @@ def names_of(model: str) -> tuple[str, ...]:
 def board_views(
     recording: Recording, board: Board, image: str = "amplitude"
 ) -> tuple[list[BoardView], list[tuple[int, str]], Camera]:
-    """Detect the board in up to 160 evenly spaced frames of a recording.
-
-    Parameters
-    ----------
-    recording
-        Depth images with amplitude, or with colour that is registered to depth.
-    board
-        The checkerboard.
-    image
-        "amplitude" or "color".
+    """Detect the board in up to 160 frames of a recording, see `search_board`.
 
     Returns
     -------
@@ -123,21 +113,12 @@ def board_views(
     views: list[BoardView] = []
     left_out: list[tuple[int, str]] = []
     camera: Camera | None = None
-    for item in recording.images(_MAX_FRAMES):
-        grey = board_image(item, image)
-        if grey is None:
-            other = "color" if image == "amplitude" else "amplitude"
-            raise InputError(
-                f"frame {item.index} has no {image} on the pixels of its depth",
-                where=recording.path,
-                remedy=f"use --image {other}, or record it",
-            )
-        camera = camera or item.camera
-        corners = find_corners(grey, board)
+    for frame, corners in search_board(recording, board, image, _MAX_FRAMES):
+        camera = camera or frame.camera
         if corners is None:
-            left_out.append((item.index, "the board was not found"))
+            left_out.append((frame.index, "the board was not found"))
         else:
-            views.append(BoardView(item.index, corners))
+            views.append(BoardView(frame.index, corners))
     if camera is None:
         raise InputError("has no readable frame", where=recording.path)
     return views, left_out, camera
