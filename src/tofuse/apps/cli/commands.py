@@ -59,7 +59,12 @@ def make_console() -> Console:
     return Console(highlight=False, soft_wrap=True)
 
 
-def show(arguments: cli.Json, data: dict[str, Any], *lines: Any, status: int = 0) -> int:
+def show(
+    arguments: cli.Json | cli.JsonLines | cli.Batch,
+    data: dict[str, Any],
+    *lines: Any,
+    status: int = 0,
+) -> int:
     """Print a result, with --json `data` and else `lines`, and return the exit status."""
     if arguments.json:
         emit(data)
