@@ -87,7 +87,7 @@ def test_each_instant_of_moving_rig_has_one_pose() -> None:
     source = RigSource(rig, [camera.recording for camera in cameras()])
     recording = Recording.of(source, "rig", "rig")
     config = changed(from_method("default"), {"fusion": {"voxel_m": 0.1}}, where="test")
-    found = reconstruct_rig(rig, cameras(), recording, config)
+    found = reconstruct_rig(cameras(), recording, config)
     assert len(found.times) == len(found.poses) == len(recording) // 2
     truth = np.stack([path(t) for t in found.times])
     off = se3.inverse(se3.inverse(truth[0]) @ truth) @ found.poses

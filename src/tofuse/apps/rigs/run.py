@@ -15,7 +15,7 @@ from tofuse.apps.rigs.calibrating import moves
 from tofuse.apps.rigs.checking import CameraMotion, compare
 from tofuse.apps.rigs.inputs import Camera, disagreement_rows, open_cameras
 from tofuse.apps.rigs.joint import RigView, SurfaceDistances, disagreements, refine_together
-from tofuse.apps.rigs.rig_trajectory import track_rig
+from tofuse.apps.rigs.rig_trajectory import RigTrajectory, track_rig
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.compute import threads as using_threads
 from tofuse.engine.errors import InputError
@@ -85,14 +85,13 @@ def run_rig(
         progress.stage("opening")
         cameras = open_cameras(inputs, options.format, list(recordings_of(rig_file)))
         recordings = [camera.recording for camera in cameras]
-        rig = read_rig(rig_file)
-        source = RigSource(rig, recordings)
+        source = RigSource(read_rig(rig_file), recordings)
         full_recording = Recording.of(source, " ".join(map(str, inputs)), "rig")
         recording = _selected(full_recording, source, options)
         config = resolve(options)
         with folders.OutputFolder(options.out, overwrite=options.overwrite) as folder:
             result = reconstruct_rig(
-                rig, cameras, recording, config, seed=options.seed or 0, progress=progress
+                cameras, recording, config, seed=options.seed or 0, progress=progress
             )
             progress.stage("writing")
             _write(result, recording, folder)
@@ -113,7 +112,6 @@ def _selected(full_recording: Recording, source: RigSource, options: Options) ->
 
 
 def reconstruct_rig(
-    rig: Rig,
     cameras: Sequence[Camera],
     recording: Recording,
     config: Config,
@@ -125,8 +123,8 @@ def reconstruct_rig(
 
     Parameters
     ----------
-    rig, cameras
-        The calibrated rig, and its opened cameras in the same order.
+    cameras
+        The opened cameras of the rig, in its order.
     recording
         Of a `RigSource`.
     config, seed
@@ -135,24 +133,21 @@ def reconstruct_rig(
     progress = progress or Silent()
     source = recording.source
     assert isinstance(source, RigSource)
+    rig = source.rig
     instants, first = np.unique(source.instant[recording.indices], return_index=True)
-    times = recording.timestamps[first]
-    poses = np.tile(np.eye(4), (len(instants), 1, 1))
-    T_rig_frame = source.T_rig_camera[recording.indices]
     displaced: list[CameraMotion] = []
-    measured: tuple[Measured, ...] = ()
-    tracked: tuple[Measured, ...] = ()
     if moves(cameras, "auto"):
         trajectory = track_rig(cameras, recording, progress)
-        poses, T_rig_frame = trajectory.poses, trajectory.T_rig_frame
-        distances = trajectory.disagreement
-        measured, tracked = trajectory.measured, trajectory.tracked
     else:
-        displaced, distances = _check_calibration(rig, cameras, recording)
+        poses = np.tile(np.eye(4), (len(instants), 1, 1))
+        displaced, distances = _check_calibration(cameras, recording)
+        T_rig_frame = source.T_rig_camera[recording.indices]
+        trajectory = RigTrajectory(poses, T_rig_frame, distances, ())
     instant = np.searchsorted(instants, source.instant[recording.indices])
-    frame_poses = poses[instant] @ T_rig_frame
-    is_moving = bool(measured or tracked)
-    edges = _calibration_edges(rig, source, recording, instant, frame_poses, follow=not is_moving)
+    frame_poses = trajectory.poses[instant] @ trajectory.T_rig_frame
+    is_moving = bool(trajectory.measured or trajectory.tracked)
+    edges = _calibration_edges(recording, instant, frame_poses, follow=not is_moving)
+    refined = AlreadyRefined(trajectory.measured, (*trajectory.tracked, *edges))
     fusion_config = replace(
         config,
         odometry=given.GivenPoses(),
@@ -163,7 +158,7 @@ def reconstruct_rig(
     )
     result = reconstructing.reconstruct(
         adaptation.with_odometry(recording, frame_poses),
-        replace(fusion_config, refinement=AlreadyRefined(measured, (*tracked, *edges))),
+        replace(fusion_config, refinement=refined),
         seed=seed,
         progress=progress,
     )
@@ -174,13 +169,11 @@ def reconstruct_rig(
         config=fusion_config.to_dict(),
         recording={**result.recording, "rig": rig_fields},
     )
-    measured_rig = replace(rig, disagreement=disagreement_rows(names, distances))
-    return RigResult(result, times, poses, measured_rig)
+    measured_rig = replace(rig, disagreement=disagreement_rows(names, trajectory.disagreement))
+    return RigResult(result, recording.timestamps[first], trajectory.poses, measured_rig)
 
 
 def _calibration_edges(
-    rig: Rig,
-    source: RigSource,
     recording: Recording,
     instant: Intp,
     T_world_frame: Float64,
@@ -192,24 +185,25 @@ def _calibration_edges(
     Calibration errors are the same at all instants: if the rig is static (`follow`), later frames
     are tied to the first frame of their camera.
     """
+    source = recording.source
+    assert isinstance(source, RigSource)
     # The bound on the errors is enlarged for systematic ones, which these covariances include.
     covariances = [
         c.covariance / pose_accuracy.UNOBSERVED_ERROR_FACTOR**2 + np.diag(_MIN_VARIANCES)
-        for c in rig.cameras
+        for c in source.rig.cameras
     ]
     covariances[0] = np.diag(_MIN_VARIANCES)
     posed = np.flatnonzero(np.isfinite(T_world_frame[:, 0, 0]))
     cameras = source.camera[recording.indices]
     edges: list[Measured] = []
-    reference: dict[int, int] = {}
+    first: dict[int, int] = {}  # frame of each instant, or if static of all instants
     first_of_camera: dict[int, int] = {}
-    for k in posed:
+    for k in map(int, posed):
         c = int(cameras[k])
-        i = reference.setdefault(0 if follow else int(instant[k]), int(k))
-        C = covariances[c]
+        C, i = covariances[c], first.setdefault(0 if follow else int(instant[k]), k)
         if follow and c in first_of_camera:
             C, i = np.diag(_MIN_VARIANCES), first_of_camera[c]
-        first_of_camera.setdefault(c, int(k))
+        first_of_camera.setdefault(c, k)
         if i != k:
             T = se3.inverse(T_world_frame[i]) @ T_world_frame[k]
             ends = int(recording.indices[i]), int(recording.indices[k])
@@ -264,7 +258,7 @@ def _calibration_reason(reason: Reason, worst: int, name: str) -> Reason:
 
 
 def _check_calibration(
-    rig: Rig, cameras: Sequence[Camera], recording: Recording
+    cameras: Sequence[Camera], recording: Recording
 ) -> tuple[list[CameraMotion], SurfaceDistances]:
     """Return the cameras that differ from the calibration, after aligning their views.
 
@@ -279,6 +273,7 @@ def _check_calibration(
         if isinstance(frame, RangeFrame):
             c = int(source.camera[index])
             views.append(RigView(c, 0, SampledView.of(cameras[c].surface(frame), _POINTS)))
+    rig = source.rig
     calibrated = np.stack([camera.T_rig_camera for camera in rig.cameras])
     refined = refine_together(views, calibrated)
     recalibrated = tuple(
