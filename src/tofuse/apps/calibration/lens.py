@@ -145,12 +145,6 @@ def calibrate_lens(
     InputError
         If too few views show the board, or they are too similar to determine the lens.
     """
-    if model not in MODELS:
-        raise InputError(
-            f"there is no lens model {model!r}",
-            where="--model",
-            remedy=f"use one of {', '.join(MODELS)}",
-        )
     views, left_out, before = board_views(recording, board, image)
     detected = len(views)
     views, similar = _distinct(views)

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame, Recording
+from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame, Recording
 from tofuse.engine.noise import (
     AmplitudeLaw,
     ConfidenceLaw,
@@ -154,16 +154,18 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
     InputError
         If no three frames are static, the frames are copies, or the depths are implausible.
     """
-    if not isinstance(_first_frame(recording), RangeFrame):
-        raise InputError(
-            "contains clouds", where=recording.path, remedy="pass a recording of depth images"
-        )
+    if not recording.images(1):
+        raise InputError("has no readable frame", where=recording.path)
     prior = noise_model_for(recording)
     stretches = [
         (a, b) for a, b in still.stationary_intervals(recording, prior) if b - a >= MIN_FRAMES
     ]
     if not stretches:
-        raise _not_static_error(recording)
+        raise InputError(
+            f"has {len(recording)} frames, and no {MIN_FRAMES} consecutive static frames",
+            where=recording.path,
+            remedy="record ten frames or more with the camera on a stand, nothing moving",
+        )
     samples = _concatenate([_segment_samples(recording, a, b, prior) for a, b in stretches])
     if len(samples.variance) < 10 * _MIN_PIXELS:
         raise InputError(
@@ -184,27 +186,6 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
             remedy="check depth_unit_m in its camera.json",
         )
     return _fit(recording, samples, prior, name or prior.name, stretches)
-
-
-def _first_frame(recording: Recording) -> Frame:
-    frame = recording.first_readable()
-    if frame is None:
-        raise InputError("has no readable frame", where=recording.path)
-    return frame
-
-
-def _not_static_error(recording: Recording) -> InputError:
-    if len(recording) < MIN_FRAMES:
-        return InputError(
-            f"has {len(recording)} frames; at least {MIN_FRAMES} are needed",
-            where=recording.path,
-            remedy="record ten frames or more with the camera on a stand",
-        )
-    return InputError(
-        f"has no {MIN_FRAMES} consecutive static frames",
-        where=recording.path,
-        remedy="record ten frames or more with the camera on a stand, nothing moving",
-    )
 
 
 def _segment_samples(recording: Recording, start: int, stop: int, prior: NoiseModel) -> _Samples:

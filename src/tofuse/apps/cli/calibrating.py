@@ -34,7 +34,6 @@ from tofuse.formats.recordings import Opening, open_recording
 # Data for JSON, lines to print, and warnings.
 Summary = tuple[dict[str, Any], list[str], list[str]]
 _MAX_LISTED = 8
-_MAX_PLANES = 20
 
 
 _NOISE_UNITS = {"amplitude": "raw amplitude", "confidence": "confidence", "range": "range (m)"}
@@ -104,10 +103,6 @@ def _depth(arguments: Calibrate) -> Summary:
     else:
         if arguments.wall:
             raise InputError("requires --board", where="--wall", remedy="pass --board as well")
-        if arguments.planes > _MAX_PLANES:
-            raise InputError(
-                f"is {arguments.planes}", where="--planes", remedy=f"use at most {_MAX_PLANES}"
-            )
         views, camera = scene_planes(recording, arguments.planes, arguments.seed or 0)
     fit = calibrate_depth(views, camera, recording.path)
     low, high = fit.range_m

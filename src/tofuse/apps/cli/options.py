@@ -17,6 +17,7 @@ from tofuse.apps.cli.values import (
     Length,
     Metres,
     NonNegative,
+    Planes,
     Port,
     Ratio,
     Seconds,
@@ -667,7 +668,7 @@ class Calibrate(Json, Seed, Selection):
     board: str | None = None
     image: Literal["amplitude", "color"] = "amplitude"
     wall: bool = False
-    planes: Count = 4
+    planes: Planes = 4
     model: Literal["pinhole", "brown", "rational", "fisheye"] = "brown"
     recording: str | None = None
 

@@ -73,6 +73,7 @@ def _size(text: str) -> int:
 
 
 Count = Annotated[int, Bounds(1)]
+Planes = Annotated[int, Bounds(1, 20)]
 NonNegative = Annotated[int, Bounds(0)]
 Port = Annotated[int, Bounds(1, 65535)]
 Ratio = Annotated[float, Bounds(0, 1, exclusive=True)]
