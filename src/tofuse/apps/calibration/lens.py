@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from tofuse.apps.calibration.board import Board, board_pose, search_board
@@ -27,6 +28,7 @@ _MIN_SPREAD = np.radians(6)  # of the board's normals
 _MAX_SIGMA = 0.01  # of the focal length
 _MIN_COVERED = 0.5
 _CELLS = 64
+_STEP = 1e-6  # of derivatives
 _INTRINSIC = ("fx", "fy", "cx", "cy")
 
 
@@ -341,15 +343,22 @@ def _least_squares(
         seen = camera.project(np.concatenate([se3.transform(T, points) for T in poses]))
         return (seen - np.concatenate([view.corners for view in views])).ravel()
 
-    # A pose affects the corners of its own view only.
-    by_pose = np.kron(np.eye(len(views)), np.ones((2 * len(points), 6)))
-    sparsity = np.hstack([np.ones((len(by_pose), len(free))), by_pose])
-    solution = least_squares(errors, np.zeros(sparsity.shape[1]), jac_sparsity=sparsity)
+    # A pose affects the corners of its own view only, so all poses are perturbed at once.
+    count = len(views)
+    own = np.kron(np.eye(count), np.ones((2 * len(points), 6)))
+    axes = block_diag(np.eye(len(free)), np.tile(np.eye(6), count))
+
+    def jacobian(x: Float64) -> Float64:
+        base = errors(x)
+        J = np.stack([(errors(x + _STEP * axis) - base) / _STEP for axis in axes], 1)
+        return np.hstack([J[:, : len(free)], own * np.tile(J[:, len(free) :], count)])
+
+    solution = least_squares(errors, np.zeros(axes.shape[1]), jacobian, method="lm")
     freedom = max(solution.fun.size - solution.x.size, 1)
-    information = (solution.jac.T @ solution.jac).toarray()
+    information = solution.jac.T @ solution.jac
     covariance = np.linalg.inv(information) * 2 * solution.cost / freedom
     deviations = np.sqrt(np.diag(covariance)[: len(free)]) * scale
     camera, poses = unpacked(solution.x)
-    squares = (solution.fun**2).reshape(len(views), -1).sum(1)
+    squares = (solution.fun**2).reshape(count, -1).sum(1)
     sigma = dict(zip(free, deviations.tolist(), strict=True))
     return _Fit(camera, sigma, list(poses), np.sqrt(squares / len(points)), float(squares.sum()))
