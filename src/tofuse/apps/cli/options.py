@@ -9,7 +9,7 @@ Imports nothing heavy, so that ``--help`` is instant.
 
 import argparse
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from tofuse.apps.cli.values import (
     Count,
@@ -28,7 +28,6 @@ REQUIRED: Any = ...
 _LAB = "tofuse.lab.commands"
 
 DemoScene = Literal["room", "empty-room", "rail", "torso", "box", "peaks"]
-DEMO_SCENES = get_args(DemoScene)
 
 
 class Command(argparse.Namespace):

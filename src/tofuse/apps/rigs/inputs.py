@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -56,23 +56,14 @@ class Camera:
         """Read image `k`; None if it can't be read, or is empty."""
         return measured_image(self.recording, k)
 
-    def every_image(self) -> Iterator[RangeFrame]:
-        """Read all images that can be read."""
-        for item in self.recording.read_all():
-            if isinstance(item, RangeFrame):
-                yield item
-
-    def corrected(self, frame: RangeFrame) -> RangeFrame:
-        """Return an image after corrections and filters."""
+    def surface(self, frame: RangeFrame) -> PreparedView:
+        """Return an image prepared for comparison, after corrections and filters."""
         for correction in self.config.corrections:
             corrected = correction.start().apply(frame)
             frame = corrected if isinstance(corrected, RangeFrame) else frame
         filtered, _ = apply_filters(self.config.filters, frame, ())
-        return filtered if isinstance(filtered, RangeFrame) else frame
-
-    def surface(self, frame: RangeFrame) -> PreparedView:
-        """Return an image prepared for comparison."""
-        return prepare_view(self.corrected(frame), SurfaceOptions())
+        frame = filtered if isinstance(filtered, RangeFrame) else frame
+        return prepare_view(frame, SurfaceOptions())
 
 
 def measured_image(recording: Recording, k: int) -> RangeFrame | None:

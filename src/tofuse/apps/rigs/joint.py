@@ -207,7 +207,8 @@ def _residuals(
     p = points[:, :3] + offsets[0] * rays
     q = se3.transform(T_target_source, p)
     ahead = q[:, 2] > projection_kernels.MIN_DEPTH
-    x, y = (q[:, :2] / np.where(ahead, q[:, 2], 1.0)[:, None]).T.astype(np.float32)
+    on_plane = q[:, :2] / np.where(ahead, q[:, 2], 1.0)[:, None]
+    x, y = np.ascontiguousarray(on_plane.T, np.float32)
     u, v = np.empty((2, len(q)))
     projection_kernels.project_rays(x, y, lookup, frame, u, v)
     rows, columns = image.shape[:2]

@@ -352,7 +352,9 @@ def _activity(camera: Camera) -> tuple[Float64, Float64]:
     """Return times (N,) and the fraction of pixels that changed since the previous frame."""
     times, fractions = [], []
     previous: RangeFrame | None = None
-    for frame in camera.every_image():
+    for frame in camera.recording.read_all():
+        if not isinstance(frame, RangeFrame):
+            continue
         if previous is not None:
             valid = previous.valid & frame.valid
             change = np.abs(frame.z - previous.z)[valid]
