@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from concurrent.futures import Future
 from typing import Any
@@ -11,6 +12,7 @@ from tofuse.apps.batch.folder import Record
 from tofuse.apps.batch.work import Task, work
 from tofuse.apps.batch.workers import Workers
 from tofuse.engine.errors import InputError
+from tofuse.formats.files import reading
 
 _TIMEOUT_S = 10.0  # of requests to a scheduler
 
@@ -102,12 +104,13 @@ def _connect(address: str) -> Any:
             where="--scheduler",
             remedy="pip install 'tofuse[dask]', or use --workers to stay on this machine",
         ) from error
-    # A file that a scheduler wrote, or its address.
-    target = {"scheduler_file" if os.path.isfile(address) else "address": address}
     client: Any = distributed.Client
     try:
-        return client(**target, timeout=_TIMEOUT_S, set_as_default=False, name="tofuse")
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        # A file that a scheduler wrote, or its address.
+        is_file = os.path.isfile(address)
+        target = json.loads(reading.read_text(address))["address"] if is_file else address
+        return client(target, timeout=_TIMEOUT_S, set_as_default=False, name="tofuse")
+    except (OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
         raise InputError(
             "no Dask scheduler answers",
             where=address,
