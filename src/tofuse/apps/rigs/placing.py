@@ -138,7 +138,7 @@ class _Placer:
         poses = np.concatenate([np.zeros((0, 4, 4)), *proposals])
         scores = np.array([self._agreement_at(a, b, T)[_SCORE] for T in poses])
         order = [k for k in np.argsort(-scores, kind="stable") if scores[k] > 0]
-        distinct = list(self._distinct(poses[order]))[:_PROPOSALS]
+        distinct = list(itertools.islice(self._distinct(poses[order]), _PROPOSALS))
         self._proposals[a, b] = poses[order][distinct]
 
     def _propose(self, target: PreparedView, source: PreparedView) -> Float64:
