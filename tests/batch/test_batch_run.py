@@ -17,8 +17,7 @@ from tofuse.apps.batch.cluster import DaskWorkers
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.table import COLUMNS, write_table
-from tofuse.apps.batch.work import Task
-from tofuse.apps.batch.workers import Workers
+from tofuse.apps.batch.work import Task, Workers
 from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError, OutputError
 

@@ -14,6 +14,6 @@ if TYPE_CHECKING:
     from tofuse.apps.batch.folder import BatchFolder, Record
     from tofuse.apps.batch.jobs import Job, read_jobs
     from tofuse.apps.batch.table import write_table
-    from tofuse.apps.batch.workers import LocalWorkers, Workers
+    from tofuse.apps.batch.work import LocalWorkers, Workers
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

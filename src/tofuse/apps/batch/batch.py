@@ -10,8 +10,7 @@ from dataclasses import replace
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.table import write_table
-from tofuse.apps.batch.work import Task
-from tofuse.apps.batch.workers import Workers
+from tofuse.apps.batch.work import Task, Workers
 
 _POLL_S = 0.5  # interval at which it is checked whether there are workers at all
 

@@ -9,8 +9,7 @@ from typing import Any
 from uuid import uuid4
 
 from tofuse.apps.batch.folder import Record
-from tofuse.apps.batch.work import Task, work
-from tofuse.apps.batch.workers import Workers
+from tofuse.apps.batch.work import Task, Workers, work
 from tofuse.engine.errors import InputError
 from tofuse.formats.files import reading
 

@@ -1,4 +1,4 @@
-"""Calibration of intrinsics and distortion from images of a checkerboard (Zhang 2000, OpenCV)."""
+"""Calibration of intrinsics and distortion from images of a checkerboard (Zhang 2000)."""
 
 from __future__ import annotations
 
