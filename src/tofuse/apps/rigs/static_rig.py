@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import ttest_1samp
+from scipy.special import stdtr
 
 from tofuse.apps.rigs.clocks import lag_between
 from tofuse.apps.rigs.inputs import Calibration, Camera, disagreement_rows
@@ -215,8 +215,7 @@ def _costs_of_lags(
         ]
         if sum(map(len, distances)):
             costs[m, column] = np.concatenate(distances).mean()
-    lags[np.isnan(costs)] = np.nan
-    return np.nanmean(lags, axis=0), costs
+    return np.ma.masked_where(np.isnan(costs), lags).mean(0).filled(np.nan), costs
 
 
 def _sampled(surface: PreparedView | None) -> SampledView | None:
@@ -255,10 +254,11 @@ def minimum_cost_lag(lags: Float64, costs: Float64) -> float | None:
 
 def _are_worse(costs: Float64, column: int) -> Bool:
     """Whether (L,) the costs are significantly above those of a column (Student's t-test)."""
-    differences = costs - costs[:, [column]]
-    known = np.isfinite(differences).sum(0) >= _MIN_INSTANTS
-    result = ttest_1samp(differences, 0.0, alternative="greater", nan_policy="omit")
-    return np.asarray(known & (result.pvalue < _SIGNIFICANCE))
+    d = np.ma.masked_invalid(costs - costs[:, [column]])
+    count = d.count(0)
+    standard_error = np.maximum(d.std(0, ddof=1) / np.sqrt(count), 1e-12)
+    chance = stdtr(count - 1, -(d.mean(0) / standard_error).filled(0.0))
+    return np.asarray((count >= _MIN_INSTANTS) & (chance < _SIGNIFICANCE))
 
 
 def _views_by_instant(
