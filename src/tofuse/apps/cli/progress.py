@@ -103,8 +103,9 @@ class TerminalProgress(Silent):
         for task in self._bar.tasks[-1:]:
             done = int(task.completed) + 1
             count = f"{done}/{task.total}" if task.total else f"{done}"
-            health = {} if record is None else {"health": self._health.after(record)}
-            self._bar.update(task.id, advance=1, count=count, **health)
+            if record is not None:
+                self._bar.update(task.id, health=self._health.after(record))
+            self._bar.update(task.id, advance=1, count=count)
 
     def note(self, text: str) -> None:
         """Print a line above the bar."""

@@ -51,12 +51,13 @@ class ModelOptions:
     def applied(self, config: Config) -> Config:
         """Return the configuration with these options."""
         texture = texturing.TEXTURE if self.texture and not config.fusion.texture else None
-        for option, value, changes in (
+        options: tuple[tuple[str, object, dict[str, Any]], ...] = (
             ("texture", texture, {"fusion": {"texture": texture}}),
             ("faces", self.faces, {"fusion": {"faces": self.faces}}),
             ("voxel", self.voxel, {"fusion": {"voxel_m": self.voxel}}),
             ("tolerance", self.tolerance, {"tolerance_m": self.tolerance}),
-        ):
+        )
+        for option, value, changes in options:
             if value is not None:
                 config = changed(config, changes, where=f"--{option}")
         return config
