@@ -253,7 +253,8 @@ def _solve(views: Sequence[PlaneView], knots: Float64, *, fixed: bool = False) -
 
 def _sigmas(state: _State, knots: Float64, ranges: Float64) -> tuple[float, float, float]:
     """Return the sigmas of the curve's mean and slope, and of its shape, over observed ranges."""
-    counts = np.bincount(_interval(ranges, knots)[0], minlength=len(knots)) + 1e-9
+    counts: Float64 = np.full(len(knots), 1e-9)
+    counts += np.bincount(_interval(ranges, knots)[0], minlength=len(knots))
     basis = np.stack([np.ones_like(knots), knots - knots.mean()], 1)
     shape = np.eye(len(knots)) - basis @ _mean_and_slope_projector(knots, np.ones(len(knots)))
     (constant, slope), shapes = (

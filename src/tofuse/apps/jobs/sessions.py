@@ -157,8 +157,8 @@ def _stated(folder: Path, run: dict[str, Any], components: int) -> dict[int, giv
     for number, k in enumerate(separate, components + 1):
         component_folder = folder / folders.component_name(k)
         if folders.is_result(component_folder):
-            component = run_json.read_run_json(component_folder / "run.json")
-            poses = _poses(component_folder, component)
+            component_run = run_json.read_run_json(component_folder / "run.json")
+            poses = _poses(component_folder, component_run)
             main |= {i: (T, number) for i, T in poses.items()}
     stated = {}
     for frame in run["frames"]:
