@@ -164,30 +164,11 @@ def z_as_range(frames: Frames, k: int) -> Frames:
 
 
 def wrong_focal(frames: Frames, k: int) -> Frames:
-    if frames[0].depth_kind == "z":
-        frames = rectified(frames)
+    """Of radial range: with z depth planes stay planes."""
     c = frames[0].camera
     factor = 1.25 if k % 2 else 0.8
-    return with_camera(frames, replace(c, fx=c.fx * factor, fy=c.fy * factor))
-
-
-def rectified(frames: Frames) -> Frames:
-    """Undistorted depth, as many drivers output it; by nearest pixels."""
-    c = frames[0].camera
-    plain = Pinhole(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
-    rays = np.concatenate([plain.rays(), np.ones((c.height, c.width, 1))], -1)
-    u, v = np.moveaxis(np.round(c.project(rays)).astype(int), -1, 0)
-    inside = (u >= 0) & (v >= 0) & (u < c.width) & (v < c.height)
-    u, v = np.clip(u, 0, c.width - 1), np.clip(v, 0, c.height - 1)
-    out = []
-    for f in frames:
-        images = {
-            name: None if getattr(f, name) is None else getattr(f, name)[v, u]
-            for name in ("amplitude_image", "confidence_image", "sigma_image")
-        }
-        depth = np.where(inside, f.depth[v, u], 0).astype(np.float32)
-        out.append(replace(f, camera=plain, depth=depth, **images))
-    return out
+    ranges = [replace(f, depth=f.radial_range, depth_kind="range") for f in frames]
+    return with_camera(ranges, replace(c, fx=c.fx * factor, fy=c.fy * factor))
 
 
 def color_intrinsics(frames: Frames, k: int) -> Frames:

@@ -430,8 +430,6 @@ def inspect(arguments: cli.Inspect) -> int:
 
     recording = Opening.of(arguments.inputs, arguments).open()
     inspection = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
-    if arguments.sheet is not None:
-        inspection.save_sheet(arguments.sheet)
     if arguments.json:
         emit(inspection.to_dict())
         return 0
@@ -447,8 +445,6 @@ def inspect(arguments: cli.Inspect) -> int:
     if not inspection.findings:
         other = " other" if inspection.notes else ""
         console.print(f"[green]No{other} problems found.[/]")
-    if arguments.sheet is not None:
-        console.print(f"see {escaped(str(arguments.sheet))}")
     return 0
 
 

@@ -14,7 +14,6 @@ from threadpoolctl import threadpool_limits
 from tofuse.apps.inspection import channels, geometry, motion_checks, times, values
 from tofuse.apps.inspection.finding import SEVERITIES, Finding
 from tofuse.apps.inspection.sample import Sample
-from tofuse.apps.inspection.sheet import write_sheet
 from tofuse.apps.inspection.values import depths_of
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import Pinhole, RayTable
@@ -30,7 +29,7 @@ _MAX_DURATION_S = 1e6  # longer ones are implausible, and perhaps astronomical
 Check = Callable[[Sample], Iterable[Finding]]
 
 # In the order in which findings of equal severity are reported.
-QUICK: tuple[Check, ...] = (
+CHECKS: tuple[Check, ...] = (
     values.check_unit,
     values.check_valid,
     geometry.check_intrinsics,
@@ -48,7 +47,6 @@ QUICK: tuple[Check, ...] = (
     motion_checks.check_still,
     motion_checks.check_walls,
 )
-CHECKS: tuple[Check, ...] = (*QUICK, geometry.check_focal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,16 +93,6 @@ class Inspection:
             "warnings": list(self.warnings),
         }
 
-    def save_sheet(self, path: str | Path) -> Path:
-        """Write a contact sheet of some of the frames as a PNG.
-
-        Raises
-        ------
-        OutputError
-            If it can't be written.
-        """
-        return write_sheet(Path(path), self.frames, self.facts, self.findings)
-
 
 def inspect_recording(
     recording: Recording | str | Path, *, turning: bool = False, quick: bool = False
@@ -118,7 +106,7 @@ def inspect_recording(
     turning
         Whether an object turns in front of a stationary camera: then motion is not checked.
     quick
-        Whether to read fewer frames and skip slow checks, as at the start of a run.
+        Whether to read fewer frames, as at the start of a run.
 
     Raises
     ------
@@ -133,7 +121,7 @@ def inspect_recording(
         raise InputError("no frame can be read", where=recording.path, remedy=notes[-1])
     # BLAS results depend on its number of threads.
     with threadpool_limits(1):
-        findings = [f for check in (QUICK if quick else CHECKS) for f in check(sample)]
+        findings = [f for check in CHECKS for f in check(sample)]
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))
     return Inspection(recording, tuple(findings), tuple(notes), sample.frames)
 

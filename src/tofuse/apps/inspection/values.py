@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -105,7 +106,9 @@ def check_flying(sample: Sample) -> Iterator[Finding]:
     """Check the number of flying pixels and the width of depth edges."""
     flying = edges = valid = 0
     for frame in sample.images:
-        is_flying, is_edge = _flying(frame.radial_range, frame.valid)
+        along_rows = _flying(frame.radial_range, frame.valid)
+        along_columns = _flying(frame.radial_range.T, frame.valid.T)
+        is_flying, is_edge = (a | b.T for a, b in zip(along_rows, along_columns, strict=True))
         flying += int(np.count_nonzero(is_flying))
         edges += int(np.count_nonzero(is_edge))
         valid += len(frame)
@@ -122,40 +125,31 @@ def check_flying(sample: Sample) -> Iterator[Finding]:
         )
 
 
-def flying_pixels(frame: RangeFrame) -> Bool:
-    """Return the (H, W) mask of flying pixels."""
-    return _flying(frame.radial_range, frame.valid)[0]
-
-
 def _flying(r: Float32, valid: Bool) -> tuple[Bool, Bool]:
-    """Masks (H, W) of flying pixels, and of all pixels at depth edges between smooth surfaces."""
+    """Masks (H, W), along rows, of flying pixels and of all at edges between smooth surfaces."""
     is_flying, is_edge = np.zeros(r.shape, bool), np.zeros(r.shape, bool)
     margin = _REACH + 2
-    for axis in (0, 1):
-        n = r.shape[axis]
-        if n <= 2 * margin:
-            continue
+    inner = slice(margin, r.shape[1] - margin)
+    if r.shape[1] <= 2 * margin:
+        return is_flying, is_edge
 
-        def shifted(shift: int, axis: int = axis, n: int = n) -> tuple[slice, ...]:
-            part = slice(margin + shift, n - margin + shift)
-            return (part, slice(None)) if axis == 0 else (slice(None), part)
+    def shifted(image: Any, shift: int) -> Any:
+        return image[:, margin + shift : image.shape[1] - margin + shift]
 
-        center, a, b = r[shifted(0)], r[shifted(-_REACH)], r[shifted(_REACH)]
-        gap = np.abs(b - a)
-        measured = valid[shifted(0)] & valid[shifted(-_REACH)] & valid[shifted(_REACH)]
-        measured &= valid[shifted(-margin)] & valid[shifted(margin)]
-        edge = measured & (gap > _MIN_STEP * np.minimum(a, b))
-        edge &= (np.abs(a - r[shifted(-margin)]) < _MAX_CHANGE * gap) & (
-            np.abs(b - r[shifted(margin)]) < _MAX_CHANGE * gap
-        )
+    center, a, b = (shifted(r, shift) for shift in (0, -_REACH, _REACH))
+    gap = np.abs(b - a)
+    edge = gap > _MIN_STEP * np.minimum(a, b)
+    for shift in (0, -_REACH, _REACH, -margin, margin):
+        edge &= shifted(valid, shift)
+    for side, surface in ((-1, a), (1, b)):
+        edge &= np.abs(surface - shifted(r, side * margin)) < _MAX_CHANGE * gap
         # Also smooth in the other direction, unlike noise.
-        for side in (-_REACH, _REACH):
-            for offset in (-1, 1):
-                neighbour = np.roll(r, offset, 1 - axis)[shifted(side)]
-                edge &= np.abs(r[shifted(side)] - neighbour) < _MAX_CHANGE * gap
-        is_edge[shifted(0)] |= edge
-        inner = np.minimum(np.abs(center - a), np.abs(b - center)) > _MIN_INSIDE * gap
-        is_flying[shifted(0)] |= edge & inner & ((center - a) * (b - center) > 0)
+        for offset in (-1, 1):
+            neighbour = shifted(np.roll(r, offset, 0), side * _REACH)
+            edge &= np.abs(surface - neighbour) < _MAX_CHANGE * gap
+    between = (center - a) * (b - center) > 0
+    between &= np.minimum(np.abs(center - a), np.abs(b - center)) > _MIN_INSIDE * gap
+    is_edge[:, inner], is_flying[:, inner] = edge, edge & between
     return is_flying, is_edge
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
 from functools import cache
 from importlib import resources
@@ -9,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from tofuse._version import __version__
-from tofuse.apps.report.policy import secured
 from tofuse.formats.files import atomic
 
 # Files of the pages' script; each uses functions of the previous ones.
@@ -45,6 +46,23 @@ def page(template: str, **values: Any) -> str:
     made = _environment().get_template(template)
     text = made.render(version=__version__, style=asset("style.css"), **values)
     return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text)
+
+
+def secured(html: str) -> str:
+    """Return a page with its content security policy in the head.
+
+    The page runs only its inline scripts, and loads nothing else. Everything filled into its
+    template must be escaped: any script in the page is allowed.
+    """
+    scripts = re.findall("<script>(.*?)</script>", html, re.DOTALL)
+    hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts]
+    allowed = " ".join(f"'sha256-{digest}'" for digest in hashes) or "'none'"
+    policy = (
+        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "
+        "img-src 'self' data: blob:; font-src data:; base-uri 'none'; form-action 'none'"
+    )
+    meta = f'\n<meta http-equiv="Content-Security-Policy" content="{policy}">'
+    return re.sub("<meta charset=[^>]*>", lambda head: head[0] + meta, html, count=1)
 
 
 def script() -> str:

@@ -20,15 +20,10 @@ if TYPE_CHECKING:
 
 
 # Placeholders that `svg` replaces by the page's variables of the same names.
-INK, MUTED, GRID, PAGE = "#010101", "#020202", "#030303", "#090909"
+INK, MUTED, GRID = "#010101", "#020202", "#030303"
 BEFORE, AFTER, REFERENCE, BAD = "#040404", "#050505", "#060606", "#080808"
-_VARIABLES = dict(
-    zip(
-        (INK, MUTED, GRID, PAGE, BEFORE, AFTER, REFERENCE, BAD),
-        ("ink", "muted", "grid", "page", "before", "after", "reference", "bad"),
-        strict=True,
-    )
-)
+_VARIABLES = {INK: "ink", MUTED: "muted", GRID: "grid"}
+_VARIABLES |= {BEFORE: "before", AFTER: "after", REFERENCE: "reference", BAD: "bad"}
 _MODEL_COLOR = (112, 138, 176)  # of the model's points: visible on white and on near-black
 _MAX_QUANTILE = 50_000  # maximum number of points of which quantiles are computed
 _MAX_MM_EXTENT_M = 0.6  # plans of smaller extent have ticks in mm
@@ -300,60 +295,3 @@ def _outline(axes: Axes, flat: Float64) -> None:
     x, y = x[:-1] + cell / 2, y[:-1] + cell / 2
     style: Any = {"colors": BAD, "linewidths": 1.6, "linestyles": "dashed"}
     axes.contour(x, y, mask.T.astype(float), levels=[0.5], **style)
-
-
-def rig(
-    poses: Float64,
-    names: Sequence[str],
-    view: str,
-    *,
-    label: str,
-    pairs: Sequence[tuple[int, int, str]] = (),
-) -> str:
-    """Draw the cameras of a rig as labelled frusta.
-
-    Parameters
-    ----------
-    poses
-        (n, 4, 4) T_rig_camera; the first camera is emphasised.
-    names
-        Names of the cameras.
-    view
-        Key of `VIEWS`.
-    label
-        Text for screen readers.
-    pairs
-        Cameras a and b that are joined by a line, and its label.
-    """
-    centres = poses[:, :3, 3]
-    radius = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
-    size = 0.35 * radius if radius > 0.01 else 0.1
-    corners = np.array([[-0.5, -0.4, 1], [0.5, -0.4, 1], [0.5, 0.4, 1], [-0.5, 0.4, 1]])
-    frusta = np.einsum("nij,kj->nki", poses[:, :3, :3], size * corners) + centres[:, None]
-    box = limits(project(centres, view), project(frusta.reshape(-1, 3), view), margin=0.16)
-    figure, axes = plan(box, view)
-    low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
-    per_pixel = float(high[0] - low[0]) / (_WIDTH - 58)
-    for a, b, text in pairs:
-        ends = project(centres[[a, b]], view)
-        axes.plot(*ends.T, color=MUTED, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
-        style: Any = {"ha": "center", "va": "center", "fontsize": 10, "color": MUTED}
-        background = {"facecolor": PAGE, "edgecolor": "none", "pad": 1.5}
-        axes.annotate(text, ends.mean(0), bbox=background, **style)
-    for k, name in enumerate(names):
-        eye, flat = project(centres[k : k + 1], view)[0], project(frusta[k], view)
-        color, linewidth = (AFTER, 1.8) if k == 0 else (INK, 1.1)
-        axes.fill(*flat.T, color=color, alpha=0.12, linewidth=0)
-        axes.plot(*np.concatenate([flat, flat[:1]]).T, color=color, linewidth=linewidth)
-        for corner in flat:
-            axes.plot(*np.stack([eye, corner]).T, color=color, linewidth=linewidth)
-        axes.plot(*eye, "o", color=color, markersize=4)
-        # The name is behind the camera, where nothing is drawn.
-        behind = eye - flat.mean(0)
-        length = float(np.linalg.norm(behind))
-        behind = behind / length if length > 0.2 * size else np.array([0.0, -1.0])
-        position = eye + 10 * per_pixel * behind
-        ha = "left" if behind[0] > 0.4 else "right" if behind[0] < -0.4 else "center"
-        va = "bottom" if behind[1] > 0.4 else "top" if behind[1] < -0.4 else "center"
-        axes.text(*position, name, color=color, fontsize=11, ha=ha, va=va)
-    return svg(figure, label)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.apps.report import plots, words
+from tofuse.apps.report import words
 from tofuse.apps.report.session_words import probability_text
 from tofuse.apps.report.subject import ROWS, Subject, Values
 from tofuse.apps.report.thumbnails import css
 from tofuse.apps.results import CHANGE_COLORS, folders
-from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import frame_ranges
 from tofuse.engine.geometry import se3
 from tofuse.engine.results import Component, SessionChange, SessionPair
 from tofuse.formats.rigs import RigCamera
 
 _COLORS = 6  # of components in the style sheet; further ones reuse them
-_MAX_PAIRS = 10  # of cameras with a distance in the picture of a rig
 _JOINED = {
     "links": "links between views",
     "motion": "extrapolated motion only",
@@ -125,52 +123,18 @@ def _component(number: int, component: Component, count: int) -> Values:
 
 
 def rig(s: Subject) -> Values | None:
-    """Return the picture and the tables of the rig; None for a single camera."""
+    """Return the tables of the rig; None for a single camera."""
     calibration = s.extras.rig
     if calibration is None:
         return None
-    poses = upright(np.stack([camera.T_rig_camera for camera in calibration.cameras]))
-    names = [camera.name for camera in calibration.cameras]
     pairs = sorted(calibration.disagreement, key=lambda d: -d.median_m)
-    # For many cameras the table is easier to read.
-    lines = [
-        (names.index(d.a), names.index(d.b), f"{1000 * d.median_m:.1f} mm")
-        for d in (calibration.disagreement if len(pairs) <= _MAX_PAIRS else ())
-    ]
-    caption = "From above, the first camera looks up."
-    if lines:
-        caption += " Dashed lines: distance between overlapping surfaces."
     return {
-        "figures": [
-            (plots.rig(poses, names, "above", label="The rig from above", pairs=lines), caption),
-            (
-                plots.rig(poses, names, "side", label="The rig from the side"),
-                "From the side, the first camera looks right.",
-            ),
-        ],
         "cameras": [_camera(c, k == 0) for k, c in enumerate(calibration.cameras)],
         "pairs": [
             (f"{d.a}, {d.b}", f"{1000 * d.median_m:.1f} mm", f"{d.pixels:,}") for d in pairs[:ROWS]
         ],
         "unplaced": [f"{name}: {reason}" for name, reason in calibration.unplaced.items()],
     }
-
-
-def upright(T_rig_camera: Float64) -> Float64:
-    """Return poses (K, 4, 4) rotated so that the mean down direction of all cameras is down.
-
-    The cameras of a ring look down from all sides: in the frame of one of them it would be tilted.
-    """
-    down = T_rig_camera[:, :3, 1].sum(0)
-    length = float(np.linalg.norm(down))
-    if length < 0.5 * len(T_rig_camera):  # they are inconsistent
-        return T_rig_camera
-    down = down / length
-    axis = np.cross(down, [0.0, 1.0, 0.0])
-    sine = float(np.linalg.norm(axis))
-    twist = np.zeros(6)
-    twist[3:] = axis / max(sine, 1e-12) * float(np.arctan2(sine, down[1]))
-    return np.asarray(se3.exp(twist) @ T_rig_camera, np.float64)
 
 
 def _camera(camera: RigCamera, first: bool) -> tuple[str, ...]:

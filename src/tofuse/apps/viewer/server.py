@@ -6,15 +6,13 @@ other sites whose name resolves to this machine (DNS rebinding).
 
 from __future__ import annotations
 
-import gzip
 import io
 import logging
 import socket
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING, Any
 
-from tofuse.apps.report import script_hashes
 from tofuse.engine.errors import InputError
 from tofuse.formats.files import reading
 
@@ -22,12 +20,6 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 HOST, PORT = "127.0.0.1", 8080
-# The script in the page of viser 1.1.1 unpacks another script.
-_UNPACKED = {
-    "'sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw='": (
-        "'sha256-o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE='"
-    )
-}
 _NAMES = ("127.0.0.1", "localhost")  # of this machine, in a browser on it
 _MAX_PORTS = 100  # that are tried if none is given
 
@@ -89,9 +81,6 @@ def _guarded() -> Iterator[list[int]]:
             response: Response | None = None
             if process_request is not None:
                 response = process_request(connection, request)
-            if response is not None:
-                for name, value in page_headers(response.headers, bytes(response.body)).items():
-                    response.headers[name] = value
             return response
 
         guards.append(1)
@@ -118,27 +107,6 @@ def is_same_origin(hosts: Sequence[str], origins: Sequence[str]) -> bool:
     if name not in _NAMES or not ((port.isascii() and port.isdecimal()) or not port):
         return False
     return all(o.lower() in (f"http://{hosts[0].lower()}",) for o in origins)
-
-
-def page_headers(headers: Mapping[str, str], body: bytes) -> dict[str, str]:
-    """Return the headers of a response that keep its page from running foreign scripts."""
-    secure_headers = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
-    if not headers.get("Content-Type", "").startswith("text/html"):
-        return secure_headers
-    if headers.get("Content-Encoding") == "gzip":
-        body = gzip.decompress(body)
-    hashes = script_hashes(body.decode("utf-8", "replace"))
-    unpacked = [_UNPACKED[outer] for outer in hashes if outer in _UNPACKED]
-    # The hash of the script that other versions unpack is not known.
-    scripts = " ".join([*hashes, *unpacked]) if unpacked else "'unsafe-inline'"
-    policy = (
-        f"default-src 'self'; script-src 'self' blob: 'unsafe-eval' {scripts}; "
-        "worker-src 'self' blob:; style-src 'self' 'unsafe-inline'; "
-        "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob:; "
-        "object-src 'none'; base-uri 'none'; form-action 'none'; "
-        "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # notebooks
-    )
-    return {**secure_headers, "Content-Security-Policy": policy}
 
 
 def stop(server: ViserServer) -> None:
