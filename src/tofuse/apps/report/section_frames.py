@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -12,6 +10,7 @@ import numpy as np
 from tofuse.apps.report import plots, thumbnails, words
 from tofuse.apps.report.section_parts import component_color
 from tofuse.apps.report.subject import ROWS, Subject, Values
+from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.compute import run_all, trim_memory
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.quality import frame_samples
@@ -130,41 +129,30 @@ def frame_text(record: FrameRecord, components: Sequence[Component] = ()) -> str
 
 def _player(s: Subject) -> Values | None:
     """The images of frames, with the status of each."""
-    shown = _draw(s.result.diagnostics.samples)
-    trim_memory()
-    if not shown:
+    samples = s.result.diagnostics.samples
+    if not samples:
         return None
+    low, high = _depth_range(samples)
+    fate_colors = np.array([_FATES[fate][0] for fate in sorted(_FATES)], np.uint8)
+    images = run_all([partial(_images, p, (low, high), fate_colors) for p in samples])
+    trim_memory()
     records = {r.index: r for r in s.result.diagnostics.frames}
-    listed = [records.get(p.index) for p in shown]
-    kinds = {kind: title for kind, title in _KINDS.items() if kind in shown[0].images}
-    low, high = _depth_range(s.result.diagnostics.samples)
+    listed = [records.get(p.index) for p in samples]
+    kinds = {kind: title for kind, title in _KINDS.items() if kind in images[0]}
     note = f"Range from dark ({words.length(low)}) to bright ({words.length(high)})."
-    if len(shown) < len(records):
-        note = f"{len(shown):,} of {len(records):,} frames have images here. " + note
+    if len(samples) < len(records):
+        note = f"{len(samples):,} of {len(records):,} frames have images here. " + note
     return {
         "data": {
-            "index": [p.index for p in shown],
+            "index": [p.index for p in samples],
             "descriptions": [frame_text(r, s.result.components) if r else "" for r in listed],
             "status": [r.status if r else "" for r in listed],
-            "images": {kind: [p.uri(kind) for p in shown] for kind in kinds},
+            "images": {kind: [each.get(kind, "data:,") for each in images] for kind in kinds},
         },
         "kinds": kinds,
         "note": note,
         "fates": [(thumbnails.css(color), text) for color, text in _FATES.values()],
     }
-
-
-@dataclass(frozen=True, eq=False)
-class _Pictures:
-    """Images of one frame by kind (`_KINDS`): JPEG, and PNG for the use of pixels."""
-
-    index: int
-    images: dict[str, bytes]
-
-    def uri(self, kind: str) -> str:
-        """Return an image as a data URI, which is empty if there is none of this kind."""
-        data, name = self.images.get(kind), "png" if kind == "fate" else "jpeg"
-        return f"data:image/{name};base64,{base64.b64encode(data).decode()}" if data else "data:,"
 
 
 def _depth_range(frames: Sequence[frame_samples.FrameSample]) -> tuple[float, float]:
@@ -176,25 +164,17 @@ def _depth_range(frames: Sequence[frame_samples.FrameSample]) -> tuple[float, fl
     return thumbnails.percentile_range(values, min_width=1e-3)
 
 
-def _draw(frames: Sequence[frame_samples.FrameSample]) -> tuple[_Pictures, ...]:
-    """Render the samples of frames."""
-    low, high = _depth_range(frames)
-    fate_colors = np.zeros((4, 3), np.uint8)
-    for fate, (color, _) in _FATES.items():
-        fate_colors[fate] = color
-
-    def render(frame: frame_samples.FrameSample) -> _Pictures:
-        depth = frame.depth.astype(float)
-        picture = thumbnails.viridis((depth - low) / (high - low))
-        picture[depth == 0] = thumbnails.NO_MEASUREMENT
-        images = {} if frame.color is None else {"color": thumbnails.encode(frame.color, jpeg=True)}
-        images["range"] = thumbnails.encode(picture, jpeg=True)
-        if frame.amplitude is not None:
-            images["amplitude"] = thumbnails.encode(thumbnails.grey(frame.amplitude), jpeg=True)
-        images["fate"] = thumbnails.encode(fate_colors[frame.fate])
-        return _Pictures(frame.index, images)
-
-    return tuple(run_all([partial(render, frame) for frame in frames]))
+def _images(
+    sample: frame_samples.FrameSample, limits: tuple[float, float], fate_colors: UInt8
+) -> dict[str, str]:
+    """The images of a frame by kind (`_KINDS`): JPEG, and PNG for the use of pixels."""
+    images = {"range": thumbnails.depth_colors(sample.depth, sample.depth > 0, limits)}
+    if sample.color is not None:
+        images["color"] = sample.color
+    if sample.amplitude is not None:
+        images["amplitude"] = thumbnails.grey(sample.amplitude)
+    uris = {kind: thumbnails.data_uri(image, jpeg=True) for kind, image in images.items()}
+    return uris | {"fate": thumbnails.data_uri(fate_colors[sample.fate])}
 
 
 def loops(s: Subject) -> Values:
@@ -238,8 +218,8 @@ def filters(s: Subject) -> Values:
                 " Grey pixels have no measurement, pink ones were removed by this filter. Below: "
                 "the points from above and to the side."
             )
-        framing = thumbnails.Framing.around(raw.points.astype(float), _FILTER)
-        images = _step_images(raw, None, limits, framing)
+        view = thumbnails.framing(raw.points.astype(float), _FILTER)
+        images = _step_images(raw, None, limits, view)
         shown.append((first, words.count(len(raw), "point"), images))
         previous = raw
         for name, frame in later:
@@ -250,7 +230,7 @@ def filters(s: Subject) -> Values:
                 text = f"corrects; {words.count(len(frame), 'point')}"
             before = counts.get(name, (0, 0))
             counts[name] = (before[0] + num_removed, before[1] + len(previous))
-            shown.append((name, text, _step_images(frame, previous, limits, framing)))
+            shown.append((name, text, _step_images(frame, previous, limits, view)))
             previous = frame
     # Corrections remove nothing.
     names = [*removed, *(n for n in counts if n not in removed and counts[n][0])]
@@ -266,14 +246,14 @@ def _step_images(
     frame: Frame,
     previous: Frame | None,
     limits: tuple[float, float],
-    framing: thumbnails.Framing,
+    view: tuple[Float64, float],
 ) -> list[str]:
     """The depth image of a frame, with the pixels removed since the previous one; its points."""
     images = []
     if isinstance(frame, RangeFrame):
         removed = previous.valid & ~frame.valid if isinstance(previous, RangeFrame) else None
         images.append(thumbnails.depth_image(frame, limits, removed, _FILTER[0]))
-    images.append(thumbnails.cloud_image(frame, limits, framing))
+    images.append(thumbnails.cloud_image(frame, limits, _FILTER, view))
     return [thumbnails.data_uri(image) for image in images]
 
 
@@ -286,8 +266,7 @@ def recording(s: Subject) -> Values | None:
     low, high = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else (0.0, 1.0)
     samples = []
     for frame in frames:
-        framing = thumbnails.Framing.around(frame.points.astype(float), _THUMBNAIL)
-        image = thumbnails.cloud_image(frame, (low, high), framing)
+        image = thumbnails.cloud_image(frame, (low, high), _THUMBNAIL)
         samples.append((frame.index, thumbnails.data_uri(image)))
     note = "Sample views before filtering, from above and to the side."
     if ranges:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.apps.report import plots, thumbnails, words
-from tofuse.apps.report.fields import fields, normalized_accuracy
+from tofuse.apps.report.fields import accuracy, fields
 from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import RigCameras, Scene, opening_yaw, packed, render
 from tofuse.apps.report.subject import OUTER, Subject, Values
@@ -91,7 +91,7 @@ def _packed_cameras(s: Subject, errors: Float64, rig: RigCameras | None) -> dict
     records = {r.index: r for r in s.result.diagnostics.frames}
     index = s.index.astype(int)
     statuses = [records[k].status if k in records else "tracked" for k in index.tolist()]
-    error_bytes = np.round(255 * normalized_accuracy(errors)).astype(np.uint8)
+    error_bytes = np.round(255 * accuracy(errors).normalized(errors)).astype(np.uint8)
 
     def displayed(poses: Float64) -> str:
         rows = np.nan_to_num(s.R_display_world @ poses[:, :3]).reshape(len(poses), 12)
