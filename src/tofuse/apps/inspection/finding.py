@@ -19,10 +19,10 @@ CODES: dict[str, Severity] = {
         ("depth_unit", "range_taken_for_z", "z_taken_for_range", "focal_length", "mirrored",
          "other_intrinsics", "lens_distortion", "color_unregistered", "time_unsorted",
          "phase_wrap"), "severe"),
-    # The effect of the last three is measured by tracking, and decides the verdict.
+    # The effect of the last two is measured by tracking, and decides the verdict.
     **dict.fromkeys(
         ("time_unit", "time_repeated", "frames_missing", "frames_repeated", "saturated",
-         "few_valid", "flying_pixels", "little_overlap", "moving_objects", "fast_motion"),
+         "few_valid", "flying_pixels", "little_overlap", "fast_motion"),
         "warning"),
     **dict.fromkeys(("static", "wall_only"), "note"),
 }  # fmt: skip

@@ -43,7 +43,6 @@ CHECKS: tuple[Check, ...] = (
     values.check_saturation,
     values.check_flying,
     motion_checks.check_motion,
-    motion_checks.check_moving_objects,
     motion_checks.check_still,
     motion_checks.check_walls,
 )

@@ -9,8 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from types import ModuleType, TracebackType
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +54,7 @@ class Settings:
     amplitude_kind: AmplitudeKind | None = None
 
 
-class Stream(ABC):
+class Stream(AbstractContextManager["Stream"], ABC):
     """A running camera; closed at the end of its ``with`` block.
 
     Attributes
@@ -65,6 +64,45 @@ class Stream(ABC):
     """
 
     settings: Settings
+
+    def __init__(self, options: Device) -> None:
+        pip, module = options.package
+        try:
+            package = importlib.import_module(module)
+        except ImportError as error:
+            raise DeviceError(
+                f"needs the package {pip}, which can't be imported ({error})",
+                where="camera",
+                remedy=f"run `pip install {pip}`",
+            ) from error
+        try:
+            self.start(package, options)
+        except DeviceError:
+            raise
+        except Exception as error:  # the maker's package may raise anything
+            raise DeviceError(
+                f"does not start ({type(error).__name__}: {error})",
+                where=options.maker,
+                remedy="check that it is connected, and not used by another program",
+            ) from error
+        try:
+            self.settings = self.read_settings()
+        except BaseException:
+            self.close()
+            raise
+
+    def start(self, package: Any, options: Any) -> None:
+        """Start the camera with the maker's package and the options of its device.
+
+        Raises
+        ------
+        DeviceError
+            If no camera is connected, or it doesn't start.
+        """
+
+    def read_settings(self) -> Settings:
+        """Return the properties of the running camera, after `start`."""
+        raise NotImplementedError
 
     @abstractmethod
     def read(self, index: int) -> RangeFrame:
@@ -101,28 +139,29 @@ class Stream(ABC):
             yield self.read(index)
             index += 1
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
-class Device(Protocol):
+class Device(ABC):
     """A kind of camera, registered by ``@part("device", name)`` in a module of `devices`.
 
     Attributes
     ----------
+    maker
+        Its name in messages.
     package
         Name of the required package for pip, and for import.
+    stream
+        Its frames.
     """
 
     part_kind: ClassVar[str] = "device"
+    maker: ClassVar[str]
     package: ClassVar[tuple[str, str]]
+    stream: ClassVar[type[Stream]]
 
-    def open(self) -> AbstractContextManager[Stream]:
+    def open(self) -> Stream:
         """Start the camera.
 
         Raises
@@ -130,7 +169,7 @@ class Device(Protocol):
         DeviceError
             If the package is missing, no camera is connected, or it doesn't start.
         """
-        ...
+        return self.stream(self)
 
 
 def device_named(name: str, options: Mapping[str, str]) -> Device:
@@ -178,38 +217,10 @@ def is_installed(device: type[Any]) -> bool:
     return importlib.util.find_spec(device.package[1]) is not None
 
 
-def vendor(package: tuple[str, str]) -> ModuleType:
-    """Import the maker's package, see `Device.package`.
-
-    Raises
-    ------
-    DeviceError
-        Stating what to install.
-    """
-    pip, module = package
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise DeviceError(
-            f"needs the package {pip}, which can't be imported ({error})",
-            where="camera",
-            remedy=f"run `pip install {pip}`",
-        ) from error
-
-
 def no_frame(sensor: str) -> DeviceError:
     """Return the error of a camera that sends no frames."""
     return DeviceError(
         f"sent no frame for {TIMEOUT_S:g} s",
         where=sensor,
         remedy="check its cable and power supply",
-    )
-
-
-def not_started(name: str, error: Exception) -> DeviceError:
-    """Return the error of a camera that does not start."""
-    return DeviceError(
-        f"does not start ({type(error).__name__}: {error})",
-        where=name,
-        remedy="check that it is connected, and not used by another program",
     )
