@@ -61,17 +61,14 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
         problem = "nearer than ToF cameras measure"
     else:
         return
+    # The power of ten by which the distance is nearest to 2 m.
+    factor = float(10.0 ** np.round(np.log10(median / 2.0)))
     yield Finding(
         "depth_unit",
         f"The median depth is {median:.3g} m, {problem}.",
-        f"Check depth_unit_m: it may be wrong by a factor of {_factor(median):g}.",
-        evidence | {"factor": _factor(median)},
+        f"Check depth_unit_m: it may be wrong by a factor of {factor:g}.",
+        evidence | {"factor": factor},
     )
-
-
-def _factor(median: float) -> float:
-    """The power of ten by which a distance is nearest to 2 m."""
-    return float(10.0 ** np.round(np.log10(median / 2.0)))
 
 
 def check_valid(sample: Sample) -> Iterator[Finding]:

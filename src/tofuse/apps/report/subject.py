@@ -18,6 +18,7 @@ Values = dict[str, Any]
 OUTER = 0.25  # percent of the points at each end that the measured size excludes
 ROWS = 150  # maximum in a table
 _ANGLES = np.arange(-44.5, 45.5, 0.5)[:, None]  # degrees
+_MIN_BOX_FILL = 0.9  # minimum fraction of a box in the hull of points that have its shape
 _MAX_SAMPLES = 5000  # maximum number of sampled points
 
 
@@ -69,9 +70,11 @@ class Subject:
             truth = truth[np.isfinite(truth).all(1)]
         truth_points = truth.astype(float) if truth is not None and len(truth) else None
         R_up_world = np.diag([1.0, -1.0, -1.0]) @ result.T_up_world[:3, :3]
-        outer = OUTER if truth_points is None else 0.0
-        points = scene.points if truth_points is None else truth_points
-        R = _upright_axes(points @ R_up_world.T, outer) @ R_up_world
+        if truth_points is None:
+            R = _upright_axes(scene.points @ R_up_world.T, OUTER) @ R_up_world
+        else:
+            R_up_world = _levelled(truth_points @ R_up_world.T) @ R_up_world
+            R = _upright_axes(truth_points @ R_up_world.T, 0.0) @ R_up_world
         return cls(result, extras, index, sequential, reference, scene, truth_points, R)
 
 
@@ -83,6 +86,22 @@ def _row_indices(result: Reconstruction) -> Float64:
         if len(candidates) == rows:
             return np.array([r.index for r in candidates], float)
     return np.arange(rows, dtype=float)
+
+
+def _levelled(points: Float64) -> Float64:
+    """Return the rotation (3, 3) that makes the floor of an exact box level, with y vertical."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(points)
+    except QhullError:  # coplanar points
+        return np.eye(3)
+    normals = hull.equations[:, :3]
+    floor = normals[normals[:, 1].argmax()]
+    R = Rotation.align_vectors([[0.0, 1.0, 0.0]], [floor])[0].as_matrix()
+    extents = np.ptp(points @ (_upright_axes(points @ R.T, 0.0) @ R).T, axis=0)
+    is_box = hull.volume > _MIN_BOX_FILL * extents.prod()
+    return np.asarray(R if is_box else np.eye(3), np.float64)
 
 
 def _upright_axes(points: Float64, outer: float) -> Float64:
