@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
+import math
 import re
 from functools import cache
 from importlib import resources
@@ -11,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from tofuse._version import __version__
+from tofuse.apps.report import session_words, words
+from tofuse.engine.frames import frame_ranges
 from tofuse.formats.files import atomic
 
 # Files of the pages' script; each uses functions of the previous ones.
@@ -89,5 +93,21 @@ def _environment() -> Any:
         lstrip_blocks=True,
         loader=loader,
     )
+    environment.filters |= {
+        "metres": words.length,
+        "signed": words.signed_length,
+        "degrees": math.degrees,
+        "percent": words.percent,
+        "duration": words.seconds,
+        "things": words.count,
+        "more": words.more,
+        "coordinates": words.coordinates,
+        "frames": lambda ends: words.frame_range(*ends),
+        "probability": session_words.probability_text,
+        "ranges": lambda ranges: frame_ranges.numbers(ranges).replace("-", "–"),
+        "number": "{:,}".format,
+        "css": lambda color: f"rgb{tuple(color)}",
+        "pretty": lambda data: json.dumps(data, indent=2, ensure_ascii=False, default=str),
+    }
     environment.policies["json.dumps_kwargs"] = {}  # keys in their order
     return environment

@@ -52,10 +52,7 @@ def frames(s: Subject) -> Values:
         "figures": _health(records),
         "has_bad": "lost" in statuses or "skipped" in statuses,
         "player": _player(s),
-        "problems": [
-            (words.frame_range(a, b), f"{n:,}", status, reason or "–", [[a, b]])
-            for a, b, n, status, reason in runs[:ROWS]
-        ],
+        "problems": runs[:ROWS],
         "more": words.more(len(runs) - ROWS),
         "apart": any(not c.connected for c in components),
     }
@@ -181,22 +178,7 @@ def loops(s: Subject) -> Values:
     """Return the table of candidates for loop closures."""
     loops = sorted(s.result.diagnostics.loops, key=lambda p: (not p.accepted, p.i, p.j))
     accepted = sum(p.accepted for p in loops)
-    rows = [
-        (
-            f"{p.i} and {p.j}",
-            "✓ accepted" if p.accepted else "✗ rejected",
-            p.reason or "–",
-            words.percent(p.overlap),
-            words.length(p.rms_m),
-            words.percent(p.free_space_violation),
-            words.percent(p.margin),
-            [[p.i, p.i], [p.j, p.j]],
-        )
-        for p in loops[:ROWS]
-    ]
-    text = f"{words.count(len(loops), 'candidate')}: {accepted:,} accepted, "
-    text += f"{len(loops) - accepted:,} rejected."
-    return {"rows": rows, "text": text, "more": words.more(len(loops) - ROWS)}
+    return {"rows": loops[:ROWS], "accepted": accepted, "rejected": len(loops) - accepted}
 
 
 def filters(s: Subject) -> Values:
@@ -263,12 +245,8 @@ def recording(s: Subject) -> Values | None:
     if not frames:
         return None
     ranges = [thumbnails.depth_limits(f) for f in frames if len(f)]
-    low, high = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else (0.0, 1.0)
-    samples = []
-    for frame in frames:
-        image = thumbnails.cloud_image(frame, (low, high), _THUMBNAIL)
-        samples.append((frame.index, thumbnails.data_uri(image)))
-    note = "Sample views before filtering, from above and to the side."
-    if ranges:
-        note += f" Depth from dark ({words.length(low)}) to bright ({words.length(high)})."
-    return {"samples": samples, "note": note}
+    lows, highs = zip(*ranges, strict=True) if ranges else ((0.0,), (1.0,))
+    limits = min(lows), max(highs)
+    images = [thumbnails.cloud_image(frame, limits, _THUMBNAIL) for frame in frames]
+    samples = [(f.index, thumbnails.data_uri(i)) for f, i in zip(frames, images, strict=True)]
+    return {"samples": samples, "limits": limits if ranges else None}

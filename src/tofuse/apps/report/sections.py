@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from tofuse._version import __version__
 from tofuse.apps.report import (
@@ -55,7 +54,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         ("filters", "Filters", section_frames.filters),
         ("loops", "Loop closures", section_frames.loops),
         ("recording", "Recording", section_frames.recording),
-        ("timings", "Time", _timings),
+        ("timings", "Time", lambda _: {}),
         ("settings", "Settings", _settings),
     )
     # Simplifying the surface takes as long as all plots, and releases the interpreter lock.
@@ -65,6 +64,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         shown = [(name, title) for name, title, _ in listed if contents[name] is not None]
         return {
             "title": extras.title,
+            "result": result,
             "subtitle": _subtitle(result),
             "contents": [("model", "Model"), *shown, ("reading", "How to read this")],
             **model.result(),
@@ -114,28 +114,7 @@ def _card(result: Reconstruction) -> list[tuple[str, str, str]]:
     return lines
 
 
-def _timings(s: Subject) -> Values:
-    durations = s.result.diagnostics.seconds
-    total = sum(durations.values())
-    frames = len(s.result.diagnostics.frames)
-    rows = [
-        (name, words.seconds(value), f"{100 * value / total if total else 0:.1f}")
-        for name, value in durations.items()
-    ]
-    per_frame = f"{words.seconds(total / frames)} per frame" if frames else ""
-    return {"rows": rows, "total": words.seconds(total), "per_frame": per_frame}
-
-
 def _settings(s: Subject) -> Values:
-    result = s.result
-    recording = {k: v for k, v in result.recording.items() if k not in ("warnings", "findings")}
-    source = {"version": __version__, **recording, "seed": result.seed, "threads": result.threads}
-    return {
-        "warnings": [str(w) for w in result.recording.get("warnings", ())],
-        "input": _pretty(source),
-        "config": _pretty(result.config),
-    }
-
-
-def _pretty(data: Any) -> str:
-    return json.dumps(data, indent=2, ensure_ascii=False, default=str)
+    recording = {k: v for k, v in s.result.recording.items() if k not in ("warnings", "findings")}
+    run = {"seed": s.result.seed, "threads": s.result.threads}
+    return {"version": __version__, **recording, **run}
