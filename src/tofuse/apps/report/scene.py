@@ -137,34 +137,6 @@ class Scene:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class RigCameras:
-    """The camera of each frame of a rig's recording.
-
-    Attributes
-    ----------
-    names
-        Names of the cameras.
-    colors
-        RGB colour of each.
-    of_frames
-        (N,) number of the camera of each frame.
-    """
-
-    names: tuple[str, ...]
-    colors: tuple[tuple[int, int, int], ...]
-    of_frames: Intp
-
-    @classmethod
-    def of(cls, rig: Any, frames: int) -> RigCameras | None:
-        """Read the entry `rig` of `run.json`; None if it does not match the number of frames."""
-        if not rig or len(rig["of_frames"]) != frames:
-            return None
-        names, of_frames = tuple(rig["cameras"]), np.array(rig["of_frames"], np.intp)
-        colors = tuple(CAMERA_COLORS[k % len(CAMERA_COLORS)] for k in range(len(names)))
-        return cls(names, colors, of_frames)
-
-
 def finite_poses(poses: Float64 | None) -> Float64:
     """Return the finite poses, (n, 4, 4)."""
     if poses is None or len(poses) == 0:

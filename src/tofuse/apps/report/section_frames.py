@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 
 from tofuse.apps.report import plots, thumbnails, words
-from tofuse.apps.report.section_parts import component_color
 from tofuse.apps.report.subject import ROWS, Subject, Values
 from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.compute import run_all, trim_memory
@@ -71,23 +71,14 @@ def _facts(s: Subject, counts: Sequence[tuple[str, int]]) -> list[tuple[str, str
     return [*facts, ("loop closures", f"{closures:,}")]
 
 
-def _strip(records: Sequence[FrameRecord], components: Sequence[Component]) -> list[Values]:
+def _strip(
+    records: Sequence[FrameRecord], components: Sequence[Component]
+) -> list[tuple[FrameRecord, str]]:
     """The cells of the strip; with more frames than cells, a cell shows the worst of several."""
-    strip = []
-    cell_frames = -(-len(records) // _STRIP)
-    for start in range(0, len(records), max(cell_frames, 1)):
-        worst = max(records[start : start + cell_frames], key=lambda r: _SEVERITY[r.status])
-        is_colored = worst.component is not None and len(components) > 1
-        strip.append(
-            {
-                "status": worst.status,
-                "lane": words.STATUSES.index(worst.status),
-                "title": frame_text(worst, components),
-                "index": worst.index,
-                "color": component_color(worst.component or 0) if is_colored else None,
-            }
-        )
-    return strip
+    size = max(-(-len(records) // _STRIP), 1)
+    cells = (records[start : start + size] for start in range(0, len(records), size))
+    worst = [max(cell, key=lambda r: _SEVERITY[r.status]) for cell in cells]
+    return [(record, frame_text(record, components)) for record in worst]
 
 
 def _health(records: Sequence[FrameRecord]) -> list[tuple[str, str]]:
@@ -184,44 +175,27 @@ def loops(s: Subject) -> Values:
 def filters(s: Subject) -> Values:
     """Return one frame after each filter (figure 3.2), and the fractions removed."""
     removed, steps = s.result.diagnostics.removed, s.extras.filter_steps
-    counts: dict[str, tuple[int, int]] = {}  # points removed, of all; a filter may be used twice
-    shown: list[tuple[str, str, list[str]]] = []
-    note = ""
+    gone: Counter[str] = Counter()  # a filter may be used twice
+    reached: Counter[str] = Counter()
+    values: Values = {"steps": []}
     if steps:
-        (first, raw), *later = steps
+        raw = previous = steps[0][1]
         limits = thumbnails.depth_limits(raw)
-        low, high = (words.length(limit) for limit in limits)
-        note = (
-            f"Frame {raw.index} after each filter; colours from dark (near, {low}) to bright (far, "
-            f"{high})."
-        )
-        if isinstance(raw, RangeFrame):
-            note += (
-                " Grey pixels have no measurement, pink ones were removed by this filter. Below: "
-                "the points from above and to the side."
-            )
+        values |= {"frame": raw.index, "limits": limits, "is_image": isinstance(raw, RangeFrame)}
         view = thumbnails.framing(raw.points.astype(float), _FILTER)
-        images = _step_images(raw, None, limits, view)
-        shown.append((first, words.count(len(raw), "point"), images))
-        previous = raw
-        for name, frame in later:
+        for k, (name, frame) in enumerate(steps):
+            images = _step_images(frame, previous if k else None, limits, view)
             num_removed = len(previous) - len(frame)
-            fraction = words.percent(num_removed / len(previous) if len(previous) else None)
-            text = f"removed {fraction} ({num_removed:,} points), {len(frame):,} are left"
-            if not num_removed and name not in removed:
-                text = f"corrects; {words.count(len(frame), 'point')}"
-            before = counts.get(name, (0, 0))
-            counts[name] = (before[0] + num_removed, before[1] + len(previous))
-            shown.append((name, text, _step_images(frame, previous, limits, view)))
+            values["steps"].append((name, len(frame), num_removed, images))
+            if k:
+                gone[name] += num_removed
+                reached[name] += len(previous)
             previous = frame
     # Corrections remove nothing.
-    names = [*removed, *(n for n in counts if n not in removed and counts[n][0])]
-    rows = []
-    for name in names:
-        num_removed, num_points = counts.get(name, (0, 0))
-        fraction = words.percent(num_removed / num_points if num_points else None)
-        rows.append((name, words.percent(removed.get(name)), fraction))
-    return {"rows": rows, "steps": shown, "note": note}
+    names = [*removed, *(n for n in gone if n not in removed and gone[n])]
+    fractions = [gone[n] / reached[n] if reached[n] else None for n in names]
+    whole = [removed.get(n) for n in names]
+    return values | {"rows": list(zip(names, whole, fractions, strict=True))}
 
 
 def _step_images(

@@ -8,8 +8,6 @@ from tofuse.apps.report.subject import ROWS, Subject, Values
 from tofuse.apps.results import CHANGE_COLORS
 from tofuse.engine.geometry import se3
 
-_COLORS = 6  # of components in the style sheet; further ones reuse them
-
 
 def sessions(s: Subject) -> Values | None:
     """Return the sessions with their frames; None for one recording."""
@@ -22,11 +20,6 @@ def sessions(s: Subject) -> Values | None:
         "colors": CHANGE_COLORS,
         "met": any(pair.joined and pair.overlap > 0 for pair in s.result.session_pairs),
     }
-
-
-def component_color(component: int) -> int:
-    """Return the number of the colour of a component."""
-    return component % _COLORS
 
 
 def components(s: Subject) -> Values | None:
