@@ -25,7 +25,7 @@ def local(points: np.ndarray, format: str = "ply", center=(0, 0, 0)) -> LocalVie
 
 def pair(points: np.ndarray, others: np.ndarray, pose=T, **more) -> PairResult:
     found = Registration(pose, True, 1, 1, 1, 0.0, 0.002, np.eye(6))
-    return PairResult(local(points, **more), local(others, **more), found, np.eye(4))
+    return PairResult(local(points, **more), local(others, **more), found)
 
 
 def sheet(seed: int, low: float = 0.0, high: float = 1.0, z: float = 1.0) -> np.ndarray:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import importlib.util
+import json
+import re
+import typing
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -20,6 +22,10 @@ from tofuse.engine.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.parts import discover, from_dict, registered
 
 TIMEOUT_S = 2.0  # without a frame until a camera counts as stopped
+
+
+# How options that are not text are written.
+_WORDS = {bool: "true|false", int: "-?[1-9][0-9]*|0"}
 
 
 class DeviceError(InputError):
@@ -185,25 +191,16 @@ def device_named(name: str, options: Mapping[str, str]) -> Device:
         raise InputError(
             f"there is no camera {name!r}", where="record", remedy=f"use one of {list(kinds)}"
         )
-    types = {f.name: f.type for f in dataclasses.fields(kinds[name])}
+    types = typing.get_type_hints(kinds[name])
     values: dict[str, Any] = {"part": name}
     for key, text in options.items():
-        values[key] = _read(text, str(types.get(key)), f"--set {key}")
+        words = _WORDS.get(types.get(key), "")
+        if words and (not re.fullmatch(words, text)):
+            remedy = "use true or false" if types[key] is bool else "use a whole number"
+            raise InputError(f"is {text!r}", where=f"--set {key}", remedy=remedy)
+        values[key] = json.loads(text) if words else text
     kind: Device = from_dict(Device, values, where="--set")
     return kind
-
-
-def _read(text: str, kind: str, where: str) -> object:
-    if kind == "bool":
-        if text not in ("true", "false"):
-            raise InputError(f"is {text!r}", where=where, remedy="use true or false")
-        return text == "true"
-    if kind == "int":
-        try:
-            return int(text)
-        except ValueError as error:
-            raise InputError(f"is {text!r}", where=where, remedy="use a whole number") from error
-    return text
 
 
 def known_devices() -> dict[str, type[Any]]:

@@ -159,13 +159,4 @@ def _writer(stream: Stream, first: RangeFrame, folder: Path) -> RecordingWriter:
         max_sigma = float(np.nanmax(first.sigma_image, initial=0.0))
         # Later frames may be noisier than the first.
         sigma_unit = max(MIN_SIGMA_UNIT_M, 4 * max_sigma / 65535)
-    return RecordingWriter(
-        folder,
-        settings.camera,
-        depth_unit_m=settings.depth_unit_m,
-        depth_kind=settings.depth_kind,
-        frame_rate_hz=settings.frame_rate_hz,
-        amplitude_kind=settings.amplitude_kind,
-        sensor=settings.sensor,
-        sigma_unit_m=sigma_unit,
-    )
+    return RecordingWriter(folder, **vars(settings), sigma_unit_m=sigma_unit)

@@ -100,7 +100,7 @@ def _registered(
 ) -> PairResult:
     views = _open_both(source, target, options)
     local_source, local_target = _near_origin(*views, guess)
-    T_start = np.eye(4)
+    T_start = None
     if guess is not None:
         T_start = guess.copy()
         T_start[:3, 3] += guess[:3, :3] @ local_source.center - local_target.center
@@ -108,12 +108,10 @@ def _registered(
         T_start = se3.orthonormalise(T_start)
     progress.stage("registering")
     start_s = perf_counter()
-    registration = register(
-        local_source.frame, local_target.frame, guess=None if guess is None else T_start
-    )
+    registration = register(local_source.frame, local_target.frame, guess=T_start)
     seconds = perf_counter() - start_s
     name = None if options.guess is None else str(options.guess)
-    return PairResult(local_source, local_target, registration, T_start, name, seconds)
+    return PairResult(local_source, local_target, registration, name, seconds)
 
 
 def _open_both(source: str, target: str, options: PairOptions) -> tuple[SingleView, SingleView]:

@@ -54,8 +54,6 @@ class PairResult:
         The views.
     registration
         The registration of the local frames.
-    T_start
-        (4, 4) initial guess T_target_source of the local frames.
     guess
         The file of the initial guess, or None.
     seconds
@@ -65,7 +63,6 @@ class PairResult:
     source: LocalView
     target: LocalView
     registration: Registration
-    T_start: Float64
     guess: str | None = None
     seconds: float = 0.0
 

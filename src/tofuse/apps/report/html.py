@@ -19,19 +19,9 @@ from tofuse.formats.files import atomic
 
 # Files of the pages' script; each uses functions of the previous ones.
 SCRIPTS = (
-    "bytes.js",
-    "eye.js",
-    "gestures.js",
-    "painter.js",
-    "section.js",
-    "measure.js",
-    "overlay.js",
-    "cameras.js",
-    "timeline.js",
-    "viewer.js",
-    "frames.js",
-    "main.js",
-)
+    "bytes", "eye", "gestures", "painter", "section", "measure",
+    "overlay", "cameras", "timeline", "viewer", "frames", "main",
+)  # fmt: skip
 
 
 def write_page(path: Path, template: str, **values: Any) -> None:
@@ -71,7 +61,7 @@ def secured(html: str) -> str:
 
 def script() -> str:
     """Return the script of a page with a 3D view."""
-    parts = "\n".join(asset(f"js/{name}") for name in SCRIPTS)
+    parts = "\n".join(asset(f"js/{name}.js") for name in SCRIPTS)
     return f'"use strict";\n(() => {{\n{parts}}})();'
 
 
