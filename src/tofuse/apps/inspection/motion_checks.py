@@ -52,23 +52,24 @@ def check_motion(sample: Sample) -> Iterator[Finding]:
     pairs = sample.pairs
     if sample.turning or len(pairs) < 2:
         return
-    lost = [p for p in pairs if not p.fits or p.alignment.overlap < _MIN_OVERLAP]
-    if 2 * len(lost) >= len(pairs):
+    fitting = [p for p in pairs if p.fits]
+    lost = len(pairs) - sum(p.alignment.overlap >= _MIN_OVERLAP for p in fitting)
+    if 2 * lost >= len(pairs):
         yield Finding(
             "little_overlap",
-            f"{len(lost)} of {len(pairs)} pairs of consecutive frames overlap too little, or are "
+            f"{lost} of {len(pairs)} pairs of consecutive frames overlap too little, or are "
             "inconsistent.",
             "Record at a higher rate or move more slowly; use a smaller --every.",
             {
                 "pairs": len(pairs),
-                "without_overlap": len(lost),
+                "without_overlap": lost,
                 "median_overlap": float(np.median([p.alignment.overlap for p in pairs])),
             },
         )
         return
-    shift = float(np.median([p.shift for p in pairs if p.fits]))
+    shift = float(np.median([p.shift for p in fitting]))
     if shift > _MAX_SHIFT:
-        angle = float(np.degrees(np.median([p.angle for p in pairs if p.fits])))
+        angle = float(np.degrees(np.median([p.angle for p in fitting])))
         yield Finding(
             "fast_motion",
             f"The camera moves fast for the frame rate: from one frame to the next the image moves "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,11 @@ def depths_of(frame: Frame) -> Float32:
     return np.linalg.norm(frame.points - frame.origin.astype(np.float32), axis=1)
 
 
+def valid_fraction(frames: Sequence[Frame]) -> float:
+    """Return the mean fraction of valid pixels of views."""
+    return float(np.mean([len(f) / max(f.valid.size, 1) for f in frames]))
+
+
 def check_unit(sample: Sample) -> Iterator[Finding]:
     """Check that the typical distance is plausible for a ToF camera."""
     depths = np.concatenate([depths_of(f) for f in sample.frames])
@@ -73,7 +78,7 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
 
 def check_valid(sample: Sample) -> Iterator[Finding]:
     """Check that enough pixels are valid."""
-    valid = float(np.mean([len(f) / max(f.valid.size, 1) for f in sample.frames]))
+    valid = valid_fraction(sample.frames)
     if 0 < valid < _MIN_VALID:
         yield Finding(
             "few_valid",
@@ -169,16 +174,16 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
         for a, b in ((np.s_[:, :-2], np.s_[:, 2:]), (np.s_[:-2], np.s_[2:])):
             seams += int(np.count_nonzero((late[a] & early[b]) | (early[a] & late[b])))
         valid += len(frame)
-        albedo = _apparent_albedo(frame, r)
-        if albedo is None:
+        amplitude = frame.amplitude_image
+        if amplitude is None:
             continue
-        usable = frame.valid & (albedo > 0)
+        usable = frame.valid & (amplitude > 0) & (amplitude < SATURATED_AMPLITUDE)
+        albedo = amplitude if frame.amplitude_kind == "range_compensated" else amplitude * r * r
         with_albedo += int(np.count_nonzero(usable))
-        if not usable.any():
-            continue
-        typical = float(np.median(albedo[usable]))
-        near = usable & surface & (r < _NEAR * period)
-        dark += int(np.count_nonzero(near & (albedo < _DARK * typical)))
+        if usable.any():
+            near = usable & surface & (r < _NEAR * period)
+            is_dark = albedo < _DARK * float(np.median(albedo[usable]))
+            dark += int(np.count_nonzero(near & is_dark))
     seam_fraction, dark_fraction = seams / max(valid, 1), dark / max(with_albedo, 1)
     if seam_fraction > _MAX_SEAM_FRACTION or dark_fraction > _MAX_DARK_FRACTION:
         yield Finding(
@@ -190,11 +195,3 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
             "drop weak pixels by an amplitude filter.",
             {"seam_fraction": seam_fraction, "dark_fraction": dark_fraction, "period_m": period},
         )
-
-
-def _apparent_albedo(frame: RangeFrame, r: Float32) -> Float32 | None:
-    amplitude = frame.amplitude_image
-    if amplitude is None:
-        return None
-    amplitude = np.where(amplitude < SATURATED_AMPLITUDE, amplitude, np.float32(0))
-    return amplitude if frame.amplitude_kind == "range_compensated" else amplitude * r * r

@@ -261,65 +261,33 @@ def path_lines(poses: Float64) -> Float64:
     return np.stack([centers[:-1], centers[1:]], axis=1).reshape(-1, 3)
 
 
-def render(
-    scene: Scene,
-    size: tuple[int, int] = (960, 600),
-    *,
-    yaw: float = YAW,
-    eye_at: tuple[Float64, float] | None = None,
-    min_radius: int = 1,
-) -> UInt8:
-    """Render the initial 3D view as an image (H, W, 3), for browsers without WebGL.
-
-    Parameters
-    ----------
-    scene
-        The scene.
-    size
-        Width and height, pixels.
-    yaw
-        Viewing direction, rad.
-    eye_at
-        Point (3,) to look at, and the distance from it, m; by default the full scene.
-    min_radius
-        Minimum size of a point, pixels.
-    """
+def render(scene: Scene, size: tuple[int, int] = (960, 600), *, yaw: float = YAW) -> UInt8:
+    """Render the initial 3D view, so that it fills an image (H, W, 3), for use without WebGL."""
     import cv2
 
-    center, distance = (scene.center, 1.2 * scene.size) if eye_at is None else eye_at
-    R = thumbnails.view_rotation(yaw, PITCH)
-    T = np.eye(4)
-    T[:3, :3] = R
-    T[:3, 3] = -R @ center
-    lens: Any = {"scale": size[1] / (2 * np.tan(0.35) * distance), "distance": distance}
     points, colors = scene.points, (36 + 0.86 * scene.colors).astype(np.uint8)
+    framed = points if len(points) else scene.after[:, :3, 3]
+    T, scale = thumbnails.framing(framed, size, yaw=yaw, pitch=PITCH)
+    R, t = T[:3, :3], T[:3, 3]
+    # So distant that the nearest points, which appear largest, fit.
+    depth = float(np.ptp(np.percentile(framed @ R[2], [0.2, 99.8]))) if len(framed) else 0.0
+    distance = size[1] / (2 * np.tan(0.35) * scale) + 0.5 * depth
+    lens: Any = {"scale": size[1] / (2 * np.tan(0.35) * distance), "distance": distance}
     if scene.normals is not None and len(points):
         # Surfaces that face away are walls in front of the interior.
-        eye = center - R.T @ np.array([0, 0, distance])
-        to_eye = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
+        to_eye = -R.T @ (t + np.array([0.0, 0.0, distance])) - points
+        to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
         facing = (to_eye * np.nan_to_num(scene.normals)).sum(1)
         colors = (colors * (0.6 + 0.4 * np.abs(facing[:, None]))).astype(np.uint8)
         points, colors = points[facing >= 0], colors[facing >= 0]
-    radius = int(np.clip(np.ceil(scene.spacing * lens["scale"]), min_radius, 6))
+    radius = int(np.clip(np.ceil(scene.spacing * lens["scale"]), 2, 6))
     rgba = thumbnails.splat(points, colors, T, size, radius=radius, **lens)
     image = np.where(rgba[..., 3:] > 0, rgba[..., :3], np.uint8(thumbnails.BACKGROUND))
     for poses, color in ((scene.before, (240, 160, 60)), (scene.after, (90, 176, 245))):
-        pixels, depth = thumbnails.project(poses[:, :3, 3], T, size, **lens)
-        path = np.rint(pixels[np.isfinite(depth)]).astype(np.int32)
+        pixels, depths = thumbnails.project(poses[:, :3, 3], T, size, **lens)
+        path = np.rint(pixels[np.isfinite(depths)]).astype(np.int32)
         image = cv2.polylines(image, [path], False, color, 2, cv2.LINE_AA)
     return image
-
-
-def render_thumbnail(scene: Scene, size: tuple[int, int]) -> UInt8:
-    """Render the model so that it fills a small image (H, W, 3)."""
-    if len(scene.points) == 0:
-        return render(scene, size)
-    T, scale = thumbnails.framing(scene.points, size, yaw=YAW, pitch=PITCH)
-    R, t = T[:3, :3], T[:3, 3]
-    # So distant that the nearest points, which appear largest, fit.
-    depth = np.ptp(np.percentile(scene.points @ R[2], [0.2, 99.8]))
-    distance = size[1] / (2 * np.tan(0.35) * scale) + 0.5 * float(depth)
-    return render(scene, size, eye_at=(-R.T @ t, distance), min_radius=2)
 
 
 def extreme_points(points: Float64, outer: float = 2.0) -> Float64:
