@@ -37,18 +37,19 @@ def frames(s: Subject) -> Values:
     statuses: list[str] = [r.status for r in records]
     runs = words.runs((r.index, r.status, r.reason) for r in records)
     runs = [run for run in runs if run[3] != "tracked"]
-    hint, found = "", words.frame_range(records[0].index, records[-1].index) if records else ""
-    if found:
-        has_bounds = any(r.covariance is not None for r in records)
-        hint = ": status above, accuracy below (dark = accurate)." if has_bounds else ": status."
     counts = [(name, statuses.count(name)) for name in words.STATUSES]
+    path = s.scene.after[:, :3, 3]
+    travelled = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     return {
-        "facts": _facts(s, counts),
+        "counts": [(f"frames {name}", f"{number:,}") for name, number in counts],
+        "triangles": s.scene.surface and len(s.scene.surface.faces),
+        "points": s.scene.total,
+        "travelled": travelled if len(path) > 1 else None,
         "lanes": [*words.STATUSES, *(["component"] if len(components) > 1 else [])],
         "strip": _strip(records, components),
-        "label": "Status of each frame: " + ", ".join(f"{n} {name}" for name, n in counts),
-        "short_hint": found.capitalize() + hint,
-        "hint": f"From left to right: {found}. Point at a frame to see its status.",
+        "label": ", ".join(f"{n} {name}" for name, n in counts),
+        "found": words.frame_range(records[0].index, records[-1].index) if records else "",
+        "bounded": any(r.covariance is not None for r in records),
         "figures": _health(records),
         "has_bad": "lost" in statuses or "skipped" in statuses,
         "player": _player(s),
@@ -56,19 +57,6 @@ def frames(s: Subject) -> Values:
         "more": words.more(len(runs) - ROWS),
         "apart": any(not c.connected for c in components),
     }
-
-
-def _facts(s: Subject, counts: Sequence[tuple[str, int]]) -> list[tuple[str, str]]:
-    facts = [(f"frames {name}", f"{number:,}") for name, number in counts]
-    if s.scene.surface is not None:
-        facts.append(("surface", words.count(len(s.scene.surface.faces), "triangle")))
-    facts.append(("point cloud", words.count(s.scene.total, "point")))
-    path = s.scene.after[:, :3, 3]
-    if len(path) > 1:
-        travelled = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-        facts.append(("trajectory length", words.length(travelled)))
-    closures = sum(p.accepted for p in s.result.diagnostics.loops)
-    return [*facts, ("loop closures", f"{closures:,}")]
 
 
 def _strip(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -65,38 +64,28 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         return {
             "title": extras.title,
             "result": result,
-            "subtitle": _subtitle(result),
             "contents": [("model", "Model"), *shown, ("reading", "How to read this")],
             **model.result(),
             **contents,
         }
 
 
-def _subtitle(result: Reconstruction) -> str:
-    parts = [words.count(len(result.diagnostics.frames), "frame")]
-    if name := result.recording.get("format"):
-        parts.append(f"format {name}")
-    if method := result.config.get("method"):
-        parts.append(f"method {method}")
-    return ", ".join([*parts, f"tofuse {__version__}"])
-
-
 def _verdict(s: Subject) -> Values:
     d = s.result.diagnostics
     findings = words.findings(d.reasons, len(d.frames))
-    head, _, tail = words.verdict_sentence(s.result, findings).partition(":")
     return {
         "headline": s.extras.headline,
         "card": _card(s.result),
         "card_tone": d.verdict if d.accuracy.assessed else "",
         "tone": d.verdict,
-        "head": head + ":",
-        "tail": tail,
+        "posed": int(s.result.has_pose.sum()),
+        "readable": sum(f.status != "skipped" for f in d.frames),
+        "decisive": any(f["level"] == d.verdict for f in findings),
         "findings": findings,
     }
 
 
-def _card(result: Reconstruction) -> list[tuple[str, str, str]]:
+def _card(result: Reconstruction) -> list[tuple[str, str, object]]:
     """Name, value and frame ranges of each line of the accuracy card."""
     d, a = result.diagnostics, result.diagnostics.accuracy
     readable = sum(f.status != "skipped" for f in d.frames)
@@ -110,7 +99,7 @@ def _card(result: Reconstruction) -> list[tuple[str, str, str]]:
         frames = [a.unbounded[0], a.unbounded[-1]] if a.unbounded else []
         if a.worst is not None and not frames:
             frames = [a.worst.frame, a.worst.frame]
-        lines.append(("Weakest", weakest, json.dumps([frames])))
+        lines.append(("Weakest", weakest, [frames]))
     return lines
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.frames import frame_ranges
-from tofuse.engine.results import Reason, Reconstruction, verdicts
+from tofuse.engine.results import Reason, verdicts
 
 STATUSES = ("tracked", "predicted", "lost", "skipped")
 
@@ -130,19 +130,3 @@ def sentence(text: str) -> str:
     if first and first[0].isalpha():  # a path or a number stays as it is
         text = text[0].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) or not text else text + "."
-
-
-def verdict_sentence(result: Reconstruction, findings: Sequence[dict[str, Any]]) -> str:
-    """Return the verdict in a sentence or two."""
-    d = result.diagnostics
-    readable = sum(f.status != "skipped" for f in d.frames)
-    posed = int(result.has_pose.sum())
-    poses_text = f"{posed} of {readable} readable frames have a pose"
-    if posed == readable:
-        poses_text = f"all {posed} frames have a pose" if posed > 1 else "the only frame has a pose"
-    decisive = [f for f in findings if f["level"] == d.verdict]
-    if d.verdict == "good":
-        return f"Good: {poses_text}. No problems found."
-    if d.verdict == "degraded":
-        return "Degraded: use this model with care."
-    return f"Failed: do not rely on this model.{'' if decisive else f' {poses_text}.'}"
