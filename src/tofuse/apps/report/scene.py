@@ -269,10 +269,10 @@ def render(scene: Scene, size: tuple[int, int] = (960, 600), *, yaw: float = YAW
     framed = points if len(points) else scene.after[:, :3, 3]
     T, scale = thumbnails.framing(framed, size, yaw=yaw, pitch=PITCH)
     R, t = T[:3, :3], T[:3, 3]
-    # So distant that the nearest points, which appear largest, fit.
+    # Smaller, so that the nearest points, which appear largest, fit.
     depth = float(np.ptp(np.percentile(framed @ R[2], [0.2, 99.8]))) if len(framed) else 0.0
-    distance = size[1] / (2 * np.tan(0.35) * scale) + 0.5 * depth
-    lens: Any = {"scale": size[1] / (2 * np.tan(0.35) * distance), "distance": distance}
+    distance = 1.5 * (scene.size + depth)
+    lens: Any = {"scale": scale * (1 - 0.5 * depth / distance), "distance": distance}
     if scene.normals is not None and len(points):
         # Surfaces that face away are walls in front of the interior.
         to_eye = -R.T @ (t + np.array([0.0, 0.0, distance])) - points
@@ -280,7 +280,7 @@ def render(scene: Scene, size: tuple[int, int] = (960, 600), *, yaw: float = YAW
         facing = (to_eye * np.nan_to_num(scene.normals)).sum(1)
         colors = (colors * (0.6 + 0.4 * np.abs(facing[:, None]))).astype(np.uint8)
         points, colors = points[facing >= 0], colors[facing >= 0]
-    radius = int(np.clip(np.ceil(scene.spacing * lens["scale"]), 2, 6))
+    radius = int(np.clip(np.ceil(1.5 * scene.spacing * lens["scale"]), 2, 6))
     rgba = thumbnails.splat(points, colors, T, size, radius=radius, **lens)
     image = np.where(rgba[..., 3:] > 0, rgba[..., :3], np.uint8(thumbnails.BACKGROUND))
     for poses, color in ((scene.before, (240, 160, 60)), (scene.after, (90, 176, 245))):
