@@ -32,8 +32,6 @@ _MIN_FRAMES = 3
 # direction correlate at many shifts.
 _MIN_COLOR_CORRELATION, _MIN_COLOR_LEAD, _MAX_COLOR_UNSHIFTED = 0.42, 0.16, 0.68
 _MAX_ELSEWHERE, _PEAK_RADIUS_PX = 0.95, 4
-# Gain in correlation by a shift of up to some pixels that shows camera motion.
-_MIN_MOTION_GAIN, _MAX_MOTION_PX = 0.03, 6
 
 
 def check_mirrored(sample: Sample) -> Iterator[Finding]:
@@ -96,18 +94,6 @@ def check_color(sample: Sample) -> Iterator[Finding]:
             "Add the colour camera's intrinsics and T_color_depth, or remove the colour.",
             {"shift_px": pixels, "lead": float(lead.mean())},
         )
-
-
-def shifted(first: RangeFrame, second: RangeFrame) -> bool:
-    """Whether the edges of one image are shifted relative to those of the other."""
-    for channel_of in (_amplitude, _log_depth):
-        a, b = channel_of(first), channel_of(second)
-        if a is None or b is None:
-            continue
-        scores = _correlations([(_edges(a), _edges(b))], _MAX_MOTION_PX)[0]
-        if scores.max() - scores[_MAX_MOTION_PX, _MAX_MOTION_PX] > _MIN_MOTION_GAIN:
-            return True
-    return False
 
 
 def _amplitude(frame: RangeFrame) -> Float32 | None:
