@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from tofuse.engine.icp import surface_shape
 
 COLORS = {"source": (240, 160, 60), "target": (90, 176, 245)}
 MAX_POINTS = 45_000  # of each view; about 1 MB for both
-_TONES = {True: "good", False: "failed", None: "degraded"}
 _NEIGHBOURS = 30  # points of a local plane fit
 _MEDIANS_PER_CAP = 4.0  # the colour bar ends at this multiple of the median distance
 _MAX_SPACINGS = 3.0  # of a point from its counterpart, along the surface
@@ -41,7 +39,11 @@ def write_pair_report(result: PairResult, path: Path) -> None:
         "pair.html.j2",
         title=f"{source} registered to {target}",
         script=html.script(),
-        verdict=_verdict(result),
+        result=result,
+        decision=pair_words.decision(result),
+        rotation=pair_words.rotation(result).split(" about ")[0],
+        sigma=pair_words.sigma(result),
+        moved_m=float(np.linalg.norm(result.moved_m)),
         scene=scene.packed(drawn) | {"fields": {field.name: field.packed()}},
         still=thumbnails.data_uri(scene.render(drawn, yaw=scene.opening_yaw(drawn))),
         colors={name: thumbnails.css(color) for name, color in COLORS.items()},
@@ -52,22 +54,6 @@ def write_pair_report(result: PairResult, path: Path) -> None:
             for name, v in views.items()
         ],
     )
-
-
-def _verdict(result: PairResult) -> dict[str, Any]:
-    registration = result.registration
-    head, tail = pair_words.decision(result)
-    name = "Displacement of the centre" if result.source.center.any() else "Translation"
-    facts = [(name, words.length(float(np.linalg.norm(result.moved_m))))]
-    facts.append(("Rotation", pair_words.rotation(result).split(" about ")[0]))
-    if registration.overlap is not None:
-        facts.append(("Overlap", pair_words.percent(registration.overlap)))
-    facts.append(("Rms distance", words.length(registration.rms_m)))
-    if result.sigma != (None, None):
-        facts.append(("Sigma", pair_words.sigma(result)))
-    if registration.margin is not None:
-        facts.append(("Margin", pair_words.percent(registration.margin)))
-    return {"tone": _TONES[registration.believed], "head": head, "tail": tail, "facts": facts}
 
 
 def pair_scene(result: PairResult) -> tuple[scene.Scene, fields.Field]:

@@ -123,14 +123,13 @@ class PairResult:
         covariance = self._observed_covariance
         if covariance is None:
             return None, None
-        variances = [
-            float(np.linalg.eigvalsh(covariance[k, k])[-1]) for k in (_TRANSLATION, _ROTATION)
-        ]
+        sigma_m, sigma_rad = se3.largest_sigmas(covariance).tolist()
         # In metres both are of similar size; a negligible one is rounding error.
-        limit = 1e-12 * max(variances[0], variances[1] * self.lever_m**2)
-        significant = variances[0] > limit, variances[1] * self.lever_m**2 > limit
-        sigma_m, sigma_rad = (float(np.sqrt(max(value, 0.0))) for value in variances)
-        return sigma_m if significant[0] else None, sigma_rad if significant[1] else None
+        limit = 1e-6 * max(sigma_m, sigma_rad * self.lever_m)
+        return (
+            sigma_m if sigma_m > limit else None,
+            sigma_rad if sigma_rad * self.lever_m > limit else None,
+        )
 
     @property
     def _observed_covariance(self) -> Float64 | None:
@@ -176,7 +175,6 @@ class PairResult:
         return points + self.target.center
 
 
-_TRANSLATION, _ROTATION = slice(0, 3), slice(3, 6)
 # A free direction with a smaller fraction of rotation counts as a translation.
 _MAX_ROTATION = 0.4
 # Attributes of a registration in `registration.json`.

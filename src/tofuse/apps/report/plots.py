@@ -5,8 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +26,7 @@ _VARIABLES |= {BEFORE: "before", AFTER: "after", REFERENCE: "reference", BAD: "b
 _MODEL_COLOR = (112, 138, 176)  # of the model's points: visible on white and on near-black
 _MAX_QUANTILE = 50_000  # maximum number of points of which quantiles are computed
 _MAX_MM_EXTENT_M = 0.6  # plans of smaller extent have ticks in mm
+_MARGIN, _MIN_MARGIN_M = 0.06, 0.02  # around a plan
 _WIDTH = 440  # of a plan, in pixels
 _LABEL: Any = {"color": MUTED, "fontsize": 10.5, "labelpad": 2}  # style of an axis label
 _STYLE: Any = {
@@ -50,8 +50,9 @@ def make_figure(
     margins
         Left, bottom, right and top, pixels.
     """
-    with _quiet("matplotlib"):  # about the font cache
-        from matplotlib.figure import Figure
+    logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # about the font cache
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width / 72, height / 72), dpi=72)
     left, bottom, right, top = margins
     size = (width - left - right, height - bottom - top)
@@ -64,18 +65,6 @@ def make_figure(
     axes.grid(color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     return figure, axes
-
-
-@contextmanager
-def _quiet(name: str) -> Iterator[None]:
-    """Suppress a logger's messages below errors."""
-    log = logging.getLogger(name)
-    level = log.level
-    log.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        log.setLevel(level)
 
 
 def svg(figure: Figure, label: str) -> str:
@@ -177,13 +166,11 @@ def project(points: Float64, view: str) -> Float64:
     return np.stack([sa * points[:, a], sb * points[:, b]], axis=1)
 
 
-def limits(
-    *groups: Float64, outer: float = 0.0, margin: float = 0.06, min_margin_m: float = 0.02
-) -> Float64:
+def limits(*groups: Float64, outer: float = 0.0) -> Float64:
     """Return (2, 2) low and high corners around groups of (N, 2) points.
 
-    `outer` percent of the points are left out at each end. The border is `margin` of the size,
-    and at least `min_margin_m` m.
+    `outer` percent of the points are left out at each end. The border is `_MARGIN` of the size,
+    and at least `_MIN_MARGIN_M`.
     """
     sampled = [g[:: -(-len(g) // _MAX_QUANTILE)] if outer else g for g in groups if len(g)]
     boxes = [np.percentile(g, [outer, 100 - outer], axis=0) for g in sampled]
@@ -191,7 +178,7 @@ def limits(
         return np.array([[-0.5, -0.5], [0.5, 0.5]])
     low = np.min([b[0] for b in boxes], axis=0)
     high = np.max([b[1] for b in boxes], axis=0)
-    border = np.maximum(margin * (high - low).max(), min_margin_m)
+    border = np.maximum(_MARGIN * (high - low).max(), _MIN_MARGIN_M)
     return np.stack([low - border, high + border])
 
 

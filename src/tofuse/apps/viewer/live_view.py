@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tofuse.apps.report import thumbnails
+from tofuse.apps.report import scene, thumbnails
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import quaternion, se3
@@ -103,19 +103,11 @@ class LiveView:
             return
         sampled = slice(None, None, -(-len(points) // _POINTS))
         world = se3.transform(T, points[sampled].astype(float)).astype(np.float32)
-        frame_colors = frame.color
-        if frame_colors is not None:
-            colors = frame_colors[sampled]
+        colors = scene.height_colors(world.astype(float))
+        if frame.color is not None:
+            colors = frame.color[sampled]
         elif frame.amplitude is not None:
-            amplitude = frame.amplitude[sampled].astype(float)
-            white_level = max(float(np.percentile(amplitude, 98)), 1e-9)
-            grey = 255 * (amplitude / white_level).clip(0.02, 1) ** (1 / 2.2)
-            colors = np.repeat(grey.astype(np.uint8)[:, None], 3, axis=1)
-        else:
-            low, high = np.percentile(world[:, 1], [2, 98])
-            colors = thumbnails.viridis(
-                (high - world[:, 1].astype(float)) / max(float(high - low), 1e-6)
-            )
+            colors = thumbnails.grey(frame.amplitude[None, sampled])[0]
         handle = self._server.scene.add_point_cloud(
             f"/live/{frame.index}",
             world,
@@ -133,7 +125,6 @@ class LiveView:
             self._spacing = (1.5 * self._spacing[0], 1.5 * self._spacing[1])
 
     def _show_current(self, frame: Frame, T: Float64) -> None:
-        scene = self._server.scene
         image = None
         if isinstance(frame, RangeFrame):
             frame_image = frame.color_image
@@ -144,7 +135,7 @@ class LiveView:
             self._image.content = (
                 f'<img alt="The frame" src="{source}" style="width:100%;padding:0 0.6em">'
             )
-        scene.add_camera_frustum(
+        self._server.scene.add_camera_frustum(
             "/live_camera",
             _FOV,
             1.25 if image is None else image.shape[1] / image.shape[0],
@@ -158,6 +149,6 @@ class LiveView:
         path = np.stack(self._path[:: -(-len(self._path) // 2000)])
         if len(path) > 1:
             ends = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)
-            scene.add_line_segments(
+            self._server.scene.add_line_segments(
                 "/live_path", ends, _PATH, thickness=2.0, thickness_units="screen"
             )
