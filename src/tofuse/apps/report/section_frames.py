@@ -69,7 +69,7 @@ def _strip(
     return [(record, frame_text(record, components)) for record in worst]
 
 
-def _health(records: Sequence[FrameRecord]) -> list[tuple[str, str]]:
+def _health(records: Sequence[FrameRecord]) -> list[str]:
     """The plots of inliers and residuals over frames."""
     index = np.array([r.index for r in records], float)
     bad = index[[r.status in ("lost", "skipped") for r in records]]
@@ -81,8 +81,9 @@ def _health(records: Sequence[FrameRecord]) -> list[tuple[str, str]]:
         y = scale * np.array(values, float)  # NaN where there is none
         if np.isfinite(y).any():
             series = [(y, plots.AFTER, "-")]
-            svg = plots.lines(index, series, label=label, ylabel=ylabel, bad=bad, floor=True)
-            figures.append((svg, ""))
+            figures.append(
+                plots.lines(index, series, label=label, ylabel=ylabel, bad=bad, floor=True)
+            )
     return figures
 
 

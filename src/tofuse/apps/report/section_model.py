@@ -134,21 +134,21 @@ def views(s: Subject) -> Values:
     R = s.R_display_world
     truth = None if s.truth is None else s.truth @ R.T
 
-    def drawing(points: Float64, poses: Float64, view: str, name: str) -> tuple[str, str]:
+    def drawing(points: Float64, poses: Float64, view: str, name: str) -> str:
         measured = np.percentile(points, [OUTER, 100 - OUTER], axis=0)
         path, label = poses[:, :3, 3] @ R.T, f"Model, {name}"
-        return plots.model(points, path, truth, view, measured=measured, label=label), name
+        return plots.model(points, path, truth, view, measured=measured, label=label)
 
     points = s.scene.points @ R.T
-    figures = [
-        drawing(points, s.scene.after, "above", "From above"),
-        drawing(points, s.scene.after, "side", "From the side"),
+    shown = [
+        (points, s.scene.after, "above", "From above"),
+        (points, s.scene.after, "side", "From the side"),
     ]
     before = s.result.diagnostics.cloud_before
     if before is not None and len(before):
         earlier = (before.points[np.isfinite(before.points).all(1)] + before.offset) @ R.T
         name = "From above, before optimisation"
-        figures.insert(0, drawing(earlier, s.scene.before, "above", name))
+        shown.insert(0, (earlier, s.scene.before, "above", name))
     every = s.result.cloud.points @ R.T.astype(np.float32)
     every = every[np.isfinite(every).all(1)]
     sizes = [
@@ -157,7 +157,7 @@ def views(s: Subject) -> Values:
         np.zeros(3) if truth is None else np.ptp(truth, axis=0),
     ]
     return {
-        "figures": figures,
+        "figures": {drawn[-1]: drawing(*drawn) for drawn in shown},
         "sizes": [
             (name, *map(float, row))
             for name, row in zip(("width", "height", "depth"), np.stack(sizes, 1), strict=True)

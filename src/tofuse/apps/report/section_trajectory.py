@@ -32,17 +32,12 @@ def error(s: Subject) -> Values:
         ]
         label = f"{quantity.capitalize()} in {axis} over frames, before and after optimisation"
         ylabel = f"{axis}, {unit}"
-        figures.append(
-            (plots.lines(s.index, series, label=label, ylabel=ylabel, zero=True, bad=bad), "")
-        )
-    legend = [("before", "6 3", "before optimisation"), ("after", "", "after optimisation")]
-    if len(bad):
-        legend.append(("bad", "x", f"{words.count(len(bad), 'frame')} without a pose"))
+        figures.append(plots.lines(s.index, series, label=label, ylabel=ylabel, zero=True, bad=bad))
     return {
         "compared": compared,
         "moved": _moved(s),
         "figures": figures,
-        "legend": legend,
+        "missing": len(bad),
         "rows": [*_rows("Before", before, compared), *_rows("After", after, compared)],
         "uncertainty": _uncertainty(s),
     }
@@ -94,7 +89,7 @@ def _rows(name: str, offsets: Float64, compared: bool) -> list[tuple[str, Float6
     return [(f"{name}, {kind}", row) for kind, row in kinds.items()]
 
 
-def _uncertainty(s: Subject) -> list[tuple[str, str]]:
+def _uncertainty(s: Subject) -> list[str]:
     """Plots of the pose uncertainty over frames: one sigma in the worst direction."""
     C = np.full((len(s.index), 6, 6), np.nan)
     for k, record in enumerate(s.result.diagnostics.frames[: len(C)]):
@@ -107,15 +102,12 @@ def _uncertainty(s: Subject) -> list[tuple[str, str]]:
     sigma[bounded] = se3.largest_sigmas(C[bounded]) * [1000.0, 180 / np.pi]
     sigma[:, 1] = np.minimum(sigma[:, 1], 180.0)
     return [
-        (
-            plots.lines(
-                s.index,
-                [(sigma[:, k], plots.AFTER, "-")],
-                label=f"Standard deviation of the {quantity} over frames",
-                ylabel=f"{quantity}, {unit}",
-                floor=True,
-            ),
-            "",
+        plots.lines(
+            s.index,
+            [(sigma[:, k], plots.AFTER, "-")],
+            label=f"Standard deviation of the {quantity} over frames",
+            ylabel=f"{quantity}, {unit}",
+            floor=True,
         )
         for k, (quantity, unit) in enumerate((("position", "mm"), ("rotation", "degrees")))
     ]
@@ -140,7 +132,7 @@ def optimisation(s: Subject) -> Values:
             log=True,
             size=(480, 240),
         )
-        figures.append((svg, ""))
+        figures.append(svg)
     return {
         "figures": figures,
         "text": text,

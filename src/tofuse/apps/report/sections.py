@@ -71,11 +71,16 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
 
 
 def _verdict(s: Subject) -> Values:
-    d = s.result.diagnostics
+    d, a = s.result.diagnostics, s.result.diagnostics.accuracy
+    frames = [a.unbounded[0], a.unbounded[-1]] if a.unbounded else []
+    if a.worst is not None and not frames:
+        frames = [a.worst.frame, a.worst.frame]
     findings = words.findings(d.reasons, len(d.frames))
     return {
         "headline": s.extras.headline,
-        "card": _card(s.result),
+        "bound": accuracy_card.bound(a, s.result.cloud.diagonal_m).removeprefix("accuracy "),
+        "weakest": accuracy_card.weakest_frame(a),
+        "frames": frames,
         "card_tone": d.verdict if d.accuracy.assessed else "",
         "tone": d.verdict,
         "posed": int(s.result.has_pose.sum()),
@@ -83,24 +88,6 @@ def _verdict(s: Subject) -> Values:
         "decisive": any(f["level"] == d.verdict for f in findings),
         "findings": findings,
     }
-
-
-def _card(result: Reconstruction) -> list[tuple[str, str, object]]:
-    """Name, value and frame ranges of each line of the accuracy card."""
-    d, a = result.diagnostics, result.diagnostics.accuracy
-    readable = sum(f.status != "skipped" for f in d.frames)
-    closures = sum(p.accepted for p in d.loops)
-    covered = f"{int(result.has_pose.sum()):,} of {words.count(readable, 'frame')}"
-    lines = [
-        ("Accuracy", accuracy_card.bound(a, result.cloud.diagonal_m).removeprefix("accuracy "), ""),
-        ("Coverage", f"{covered}, {words.count(closures, 'loop closure')}", ""),
-    ]
-    if weakest := accuracy_card.weakest_frame(a):
-        frames = [a.unbounded[0], a.unbounded[-1]] if a.unbounded else []
-        if a.worst is not None and not frames:
-            frames = [a.worst.frame, a.worst.frame]
-        lines.append(("Weakest", weakest, [frames]))
-    return lines
 
 
 def _settings(s: Subject) -> Values:

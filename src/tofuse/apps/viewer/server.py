@@ -10,7 +10,7 @@ import io
 import logging
 import socket
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from typing import TYPE_CHECKING, Any
 
 from tofuse.engine.errors import InputError
@@ -120,16 +120,6 @@ def address(server: ViserServer) -> str:
     return f"http://{HOST}:{server.get_port()}"
 
 
-def _is_free(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((HOST, port))
-        except (OSError, OverflowError):
-            return False
-    return True
-
-
 def choose_port(port: int | None) -> int:
     """Return a port if it is free, or for None the first free one from 8080 on.
 
@@ -138,11 +128,11 @@ def choose_port(port: int | None) -> int:
     InputError
         If it is in use.
     """
+    for candidate in range(PORT, PORT + _MAX_PORTS) if port is None else (port,):
+        with socket.socket() as probe, suppress(OSError, OverflowError):
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((HOST, candidate))
+            return candidate
     if port is None:
-        free = next((p for p in range(PORT, PORT + _MAX_PORTS) if _is_free(p)), None)
-        if free is None:
-            raise InputError(f"no port from {PORT} on is free", where="--port", remedy="use it")
-        return free
-    if not _is_free(port):
-        raise InputError("is in use", where=f"--port {port}", remedy="use another, or none")
-    return port
+        raise InputError(f"no port from {PORT} on is free", where="--port", remedy="use it")
+    raise InputError("is in use", where=f"--port {port}", remedy="use another, or none")

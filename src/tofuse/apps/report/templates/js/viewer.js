@@ -69,7 +69,7 @@ async function startViewer(box, scene, bus) {
     if (points && on("points")) out.push(dressed(points));
     return out;
   }
-  const options = () => ({ peel: on("peel"), peelPoints: on("peel") });
+  const options = () => ({ peel: on("peel") });
 
   // While it moves, a machine that can't keep up draws fewer triangles and fewer pixels. Once the
   // view rests all of them are drawn, and more pixels than are seen, for smooth edges.
