@@ -25,7 +25,7 @@ TIMEOUT_S = 2.0  # without a frame until a camera counts as stopped
 
 
 # How options that are not text are written.
-_WORDS = {bool: "true|false", int: "-?[1-9][0-9]*|0"}
+_WORDS: dict[Any, str] = {bool: "true|false", int: "-?[1-9][0-9]*|0"}
 
 
 class DeviceError(InputError):
