@@ -133,11 +133,11 @@ class _Reader(AbstractContextManager["_Reader"]):
                     self._queue.put_nowait(frame)
                 except queue.Full:
                     self.dropped += 1
+        except DeviceError as error:
+            self.error = error
         except Exception as error:  # the maker's package may raise anything
             problem = f"failed ({type(error).__name__}: {error})"
-            is_known = isinstance(error, DeviceError)
-            where = self._stream.settings.sensor
-            self.error = error if is_known else DeviceError(problem, where=where)
+            self.error = DeviceError(problem, where=self._stream.settings.sensor)
 
 
 def _writer(stream: Stream, first: RangeFrame, folder: Path) -> RecordingWriter:

@@ -123,7 +123,9 @@ def _accuracy(data: dict[str, Any]) -> pose_accuracy.Accuracy:
         bounds = _bound(worst["position_m"]), _bound(worst["rotation_rad"])
         worst = pose_accuracy.WorstFrame(worst["frame"], *bounds)
     return pose_accuracy.Accuracy(
-        *(_bound(data[name]) for name in ("position_m", "rotation_rad", "relative")),
+        _bound(data["position_m"]),
+        _bound(data["rotation_rad"]),
+        _bound(data["relative"]),
         data["assessed"],
         worst,
         tuple(data["unbounded"]),
@@ -134,9 +136,15 @@ def _accuracy(data: dict[str, Any]) -> pose_accuracy.Accuracy:
 def _calibration(data: dict[str, Any] | None) -> SelfCalibration | None:
     if data is None:
         return None
-    names = ("focal", "offset_m", "center_x", "center_y", "distortion", "sigma")
-    bounds = _bound(data["stated_bound_m"]), _bound(data["corrected_bound_m"])
-    return SelfCalibration(*(data[name] for name in names), bounds)
+    return SelfCalibration(
+        data["focal"],
+        data["offset_m"],
+        data["center_x"],
+        data["center_y"],
+        data["distortion"],
+        data["sigma"],
+        (_bound(data["stated_bound_m"]), _bound(data["corrected_bound_m"])),
+    )
 
 
 def _component(folder: Path, number: int, data: dict[str, Any]) -> Component:
