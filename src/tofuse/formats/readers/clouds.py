@@ -10,6 +10,7 @@ from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import Pcd, read_pcd
@@ -29,12 +30,8 @@ class PlyClouds(cloud_sequence.CloudReader):
 
     def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
         """See `CloudReader.source`."""
-        return cloud_sequence.CloudFileSource(
-            path,
-            files,
-            cloud_frames.ply_frame,
-            cloud_frames.ply_frame,
-        )
+        ply_frame = cloud_frames.ply_frame
+        return cloud_sequence.CloudFileSource(path, files, ply_frame, ply_frame)
 
 
 @part("reader", "pcd", label="validated")
@@ -58,53 +55,29 @@ class PcdClouds(cloud_sequence.CloudReader):
 def pcd_cloud(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
     """Read a file as a cloud, minus `shift` (3,) in m; its viewpoint is the sensor's position."""
     pcd = read_pcd(path)
-    cloud = pcd.cloud
     return cloud_frames.cloud_frame(
-        index,
-        timestamp,
-        cloud.points,
-        cloud.normals,
-        amplitude=cloud.amplitude,
-        color=cloud.color,
-        origin=pcd.viewpoint[:3],
-        shift=shift,
+        index, timestamp, pcd.cloud, origin=pcd.viewpoint[:3], shift=shift
     )
 
 
 def pcd_image(path: Path, index: int, timestamp: float, camera: Camera) -> Frame:
     """Read an organised file as an image of `camera`; see `organised_frame`."""
     pcd = read_pcd(path)
-    return organised.organised_frame(
-        _image(pcd),
-        camera,
-        index,
-        timestamp,
-        path,
-        amplitude=pcd.cloud.amplitude,
-        color=pcd.cloud.color,
-        normals=pcd.cloud.normals,
-    )
+    return organised.organised_frame(_image(pcd), pcd.cloud, camera, index, timestamp)
 
 
 def _camera(files: list[Path]) -> Camera | None:
     """Return the camera of organised files, from up to `SAMPLES` readable ones; or None."""
-    step = max(1, len(files) // organised.SAMPLES)
     images: list[Float32] = []
-    for file in files[::step][: organised.SAMPLES]:
-        try:
-            pcd = read_pcd(file)
-        except InputError:
-            continue
+    for file, pcd in organised.samples(len(files), lambda k: (files[k], read_pcd(files[k]))):
         if not pcd.organised or pcd.viewpoint[:3].any():
             return None
         images.append(_image(pcd))
-        points = images[-1].reshape(-1, 3)
-        if (
-            organised.find_raster(points, pcd.width) is None
-            and organised.find_raster(points, pcd.height) is not None
-        ):
+        points, size = images[-1].reshape(-1, 3), f"WIDTH {pcd.width} and HEIGHT {pcd.height}"
+        fits, fits_turned = (organised.find_raster(points, n) for n in (pcd.width, pcd.height))
+        if fits is None and fits_turned is not None:
             raise InputError(
-                f"has WIDTH {pcd.width} and HEIGHT {pcd.height}, but rows of {pcd.height} points",
+                f"has {size}, but rows of {pcd.height} points",
                 where=file,
                 remedy="swap WIDTH and HEIGHT",
             )
@@ -139,26 +112,24 @@ def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = 
     table = tables.read_numbers(path)
     if table.shape[1] < 3:
         raise InputError(f"has {table.shape[1]} numbers per line", where=path, remedy="write x y z")
-    points = _float32(table[:, :3]) if shift is None else table[:, :3]
-    amplitude = normals = color = None
-    if table.shape[1] == 4:
-        amplitude = _float32(table[:, 3])
-    elif table.shape[1] >= 6:
+    points = cloud_frames.to_float32(table[:, :3]) if shift is None else table[:, :3]
+    normals = color = None
+    if table.shape[1] >= 6:
         columns = table[:, 3:6]
         if path.suffix.lower() == ".xyzrgb":
             color = np.clip(np.rint(np.nan_to_num(columns) * 255), 0, 255).astype(np.uint8)
         elif path.suffix.lower() == ".xyzn" or _are_unit(columns):
-            normals = _float32(columns)
+            normals = cloud_frames.to_float32(columns)
         elif ((columns >= 0) & (columns <= 255) & (columns == np.rint(columns))).all():
             color = columns.astype(np.uint8)
-    return cloud_frames.cloud_frame(
-        index, timestamp, points, normals, amplitude=amplitude, color=color, shift=shift
-    )
+    cloud = GeometryRecord(points, None, normals, color, scalars=_fourth(table))
+    return cloud_frames.cloud_frame(index, timestamp, cloud, shift=shift)
 
 
-def _float32(values: Float64) -> Float32:
-    with np.errstate(over="ignore"):
-        return values.astype(np.float32)
+def _fourth(table: Float64) -> dict[str, Float32]:
+    """The last column of four, which is an amplitude."""
+    four = table.shape[1] == 4
+    return {"amplitude": cloud_frames.to_float32(table[:, 3])} if four else {}
 
 
 def _are_unit(vectors: Float64) -> bool:
@@ -200,12 +171,11 @@ def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     table = tables.parse_numbers(text, path, skip=int(len(first) == 1))
     if table.shape[1] < 3:
         raise InputError(f"has {table.shape[1]} numbers per line", where=path)
-    with np.errstate(over="ignore"):
-        points = (table[:, :3] * np.diag(FLIP) * CENTIMETRE).astype(np.float32)
+    points = cloud_frames.to_float32(table[:, :3] * np.diag(FLIP) * CENTIMETRE)
     # The scanner writes (0, 0, 0) for missing measurements.
     points[(points == 0).all(1)] = np.nan
-    amplitude = table[:, 3].astype(np.float32) if table.shape[1] == 4 else None
-    return cloud_frames.cloud_frame(index, timestamp, points, amplitude=amplitude)
+    cloud = GeometryRecord(points, scalars=_fourth(table))
+    return cloud_frames.cloud_frame(index, timestamp, cloud)
 
 
 def read_pose(path: Path) -> Float64:

@@ -14,6 +14,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading
@@ -164,20 +165,16 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
     with reading.library_errors(path, _COPY):
         xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1)
         names = set(points.point_format.dimension_names)
-        amplitude = np.asarray(points["intensity"], np.float32)
+        intensity = np.asarray(points["intensity"], np.float32)
         color = None
         if {"red", "green", "blue"} <= names:
             values = np.stack([np.asarray(points[c]) for c in ("red", "green", "blue")], 1)
             # The standard uses 16 bits; many programs write 8-bit values.
             color = (values >> 8 if values.max(initial=0) > 255 else values).astype(np.uint8)
-    return cloud_frames.cloud_frame(
-        index,
-        timestamp,
-        xyz,
-        amplitude=amplitude if amplitude.any() else None,
-        color=color if color is not None and color.any() else None,
-        shift=shift,
-    )
+    color = color if color is not None and color.any() else None
+    scalars = {"intensity": intensity} if intensity.any() else {}
+    cloud = GeometryRecord(xyz, color=color, scalars=scalars)
+    return cloud_frames.cloud_frame(index, timestamp, cloud, shift=shift)
 
 
 @part("reader", "e57")
@@ -246,15 +243,9 @@ class E57Source(FileSource):
         if all(f"color{c}" in data for c in ("Red", "Green", "Blue")):
             color = np.stack([np.asarray(data[f"color{c}"]) for c in ("Red", "Green", "Blue")], 1)
             color = color.astype(np.uint8)
-        amplitude = data.get("intensity")
-        return cloud_frames.cloud_frame(
-            index,
-            float(index),
-            points,
-            amplitude=None if amplitude is None else np.asarray(amplitude, np.float32),
-            color=color,
-            shift=shift,
-        )
+        scalars = {"intensity": data["intensity"]} if "intensity" in data else {}
+        cloud = GeometryRecord(points, color=color, scalars=scalars)
+        return cloud_frames.cloud_frame(index, float(index), cloud, shift=shift)
 
     def _pose(self, header: Any) -> Float64:
         if not header.has_pose():

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.frames import (
-    CloudFrame,
-)
+from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.frames import CloudFrame
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.formats.geometry import read_ply
 
@@ -21,15 +21,7 @@ def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = 
     ply = read_ply(path)
     with np.errstate(invalid="ignore"):  # signalling NaN
         points = to_float32(ply.points) if shift is None else ply.points.astype(np.float64)
-    return cloud_frame(
-        index,
-        timestamp,
-        points,
-        ply.normals,
-        amplitude=ply.amplitude,
-        color=ply.color,
-        shift=shift,
-    )
+    return cloud_frame(index, timestamp, replace(ply, points=points), shift=shift)
 
 
 def to_float32(values: NDArray[Any]) -> Float32:
@@ -41,18 +33,16 @@ def to_float32(values: NDArray[Any]) -> Float32:
 def cloud_frame(
     index: int,
     timestamp: float,
-    points: NDArray[np.floating],
-    normals: Float32 | None = None,
+    cloud: GeometryRecord,
     *,
-    amplitude: Float32 | None = None,
-    color: UInt8 | None = None,
     origin: Float64 | None = None,
     shift: Float64 | None = None,
 ) -> CloudFrame:
-    """Return a cloud of (N, 3) points in m with columns (N, ...), without invalid points.
+    """Return a cloud of a file as a view, without invalid points.
 
     `shift` (3,) is subtracted from the points, in their own precision, and from the `origin` (3,).
     """
+    points = cloud.points
     # False for NaN; the squares of the remaining coordinates fit into float32.
     measured = np.asarray((np.abs(points) < se3.MAX_COORDINATE_M).all(1))
     if shift is not None:
@@ -66,9 +56,9 @@ def cloud_frame(
         index,
         timestamp,
         to_float32(points),
-        normals,
-        amplitude=amplitude,
-        color=color,
+        cloud.normals,
+        amplitude=cloud.amplitude,
+        color=cloud.color,
         origin=np.zeros(3) if origin is None else origin,
     )
     return frame if measured.all() else frame.keep(measured)
