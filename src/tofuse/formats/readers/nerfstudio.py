@@ -146,9 +146,8 @@ class _Frame:
     def time(self) -> float:
         """Timestamp in s; NaN if not given."""
         value = self.entry.get("timestamp")
-        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e18:
-            return math.nan
-        return float(value)
+        known = isinstance(value, int | float) and not isinstance(value, bool)
+        return float(value) if known and abs(value) <= 1e18 else math.nan
 
     @property
     def key(self) -> list[tuple[int, int, str]]:
@@ -165,8 +164,7 @@ class _Frame:
         base = self.path("file_path")
         if base is None:
             return None
-        candidates = (base.with_name(base.name + suffix) for suffix in _IMAGES)
-        return next((path for path in candidates if reading.is_file(path)), None)
+        return reading.first_file(*(base.with_name(base.name + suffix) for suffix in _IMAGES))
 
     def pose(self) -> Float64:
         where = f"{self.where}: transform_matrix"

@@ -78,10 +78,7 @@ def _depth_files(path: Path) -> list[tuple[int, Path]]:
 
 def _color(file: Path) -> Path | None:
     stem = file.name[: -len(".depth.png")]
-    for suffix in (".color.png", ".color.jpg"):
-        if reading.is_file(file.with_name(stem + suffix)):
-            return file.with_name(stem + suffix)
-    return None
+    return reading.first_file(*(file.with_name(f"{stem}.color.{s}") for s in ("png", "jpg")))
 
 
 def _camera(folder: Path, files: Sequence[Path]) -> Pinhole:
