@@ -17,8 +17,8 @@ from tofuse.formats.geometry import Pcd, read_pcd
 from tofuse.formats.sources import (
     cloud_frames,
     cloud_sequence,
+    inputs,
     organised,
-    per_frame,
 )
 
 
@@ -151,7 +151,7 @@ class Slam6d(cloud_sequence.CloudReader):
     def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
         """See `CloudReader.source`."""
         source = cloud_sequence.CloudFileSource(path, files, scan_frame)
-        poses = per_frame.poses_from_files(
+        poses = inputs.poses_from_files(
             source, [file.with_suffix(".pose") for file in files], read_pose
         )
         if poses is not None:

@@ -17,7 +17,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import read_raw
-from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, per_frame
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
 
 # The streams by preference, with their ambiguity range in m.
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
@@ -95,7 +95,7 @@ class HoloLens2Source(FileSource):
             self.warnings.append(f"{missing.name} is missing: there are no reference poses")
             return
         try:
-            T_camera_rig = per_frame.read_matrix_pose(
+            T_camera_rig = inputs.read_matrix_pose(
                 tables.read_numbers(extrinsics).reshape(4, 4), str(extrinsics)
             )
             table = tables.read_numbers(trajectory)
@@ -115,12 +115,10 @@ class HoloLens2Source(FileSource):
                 return None
             row = order[position]
             table_of_row = table[row, 1:].reshape(4, 4)
-            T_world_rig = per_frame.read_matrix_pose(table_of_row, f"{trajectory}, row {row}")
+            T_world_rig = inputs.read_matrix_pose(table_of_row, f"{trajectory}, row {row}")
             return T_world_rig @ se3.inverse(T_camera_rig)
 
-        self.reference = per_frame.poses_of(
-            self, zip(self.ticks, nearest.tolist(), strict=True), pose
-        )
+        self.reference = inputs.poses_of(self, zip(self.ticks, nearest.tolist(), strict=True), pose)
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""

@@ -27,7 +27,6 @@ from tofuse.formats.sources import (
     ReaderOptions,
     Sniff,
     inputs,
-    per_frame,
     pixels,
 )
 
@@ -124,7 +123,7 @@ def _times(frames: list[dict[int, Chunk] | InputError]) -> Float64:
             times[k] = next(iter(chunks.values())).time
     if not np.isfinite(times).any():
         return np.arange(len(times), dtype=float)
-    return per_frame.interpolated(times)
+    return inputs.interpolated(times)
 
 
 BOUGUET, FISHEYE = 0, 2

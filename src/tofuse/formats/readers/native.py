@@ -27,7 +27,6 @@ from tofuse.formats.sources import (
     cloud_frames,
     gravity_at,
     inputs,
-    per_frame,
     pixels,
 )
 
@@ -177,7 +176,7 @@ class NativeSource(FileSource):
                 )
             return lenses[row]
 
-        return per_frame.cameras_of(rows, lens)
+        return inputs.cameras_of(rows, lens)
 
     def _read_camera(
         self, camera_path: Path | None

@@ -26,7 +26,6 @@ from tofuse.formats.sources import (
     cloud_frames,
     cloud_sequence,
     inputs,
-    per_frame,
 )
 
 MAX_POINTS = 100_000_000
@@ -212,10 +211,10 @@ class E57Source(FileSource):
                 "contains no scan", where=path, remedy="export scans, not only pictures"
             )
         super().__init__(np.arange(len(self.counts), dtype=float))
-        self.reference = per_frame.poses_of(
+        self.reference = inputs.poses_of(
             self,
             range(len(poses)),
-            lambda k: per_frame.read_matrix_pose(poses[k], f"{path}: scan {k}"),
+            lambda k: inputs.read_matrix_pose(poses[k], f"{path}: scan {k}"),
         )
         read_unshifted = partial(self._read, shift=np.zeros(3))
         self._shift, self._cached = cloud_sequence.find_shift(read_unshifted, len(self.counts))

@@ -25,7 +25,6 @@ from tofuse.formats.sources import (
     ReaderOptions,
     Sniff,
     inputs,
-    per_frame,
     pixels,
 )
 
@@ -79,14 +78,14 @@ class SensSource(FileSource):
         self.entries = [entry for entry, _, _ in frames]
         times = np.array([time for _, time, _ in frames]) / _TIMES_PER_S
         self.timestamps = times if times.any() else np.arange(len(frames)) / _RATE_HZ
-        per_frame.check_timestamps(self.timestamps, path, self.warnings)
+        inputs.check_timestamps(self.timestamps, path, self.warnings)
         if len(frames) < count:
             self.warnings.append(f"{path}: cut off after {len(frames)} of {count} frames")
         # The format stores minus infinity where tracking was lost.
-        self.reference = per_frame.poses_of(
+        self.reference = inputs.poses_of(
             self,
             range(len(frames)),
-            lambda k: per_frame.read_matrix_pose(frames[k][2], f"{path}: pose of frame {k}"),
+            lambda k: inputs.read_matrix_pose(frames[k][2], f"{path}: pose of frame {k}"),
         )
         if options.camera is not None:
             self.use_camera(options.camera, self.depth_size)
@@ -146,7 +145,7 @@ class SensSource(FileSource):
         """T_color_depth (4, 4); identity if not given."""
         try:
             poses = [
-                per_frame.read_matrix_pose(T, f"{self.path}: extrinsics")
+                inputs.read_matrix_pose(T, f"{self.path}: extrinsics")
                 for T in (T_device_color, T_device_depth)
             ]
         except InputError as error:

@@ -20,8 +20,7 @@ from tofuse.engine.frames import (
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import check_first_size, read_color, read_image
-from tofuse.formats.sources.per_frame import read_timestamps, tum_poses
-from tofuse.formats.sources.reader import ReaderOptions
+from tofuse.formats.sources.inputs import ReaderOptions, read_timestamps, tum_poses
 
 
 class FileSource(ABC):
