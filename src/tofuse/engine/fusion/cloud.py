@@ -176,11 +176,7 @@ def as_cloud(frame: Frame, max_points: int) -> CloudFrame:
     return CloudFrame(
         frame.index,
         frame.timestamp,
-        subsampled(frame.points),
-        subsampled(frame.normals),
-        subsampled(frame.sigma),
-        subsampled(amplitude),
-        subsampled(frame.color),
+        *map(subsampled, (frame.points, frame.normals, frame.sigma, amplitude, frame.color)),
         frame.origin,
     )
 

@@ -52,7 +52,6 @@ class Kinect2(Reader):
             files,
             np.arange(len(files), dtype=float),
             None if options.camera else _camera(path, first_size(files)),
-            0.001,
             color=color if any(color) else None,
             sensor="Kinect v2 (ToF)",
             options=options,

@@ -51,11 +51,16 @@ class LasScans(cloud_sequence.CloudReader):
 
 
 def _las_header(path: Path) -> Any:
+    with reading.about(path, _COPY):
+        return _checked_header(path)
+
+
+def _checked_header(path: Path) -> Any:
     import laspy
 
     head = reading.read_head(path, 375)
     if head[:4] != b"LASF":
-        raise InputError("isn't a LAS file", where=path, remedy="check the file")
+        raise InputError("isn't a LAS file")
     _check_records(head, path)
     with reading.library_errors(path, _COPY), laspy.open(path) as file:
         header = file.header
@@ -63,11 +68,7 @@ def _las_header(path: Path) -> Any:
     file_size = path.stat().st_size
     compressed = bool(getattr(header, "are_points_compressed", False))
     if count > MAX_POINTS or count * size > file_size * (_MAX_COMPRESSION if compressed else 1):
-        raise InputError(
-            f"point count: {count} points don't fit into {file_size} bytes",
-            where=path,
-            remedy=_COPY,
-        )
+        raise InputError(f"point count: {count} points don't fit into {file_size} bytes")
     if compressed and count:
         with reading.library_errors(path, _COPY):
             _check_chunks(path, header)
@@ -80,9 +81,7 @@ def _check_records(head: bytes, path: Path) -> None:
     extended = int.from_bytes(head[243:247], "little") if head[25:26] >= b"\x04" else 0
     if 54 * count + 60 * extended > path.stat().st_size:  # header sizes in bytes
         raise InputError(
-            f"header: {count + extended} variable-length records don't fit into the file",
-            where=path,
-            remedy=_COPY,
+            f"header: {count + extended} variable-length records don't fit into the file"
         )
 
 
@@ -100,9 +99,7 @@ def _check_chunks(path: Path, header: Any) -> None:
     if layout.item_size() != header.point_format.size:
         raise InputError(
             f"LASzip record: a point has {layout.item_size()} bytes, in the header"
-            f" {header.point_format.size}",
-            where=path,
-            remedy=_COPY,
+            f" {header.point_format.size}"
         )
     with path.open("rb") as file:
         file.seek(start)
@@ -111,27 +108,19 @@ def _check_chunks(path: Path, header: Any) -> None:
             file.seek(-8, os.SEEK_END)
             (table,) = struct.unpack("<q", file.read(8))
         if not start + 8 <= table <= size - 8:
-            raise InputError(
-                f"chunk table: offset {table} is outside the point data", where=path, remedy=_COPY
-            )
+            raise InputError(f"chunk table: offset {table} is outside the point data")
         file.seek(table)
         _, count = struct.unpack("<II", file.read(8))
         # Each chunk begins with an uncompressed point.
         if count * layout.item_size() > table - start:
-            raise InputError(
-                f"chunk table: {count} chunks don't fit into {table - start} bytes",
-                where=path,
-                remedy=_COPY,
-            )
+            raise InputError(f"chunk table: {count} chunks don't fit into {table - start} bytes")
         file.seek(start)
         chunks = lazrs.read_chunk_table(file, layout)
     points, compressed = (sum(column) for column in zip(*chunks, strict=True)) if chunks else (0, 0)
     if compressed > table - start or points < header.point_count:
         raise InputError(
             f"chunk table: {points} points in {compressed} bytes, while the file has"
-            f" {header.point_count} in {table - start}",
-            where=path,
-            remedy=_COPY,
+            f" {header.point_count} in {table - start}"
         )
 
 

@@ -44,7 +44,6 @@ class SevenScenes(Reader):
             files,
             numbers / FRAME_RATE_HZ,
             None if options.camera else _camera(path, files),
-            0.001,
             color=color if complete else None,
             color_registered=False,
             # Other programs write this format too, with other cameras.

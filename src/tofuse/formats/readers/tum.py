@@ -73,7 +73,7 @@ class Tum(Reader):
             files,
             times,
             camera,
-            DEPTH_UNIT_M,
+            depth_unit_m=DEPTH_UNIT_M,
             color=color,
             sensor="" if camera is None else SENSOR,
             options=options,
