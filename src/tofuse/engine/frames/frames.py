@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -105,9 +105,11 @@ class RangeFrame:
         _check_frame(self)
         where = f"frame {self.index}"
         if not isinstance(self.camera, Camera):
-            problem, remedy = "not a camera", "pass a camera, such as tofuse.Pinhole"
-            problem = f"is a {type(self.camera).__name__}, {problem}"
-            raise InputError(problem, where=f"{where}: camera", remedy=remedy)
+            raise InputError(
+                f"is a {type(self.camera).__name__}, not a camera",
+                where=f"{where}: camera",
+                remedy="pass a camera, such as tofuse.Pinhole",
+            )
         for kind, known in (("depth_kind", DepthKind), ("amplitude_kind", AmplitudeKind)):
             value, choices = getattr(self, kind), get_args(known)
             if value not in choices:
@@ -288,7 +290,8 @@ class CloudFrame:
     def keep(self, mask: Bool) -> Self:
         """Return the view with only the points of the (N,) mask."""
         columns = {name: getattr(self, name) for name in COLUMNS}
-        return replace(self, **{n: v if v is None else v[mask] for n, v in columns.items()})
+        kept: dict[str, Any] = {n: v if v is None else v[mask] for n, v in columns.items()}
+        return replace(self, **kept)
 
 
 Frame = RangeFrame | CloudFrame

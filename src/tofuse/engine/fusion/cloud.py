@@ -176,7 +176,11 @@ def as_cloud(frame: Frame, max_points: int) -> CloudFrame:
     return CloudFrame(
         frame.index,
         frame.timestamp,
-        *map(subsampled, (frame.points, frame.normals, frame.sigma, amplitude, frame.color)),
+        subsampled(frame.points),
+        subsampled(frame.normals),
+        subsampled(frame.sigma),
+        subsampled(amplitude),
+        subsampled(frame.color),
         frame.origin,
     )
 
