@@ -145,8 +145,9 @@ class _Frame:
     def time(self) -> float:
         """Timestamp in s; NaN if not given."""
         value = self.entry.get("timestamp")
-        known = isinstance(value, int | float) and not isinstance(value, bool)
-        return float(value) if known and abs(value) <= 1e18 else math.nan
+        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e18:
+            return math.nan
+        return float(value)
 
     @property
     def key(self) -> list[tuple[int, int, str]]:

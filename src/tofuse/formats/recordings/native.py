@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -162,7 +162,10 @@ class RecordingWriter:
         self._check_channels(frame, *(name for name, image in images.items() if image is not None))
         depth = frame.z if self.depth_kind == "z" else frame.radial_range
         write_png(self._frame_path("depth", ".png"), self._counts(depth))
-        stored = {"amplitude": self._amplitude, "sigma": self._sigma}
+        stored: dict[str, Callable[[Any], UInt16]] = {
+            "amplitude": self._amplitude,
+            "sigma": self._sigma,
+        }
         for name, image in images.items():
             if image is not None:
                 pixels = stored[name](image) if name in stored else image.astype(np.uint8)

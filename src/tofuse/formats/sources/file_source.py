@@ -39,7 +39,7 @@ class FileSource(ABC):
     """
 
     concurrent = False
-    path: Path | None = None
+    path: Path  # of a single file
     remedy: str | None = None
     camera: Camera
     unit: float = 0.001
@@ -58,7 +58,8 @@ class FileSource(ABC):
 
     def where(self, index: int) -> str:
         """Return the name of a frame for errors."""
-        return f"{self.path}: frame {index}" if self.path else f"frame {index}"
+        path = getattr(self, "path", None)
+        return f"frame {index}" if path is None else f"{path}: frame {index}"
 
     @abstractmethod
     def load(self, index: int) -> Frame:

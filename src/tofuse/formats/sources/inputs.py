@@ -150,9 +150,6 @@ def files_at(path: Path, *suffixes: str) -> list[Path]:
     return reading.files_with(path, *suffixes) if reading.is_folder(path) else []
 
 
-T = TypeVar("T")
-
-
 def tum_poses(source: Source, path: Path) -> Float64:
     """Return (N, 4, 4) poses of a TUM file at the source's timestamps, NaN without a match."""
     times, poses = read_tum(path)
