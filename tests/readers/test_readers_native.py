@@ -295,7 +295,7 @@ def test_unusable_rays(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has only equal rays"):
         NativeSource(folder)
     np.save(folder / "rays.npy", np.full((30, 40, 2), np.nan, np.float32))
-    with pytest.raises(InputError, match="no pixel has a ray"):
+    with pytest.raises(InputError, match="has no pixel with a ray"):
         NativeSource(folder)
     np.save(folder / "rays.npy", np.zeros((30, 40), np.float32))
     with pytest.raises(InputError, match="shape"):
