@@ -152,25 +152,6 @@ def test_ndt_has_larger_convergence_basin_than_point_to_plane():
     assert good["ndt"] >= good["plane"] + 2
 
 
-def test_ndt_derivatives_match_finite_differences():
-    from tofuse.lab.methods.ndt import _cells, _score
-
-    cells = _cells(stone(3000, 0), 0.2)
-    p = stone(300, 1)
-    T = small(0, 2, 0.005)
-    value, g, H = _score(p, cells, T)
-    step = 1e-6
-    for k in range(6):
-        xi = np.zeros(6)
-        xi[k] = step
-        up, down = (_score(p, cells, T @ se3.exp(s * xi)) for s in (1, -1))
-        assert (up[0] - down[0]) / (2 * step) == pytest.approx(g[k], rel=1e-4, abs=1e-6)
-        assert (up[1] - down[1]) / (2 * step) == pytest.approx(
-            H[k], rel=0.05, abs=0.02 * abs(H).max()
-        )
-    assert value < 0
-
-
 @pytest.mark.parametrize("away", [-0.05, 0.08])
 def test_squared_distance_is_second_order_accurate(away):
     """Distance from a sphere, near a point in front of or behind its surface."""

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.formats.recordings.open import open_recording
@@ -231,19 +230,6 @@ def test_plausible_wrong_image_does_not_affect_other_poses(request, damage):
     assert_right(after, poses[BAD + 1 :], 0.03, 1.0)
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("damage", ["mirrored", "upside down", "turned round"])
-def test_run_of_wrong_images_forms_its_own_component(corner, damage):
-    frames = list(corner.frames)
-    frames[3:6] = [PLAUSIBLE[damage](frame) for frame in frames[3:6]]
-    steps = run(frames)
-    assert components(steps) == [0, 0, 0, 1, 1, 1, 2, 2]
-    assert certain_links(steps)
-    assert not any(i in (3, 4, 5) or j in (3, 4, 5) for i, j in certain_links(steps))
-    right = [*corner.poses[:3], None, None, None, *corner.poses[6:]]
-    assert_right(steps, right)
-
-
 @pytest.mark.parametrize("damage", [UNUSABLE["blank"], UNUSABLE["sparse"]], ids=["blank", "sparse"])
 def test_recording_may_start_with_corrupted_frames(room, damage):
     steps = run([damage(room.frames[0]), damage(room.frames[1]), *room.frames[2:]])
@@ -291,22 +277,6 @@ def test_degenerate_directions_are_reported():
             # Translation along the wall and rotation about its normal, which is the optical axis.
             assert np.abs(found.unobservable[:, [2, 3, 4]]).max() < 0.1
         assert len(tracked[-1].unobservable) == 3
-
-
-@pytest.mark.slow
-def test_result_is_independent_of_threads(room, elsewhere):
-    frames = in_order([*room.frames[:3], *elsewhere, *room.frames[2:5]])
-    results = []
-    for count in (1, 2):
-        with threads(count):
-            results.append(run(frames))
-    for one, two in zip(*results, strict=True):
-        assert one.T_component_camera.tobytes() == two.T_component_camera.tobytes()
-        assert one.component == two.component
-        assert one.reason == two.reason
-        assert [link.T_i_j.tobytes() for link in one.links] == [
-            link.T_i_j.tobytes() for link in two.links
-        ]
 
 
 @pytest.mark.slow

@@ -11,6 +11,10 @@ import pytest
 from coarse_steps import without_multipath
 from made_rooms import CAMERA, at, seen
 from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.config import changed
+from tofuse.engine.mapping.methods import from_method
+from tofuse.engine.mapping.reconstructing import reconstruct
+from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.search import pair_agreement
 from tofuse.engine.search.verification import FitQuality, FitStatistics
 from tofuse.engine.tracking.keyframes import Keyframes
@@ -193,35 +197,20 @@ def test_new_component_continues_motion() -> None:
 
 
 @pytest.mark.nightly
-def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
-    """Steps of 26 cm: a wall fits anywhere, and the objects before it are out of reach."""
-    from tofuse.engine.mapping.config import changed
-    from tofuse.engine.mapping.methods import from_method
-    from tofuse.engine.mapping.reconstructing import reconstruct
-    from tofuse.engine.quality.trajectory_errors import displacement
-
-    recording = without_multipath(tmp_path, "rail", "ifm-o3r", every=20, frames=16)
-    changes = {"refinement": {"part": "none"}, "fusion": {"voxel_m": 0.1}}
-    config = changed(from_method("default"), changes, where="test")
+@pytest.mark.parametrize(
+    ("scene", "camera", "taken", "bound"),
+    [
+        # Steps of 26 cm: a wall fits anywhere, and the objects before it are out of reach.
+        ("rail", "ifm-o3r", {"every": 20, "frames": 16}, 0.04),
+        # Steps of 14, 37 and 46 cm: the prediction is too short; 0.27 m if started only near it.
+        ("corridor", "sr4000", {"every": 12}, 0.02),
+    ],
+)
+def test_large_steps_along_walls_are_searched(tmp_path, scene, camera, taken, bound) -> None:
+    recording = without_multipath(tmp_path, scene, camera, **taken)
+    changes = {"refinement": {"part": "none"}} if scene == "rail" else {}
+    config = changed(from_method("default"), changes | {"fusion": {"voxel_m": 0.1}}, where="test")
     result = reconstruct(recording, config)
-    assert recording.reference is not None
     assert result.has_pose.all()
-    assert displacement(recording.reference, result.trajectory)[0] < 0.04
-    assert not any(len(f.unobservable) for f in result.diagnostics.frames)
-
-
-@pytest.mark.nightly
-def test_starts_along_corridor_correct_short_prediction(tmp_path) -> None:
-    """Steps of 14, 37 and 46 cm: the walls fit anywhere, and the prediction is too short."""
-    from tofuse.engine.mapping.config import changed
-    from tofuse.engine.mapping.methods import from_method
-    from tofuse.engine.mapping.reconstructing import reconstruct
-    from tofuse.engine.quality.trajectory_errors import displacement
-
-    recording = without_multipath(tmp_path, "corridor", "sr4000", every=12)
-    config = changed(from_method("default"), {"fusion": {"voxel_m": 0.1}}, where="test")
-    result = reconstruct(recording, config)
-    assert recording.reference is not None
-    assert result.has_pose.all()
-    # 0.27 m if started only near the prediction.
-    assert displacement(recording.reference, result.trajectory)[0] < 0.02
+    assert displacement(recording.reference, result.trajectory)[0] < bound
+    assert scene == "corridor" or not any(len(f.unobservable) for f in result.diagnostics.frames)
