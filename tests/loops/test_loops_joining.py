@@ -10,7 +10,6 @@ import pytest
 
 from made_rooms import OTHER, at, seen, surface
 from tofuse.engine.alignment.base import Link, Registration
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.join_checks import JoinChecks
 from tofuse.engine.loops.joining import Joining
@@ -120,15 +119,6 @@ def test_order_of_links_does_not_matter(three, seed) -> None:
     for c, T in expected.T_group_component.items():
         np.testing.assert_allclose(group.T_group_component[c], T, atol=1e-9)
     assert_joined(group, three)
-
-
-def test_result_is_independent_of_threads(three) -> None:
-    found = []
-    for count in (1, 2):
-        with threads(count):
-            (group,) = SPARSELY.join(three, [])
-        found.append([T.tobytes() for T in group.T_group_component.values()])
-    assert found[0] == found[1]
 
 
 def test_views_of_two_scenes_stay_separate(three, elsewhere) -> None:

@@ -108,23 +108,6 @@ def test_live_poses_of_connected_components_are_correct(there_and_back, joined) 
 
 
 @pytest.mark.slow
-def test_result_is_independent_of_threads(there_and_back, joined) -> None:
-    result, live = joined
-    other, also = run(there_and_back[1], threads=2)
-    assert other.trajectory.tobytes() == result.trajectory.tobytes()
-    assert [c.frames for c in other.components] == [c.frames for c in result.components]
-    for one, two in zip(result.components, other.components, strict=True):
-        assert one.joined == two.joined
-        for a, b in ((one.T_main_component, two.T_main_component),):
-            assert (a is None) == (b is None)
-            if a is not None:
-                assert a.tobytes() == b.tobytes()
-    for one, two in zip(live, also, strict=True):
-        assert (one is None) == (two is None)
-        assert one is None or one.tobytes() == two.tobytes()
-
-
-@pytest.mark.slow
 def test_two_scenes_give_two_components_with_models() -> None:
     places = [*range(10), *range(8)]
     result, _ = run(in_order([*frames_of(range(10)), *frames_of(range(8), **STRANGE)]))

@@ -108,14 +108,6 @@ def test_folder_of_exported_clouds_is_read_as_images(tmp_path: Path) -> None:
     assert len(recording[3]) == 0
 
 
-def test_folder_with_other_clouds_stays_clouds(tmp_path: Path) -> None:
-    frames = [seen(PINHOLE, k) for k in range(3)]
-    for k, frame in enumerate(frames):
-        points = np.concatenate([frame.points, moved(frame.points)]) if k else frame.points
-        write_ply(tmp_path / f"{k}.ply", GeometryRecord(points))
-    assert isinstance(open_recording(tmp_path)[0], CloudFrame)
-
-
 def test_cloud_off_the_rays_is_unreadable(tmp_path: Path) -> None:
     frames = [seen(PINHOLE, k % 5) for k in range(24)]
     for k, frame in enumerate(frames):

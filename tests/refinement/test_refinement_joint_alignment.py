@@ -9,7 +9,6 @@ import pytest
 
 from aligned_surfaces import OPTIONS, away, drifted, path, surfaces
 from corner_views import SHARP, corner
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import build_graph
 from tofuse.engine.graph.graph_covariances import GraphCovariances
@@ -54,16 +53,6 @@ def test_only_given_pairs_are_compared(swing):
     # A view without pairs stays.
     alone = refine(views, start, OPTIONS, pairs=chain[:-1])
     np.testing.assert_allclose(alone.poses[-1], start[-1], atol=1e-12)
-
-
-def test_result_is_independent_of_threads(swing):
-    views, truth = swing
-    results = []
-    for count in (1, 2, 3):
-        with threads(count):
-            results.append(refine(views, drifted(truth), OPTIONS).poses)
-    np.testing.assert_array_equal(results[0], results[1])
-    np.testing.assert_array_equal(results[0], results[2])
 
 
 @pytest.mark.slow

@@ -201,15 +201,3 @@ def test_two_sides_of_wall_stay_separate():
     ]
     found = refined(Planes(), views, truth)
     assert np.abs(found.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01
-
-
-@pytest.mark.nightly
-def test_frames_that_are_not_kept_follow_the_others():
-    views, truth = peaks_views(0.03, 0)
-    part = Planes(max_views=12)
-    drift = np.cumsum(np.tile([0.01, 0.01, 0.0, 0.001, -0.001, 0.0], (20, 1)), axis=0)
-    start = truth @ se3.exp(drift - drift[0])
-    found = refined(part, views, start)
-    assert 6 <= found.views <= 12
-    error = PoseErrors.of(found.poses, truth).position
-    assert error.mean() < PoseErrors.of(start, truth).position.mean() / 2

@@ -10,7 +10,6 @@ import pytest
 
 import tofuse
 from tofuse.engine.cameras.depth_conversion import range_from_z
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.sensor.frequencies import SPEED_OF_LIGHT, combined
@@ -91,18 +90,6 @@ def test_amplitude_is_adapted_to_unwrapped_range() -> None:
     )
     still = out.depth == frame.depth
     np.testing.assert_array_equal(out.amplitude_image[still], frame.amplitude_image[still])
-
-
-def test_result_is_independent_of_threads() -> None:
-    frame, _ = taken("hall", 180)[0]
-    corrector = Unwrap(white=3000.0).start()
-    with threads(1):
-        one = corrector.apply(frame)
-    with threads(3):
-        three = corrector.apply(frame)
-    assert isinstance(one, RangeFrame)
-    assert isinstance(three, RangeFrame)
-    np.testing.assert_array_equal(one.depth, three.depth)
 
 
 def test_messages_find_minimum_of_a_chain() -> None:
