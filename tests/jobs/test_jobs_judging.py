@@ -80,15 +80,6 @@ def test_stated_error_of_wrong_poses_is_correct(of_bent, truth) -> None:
 
 
 @pytest.mark.slow
-def test_tolerance_decides_verdict(recording, truth) -> None:
-    recording, near = recording.select(every=2), truth[::2].copy()
-    near[:, :3, 3] += 0.004 * np.random.default_rng(3).standard_normal((4, 3))
-    assert tofuse.judge(recording, near, tolerance_m=0.05).verdict == "good"
-    (reason,) = tofuse.judge(recording, near, tolerance_m=0.004).reasons
-    assert reason.code == "uncertain_poses"
-
-
-@pytest.mark.slow
 def test_poses_of_another_place_are_contradicted_and_replaced(recording, truth) -> None:
     turns = np.array([se3.exp(np.array([0, 0, 0, 0, 2.5 * k, 0])) for k in range(8)])
     found = tofuse.judge(recording, turns @ truth)

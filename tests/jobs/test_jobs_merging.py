@@ -20,7 +20,6 @@ from tofuse.apps.jobs.sessions import read_sessions
 from tofuse.apps.report.session_words import session_sentences
 from tofuse.apps.results.folders import OutputFolder
 from tofuse.apps.results.output import write_result
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion import texture
@@ -138,15 +137,6 @@ def test_loops_of_earlier_merge_are_registered_again(both, session_results, pair
     assert closed == set(across)
     codes = {reason.code for reason in apart.diagnostics.reasons}
     assert "loop_rejected" not in codes
-
-
-@pytest.mark.slow
-def test_result_is_independent_of_threads(both, session_results) -> None:
-    sessions = read_sessions([session_results["here"], session_results["there"]], 1, Silent())
-    with threads(1):
-        again = merge_sessions(sessions, quick_merge(sessions), threads=1)
-    assert again.trajectory.tobytes() == both.trajectory.tobytes()
-    assert again.cloud.points.tobytes() == both.cloud.points.tobytes()
 
 
 @pytest.mark.slow
