@@ -12,13 +12,8 @@ from ball_views import CAMERA, EYE, around_a_ball, frame_of, look, plane_range, 
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.spill import Spill
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.fusion import tsdf_kernels as tsdf
 from tofuse.engine.fusion.block_kernels import (
-    block_key,
     block_of,
-    index_of,
-    mark_octants,
-    parent_of,
     voxel_of,
 )
 from tofuse.engine.fusion.model import ModelBuilder
@@ -429,32 +424,3 @@ def test_round_robin_views_make_accurate_surface() -> None:
     assert np.abs(r - 0.3).max() < 0.03
     area = 4 * np.pi * 0.3**2
     assert len(mesh) == pytest.approx(1.5 * area / 0.012**2, rel=0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stride", [1, 2])
-def test_near_cubes_match_slow_twin(stride) -> None:
-    rng = np.random.default_rng(9)
-    view = RangeView.of(frame_of(rng.uniform(1, 3, (72, 88))))
-    T = look([0.3, -0.2, 0.1], [0.5, 0.4, 2.0])
-    first = (1 % stride, 0)
-    keys = tsdf.near_cubes(view.stored, T, 0.05, 0.04, 0.5, first, stride)
-    expected = set()
-    steps = int(np.ceil(0.08 / 0.025))
-    for r in range(first[0], 72, stride):
-        for c in range(first[1], 88, stride):
-            if view.z[r, c] == 0 or view.strength[r, c] == 0:
-                continue
-            p = view.z[r, c] * view.unit * np.array([*view.projection.rays[r, c], 1.0])
-            for t in np.linspace(-0.04, 0.04, steps + 1):
-                q = se3.transform(T, (p + t * view.normals[r, c] / 127)[None])[0]
-                expected.add(block_key(*(int(n) for n in np.floor(q / 0.05))))
-    assert len(expected) > 200
-    both = expected & set(keys.tolist())
-    assert len(both) > 0.998 * max(len(expected), len(set(keys.tolist())))  # except for rounding
-    marks = np.zeros(2, np.uint8)
-    parents = np.array(sorted({parent_of(k)[0] for k in expected}))[:2]
-    mark_octants(keys, *index_of(parents), marks)
-    for parent, mark in zip(parents, marks, strict=True):
-        octants = {parent_of(k)[1] for k in set(keys.tolist()) if parent_of(k)[0] == parent}
-        assert mark == sum(1 << e for e in octants)

@@ -202,27 +202,6 @@ def test_wiggling_has_four_periods_per_phase_period() -> None:
     assert amplitude == pytest.approx((h3 - h5) * model.period_m / (2 * np.pi), rel=0.05)
 
 
-def test_pixel_offsets_grow_along_readout() -> None:
-    offset = ranges(wall(2.0), Effects.none(pixel_offsets=1.0)) - ranges(wall(2.0), Effects.none())
-    np.testing.assert_allclose(offset, sensor.pixel_offsets(MODEL), atol=2e-4)
-    slope = np.polyfit(np.arange(44), offset.mean(0), 1)[0]
-    assert slope * 43 == pytest.approx(MODEL.readout_delay_m, rel=0.2)
-    assert (offset - offset.mean(0)).std() > 0.5 * MODEL.pixel_delay_m
-
-
-def test_thermal_drift_grows_monotonically_to_limit() -> None:
-    times = [0, 300, 1500, 6000, 300000]
-    seen = [
-        float(ranges(wall(2.0), Effects.none(thermal_drift=1.0), index=k).mean()) for k in times
-    ]
-    base = float(ranges(wall(2.0), Effects.none()).mean())
-    drift = np.array(seen) - base
-    assert (np.diff(drift) > 0).all()
-    seconds = np.array(times) / 30.0
-    expected = MODEL.drift_m * (1 - np.exp(-seconds / MODEL.drift_time_s))
-    np.testing.assert_allclose(drift, expected, atol=1e-4)
-
-
 def test_scattering_biases_background_towards_bright_foreground() -> None:
     near = Board((-0.25, 0, 0.5), a=(0.2, 0, 0), b=(0, 0.5, 0), albedo=0.9)
     scene = Boards([near, Board((0, 0, 2.0), albedo=0.3)])

@@ -87,16 +87,6 @@ def test_moving_object_defines_world() -> None:
         np.testing.assert_allclose(pose, expected, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_raw_frame_is_independent_of_stride() -> None:
-    effects = Effects()
-    two = simulate_recording("wall", every=2, frames=3, effects=effects)
-    four = simulate_recording("wall", every=4, frames=2, effects=effects)
-    np.testing.assert_array_equal(two[2].depth, four[1].depth)
-    assert two[2].timestamp == four[1].timestamp
-    assert not np.array_equal(two[1].depth, four[1].depth)
-
-
 def test_bias_remains_without_correction(tmp_path) -> None:
     effects = Effects.none(wiggling=1.0, pixel_offsets=1.0)
     path = simulate("wall", tmp_path / "raw", every=10, frames=1, effects=effects, correction=False)

@@ -149,19 +149,6 @@ def test_wrong_focal_length_of_range_camera_is_corrected(recording) -> None:
     assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
 
 
-@pytest.mark.nightly
-def test_bound_without_loop_includes_focal_length_error(recording) -> None:
-    half = replace(recording, indices=recording.indices[:12])
-    wrong = seen_by(half, 1.05)
-    result = reconstruct(wrong, COARSE)
-    assert result.diagnostics.calibrated is None
-    assert "unchecked_calibration" in {r.code for r in result.diagnostics.reasons}
-    assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
-    right = reconstruct(half, COARSE)
-    assert right.diagnostics.accuracy.position_m < 0.5 * result.diagnostics.accuracy.position_m
-    assert error_of(half, right) < right.diagnostics.accuracy.position_m
-
-
 # A sweep to both sides and back, which closes loops without a full turn.
 SWEEP = np.linspace(0, 2 * np.pi, 30)
 SWEPT = np.tile(np.eye(4), (30, 1, 1))

@@ -305,14 +305,6 @@ def test_unusable_rays(tmp_path: Path) -> None:
         NativeSource(folder)
 
 
-def test_rays_that_mirror_image(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a")
-    np.save(folder / "rays.npy", PINHOLE.rays() * np.array([1, -1], np.float32))
-    with pytest.raises(InputError, match=r"mirror the image.*negate one") as caught:
-        NativeSource(folder)
-    assert "rays.npy" in str(caught.value)
-
-
 def test_rays_override_the_lens(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
     rays = (PINHOLE.rays() * 2).astype(np.float32)

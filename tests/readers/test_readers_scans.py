@@ -110,16 +110,6 @@ def test_las_written_by_laspy(tmp_path: Path, suffix: str) -> None:
     assert np.array_equal(frame.color, RGB)
 
 
-def test_exported_las_is_read_back(tmp_path: Path) -> None:
-    pytest.importorskip("laspy")
-    write_las(tmp_path / "a.las", GeometryRecord(POINTS, color=RGB))
-    frame = tofuse.open(tmp_path / "a.las")[0]
-    assert isinstance(frame, CloudFrame)
-    assert np.allclose(frame.points, POINTS, atol=1e-4)
-    assert np.array_equal(frame.color, RGB)
-    assert frame.amplitude is None
-
-
 def test_map_coordinates_keep_millimetre_precision(tmp_path: Path) -> None:
     """Easting and northing exceed float32 precision: they are shifted, with a warning."""
     laspy = pytest.importorskip("laspy")

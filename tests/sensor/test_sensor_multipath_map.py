@@ -11,8 +11,6 @@ import pytest
 from multipath_corner import CAMERA, FLOOR, GAIN, LEFT, PERIOD_M, RIGHT, Plane, Seen
 from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.sensor.base import Correction, Corrector
 from tofuse.engine.sensor.multipath import MultipathModel, ToFImage
 from tofuse.engine.sensor.multipath_correction import Multipath
@@ -196,26 +194,3 @@ class Recorder(Correction, Corrector):
 
     def add_pose(self, frame: Frame, T_world_camera: np.ndarray) -> None:
         self.received.append((frame.index, T_world_camera))
-
-
-@pytest.mark.slow
-def test_mapper_passes_poses_and_predictions_to_corrections() -> None:
-    listener = Recorder()
-    mapper = Mapper(replace(from_method("default"), corrections=(listener,)))
-    world = (LEFT, RIGHT, FLOOR)
-    frames = [replace(seen_from(turned(0.03 * k), *world).frame(), index=k) for k in range(5)]
-    frames[3] = frames[3].keep(np.zeros(frames[3].depth.shape, bool))
-    poses = [mapper.push(frame) for frame in frames]
-    assert poses[3] is None
-    tracked = {k: T for k, T in enumerate(poses) if T is not None}
-    assert {0, 1, 2} <= set(tracked)
-    assert [index for index, _ in listener.received] == list(tracked)
-    for index, T in listener.received:
-        np.testing.assert_array_equal(T, tracked[index])
-    assert listener.expected[0] is None
-    assert listener.expected[1] is None
-    assert listener.expected[2] is not None
-    motion = se3.inverse(tracked[0]) @ tracked[1]
-    np.testing.assert_allclose(listener.expected[2], tracked[1] @ motion, atol=1e-9)
-    # After a lost frame the pose is unknown.
-    assert listener.expected[4] is None
