@@ -86,10 +86,6 @@ def resume(listed: Path, out: Path) -> None:
     assert main(words) in (0, 3)
 
 
-def running(out: Path) -> bool:
-    return (out / "jobs").is_dir() and any(r["state"] == "running" for r in records(out))
-
-
 @pytest.mark.slow
 def test_bad_recording_does_not_stop_batch(room_recording: Path, tmp_path: Path, capsys) -> None:
     (tmp_path / "list.csv").write_text(

@@ -186,13 +186,6 @@ def test_surfaces_read_by_trimesh(name: str, result: Path, upright) -> None:
     check_surface(upright, mesh.vertices, mesh.faces, None if plain else mesh.vertex_normals, color)
 
 
-def sampled(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) at UV coordinates (N, 2) from the upper left corner."""
-    size = np.array(image.shape[1::-1])
-    u, v = np.rint(uv * size - 0.5).astype(int).clip(0, size - 1).T
-    return image[v, u, :3]
-
-
 def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) -> None:
     trimesh = pytest.importorskip("trimesh")
     monkeypatch.setattr("tofuse.apps.export.exporting._MAX_TEXTURED_FACES", 10)

@@ -9,31 +9,6 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.geometry.kdtree import KdTree
 
 
-def all_distances(points, queries):
-    """Squared distances (M, N), summed in the order in which the kernel sums."""
-    p = np.asarray(points, float).reshape(-1, 3)
-    q = np.asarray(queries, float).reshape(-1, 3)
-    d = q[:, None, :] - p[None, :, :]
-    return d[..., 0] * d[..., 0] + d[..., 1] * d[..., 1] + d[..., 2] * d[..., 2]
-
-
-def clouds(seed, n, kind):
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-1, 1, (n, 3))
-    if kind == "grid":  # many exact ties
-        points = np.round(points * 2) / 2
-    elif kind == "line":
-        points = np.outer(points[:, 0], [1.0, 2.0, -0.5])
-    elif kind == "same":
-        points[:] = 0.25
-    elif kind == "plane":
-        points[:, 2] = 3.0
-    return points
-
-
-KINDS = ["random", "grid", "line", "same", "plane"]
-
-
 def test_distance_bound_is_inclusive():
     tree = KdTree([[0.0, 0, 0]])
     query = np.array([[0.5, 0, 0]])

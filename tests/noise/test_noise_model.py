@@ -140,21 +140,6 @@ def test_tilted_wall_is_noisier_by_change_within_pixel() -> None:
     assert (model.sigma(seen, unknown) < 1e-5).all()
 
 
-def twin(seen: RangeFrame, model: NoiseModel, cosine: np.ndarray) -> np.ndarray:
-    r = seen.radial_range.astype(float)
-    length = ray_lengths(CAMERA).astype(float)
-    light = model.amplitude
-    assert light is not None
-    with np.errstate(all="ignore"):
-        counts = seen.amplitude_image / r**2 / length**light.falloff
-        variance = light.floor**2 + light.shot**2 / counts + (light.dark / counts) ** 2
-        bad = (seen.amplitude_image <= 0) | (seen.amplitude_image >= 65535)
-        variance = np.minimum(np.where(bad, np.inf, variance), model.ceiling_m**2)
-        change = model.footprint / 30.0 * r / length * np.sqrt(1 / np.maximum(cosine, 0.1) ** 2 - 1)
-    variance += np.where(np.isfinite(cosine), change, 0) ** 2
-    return np.where(r > 0, np.sqrt(variance), 0)
-
-
 def test_json_round_trip(tmp_path: Path) -> None:
     for model in NOISE.values():
         write_noise(tmp_path / "noise.json", model)

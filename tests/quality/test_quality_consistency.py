@@ -17,7 +17,7 @@ from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording, evenly_spaced
-from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.geometry import se3
 from tofuse.engine.quality.map_agreement import (
     Consistency,
     SurfaceImage,
@@ -26,7 +26,6 @@ from tofuse.engine.quality.map_agreement import (
     poses_of_frames,
 )
 from tofuse.formats.poses.trajectory import write_tum
-from tofuse.formats.readers.native import NativeSource
 
 # A synthetic room, and poses in it -------------------------------------------------------------
 
@@ -282,12 +281,3 @@ def test_depths_are_requantized_to_recording_unit() -> None:
 
 
 # The reference tool ----------------------------------------------------------------------------
-
-
-def ours(recording: Path, trajectory: Path, frames: int) -> Consistency:
-    opened = Recording.of(NativeSource(recording), recording, "native")
-    rows = np.loadtxt(trajectory)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = quaternion.to_matrix(rows[:, 4:8])
-    poses[:, :3, 3] = rows[:, 1:4]
-    return map_consistency(opened, poses_of_frames(opened.timestamps, rows[:, 0], poses), frames)

@@ -42,18 +42,6 @@ def solved(
     return found
 
 
-def angles_deg(seen: Seen, z: np.ndarray) -> np.ndarray:
-    """Angles between planes fitted to each pair of surfaces."""
-    rays = seen.camera.rays().astype(float)
-    points = np.concatenate([rays, np.ones((*z.shape, 1))], -1) * z[..., None]
-    normals = []
-    for k in np.unique(seen.plane):
-        p = points[seen.plane == k]
-        normals.append(np.linalg.svd(p - p.mean(0), full_matrices=False)[2][2])
-    pairs = [abs(a @ b) for i, a in enumerate(normals) for b in normals[:i]]
-    return np.degrees(np.arccos(pairs))
-
-
 def test_corner_bias_is_positive_and_removed(corner: Seen) -> None:
     before = corner.errors(corner.image.z)
     # Indirect light travels farther: corners appear too far away.

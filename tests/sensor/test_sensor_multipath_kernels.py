@@ -116,14 +116,3 @@ def test_edge_nodes_are_compared_with_corrected_planes() -> None:
     inner = nodes[..., X] > 0.02
     assert strip[inner].any()
     np.testing.assert_allclose(nodes[inner & strip][:, A], 0.3, atol=1e-6)
-
-
-SLANTEST = 0.6
-
-
-def surfaces_of(nodes: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, ...]:
-    shape = nodes.shape[:2]
-    good = np.empty(shape, bool)
-    points, normals, values = np.empty((*shape, 3)), np.empty((*shape, 3)), np.empty((5, *shape))
-    kernels.surface_radiometry(nodes, factor, 4.0, SLANTEST, good, points, normals, values)
-    return good, points, normals, values

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from multipath_corner import CAMERA, FLOOR, GAIN, LEFT, PERIOD_M, RIGHT, Plane, Seen
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.sensor.base import Correction, Corrector
 from tofuse.engine.sensor.multipath import MultipathModel, ToFImage
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.sensor.multipath_kernels import PATCH
@@ -174,23 +172,3 @@ def test_correction_uses_map_only_with_poses() -> None:
     fixed = corrector.apply(second, np.eye(4))
     assert isinstance(fixed, RangeFrame)
     np.testing.assert_array_equal(fixed.depth, guessed)
-
-
-@dataclass(frozen=True)
-class Recorder(Correction, Corrector):
-    """Changes nothing, and records its calls."""
-
-    expected: list[np.ndarray | None] = field(default_factory=list)
-    received: list[tuple[int, np.ndarray]] = field(default_factory=list)
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def start(self) -> Recorder:
-        return self
-
-    def apply(self, frame: Frame, T_world_camera: np.ndarray | None = None) -> Frame:
-        self.expected.append(T_world_camera)
-        return frame
-
-    def add_pose(self, frame: Frame, T_world_camera: np.ndarray) -> None:
-        self.received.append((frame.index, T_world_camera))

@@ -14,7 +14,6 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.geometry.rigid_motion_kernels import distance_and_angle
 from tofuse.engine.search.pair_agreement import agreement
-from tofuse.engine.tracking import moving_object_kernels as kernels
 from tofuse.engine.tracking.moving_objects import (
     Moving,
     MovingObjects,
@@ -338,35 +337,6 @@ def pair(seed=3):
     return camera, views[1], views[0], T
 
 
-def depth_and_variance(view, stride=1):
-    w, z, sigma = (
-        a[::stride, ::stride].astype(float) for a in (view.planes[..., 3], view.z, view.sigma)
-    )
-    pv = view.plane_variance[::stride, ::stride].astype(float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.where(w > 0, 1 / w, np.where((z > 0) & (sigma > 0), z, 0))
-        return depth, np.where(w > 0, pv / w**4, np.where(depth > 0, sigma**2, 0))
-
-
-def along(view, xy, i, j):
-    """Depth and variance of pixels (i, j) on rays xy."""
-    plane = view.planes[i, j].astype(float)
-    depth, variance = (a[i, j] for a in depth_and_variance(view))
-    w = plane[..., 3]
-    on = (plane[..., :2] * xy).sum(-1) + plane[..., 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        there = np.where(w > 0, 1 / np.clip(on, 0.9 * w, 1.1 * w), depth)
-    pv = view.plane_variance[i, j].astype(float)
-    return there, np.where(w > 0, pv * there**4, variance)
-
-
-def window(z, i, j, radius):
-    """Minimum and maximum valid depth, and number of invalid pixels, around a pixel."""
-    part = z[max(i - radius, 0) : i + radius + 1, max(j - radius, 0) : j + radius + 1]
-    valid = part[part > 0]
-    return valid.min(initial=np.inf), valid.max(initial=0), part.size - valid.size
-
-
 SCALE, MODEL_ERROR, JUMP, RADIUS, MOST, LEAST, WEIGHT, STRIDE = (
     1.3,
     0.004,
@@ -377,12 +347,6 @@ SCALE, MODEL_ERROR, JUMP, RADIUS, MOST, LEAST, WEIGHT, STRIDE = (
     0.3,
     2,
 )
-
-
-def sampled(view):
-    """The view and its cells in the form that the kernels take."""
-    images = view.rays, view.z, view.sigma, view.planes, view.plane_variance
-    return kernels.View(*images, view.projection.lookup, view.projection.frame, STRIDE)
 
 
 @pytest.mark.slow
