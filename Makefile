@@ -29,7 +29,7 @@ nightly: .venv/.ready       ## run the other tests: long runs, clusters, killed 
 	$(PYTEST) -m "nightly or nightly_part"
 
 nightly-part: .venv/.ready  ## run those of them that .ci/run takes as well, 2 minutes
-	$(PYTEST) -m nightly_part
+	$(PYTEST) -m "nightly_part and not nightly"
 
 lint: .venv/.ready          ## formatting, style, strict types, and who may import whom
 	$(BIN)/ruff format --check .

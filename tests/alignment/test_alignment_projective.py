@@ -177,7 +177,6 @@ def test_changed_exposure_is_estimated(room, wall, gain):
         assert_near(found, pair.poses[1], 0.001, 0.03)
 
 
-@pytest.mark.slow
 def test_several_targets_are_combined(room):
     targets = [room.target, Target(room.views[1], se3.inverse(room.poses[1]))]
     both = align(room.views[2], targets, room.poses[1], OPTIONS)

@@ -63,7 +63,6 @@ def test_reconstruction_from_arrays_matches_reference(result):
     assert re.fullmatch(r"Evaluation: ATE 0\.00\d+ m, .* over 6 poses", repr(found))
 
 
-@pytest.mark.slow
 def test_saved_result_round_trips(result, tmp_path):
     assert result.save(tmp_path / "out") == tmp_path / "out"
     again = tofuse.load(tmp_path / "out")
@@ -294,7 +293,6 @@ def test_cloud_format_follows_suffix(result, tmp_path, suffix):
     )
 
 
-@pytest.mark.slow
 def test_view_serves_report_and_images_until_stopped(result):
     from urllib.error import URLError
     from urllib.request import urlopen

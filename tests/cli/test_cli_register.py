@@ -70,7 +70,7 @@ def true_motion(recording: Path, source: int, target: int) -> np.ndarray:
     return se3.inverse(poses[target]) @ poses[source]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_two_frames_of_recording_are_registered(room_recording, tmp_path, capfd) -> None:
     out = tmp_path / "out"
     status, output = register_json(
@@ -113,7 +113,7 @@ def test_frame_numbers_select_source_and_target(room_recording, capfd) -> None:
     near(se3.inverse(back["T_target_source"]), np.array(there["T_target_source"]), metres=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_georeferenced_and_local_cloud_are_registered(tmp_path, capfd) -> None:
     """Without a guess the centres are aligned first; the result is in the frames of the files."""
     target = bumpy_ball(6000, 1) + MAP

@@ -127,7 +127,6 @@ def test_run_json_follows_contract(room_result, room_recording) -> None:
         assert 0 <= values["removed"] <= 1
 
 
-@pytest.mark.slow
 def test_result_depends_on_neither_threads_nor_reference(recording, room_result, tmp_path) -> None:
     assert run_json(room_result)["threads"] == 2
     (recording / "groundtruth.txt").write_text("0 5 5 5 0 0 0 1\n0.1 -5 5 5 0 0 0 1\n")
@@ -135,7 +134,7 @@ def test_result_depends_on_neither_threads_nor_reference(recording, room_result,
     assert same(tmp_path / "out") == same(room_result)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_seed_controls_randomness(room_recording, tmp_path) -> None:
     for name, seed in (("a", 5), ("b", 5), ("c", 6)):
         run(room_recording, "--out", tmp_path / name, "--seed", seed, *QUICK)
@@ -144,7 +143,7 @@ def test_seed_controls_randomness(room_recording, tmp_path) -> None:
     assert len(found) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_run_json_as_config_reproduces_result(recording, tmp_path) -> None:
     camera = json.loads((recording / "camera.json").read_text())
     (recording / "camera.json").write_text(json.dumps(camera | {"confidence_max": 2}))
@@ -172,7 +171,7 @@ def test_run_json_as_config_reproduces_result(recording, tmp_path) -> None:
     assert run_json(tmp_path / "c")["seed"] == 4
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_object_is_segmented_from_background(tmp_path, capsys) -> None:
     effects = Effects.none(shot_noise=True, scatter=0.02)
     simulate("box", tmp_path / "rec", every=20, frames=6, effects=effects)
@@ -206,7 +205,6 @@ def test_object_option_rejects_moving_camera(room_recording, tmp_path, capsys) -
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
 def test_unreadable_frame_is_skipped_and_blank_one_lost(recording, tmp_path, capsys) -> None:
     unreadable, blank = (recording / f"depth/00000{k}.png" for k in (1, 3))
     unreadable.write_bytes(unreadable.read_bytes()[:200])
@@ -227,7 +225,6 @@ def test_unreadable_frame_is_skipped_and_blank_one_lost(recording, tmp_path, cap
     assert "Frame 1 could not be read." in (tmp_path / "out/report.html").read_text()
 
 
-@pytest.mark.slow
 def test_loops_are_read_from_file(room_recording, tmp_path) -> None:
     loops = tmp_path / "loops.txt"
     T = read_tum(room_recording / "groundtruth.txt")[1][6]
@@ -239,7 +236,6 @@ def test_loops_are_read_from_file(room_recording, tmp_path) -> None:
     assert len(read_g2o(tmp_path / "out/pose_graph.g2o").edges) == 8
 
 
-@pytest.mark.slow
 def test_json_lines_end_with_result(room_recording, tmp_path, capfd) -> None:
     run(room_recording, "--out", tmp_path / "out", "--json", "--every", 4, "--voxel", "10cm")
     done = capfd.readouterr()
@@ -255,7 +251,6 @@ def test_json_lines_end_with_result(room_recording, tmp_path, capfd) -> None:
     assert json.loads(capfd.readouterr().out)["facts"]["frames"] == "8"
 
 
-@pytest.mark.slow
 def test_log_output_is_concise_and_notes_appear_once(recording, tmp_path, capfd) -> None:
     camera = json.loads((recording / "camera.json").read_text())
     (recording / "camera.json").write_text(json.dumps(camera | {"colour_of_case": "grey"}))
@@ -271,7 +266,7 @@ def test_log_output_is_concise_and_notes_appear_once(recording, tmp_path, capfd)
     assert "\x1b" not in done.out
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize(
     ("stage", "error"),
     [
@@ -354,7 +349,7 @@ def test_module_runs_as_script() -> None:
     assert done.stdout.startswith("usage: tofuse")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_closed_output_pipe_is_silent(room_recording) -> None:
     words = [sys.executable, "-m", "tofuse", "inspect", str(room_recording)]
     reading, writing = os.pipe()
@@ -364,7 +359,7 @@ def test_closed_output_pipe_is_silent(room_recording) -> None:
     assert (done.returncode, done.stderr) == (141, "")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_peaks_demo(tmp_path, capsys, monkeypatch) -> None:
     out = tmp_path / "demo"
     # A part of the circle.

@@ -42,7 +42,7 @@ def test_clouds_of_any_size_are_registered(scale, degrees):
     assert len(found.unobservable) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_half_of_each_view_may_be_outside_overlap():
     for k in range(3):
         T = turn(rng(k).normal(size=3), 6)
@@ -76,7 +76,7 @@ def test_map_coordinates_keep_precision():
     np.testing.assert_allclose(np.diag(back)[:3], np.diag(near.information)[:3], rtol=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("walls", "count", "noise"),
     [("z", 3, 0.01), ("x", 3, 0.001), ("xy", 1, 0.01), ("xyz", 0, 0.001)],

@@ -126,7 +126,6 @@ def slow_distances(volume, views, poses):
     return np.divide(top, weight, out=np.zeros_like(top), where=weight > 0), weight, seen, margin
 
 
-@pytest.mark.slow
 def test_distances_match_slow_sum_over_views() -> None:
     # A ball in front of a wall, gone after two views: free-space violations, occlusion and jumps.
     rng = np.random.default_rng(2)
@@ -287,7 +286,6 @@ def test_empty_views_make_empty_mesh() -> None:
     assert mesh.cloud().points.shape == (0, 3)
 
 
-@pytest.mark.slow
 def test_builder_keeps_views_within_memory_limit() -> None:
     frames, poses = around_a_ball(60, noise=np.random.default_rng(1))
     posed = dict(enumerate(poses))

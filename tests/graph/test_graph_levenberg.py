@@ -178,7 +178,6 @@ def test_robust_kernels(kernel):
     assert ate(done.graph.poses, truth) < 0.8 * ate(plain.graph.poses, truth)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least"), [("sphere", 63789.07892761), ("parking-garage", 0.63419240)]
 )

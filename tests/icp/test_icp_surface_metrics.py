@@ -102,7 +102,7 @@ def test_symmetric_error_vanishes_on_a_ball():
     assert np.abs(moved - np.eye(4)).max() > 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_gicp_is_insensitive_to_maximum_distance():
     """Figures 3 to 5 of Segal et al.: the largest distance is easy to choose."""
     worst = {}

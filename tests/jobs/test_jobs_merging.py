@@ -104,7 +104,7 @@ def test_run_json_states_session_of_each_frame(both, session_results) -> None:
     assert data["session_pairs"][0]["joined"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_flat_of_same_plan_is_not_joined(session_results) -> None:
     found = merged(session_results["here"], session_results["elsewhere"], searches=4)
     assert found.has_pose.tolist() == [True] * N + [False] * N
@@ -121,7 +121,7 @@ def test_flat_of_same_plan_is_not_joined(session_results) -> None:
     assert exit_status(found) == 3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_loops_of_earlier_merge_are_registered_again(both, session_results, pair) -> None:
     sessions = read_sessions([session_results["elsewhere"], pair], 2, Silent())
     across = [(p.i, p.j) for p in both.diagnostics.loops if p.accepted and p.i < N <= p.j]
@@ -139,7 +139,7 @@ def test_loops_of_earlier_merge_are_registered_again(both, session_results, pair
     assert "loop_rejected" not in codes
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_command_writes_result(session_results, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(merging, "merged_config", quick_merge)
     out = tmp_path / "all"
@@ -237,7 +237,7 @@ def test_damaged_result_is_refused(session_results, tmp_path, changes) -> None:
     refused([session_results["here"], again], "damaged")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_recording_is_added_to_map(session_results, tmp_path, monkeypatch, capsys) -> None:
     """And one that cannot be located in the map leaves it unchanged."""
     monkeypatch.setattr(merging, "merged_config", quick_merge)

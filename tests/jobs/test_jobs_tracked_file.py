@@ -72,7 +72,7 @@ def comparable(result: tofuse.Reconstruction) -> list[object]:
     return [json.dumps(data), *(a.tobytes() for a in arrays)]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_reconstruction_is_repeated_exactly(tmp_path: Path, monkeypatch) -> None:
     """Also with moving objects, lost frames, components and their links."""
     recording = moving_scene()
@@ -109,7 +109,7 @@ def interrupted_at(stage: str, error: BaseException, words: Sequence[str]) -> in
         return main(words)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_interrupted_run_gives_same_bytes(room_recording: Path, tmp_path: Path, capfd) -> None:
     options = [str(room_recording), "--every", "2", "--voxel", "5cm", "--out"]
     whole, out = tmp_path / "whole", tmp_path / "out"

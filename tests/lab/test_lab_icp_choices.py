@@ -96,7 +96,7 @@ def grooved_wall(n, seed):
     return p
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_normal_space_registers_grooves_that_random_points_miss():
     """Figures 7 and 8 of Rusinkiewicz and Levoy: an incised plane."""
     T = se3.exp([0.008, -0.006, 0.003, 0.004, -0.003, 0.01])

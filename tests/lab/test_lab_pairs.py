@@ -98,7 +98,7 @@ def test_cicp_is_more_accurate_in_fewer_iterations_with_noise():
     assert (np.median(comprehensive, 0) < 0.7 * np.median(closest, 0)).all()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ls3d_estimates_free_scale_and_its_precision():
     T = small(1, 4)
     target = view(bumpy_ball(6000, 0))
@@ -136,7 +136,7 @@ def test_ls3d_with_intensity_does_not_slide_along_wall():
     assert error(lit, T)[0] < 0.003
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ndt_has_larger_convergence_basin_than_point_to_plane():
     """Magnusson 2009: coarse cells reach further than closest points."""
     target = view(relief(5000, 0))

@@ -80,7 +80,7 @@ def test_method_is_nearly_exact_without_noise():
     assert run.optimised.position.max() < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_noise_sweep_reproduces_thesis():
     """Figure 5.12, and the level that an independent implementation of the method reaches."""
     sweep = sweep_peaks(range(3), (0.02, 0.06, 0.10))

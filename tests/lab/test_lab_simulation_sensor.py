@@ -229,7 +229,6 @@ def corner(albedo: float = 0.6) -> Boards:
     )
 
 
-@pytest.mark.slow
 def test_corner_multipath_matches_integral_over_walls() -> None:
     """Falloff: half lamp, half lens; bounced light has that of the lamp at its source."""
     model = replace(MODEL, camera=Pinhole(176, 144, 152.0, 152.0, 87.5, 71.5))

@@ -29,7 +29,7 @@ def folder(tmp_path_factory):
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_written_folder_matches_recording_in_memory(folder) -> None:
     source = NativeSource(folder)
     memory = simulate_recording("corner", every=10, frames=3)

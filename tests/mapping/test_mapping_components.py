@@ -107,7 +107,7 @@ def test_live_poses_of_connected_components_are_correct(there_and_back, joined) 
     assert_right([np.eye(4) if T is None else T for T in live], places, rows)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_two_scenes_give_two_components_with_models() -> None:
     places = [*range(10), *range(8)]
     result, _ = run(in_order([*frames_of(range(10)), *frames_of(range(8), **STRANGE)]))
@@ -129,14 +129,14 @@ def test_two_scenes_give_two_components_with_models() -> None:
     assert result.diagnostics.verdict == "degraded"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_few_frames_of_another_scene_get_no_model() -> None:
     result, _ = run(in_order([*frames_of(range(6)), *frames_of(range(3), **STRANGE)]))
     assert [c.connected for c in result.components] == [True, False]
     assert result.components[1].result is None
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_unordered_views_are_joined() -> None:
     places = np.random.default_rng(2).permutation(range(0, 24, 2)).tolist()
     result, _ = run(in_order(frames_of(places)))

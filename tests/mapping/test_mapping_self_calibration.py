@@ -112,7 +112,7 @@ def wrong(recording):
     return seen_by(recording, 1.05)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_wrong_focal_length_is_corrected(wrong) -> None:
     config = replace(COARSE, self_calibration=False)
     stated = reconstruct(wrong, config)
@@ -184,7 +184,7 @@ def test_wrong_intrinsics_are_corrected_or_part_of_bound(true, errors, corrected
         assert run_json(result)["self_calibration"][name] == getattr(d.calibrated, name)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_correct_focal_length_is_unchanged(recording) -> None:
     result = reconstruct(recording, COARSE)
     assert result.diagnostics.calibrated is None

@@ -37,7 +37,7 @@ def opencv_lens(mode: str, lens: list[float]) -> tuple[np.ndarray, np.ndarray]:
     return K, np.array([k[0], k[1], k[9], k[8], k[2], k[3], k[4], k[5]])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("mode", SIZES)
 def test_rays_match_opencv_in_every_mode(tmp_path: Path, mode: str) -> None:
     width, height, *_ = SIZES[mode]

@@ -219,7 +219,7 @@ def test_memory_of_long_intervals_is_bounded() -> None:
     assert np.median(frame.sigma_image) == pytest.approx(SIGMA / np.sqrt(48), rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sr4000_corridor(shared_data: Path) -> None:
     recording = open_recording(shared_data / "sr4000_corridor")
     assert stationary_intervals(recording) == [(0, 4), (4, 8)]

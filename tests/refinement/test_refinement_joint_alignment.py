@@ -55,7 +55,7 @@ def test_only_given_pairs_are_compared(swing):
     np.testing.assert_allclose(alone.poses[-1], start[-1], atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_camera_errors_are_estimated_where_observable():
     truth = path(12)
     views = [SampledView.of(s, 1500) for s in surfaces(truth, offset=0.05)]

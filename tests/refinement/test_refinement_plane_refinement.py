@@ -23,7 +23,7 @@ def nudged(poses, size, seed=0):
     return poses @ se3.exp(steps)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_peaks_error_is_near_bound():
     """From the drift of the thesis's method; `benchmarks/peaks.py` has more noise levels."""
     sigma = 0.04
@@ -41,7 +41,7 @@ def test_peaks_error_is_near_bound():
     assert 0.7 < rms / peaks_bound(sigma) < 2
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_result_is_independent_of_threads():
     views, truth = peaks_views(0.05, 0)
     clouds, start = [v.points[::2] for v in views[:5]], nudged(truth[:5], 0.05)
@@ -61,7 +61,7 @@ def refined(part, views, poses):
     return out.finish([v.index for v in views], poses)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_refinement_is_kept_only_if_views_support_it():
     views, truth = peaks_views(0.05, 2)
     start = nudged(truth[:10], 0.1)
@@ -97,7 +97,7 @@ def test_view_of_another_place_does_not_drag_others():
     assert error.mean() < 2 * peaks_bound(0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_two_sides_of_wall_stay_separate():
     """Two rooms with a thin wall between them, each seen from inside; the rest is seen by both."""
     rng = np.random.default_rng(0)

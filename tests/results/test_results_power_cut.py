@@ -44,7 +44,7 @@ def shown(folder: Path) -> dict[str, bytes]:
     return {name: data for name, data in found.items() if not name.startswith(".tofuse-")}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize("old", [True, False], ids=["over an old one", "a first one"])
 def test_result_is_old_or_new_after_power_cut(memory, power, old) -> None:
     numbers = itertools.count()

@@ -290,7 +290,7 @@ def test_large_step_is_found_without_guess(pair, mode):
     assert found.agreement.violation < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_albedo_resolves_geometric_ambiguity():
     """Bare textured walls, 27 degrees apart."""
     effects = Effects.none(shot_noise=True)

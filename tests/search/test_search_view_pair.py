@@ -87,7 +87,7 @@ def test_covariance_covers_error(far):
     assert gap @ far.information @ gap < 22.5  # 99.9 % of a chi square of six dimensions
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("quarters", [1, 2])
 def test_camera_on_its_side_is_found(quarters):
     # Outside the exhaustive search, whose poses are upright.
@@ -111,7 +111,7 @@ def test_camera_on_its_side_is_found(quarters):
     assert found.believed
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_views_of_different_rooms_are_rejected(pair):
     for k, boxes in enumerate((OTHER, BOXES)):
         half = (3.4, 1.6, 2.9)

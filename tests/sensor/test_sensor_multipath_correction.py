@@ -89,7 +89,7 @@ def test_convex_edge_is_unchanged() -> None:
     assert np.abs(found.z - z).max() < 0.0005
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("albedo", [0.25, 0.9])
 def test_gain_is_estimated_from_flatness_of_surfaces(albedo: float) -> None:
     seen = Seen(LEFT, RIGHT, FLOOR, albedo=albedo)

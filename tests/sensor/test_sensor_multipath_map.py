@@ -69,7 +69,7 @@ def test_cells_tile_surroundings_of_image_up_to_lamp_cone() -> None:
     assert around.fraction.sum() * around.pitch.prod() == pytest.approx(lit, rel=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_map_recalls_planes_and_albedo_after_rotation() -> None:
     known = ReflectorMap()
     # Back and forth, so that the newest view is the one in the middle.
@@ -144,7 +144,7 @@ def test_views_are_stored_by_motion_up_to_a_limit() -> None:
     assert known.patches[:, 0].min() > 20
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_correction_uses_map_only_with_poses() -> None:
     world = (LEFT, RIGHT, FLOOR)
     T = turned(0.45)

@@ -45,7 +45,7 @@ def periods_of(frame: RangeFrame, radial: np.ndarray) -> tuple[np.ndarray, np.nd
     return lacks, frame.valid & (radial > 0) & (off < 0.5) & confident
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_hall_beyond_period_is_unwrapped() -> None:
     """8 x 8 m before a camera with a period of 5 m: most of it is wrapped."""
     frames = taken("hall", 90)
@@ -65,7 +65,7 @@ def test_hall_beyond_period_is_unwrapped() -> None:
     assert harmed <= 0.001 * good
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_room_within_period_is_unchanged() -> None:
     """Its dark chairs and floor reflect as little as a white wall one period farther."""
     frames = taken("room", 128)

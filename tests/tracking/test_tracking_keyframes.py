@@ -127,7 +127,6 @@ def test_motion_thresholds_decide_keyframes(room):
     assert [step.reference for step in always[1:]] == list(range(7))
 
 
-@pytest.mark.slow
 def test_odometry_fills_degenerate_directions():
     sequence = Sequence("wall", range(0, 15, 3))
     # In a frame of reference of its own, as in odometry files.
@@ -203,7 +202,7 @@ def test_unusable_image_is_lost(request, scene, damage, amplitude):
     assert_right(steps, poses)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @BOTH_KINDS
 @pytest.mark.parametrize("damage", NONSENSE.values(), ids=NONSENSE.keys())
 def test_corrupted_image_stays_unconnected(request, scene, damage, amplitude):
@@ -245,7 +244,7 @@ def test_static_camera_stays_static(room):
     assert_right(steps, [*room.poses[:4], *[room.poses[3]] * 4])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize("searches", [True, False])
 def test_jump_away_and_back_gives_three_components(corner, elsewhere, searches):
     frames = in_order([*corner.frames[:4], *elsewhere, *corner.frames[2:5]])
@@ -263,7 +262,6 @@ def test_jump_away_and_back_gives_three_components(corner, elsewhere, searches):
     assert any(i < 4 and j >= 7 for i, j in links) == searches
 
 
-@pytest.mark.slow
 def test_degenerate_directions_are_reported():
     """A flat wall without albedo does not constrain motion within its plane."""
     wall = Sequence("wall", range(0, 12, 3), False)
@@ -279,7 +277,7 @@ def test_degenerate_directions_are_reported():
         assert len(tracked[-1].unobservable) == 3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_interruption_starts_component_without_motion_prior(room):
     frames, poses = [*room.frames[:6], *room.frames[:6]], [*room.poses[:6], *room.poses[:6]]
     tracker = Keyframes().start(0)
@@ -296,7 +294,7 @@ def test_interruption_starts_component_without_motion_prior(room):
     assert_right(run(in_order(frames)), poses)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_real_camera_after_large_move_is_correct_or_doubtful(shared_data):
     """Two positions 305 mm apart along a corridor, with nothing recorded in between."""
     recording = open_recording(shared_data / "sr4000_corridor")

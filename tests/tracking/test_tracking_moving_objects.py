@@ -349,7 +349,6 @@ SCALE, MODEL_ERROR, JUMP, RADIUS, MOST, LEAST, WEIGHT, STRIDE = (
 )
 
 
-@pytest.mark.slow
 def test_person_before_static_camera_is_segmented(shared_data):
     frames = list(open_recording(shared_data / "person_turning"))[:40:4]
     views = [prepare_view(frame, SurfaceOptions()) for frame in frames]

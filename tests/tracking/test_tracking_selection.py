@@ -118,7 +118,7 @@ def test_conflict_is_explained_by_objects_or_rivals(monkeypatch) -> None:
     assert Selection(alignments).best() is static[1]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_passing_object_does_not_drag_poses() -> None:
     """A plate moves with the camera at 3 cm per frame: nearly half a metre in total."""
     frames = []
@@ -138,7 +138,7 @@ def test_passing_object_does_not_drag_poses() -> None:
     assert all(step.moving is None for step in steps[:FIRST])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("there", "component"),
     [(at(0.35, 0.3, 0.25), 1), (at(-0.4, 0.0, 0.25), 0), (at(0.45, 0.0, 0.25), 1)],
@@ -157,7 +157,6 @@ def test_camera_jump_is_not_explained_by_moving_objects(there, component) -> Non
         assert not link.certain or np.linalg.norm(error[:3, 3]) < 0.03
 
 
-@pytest.mark.slow
 def test_fast_turn_keeps_component_if_search_is_certain() -> None:
     path = [*WALK[:12], *(at(-0.07 + 0.03 * k, 0.0, 0.165 + 0.45 + 0.015 * k) for k in range(6))]
     steps = run([seen(T, k) for k, T in enumerate(path)])
@@ -167,7 +166,6 @@ def test_fast_turn_keeps_component_if_search_is_certain() -> None:
         assert off(step, pose)[0] < 0.03
 
 
-@pytest.mark.slow
 def test_fast_turn_measured_by_odometry_needs_no_search() -> None:
     rng = np.random.default_rng(5)
     path = [T @ se3.exp([0, 0, 0, *rng.normal(0, 0.01, 3)]) for T in WALK[:12]]
@@ -181,7 +179,7 @@ def test_fast_turn_measured_by_odometry_needs_no_search() -> None:
         assert off(step, pose, path[0])[0] < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_new_component_continues_motion() -> None:
     """Another room from one frame to the next, with the same camera motion."""
     frames = [seen(T, k) for k, T in enumerate(WALK[:12])]

@@ -76,7 +76,7 @@ def test_halving_matches_slow_twin(shape):
 # --- planes --------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_pixels_without_weight_are_ignored_even_with_unknown_rays():
     rays = CAMERA.rays().copy()
     w, weight = plane_w(rays), np.ones(rays.shape[:2], np.float32)
