@@ -24,7 +24,7 @@ import numba
 from tofuse.engine.compute.ahead import DTYPES
 
 ROOT = Path(__file__).resolve().parents[1]
-LIST = ROOT / "src" / "tofuse" / "kernels" / "signatures.txt"
+LIST = ROOT / "src" / "tofuse" / "engine" / "compute" / "signatures.txt"
 ALONE = (
     "import sys; from tofuse.engine.compute import ahead; ahead.usable_cores = lambda: 1; "
     "from tofuse.apps.cli.program import main; sys.exit(main())"

@@ -65,7 +65,7 @@ def loaded(folder: Path) -> Mesh:
     unknown = np.zeros(len(ply))
     return Mesh(
         ply.points.astype(np.float32), ply.faces, ply.normals, ply.color,
-        unknown.astype(np.float32), unknown.astype(np.int32), np.zeros(3),
+        unknown.astype(np.float32), unknown.astype(np.int32),
     )  # fmt: skip
 
 

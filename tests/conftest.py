@@ -21,7 +21,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if several and not hasattr(config, "workerinput") and not config.option.collectonly:
         from tofuse.engine.compute import ahead
 
-        if not ahead.compiled_marker().exists():
+        marker = ahead.compiled_marker()
+        if marker is not None and not marker.exists():
             with ahead.compiling_in_background():
                 ahead.compile_listed(1, 2)
 

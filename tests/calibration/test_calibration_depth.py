@@ -15,7 +15,7 @@ from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import Recording
-from tofuse.formats.cameras.correction_file import read_correction
+from tofuse.formats.cameras.calibration_files import read_correction
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.scenes import checkerboard

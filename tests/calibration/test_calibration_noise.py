@@ -18,7 +18,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.noise.model import NOISE, NoiseModel, noise_model_for
-from tofuse.formats.cameras.noise_file import read_noise
+from tofuse.formats.cameras.calibration_files import read_noise
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects

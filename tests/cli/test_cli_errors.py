@@ -14,8 +14,7 @@ import pytest
 
 from cli_calls import listing, refuses
 from tofuse.apps.cli.program import main
-from tofuse.formats.images.images import read_image
-from tofuse.formats.images.writing import write_png
+from tofuse.formats.images.images import read_image, write_png
 
 
 @pytest.fixture

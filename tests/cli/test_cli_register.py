@@ -12,8 +12,8 @@ import pytest
 
 from cli_calls import call, listing, refuses
 from registration_scenes import bumpy_ball, stone, turn
-from tofuse.apps.pairs import job as pair_module
 from tofuse.engine.alignment.base import Registration
+from tofuse.engine.clouds import AnyPair
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.formats.geometry.ply import read_ply, write_ply
@@ -118,8 +118,8 @@ def test_georeferenced_and_local_cloud_are_registered(tmp_path, capfd) -> None:
     """Without a guess the centres are aligned first; the result is in the frames of the files."""
     target = bumpy_ball(6000, 1) + MAP
     source = se3.transform(se3.inverse(T_SMALL), bumpy_ball(6000, 2))
-    write_ply(tmp_path / "map.ply", GeometryRecord(target), double=True)
-    write_ply(tmp_path / "local.ply", GeometryRecord(source), double=True)
+    write_ply(tmp_path / "map.ply", GeometryRecord(target))
+    write_ply(tmp_path / "local.ply", GeometryRecord(source))
     _, output = register_json(capfd, tmp_path / "local.ply", tmp_path / "map.ply")
     shift = np.eye(4)
     shift[:3, 3] = MAP
@@ -167,11 +167,11 @@ def test_guess_is_passed_to_registration(clouds, tmp_path, capfd, monkeypatch) -
     """Registration receives the guess, or none."""
     seen = []
 
-    def spy(source, target, *, guess=None):
+    def spy(_, source, target, guess, rng):
         seen.append(guess)
         return made(np.eye(4) if guess is None else guess)
 
-    monkeypatch.setattr(pair_module, "register", spy)
+    monkeypatch.setattr(AnyPair, "register", spy)
     T = se3.exp([0.1, 0.2, 0.3, 0.4, -0.2, 1.0])
     (tmp_path / "guess.txt").write_text(GUESSES["tum"](T))
     _, output = register_json(capfd, *clouds, "--guess", tmp_path / "guess.txt")
@@ -298,7 +298,7 @@ def test_verification_sets_exit_status(
     more, status, says, clouds, tmp_path, capfd, monkeypatch, light_page
 ) -> None:
     """Even if all optional fields are missing."""
-    monkeypatch.setattr(pair_module, "register", lambda *a, **k: made(T_SMALL, **more))
+    monkeypatch.setattr(AnyPair, "register", lambda *a, **k: made(T_SMALL, **more))
     assert call("register", *clouds, "--out", tmp_path / "out") == status
     assert capfd.readouterr().out.splitlines()[0] == says
     assert {p.name for p in (tmp_path / "out").iterdir()} == FILES

@@ -19,8 +19,7 @@ from tofuse.apps.cli.program import main
 from tofuse.engine.errors import TofuseError
 from tofuse.engine.results.verdicts import REASONS
 from tofuse.formats.geometry.ply import read_ply
-from tofuse.formats.images.images import read_image
-from tofuse.formats.images.writing import write_png
+from tofuse.formats.images.images import read_image, write_png
 from tofuse.formats.poses.g2o import read_g2o
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.lab import demo as demo_module

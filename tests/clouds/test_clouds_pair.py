@@ -15,8 +15,9 @@ from registration_scenes import (
     turn,
     view,
 )
+from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.icp.coarse_to_fine import averaged
+from tofuse.engine.icp.coarse_to_fine import CoarseToFine, averaged
 from tofuse.engine.icp.icp import Remapping
 from tofuse.lab.methods.variants import Tricp
 
@@ -185,3 +186,14 @@ def test_non_finite_points_are_dropped():
     source[::7] = np.nan
     target[5] = np.inf
     assert error(tofuse.register(source, target), T)[0] < 0.003
+
+
+def test_method_is_a_part_or_its_name() -> None:
+    T = turn([0, 0, 1], 2)
+    source, target = source_of(stone(1500, 1), T), stone(1500, 0)
+    by_name = tofuse.register(source, target, method="coarse-to-fine")
+    by_part = tofuse.register(source, target, method=CoarseToFine())
+    np.testing.assert_array_equal(by_name.T_target_source, by_part.T_target_source)
+    for wrong in ("ecp", CoarseToFine, 3):
+        with pytest.raises(InputError, match=r"method: is .*; use one of any-pair, coarse-to-fine"):
+            tofuse.register(source, target, method=wrong)

@@ -26,7 +26,9 @@ def test_listed_signatures_compile(tmp_path: Path) -> None:
     """From the cache of these tests, or compiled now: unsupported types would fail."""
     words = [sys.executable, "-m", "tofuse.engine.compute.ahead"]
     subprocess.run(words, check=True, capture_output=True)
-    assert ahead.compiled_marker().exists()
+    marker = ahead.compiled_marker()
+    assert marker is not None
+    assert marker.exists()
 
 
 @pytest.mark.nightly_part
@@ -60,7 +62,7 @@ def test_failed_process_start_is_ignored(tmp_path: Path, monkeypatch: pytest.Mon
     def refused(*_: object, **__: object) -> None:
         raise OSError("no more processes")
 
-    monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(subprocess, "Popen", refused)
     with ahead.compiling_in_background():

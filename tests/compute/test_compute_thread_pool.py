@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import textwrap
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,7 +16,6 @@ from tofuse.engine.compute.thread_pool import (
     chunk_bounds,
     job_pool,
     run_chunks,
-    serial_chunks,
     set_thread_count,
     thread_count,
     threads,
@@ -114,8 +117,39 @@ def test_work_in_job_pool_is_serial() -> None:
     with threads(2):
         with job_pool(1, "beside") as pool:
             assert set(pool.submit(names).result()) == {"beside_0"}
-        with serial_chunks():
+        with threads(2, serial=True):
             assert set(names()) == {threading.current_thread().name}
-        with serial_chunks(False):
+        with threads(2):
             assert threading.current_thread().name not in names()
         assert threading.current_thread().name not in names()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
+def test_forked_child_has_pools_and_locks_of_its_own() -> None:
+    """Also where another thread of its parent holds a lock for ever."""
+    program = textwrap.dedent(
+        """
+        import multiprocessing, threading
+        from tofuse.engine.compute import thread_pool
+        from tofuse.engine.compute.thread_pool import one_blas_thread, run_chunks, threads
+
+        def work():
+            with threads(2), one_blas_thread():
+                return sum(run_chunks(lambda a, b: b - a, 100))
+
+        assert work() == 100
+        def hold(lock, held):
+            with lock:
+                held.set()
+                threading.Event().wait()
+        for lock in (thread_pool._lock, thread_pool._blas_lock):
+            held = threading.Event()
+            threading.Thread(target=hold, args=(lock, held), daemon=True).start()
+            held.wait()
+        with multiprocessing.get_context("fork").Pool(2) as pool:
+            print([pool.apply_async(work).get(30) for _ in range(2)])
+        """
+    )
+    words = [sys.executable, "-W", "ignore", "-c", program]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout == "[100, 100]\n", done.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tofuse.engine.compute import tukey_kernels as tukey
 
@@ -47,3 +48,14 @@ def test_scalars_match_arrays() -> None:
             slope = tukey.slopes(np.float64(e2))
             np.testing.assert_allclose(w * tukey.relative_slope(w), slope, atol=tolerance)
     assert tukey.relative_slope(0.0) == 0
+
+
+@pytest.mark.parametrize("cutoff", [1.0, 2.5, 3.5, 4.685, 10.0])
+def test_consistency_gives_variance_of_normal_residuals(cutoff: float) -> None:
+    residuals = np.random.default_rng(0).normal(0, 1, 1_000_000)
+    weights = tukey.weights((residuals / cutoff) ** 2)
+    mean_square = (weights * residuals**2).sum() / weights.sum()
+    assert tukey.consistency(cutoff) == pytest.approx(mean_square, rel=5e-3)
+    # The derivative of the influence has the same mean: an M-estimate's sandwich needs it.
+    slopes = tukey.slopes((residuals / cutoff) ** 2)
+    assert tukey.consistency(cutoff) == pytest.approx(slopes.sum() / weights.sum(), rel=2e-2)

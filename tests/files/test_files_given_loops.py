@@ -7,7 +7,7 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.formats.poses.given_loops import read_loops
+from tofuse.formats.poses.pose import read_loops
 
 
 def test_loops_from_file(tmp_path):

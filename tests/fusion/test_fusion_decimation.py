@@ -32,7 +32,6 @@ def hills(count: int = 120, seed: int = 0) -> Mesh:
         np.round(128 + 100 * np.sin(2 * points)).astype(np.uint8),
         rng.uniform(0.001, 0.01, len(points)).astype(np.float32),
         rng.integers(1, 40, len(points)).astype(np.int32),
-        np.array([10.0, 20.0, 30.0]),
     )
 
 
@@ -45,7 +44,6 @@ def together(*meshes: Mesh) -> Mesh:
         np.concatenate([each.color for each in meshes]),
         np.concatenate([each.sigma for each in meshes]),
         np.concatenate([each.views for each in meshes]),
-        meshes[0].offset,
     )
 
 
@@ -82,7 +80,6 @@ def test_edge_collapse_is_more_accurate_than_clustering(scale: float) -> None:
     assert off(whole, by_edges) < 0.7 * off(whole, by_cells)
     assert turned_away(whole, by_edges) < 0.001
     assert np.linalg.norm(across(by_edges), axis=1).min() > 0
-    np.testing.assert_array_equal(by_edges.offset, whole.offset)
 
 
 def test_attributes_are_means_of_merged_vertices() -> None:
@@ -144,7 +141,7 @@ def test_meshes_of_several_pieces_are_decimated() -> None:
         .reshape(-1, 3).astype(np.float32),
         np.arange(n, dtype=np.int32).reshape(-1, 3),
         np.tile(np.float32([0, 0, 1]), (n, 1)),
-        None, np.ones(n, np.float32), np.ones(n, np.int32), np.zeros(3),
+        None, np.ones(n, np.float32), np.ones(n, np.int32),
     )  # fmt: skip
     assert len(scraps.decimated(100).faces) <= 100
 
@@ -165,7 +162,7 @@ def test_irregular_meshes_are_decimated(seed: int) -> None:
     soup = Mesh(
         points.astype(np.float32), faces.astype(np.int32),
         np.tile(np.float32([0, 0, 1]), (n, 1)), None,
-        np.ones(n, np.float32), np.ones(n, np.int32), np.zeros(3),
+        np.ones(n, np.float32), np.ones(n, np.int32),
     )  # fmt: skip
     for count in (1, 40, 500):
         small = soup.decimated(count)

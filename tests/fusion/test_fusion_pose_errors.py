@@ -21,14 +21,13 @@ def wall(z: float = 2.0) -> RangeFrame:
     return RangeFrame(0, 0.0, CAMERA, np.full((30, 40), z, np.float32))
 
 
-def model_of(points, offset=(0.0, 0, 0)) -> Model:
+def model_of(points) -> Model:
     n = len(points)
     cloud = Cloud(
         np.asarray(points, np.float32),
         None,
         None,
         np.ones(n, np.int32),
-        np.array(offset),
         np.full(n, SIGMA, np.float32),
     )
     return Model(cloud, None)
@@ -99,7 +98,6 @@ def test_mesh_vertices_include_pose_errors(same) -> None:
         None,
         np.full(n, SIGMA, np.float32),
         np.ones(n, np.int32),
-        np.zeros(3),
     )
     found = with_pose_errors(
         Model(model.cloud, mesh), [wall()], np.eye(4)[None], covariance(0.02)[None]

@@ -25,7 +25,6 @@ def surface(points: np.ndarray, normals: np.ndarray) -> Mesh:
         None,
         np.full(count, 0.001, np.float32),
         np.ones(count, np.int32),
-        np.zeros(3),
     )
 
 

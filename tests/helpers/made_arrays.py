@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.geometry.se3 import exp
-from tofuse.formats.images.writing import write_png
+from tofuse.formats.images.images import write_png
 
 RNG = np.random.default_rng(90)
 COUNTS = RNG.integers(300, 5000, (3, 12, 16)).astype(np.uint16)

@@ -11,7 +11,7 @@ import numpy as np
 
 import made_phones
 from made_phones import ARKIT, CONFIDENCE, CX, CY, DEPTH, FX, HEIGHT, POSES, WIDTH, millimetres
-from tofuse.formats.images.writing import write_png
+from tofuse.formats.images.images import write_png
 
 IMAGE = (8 * WIDTH, 8 * HEIGHT)  # of colour
 TICKS = [132_000_000_000_000_000 + 2_000_000 * k for k in range(3)]  # 0.2 s apart

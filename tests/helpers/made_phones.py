@@ -14,7 +14,7 @@ import numpy as np
 
 from tofuse.engine.geometry.quaternion import from_matrix
 from tofuse.engine.geometry.se3 import exp
-from tofuse.formats.images.writing import write_png
+from tofuse.formats.images.images import write_png
 
 WIDTH, HEIGHT = 32, 24  # with the aspect ratio of 1920 x 1440
 FX, CX, CY = 1300.0, 961.5, 718.25

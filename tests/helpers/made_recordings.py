@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.geometry.se3 import exp
-from tofuse.formats.images.writing import write_png
+from tofuse.formats.images.images import write_png
 from tofuse.formats.poses.trajectory import write_tum
 
 RNG = np.random.default_rng(20)

@@ -152,7 +152,6 @@ def lonely(**changes):
         None,
         None,
         np.ones(3, np.int32),
-        np.zeros(3),
     )
     diagnostics = Diagnostics(
         "good",

@@ -28,5 +28,4 @@ def waves(n=N, origin=(3.0, -2.0, 5.0)):
         rng.integers(0, 256, (count, 3)).astype(np.uint8),
         rng.uniform(0.001, 0.02, count).astype(np.float32),
         rng.integers(1, 900, count).astype(np.int32),
-        np.zeros(3),
     )

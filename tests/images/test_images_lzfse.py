@@ -10,7 +10,7 @@ import pytest
 
 from made_phones import lzfse_raw
 from tofuse.engine.errors import InputError
-from tofuse.formats.readers.lzfse import lzfse_decompress
+from tofuse.formats.readers.record3d import lzfse_decompress
 
 # `CONTENT` compressed by Apple's reference encoder.
 STREAM = base64.b64decode(

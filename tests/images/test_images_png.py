@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.errors import InputError
-from tofuse.formats.images.images import read_color, read_header, read_image
-from tofuse.formats.images.writing import write_png
+from tofuse.formats.images.images import read_color, read_header, read_image, write_png
 
 
 def _depth(rng: np.random.Generator) -> np.ndarray:

@@ -22,7 +22,8 @@ from tofuse.engine.errors import OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.results.types import SelfCalibration
+from tofuse.engine.quality.pose_accuracy import Accuracy, WorstFrame
+from tofuse.engine.results.types import Reason, SelfCalibration
 from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.native import RecordingWriter
 from wrapped_depth import wrapping
@@ -384,6 +385,37 @@ def test_corrected_intrinsics_do_not_affect_verdict(
 
     assert not faults(harmless)
     assert faults(severe)
+
+
+@pytest.mark.parametrize(
+    ("factor", "corrected"), [(0.95, True), (0.97, True), (0.83, False), (1.05, False)]
+)
+def test_focal_length_is_corrected_only_as_finding_says(
+    result: tofuse.Result, factor: float, corrected: bool
+) -> None:
+    """A focal length and an offset trade off: the correction may be of another amount."""
+    wrong = Finding("focal_length", "Wrong.", "Use it.", {"factor": factor, "sigma": 0.01})
+    calibrated = SelfCalibration(0.05, 0.1, 0.0, 0.0, 0.0, {"focal": 0.002}, (0.1, 0.01))
+    diagnostics = replace(result.diagnostics, calibrated=calibrated)
+    found = with_findings(replace(result, diagnostics=diagnostics), [wrong])
+    codes = {reason.code for reason in found.diagnostics.reasons}
+    assert ("faulty_recording" not in codes) == corrected
+
+
+def test_no_bound_is_stated_with_a_severe_fault(result: tofuse.Result) -> None:
+    bounded = replace(
+        result.diagnostics,
+        accuracy=Accuracy(0.02, 0.01, 0.003, True, WorstFrame(1, 0.03, 0.01)),
+        reasons=(Reason("uncertain_poses", ((0, 2),), "Pose errors may reach 20 mm."),),
+    )
+    sound = replace(result, diagnostics=bounded)
+    fault = Finding("z_taken_for_range", "Walls are concave.", "Declare z.", {})
+    found = with_findings(sound, [fault])
+    assert not np.isfinite(found.diagnostics.accuracy.position_m)
+    assert found.diagnostics.accuracy.assessed
+    assert [r.code for r in found.diagnostics.reasons] == ["faulty_recording"]
+    note = Finding("static", "It stands still.", "Move.", {})
+    assert with_findings(sound, [note]).diagnostics.accuracy == bounded.accuracy
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
-from tofuse.formats.cameras.correction_file import corrected_depth
+from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.models import CAMERAS, camera_model

@@ -22,7 +22,7 @@ from tofuse.engine.noise.model import (
     RangeLaw,
     incidence_cosine,
 )
-from tofuse.formats.cameras.noise_file import read_noise, write_noise
+from tofuse.formats.cameras.calibration_files import read_noise, write_noise
 
 CAMERA = Pinhole(40, 30, 30.0, 30.0, 19.5, 14.5)
 DARK = NoiseModel("dark", RangeLaw(0.01, 0.0), AmplitudeLaw(0.0, 2.0), ceiling_m=10.0)

@@ -95,7 +95,7 @@ def test_fixed_vertices_comments_and_order_are_tolerated(tmp_path):
         (VERTICES.replace("0.6", "0.1"), 2, "quaternion has length 0.8062"),
         (VERTICES.replace("0.6 0.8", "0 0"), 2, "quaternion has length 0"),
         (VERTICES.replace("0.6", "x"), 2, "not a number"),
-        (VERTICES.replace("QUAT 7", "QUAT 7.5"), 2, "not a whole number"),
+        (VERTICES.replace("QUAT 7", "QUAT 7.5"), 2, "not a number (invalid literal for int"),
         (VERTICES.replace(" 0.8", ""), 2, "has 7 numbers, not 8"),
         (VERTICES + EDGE.rsplit(" ", 1)[0], 3, "has 29 numbers, not 30"),
         (VERTICES + "VERTEX_SE2 1 0 0 0\n", 3, "'VERTEX_SE2'"),

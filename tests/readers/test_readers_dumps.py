@@ -18,7 +18,7 @@ from posed_results import POSES as EXPORTED_POSES
 from tofuse.apps.export.exporting import export
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.formats.readers.pgm import parse_pgm
+from tofuse.formats.readers.hololens2 import parse_pgm
 from tofuse.formats.recordings.open import open_recording
 
 

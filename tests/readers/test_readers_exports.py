@@ -16,7 +16,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.geometry.ply import read_ply, write_ply
-from tofuse.formats.images.tiff import read_tiff
+from tofuse.formats.images.images import read_tiff
 from tofuse.formats.recordings.open import open_recording
 
 Maker = Callable[[Path], None]

@@ -13,7 +13,7 @@ from tofuse.engine.errors import InputError, OutputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.geometry.se3 import exp
 from tofuse.engine.sensor.camera_errors import DepthCorrection
-from tofuse.formats.images.writing import write_png
+from tofuse.formats.images.images import write_png
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.readers.native import NativeSource
 from tofuse.formats.recordings.native import RecordingWriter

@@ -30,7 +30,7 @@ from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, Rational
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry.se3 import exp, inverse, log
-from tofuse.formats.images.writing import png_bytes
+from tofuse.formats.images.images import png_bytes
 from tofuse.formats.readers.maker_bags import RealSenseSource
 from tofuse.formats.recordings.open import open_recording
 

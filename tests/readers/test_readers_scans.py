@@ -119,15 +119,13 @@ def written(path: Path, points: np.ndarray = POINTS, **header: object) -> Path:
 
 
 def test_map_coordinates_keep_millimetre_precision(tmp_path: Path) -> None:
-    """Easting and northing exceed float32 precision: they are shifted, with a warning."""
+    """Easting and northing exceed float32 precision: the frame has the shift to them."""
     where = np.array([453_210.0, 5_411_870.0, 300.0])
     path = written(tmp_path / "a.las", POINTS + where, scales=np.full(3, 1e-3), offsets=where)
-    recording = tofuse.open(path)
-    shift = np.array(recording.metadata["shift_m"])
-    frame = recording[0]
+    frame = tofuse.open(path)[0]
     assert isinstance(frame, CloudFrame)
-    assert np.allclose(frame.points + shift, POINTS + where, atol=2e-3)
-    assert any("minus (453000, 5412000, 0) m" in w for w in recording.warnings)
+    np.testing.assert_array_equal(frame.shift, [453_000, 5_412_000, 0])
+    assert np.allclose(frame.points + frame.shift, POINTS + where, atol=2e-3)
 
 
 def test_las_with_excessive_point_count(tmp_path: Path) -> None:

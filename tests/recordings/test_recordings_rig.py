@@ -38,7 +38,7 @@ def test_round_trip(tmp_path: Path) -> None:
     ("change", "message"),
     [
         (lambda d: d.update(schema=2), "schema is 2"),
-        (lambda d: d.pop("cameras"), "cameras is not a list"),
+        (lambda d: d.pop("cameras"), "cameras: is not a list"),
         (lambda d: d["cameras"][1].update(name="left"), "two cameras called 'left'"),
         (lambda d: d["cameras"][1].update(T_rig_camera=[1, 2, 3]), "4 x 4 finite numbers"),
         (lambda d: d["cameras"][1].update(T_rig_camera=(2 * np.eye(4)).tolist()), "rotation"),

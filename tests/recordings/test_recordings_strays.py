@@ -19,8 +19,7 @@ from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError
 from tofuse.formats.files.stamps import stamps_in
 from tofuse.formats.poses.g2o import read_g2o
-from tofuse.formats.poses.given_loops import read_loops
-from tofuse.formats.poses.pose import read_pose
+from tofuse.formats.poses.pose import read_loops, read_pose
 from tofuse.formats.poses.trajectory_formats import read_poses
 from tofuse.formats.rigs.rig_file import read_rig
 

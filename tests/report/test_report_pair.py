@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from registration_scenes import relief, view
 from tofuse.apps.pairs.page import PairScene, distances, packed, still
-from tofuse.apps.pairs.result import LocalView, PairResult
+from tofuse.apps.pairs.result import PairResult
 from tofuse.apps.report import thumbnails
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.geometry import se3
@@ -17,10 +19,9 @@ from unpacked import unpack
 T = se3.exp([0.1, -0.05, 0.02, 0.02, 0.1, -0.05])
 
 
-def local(points: np.ndarray, format: str = "ply", center=(0, 0, 0)) -> LocalView:  # noqa: A002
-    frame = view(points)
-    center = np.asarray(center, float)
-    return LocalView(SingleView("a", "a", format, 0, frame, center), frame, center)
+def local(points: np.ndarray, format: str = "ply", center=(0, 0, 0)) -> SingleView:  # noqa: A002
+    frame = replace(view(points), shift=np.asarray(center, float))
+    return SingleView("a", "a", format, 0, frame)
 
 
 def pair(points: np.ndarray, others: np.ndarray, pose=T, start=None, **more) -> PairResult:

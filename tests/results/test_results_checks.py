@@ -206,6 +206,7 @@ CASES = {
     "bridged_gap": in_components(Component(((5, 8),), np.eye(4), "motion")),
     "single_link": replace(evidence(), single_link_frames=(5, 6, 7, 8)),
     "moving_objects": evidence(moving=((3, 0.1), (4, 0.234), (6, 0.0))),
+    "open_motion": evidence(moving=((3, 0.1), (4, 0.26))),
     "doubtful_poses": evidence(doubtful=(2, 3, 6)),
 }
 
@@ -235,7 +236,7 @@ def test_each_reason_comes_from_its_own_evidence(code) -> None:
     assert isinstance(first, int)
     assert 0 <= first <= last < len(CASES[code].records)
     # No other reasons, except those that follow from it.
-    follows = {"few_poses": {"lost_frames"}}
+    follows = {"few_poses": {"lost_frames"}, "open_motion": {"moving_objects"}}
     assert {r.code for r in reasons} - {code} <= follows.get(code, set())
 
 

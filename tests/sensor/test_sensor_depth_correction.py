@@ -5,7 +5,7 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.sensor.camera_errors import DepthCorrection
-from tofuse.formats.cameras.correction_file import read_correction, write_correction
+from tofuse.formats.cameras.calibration_files import read_correction, write_correction
 
 
 def test_curve_is_linear_between_knots_and_constant_outside() -> None:

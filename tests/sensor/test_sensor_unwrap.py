@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tofuse.formats.images.writing import write_png
 
 import tofuse
 from tofuse.engine.cameras.depth_conversion import range_from_z
@@ -19,7 +20,6 @@ from tofuse.engine.sensor.unwrap import (
     on_surface,
 )
 from tofuse.engine.sensor.unwrap_kernels import NEIGHBOURS, pass_messages
-from tofuse.formats.images.writing import write_png
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 

@@ -50,6 +50,10 @@ class RegistrationError(TofuseError):
     """Two views can't be registered (no points, no overlap)."""
 
 
+class KernelCacheWarning(RuntimeWarning):
+    """Compiled kernels can't be kept, so that each run takes half a minute longer."""
+
+
 _REMEDIES = {
     errno.ENOSPC: "free some space, or choose another folder",
     errno.EDQUOT: "free some space, or choose another folder",

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 # Median of the absolute values, in standard deviations; and the reciprocal.
 MEDIAN_OF_NORMAL = 0.6745
 SIGMA_OF_MEDIAN = 1.4826
-# One in twenty errors exceeds this many standard deviations.
-OF_95_PERCENT = 1.96
+# One in twenty errors exceeds this many standard deviations; one in a hundred.
+OF_95_PERCENT, OF_99_PERCENT = 1.96, 2.576
 
 
 def robust_sigma(errors: ArrayLike) -> float:

@@ -186,7 +186,7 @@ class Result(Reconstruction):
         """Draw the model and the camera trajectory from above and from the side."""
         from tofuse.apps.report import plots
 
-        points = self.cloud.points.astype(float) + self.cloud.offset
+        points = self.cloud.points.astype(float)
         points = points[np.isfinite(points).all(1)]
         path = self.trajectory[self.has_pose][:, :3, 3]
         if not len(points):

@@ -12,7 +12,7 @@ from tofuse.engine.cameras import Camera, RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.formats.cameras import camera_file
-from tofuse.formats.files import atomic, json_data, reading
+from tofuse.formats.files import atomic, reading
 
 _LENS = ("schema", "model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
 _METADATA = (
@@ -29,7 +29,7 @@ def recording_fields(recording: Recording) -> dict[str, Any]:
     """Return the fields of camera.json that describe a recording's images, without the lens."""
     path = Path(recording.path) / "camera.json"
     if reading.is_folder(Path(recording.path)) and reading.is_file(path):
-        return {key: value for key, value in json_data.read_json(path).items() if key not in _LENS}
+        return {key: value for key, value in reading.read_json(path).items() if key not in _LENS}
     metadata = {key: recording.metadata.get(key) for key in _METADATA}
     present = {key: value for key, value in metadata.items() if value is not None}
     frame = next((f for f in recording.sample(3) if isinstance(f, RangeFrame)), None)

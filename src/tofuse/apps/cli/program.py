@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from time import sleep
@@ -43,11 +44,27 @@ def console() -> int:
 
 
 def prepare_process() -> None:
-    """Set environment variables that libraries read when they are loaded."""
+    """Set environment variables that libraries read when they are loaded, and plain warnings."""
+    warnings.formatwarning = _format_warning
     # BLAS is limited to one thread later, but reserves memory for more; if that fails, it hangs.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Otherwise it prints several lines for a damaged image, besides the message of this program.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+
+
+def _format_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
+) -> str:
+    """Format those of this package as its other messages."""
+    from tofuse.engine.errors import KernelCacheWarning
+
+    if issubclass(category, KernelCacheWarning):
+        return f"tofuse: {message}\n"
+    return f"{filename}:{lineno}: {category.__name__}: {message}\n"
 
 
 @contextmanager

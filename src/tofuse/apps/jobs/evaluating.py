@@ -109,6 +109,11 @@ def evaluate(
         )
     times, poses = _timed(timed[0], estimate, clock, names[0])
     reference_times, reference_poses = _timed(timed[1], reference, clock, names[1])
+    # About the clouds: errors of rotation have long lever arms at the origin of map coordinates.
+    shift = _shift(estimate)
+    reference_poses = se3.about(-shift, reference_poses)
+    if not isinstance(estimate, Reconstruction):
+        poses = se3.about(-shift, poses)
     frame_times = None if recording is None else recording.timestamps
     try:
         error = trajectory_errors.evaluate_trajectory(
@@ -132,14 +137,31 @@ def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corr
         return CameraErrors.made_with(config)
     if isinstance(estimate, Reconstruction):
         return CameraErrors.made_with(estimate.config)
-    if not isinstance(estimate, str | Path):
-        return ()
-    folder = Path(estimate)
-    folder = folder.parent if folder.name == _TRAJECTORY else folder
-    if not folders.is_result(folder):
+    folder = _result_folder(estimate)
+    if folder is None:
         return ()
     with run_json.opened(folder) as run:
         return CameraErrors.made_with(run["config"])
+
+
+def _shift(estimate: Poses) -> Float64:
+    """Return the shift (3,) in m of the clouds of a result; zero for other poses."""
+    if isinstance(estimate, Reconstruction):
+        return estimate.shift
+    folder = _result_folder(estimate)
+    if folder is None:
+        return np.zeros(3)
+    with run_json.opened(folder) as run:
+        return run_json.shift_of(run, folder / "run.json")
+
+
+def _result_folder(poses: Poses) -> Path | None:
+    """Return the result that poses are read from; None if there is none."""
+    if not isinstance(poses, str | Path):
+        return None
+    folder = Path(poses)
+    folder = folder.parent if folder.name == _TRAJECTORY else folder
+    return folder if folders.is_result(folder) else None
 
 
 def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:

@@ -100,9 +100,9 @@ def reference_in_world(recording: Recording, result: Reconstruction) -> Float64 
 
     They are aligned at the first frame that has both poses.
     """
-    reference = recording.reference
-    if reference is None:
+    if recording.reference is None:
         return None
+    reference = se3.about(-result.shift, recording.reference)
     common = np.flatnonzero(np.isfinite(reference[:, 0, 0]) & result.has_pose)
     if len(common) == 0:
         return None

@@ -26,8 +26,15 @@ from tofuse.engine.frames import Recording
 from tofuse.engine.fusion import texture
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import Config, adaptation, reconstructing, texturing
+from tofuse.engine.normal import OF_99_PERCENT
 from tofuse.engine.progress import Progress, Silent, Stopwatch
-from tofuse.engine.results import Reason, Reconstruction, in_main_model, verdicts
+from tofuse.engine.results import (
+    Reason,
+    Reconstruction,
+    SelfCalibration,
+    in_main_model,
+    verdicts,
+)
 from tofuse.engine.sensor import Unwrap
 from tofuse.formats.files import stamps
 from tofuse.formats.poses import read_loops
@@ -194,32 +201,31 @@ def with_findings(
     """Return the result with the findings of an inspection, which may change the verdict.
 
     Two kinds of faults are ignored: wrapped background behind a turning object, as it is removed,
-    and intrinsics that self-calibration has corrected.
+    and intrinsics that self-calibration has corrected as the finding says. With any other severe
+    fault no bound is stated: its evidence supposes a sound recording.
     """
     indices = [f.index for f in result.diagnostics.frames]
     full_range = ((indices[0], indices[-1]),)
     calibrated = result.diagnostics.calibrated
-    harmless = {"phase_wrap"} if turning else set()
-    if calibrated is not None:
-        corrections = {
-            "focal_length": calibrated.focal,
-            "other_intrinsics": calibrated.center_x or calibrated.center_y,
-            "lens_distortion": calibrated.distortion,
-        }
-        harmless |= {code for code, correction in corrections.items() if correction}
     severe = [
         Reason("faulty_recording", full_range, f"{f.text} {f.remedy}")
         for f in findings
-        if f.severity == "severe" and f.code not in harmless
+        if f.severity == "severe"
+        and not (turning and f.code == "phase_wrap")
+        and not _is_corrected(f, calibrated)
     ]
-    reasons = verdicts.ranked((*result.diagnostics.reasons, *severe))
+    known, accuracy = result.diagnostics.reasons, result.diagnostics.accuracy
+    if severe:
+        accuracy = accuracy.without_bound()
+        known = tuple(reason for reason in known if reason.code != "uncertain_poses")
+    reasons = verdicts.ranked((*known, *severe))
     verdict = verdicts.verdict_of(reasons)
     recording = {
         **result.recording,
         "warnings": [*result.recording["warnings"], *(str(f) for f in findings)],
         "findings": [f.to_dict() for f in findings],
     }
-    diagnostics = replace(result.diagnostics, verdict=verdict, reasons=reasons)
+    diagnostics = replace(result.diagnostics, verdict=verdict, reasons=reasons, accuracy=accuracy)
     components = tuple(
         c
         if c.result is None
@@ -227,6 +233,22 @@ def with_findings(
         for c in result.components
     )
     return replace(result, recording=recording, diagnostics=diagnostics, components=components)
+
+
+def _is_corrected(finding: Finding, calibrated: SelfCalibration | None) -> bool:
+    """Whether self-calibration has corrected what a finding reports, by the amount it states."""
+    if calibrated is None:
+        return False
+    if finding.code == "focal_length" and calibrated.focal and "factor" in finding.evidence:
+        difference = finding.evidence["factor"] - 1 / (1 + calibrated.focal)
+        sigma = np.hypot(finding.evidence["sigma"], dict(calibrated.sigmas).get("focal", 0.0))
+        return bool(abs(difference) <= OF_99_PERCENT * sigma)
+    corrections = {
+        "focal_length": calibrated.focal,
+        "other_intrinsics": calibrated.center_x or calibrated.center_y,
+        "lens_distortion": calibrated.distortion,
+    }
+    return bool(corrections.get(finding.code))
 
 
 def exit_status(result: Reconstruction) -> int:

@@ -13,25 +13,19 @@ from threadpoolctl import threadpool_limits
 from tofuse.apps.pairs.result import (
     CONTRACT,
     MARKER,
-    LocalView,
     PairResult,
     pair_json,
     write_aligned,
 )
 from tofuse.apps.results import folders
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds import register
+from tofuse.engine.clouds import AnyPair, NearOrigin
 from tofuse.engine.compute import threads
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import CloudFrame
-from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Progress, Silent
 from tofuse.formats.files import atomic
 from tofuse.formats.poses import pose_text, read_pose
 from tofuse.formats.recordings import SingleView, open_view
-
-# Clouds farther from the origin are centred first: rotation errors would have long lever arms.
-MAX_ORIGIN_DISTANCE_M = 1000.0
 
 
 @dataclass(frozen=True)
@@ -99,21 +93,18 @@ def _registered(
     source: str, target: str, guess: Float64 | None, options: PairOptions, progress: Progress
 ) -> PairResult:
     views = _open_both(source, target, options)
-    local_source, local_target = _near_origin(*views, guess)
-    T_start = np.eye(4)
-    if guess is not None:
-        T_start = guess.copy()
-        T_start[:3, 3] += guess[:3, :3] @ local_source.center - local_target.center
-        # Projected onto a rotation: rounded entries would move points far from the origin.
-        T_start = se3.orthonormalise(T_start)
+    near = NearOrigin.of(views[0].frame, views[1].frame, guess)
     progress.stage("registering")
     start_s = perf_counter()
-    registration = register(
-        local_source.frame, local_target.frame, guess=None if guess is None else T_start
+    registration = AnyPair().register(
+        near.source, near.target, near.guess, np.random.default_rng([0, 0])
     )
     seconds = perf_counter() - start_s
     name = None if options.guess is None else str(options.guess)
-    return PairResult(local_source, local_target, registration, T_start, name, seconds)
+    near_source = replace(views[0], frame=near.source)
+    near_target = replace(views[1], frame=near.target)
+    T_start = np.eye(4) if near.guess is None else near.guess
+    return PairResult(near_source, near_target, registration, T_start, name, seconds)
 
 
 def _open_both(source: str, target: str, options: PairOptions) -> tuple[SingleView, SingleView]:
@@ -135,44 +126,6 @@ def _open_both(source: str, target: str, options: PairOptions) -> tuple[SingleVi
     if len(refusals) == 2:
         raise refusals[0]
     return views[0], views[1]
-
-
-def _near_origin(
-    source: SingleView, target: SingleView, guess: Float64 | None
-) -> tuple[LocalView, LocalView]:
-    """Move clouds that are far from the origin near it.
-
-    Without a guess, clouds close to each other are shifted equally, which preserves the identity as
-    initial pose; else each is centred.
-    """
-    boxes = [_box(view) for view in (source, target)]
-    if not any(np.abs(box).max() > MAX_ORIGIN_DISTANCE_M for box in boxes):
-        zero = np.zeros(3)
-        return LocalView(source, source.frame, zero), LocalView(target, target.frame, zero)
-    centers = [np.round(box.mean(0)) for box in boxes]
-    for k, view in enumerate((source, target)):
-        if not isinstance(view.frame, CloudFrame):
-            centers[k] = np.zeros(3)
-    if guess is None and all(isinstance(v.frame, CloudFrame) for v in (source, target)):
-        max_distance = np.ptp(boxes[0], axis=0).max() + np.ptp(boxes[1], axis=0).max()
-        if np.linalg.norm(centers[0] - centers[1]) <= max_distance:
-            centers[0] = centers[1]
-    return _shifted(source, centers[0]), _shifted(target, centers[1])
-
-
-def _box(view: SingleView) -> Float64:
-    """Return the corners (2, 3) of the box of 90 % of the points, in the file's coordinates."""
-    box: Float64 = np.percentile(view.frame.points.astype(float), [5, 95], axis=0)
-    return box + view.shift
-
-
-def _shifted(view: SingleView, center: Float64) -> LocalView:
-    frame = view.frame
-    if isinstance(frame, CloudFrame):
-        step = view.shift - center
-        points = (frame.points.astype(np.float64) + step).astype(np.float32)
-        frame = replace(frame, points=points, origin=frame.origin + step)
-    return LocalView(view, frame, center)
 
 
 def _write(result: PairResult, folder: folders.OutputFolder) -> None:

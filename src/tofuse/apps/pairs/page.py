@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from tofuse.apps.pairs import pair_words
-from tofuse.apps.pairs.result import LocalView, PairResult
+from tofuse.apps.pairs.result import PairResult
 from tofuse.apps.report import html, packing, scene, thumbnails, words
 from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp import surface_shape
+from tofuse.formats.recordings import SingleView
 
 COLORS = {"source": (240, 160, 60), "target": (90, 176, 245)}
 MODES = {"before": "Before", "after": "After", "distance": "After, by distance"}
@@ -40,7 +41,7 @@ def write_pair_report(result: PairResult, path: Path) -> None:
         If the file can't be written; an earlier one is unchanged then.
     """
     pair = PairScene.of(result)
-    source, target = (Path(v.view.name).name or v.view.name for v in (result.source, result.target))
+    source, target = (Path(v.name).name or v.name for v in (result.source, result.target))
     html.write_page(
         path,
         "pair.html.j2",
@@ -59,7 +60,7 @@ def write_pair_report(result: PairResult, path: Path) -> None:
 def _verdict(result: PairResult) -> dict[str, Any]:
     registration = result.registration
     head, tail = pair_words.decision(result)
-    name = "Displacement of the centre" if result.source.center.any() else "Translation"
+    name = "Displacement of the centre" if result.source.frame.shift.any() else "Translation"
     facts = [(name, words.length(float(np.linalg.norm(result.moved_m))))]
     facts.append(("Rotation", pair_words.rotation(result).split(" about ")[0]))
     if registration.overlap is not None:
@@ -98,8 +99,7 @@ def _model(pair: PairScene) -> dict[str, Any]:
     }
 
 
-def _row(name: str, local: LocalView) -> tuple[str, ...]:
-    view = local.view
+def _row(name: str, view: SingleView) -> tuple[str, ...]:
     return name, view.path, str(view.index), view.format, f"{len(view.frame):,}"
 
 
@@ -193,13 +193,13 @@ def _search_points(frame: Frame) -> CloudFrame:
     return CloudFrame(0, 0.0, frame.points[sampled], normals, origin=frame.origin)
 
 
-def _is_z_up(local: LocalView) -> bool:
+def _is_z_up(view: SingleView) -> bool:
     """Whether z is up: in maps, and with scanners, which measure in all directions."""
-    if not isinstance(local.view.frame, CloudFrame):
+    if not isinstance(view.frame, CloudFrame):
         return False
-    if local.view.format in _Z_UP or local.center.any():
+    if view.format in _Z_UP or view.frame.shift.any():
         return True
-    return _MIN_BEHIND <= float((local.view.frame.points[:, 2] < 0).mean()) <= 1 - _MIN_BEHIND
+    return _MIN_BEHIND <= float((view.frame.points[:, 2] < 0).mean()) <= 1 - _MIN_BEHIND
 
 
 def _cap(distance: Float64, rms_m: float) -> float:

@@ -33,7 +33,7 @@ def lines(result: PairResult) -> list[tuple[str, str]]:
     """Return name and value of each property of the pose; values may have several lines."""
     t = result.T_target_source[:3, 3]
     translation = f"{vector(t, 4)} m, length {np.linalg.norm(t):.4f} m"
-    center = result.source.center
+    center = result.source.frame.shift
     if center.any():
         displacement = f"displacement {vector(result.moved_m, 4)} m"
         translation += f"\n{displacement} at {vector(center, 0)}, the source's centre"

@@ -14,34 +14,14 @@ from tofuse._version import __version__
 from tofuse.apps.results import folders, run_json
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames import Frame
+from tofuse.engine.clouds import NearOrigin
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.formats.geometry import write_ply
 from tofuse.formats.recordings import SingleView
-from tofuse.formats.sources import cloud_sequence
 
 MARKER = "registration.json"
 FILES = ("transform.txt", "aligned.ply", "report.html", MARKER)
-
-
-@dataclass(frozen=True, eq=False)
-class LocalView:
-    """A view translated to the origin, where single precision is sufficient.
-
-    Attributes
-    ----------
-    view
-        The view as it was read.
-    frame
-        The same view, with `center` as its origin.
-    center
-        (3,) m, in the coordinates of the file; zero for images, and for clouds near the origin.
-    """
-
-    view: SingleView
-    frame: Frame
-    center: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,47 +31,46 @@ class PairResult:
     Attributes
     ----------
     source, target
-        The views.
+        The views, near the origin: a cloud in map coordinates has the `shift` to them.
     registration
-        The registration of the local frames.
+        The registration of these views.
     T_start
-        (4, 4) initial guess T_target_source of the local frames.
+        (4, 4) initial guess T_target_source of these views.
     guess
         The file of the initial guess, or None.
     seconds
         Time that registration took.
     """
 
-    source: LocalView
-    target: LocalView
+    source: SingleView
+    target: SingleView
     registration: Registration
     T_start: Float64
     guess: str | None = None
     seconds: float = 0.0
 
-    def in_files(self, T: Float64) -> Float64:
-        """Convert T_target_source (4, 4) of the local frames to the coordinates of the files."""
-        out = np.array(T, float)
-        out[:3, 3] += self.target.center - out[:3, :3] @ self.source.center
-        return out
+    @cached_property
+    def in_files(self) -> Registration:
+        """The registration in the coordinates of the files."""
+        near = NearOrigin(self.source.frame, self.target.frame, None)
+        return near.in_files(self.registration)
 
     @property
     def T_target_source(self) -> Float64:
         """(4, 4), maps coordinates of the source's file to those of the target's."""
-        return self.in_files(self.registration.T_target_source)
+        return self.in_files.T_target_source
 
     @property
     def moved_m(self) -> Float64:
-        """(3,) displacement of the source's `center`, m: the translation if that is the origin."""
-        center = self.source.center
+        """(3,) displacement of the source's `shift`, m: the translation if that is zero."""
+        center = self.source.frame.shift
         displacement: Float64 = se3.transform(self.T_target_source, center[None])[0] - center
         return displacement
 
     @property
     def runner_up(self) -> Float64 | None:
         """(4, 4) T_target_source of the best rival pose; None where there is none."""
-        T_rival = self.registration.runner_up
-        return None if T_rival is None else self.in_files(T_rival)
+        return self.in_files.runner_up
 
     @property
     def runner_up_distance(self) -> tuple[float, float] | None:
@@ -106,7 +85,7 @@ class PairResult:
 
     @cached_property
     def lever_m(self) -> float:
-        """Median distance of the source's points from `center`: converts radians to metres."""
+        """Median distance of the source's points from its origin: converts radians to metres."""
         distance = np.linalg.norm(self.source.frame.points.astype(float), axis=1)
         return max(float(np.median(distance)), 1e-6) if len(distance) else 1.0
 
@@ -176,7 +155,7 @@ class PairResult:
         points = se3.transform(
             self.registration.T_target_source, self.source.frame.points.astype(np.float64)
         )
-        return points + self.target.center
+        return points + self.target.frame.shift
 
 
 _TRANSLATION, _ROTATION = slice(0, 3), slice(3, 6)
@@ -213,17 +192,16 @@ def pair_json(result: PairResult) -> dict[str, Any]:
             "sigma_m": sigma_m,
             "sigma_rad": sigma_rad,
             "information": np.asarray(registration.information).ravel(),
-            "reference_point_m": result.source.center,
+            "reference_point_m": result.source.frame.shift,
             **{name: getattr(registration, name) for name in _FIT},
             "seconds": round(result.seconds, 4),
-            "warnings": [*result.source.view.warnings, *result.target.view.warnings],
+            "warnings": [*result.source.warnings, *result.target.warnings],
         }
     )
     return data
 
 
-def _view_json(local: LocalView) -> dict[str, Any]:
-    view = local.view
+def _view_json(view: SingleView) -> dict[str, Any]:
     return {
         "name": view.name,
         "path": view.path,
@@ -257,5 +235,4 @@ def write_aligned(result: PairResult, path: Path) -> None:
             color=frame.color,
             scalars={} if frame.amplitude is None else {"intensity": frame.amplitude},
         ),
-        double=bool(np.abs(points).max(initial=0) > cloud_sequence.MAP_COORDINATES_M),
     )

@@ -16,7 +16,6 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
 
 MAX_POINTS = 150_000
-MAX_FACES = 300_000
 MAX_CAMERAS = 72
 _MAX_SEGMENTS = 1000  # segments of a trajectory
 _MAX_EXTENT_RATIO = 1.8  # of model and cameras to the model; beyond, cameras are not framed
@@ -73,7 +72,7 @@ class Scene:
         """The surface, simplified for a browser on a phone; None without one."""
         if self.surface is None or len(self.surface.faces) == 0:
             return None
-        return self.surface.clustered(MAX_FACES)
+        return self.surface.overview
 
     @property
     def box(self) -> Float64:
@@ -190,7 +189,7 @@ def make_scene(
     """
     cloud = result.cloud
     sampled = random_subset(len(cloud), MAX_POINTS)
-    points = cloud.points[sampled].astype(float) + cloud.offset
+    points = cloud.points[sampled].astype(float)
     finite = np.isfinite(points).all(1)
     points, sampled = points[finite], sampled[finite]
     ends = [

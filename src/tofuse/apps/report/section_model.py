@@ -154,7 +154,7 @@ def views(s: Subject) -> Values:
     ]
     before = s.result.diagnostics.cloud_before
     if before is not None and len(before):
-        earlier = (before.points[np.isfinite(before.points).all(1)] + before.offset) @ R.T
+        earlier = before.points[np.isfinite(before.points).all(1)].astype(float) @ R.T
         name = "From above, before optimisation"
         figures.insert(0, drawing(earlier, s.scene.before, "above", name))
     legend = [("after", "", "measured extents")]

@@ -13,7 +13,9 @@ from tofuse.apps.results.run_json import (
     main_poses,
     opened,
     rotation_up_world,
+    shift_of,
 )
+from tofuse.engine.arrays import Float64
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
 from tofuse.engine.graph import GraphPart, LoopRecord, external_sensors
 from tofuse.engine.quality import pose_accuracy
@@ -55,6 +57,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
     row = {frame.index: k for k, frame in enumerate(frames)}
     trajectory = np.full((len(frames), 4, 4), np.nan)
     indices, poses = main_poses(folder, run)
+    shift = shift_of(run, folder / "run.json")
     trajectory[[row[index] for index in indices]] = poses
     diagnostics = Diagnostics(
         run["verdict"],
@@ -77,7 +80,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         trajectory,
         np.array([frame.timestamp for frame in frames]),
         read_g2o(folder / "pose_graph.g2o"),
-        _cloud(folder),
+        _cloud(folder, shift),
         diagnostics,
         run["config"],
         {
@@ -93,6 +96,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         tuple(_session(each) for each in run.get("sessions", ())),
         tuple(SessionPair(**each) for each in run.get("session_pairs", ())),
         up=rotation_up_world(run, folder / "run.json")[1],
+        shift=shift,
     )
 
 
@@ -189,15 +193,14 @@ def _compressed_cloud(path: Path) -> GeometryRecord:
     )
 
 
-def _cloud(folder: Path) -> Cloud:
+def _cloud(folder: Path, shift: Float64) -> Cloud:
     record = read_cloud(folder)
     sigma = record.scalars.get("sigma")
     return Cloud(
-        record.points.astype(np.float32),
+        record.shifted(-shift).points.astype(np.float32),
         record.normals,
         record.color,
         np.asarray(record.scalars["views"], np.int32),
-        np.zeros(3),
         None if sigma is None else np.asarray(sigma, np.float32),
     )
 

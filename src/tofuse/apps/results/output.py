@@ -11,9 +11,12 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.apps.results.folders import OutputFolder, component_name
 from tofuse.apps.results.run_json import write_run_json
+from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import job_pool
 from tofuse.engine.fusion import GeometryRecord, Mesh, display_colors, texture
+from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
+from tofuse.formats.export import exchange
 from tofuse.formats.geometry import write_glb, write_obj, write_ply
 from tofuse.formats.images import png_bytes
 from tofuse.formats.poses import write_g2o, write_tum
@@ -22,9 +25,6 @@ from tofuse.formats.poses import write_g2o, write_tum
 CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
 
 MAX_PLY_POINTS = 4_000_000  # a larger cloud is compressed
-OVERVIEW_BYTES = 8_000_000  # of `mesh.glb`
-# A vertex has a position, normal and colour; a triangle has its corners.
-_VERTEX_BYTES, _FACE_BYTES, _HEAD_BYTES = 12 + 12 + 8, 12, 2000
 
 
 def write_result(
@@ -71,24 +71,30 @@ def _write_files(
 ) -> None:
     # Both release the interpreter lock for much of their time.
     with job_pool(1, "tofuse-writer") as background:
-        model = background.submit(_write_model, result, folder, texture)
+        model = background.submit(_write_model, result, folder)
         posed = result.has_pose
-        write_tum(folder / "trajectory.txt", result.timestamps[posed], result.trajectory[posed])
+        poses = se3.about(result.shift, result.trajectory[posed])
+        write_tum(folder / "trajectory.txt", result.timestamps[posed], poses)
         write_g2o(folder / "pose_graph.g2o", result.graph)
         if report is not None:
             report(result, folder)
         model.result()
+        # Last, since it shares the report's overview of the surface.
+        if result.mesh is not None:
+            _write_scene(result.mesh, result.T_up_world, folder, texture)
         write_run_json(folder / "run.json", result)
 
 
-def _write_model(result: Reconstruction, folder: Path, texture: texture.Textured | None) -> None:
-    """Write cloud and surface."""
+def _write_model(result: Reconstruction, folder: Path) -> None:
+    """Write cloud and surface, in the world frame."""
+    # In the coordinates of the input's files, also where float32 doesn't hold them.
+    cloud = result.cloud.record().shifted(result.shift)
     if len(result.cloud) > MAX_PLY_POINTS:
-        result.cloud.save(folder / "cloud.laz")
+        exchange.save(cloud, folder / "cloud.laz")
     else:
-        write_ply(folder / "cloud.ply", result.cloud.local_record())
+        write_ply(folder / "cloud.ply", cloud)
     if result.mesh is not None:
-        _write_mesh(result.mesh, result, folder, texture)
+        write_ply(folder / "mesh.ply", result.mesh.record())
     if result.changes:
         _write_changes(result, folder / "changes.ply")
 
@@ -108,18 +114,13 @@ def _write_changes(result: Reconstruction, path: Path) -> None:
     )
 
 
-def _write_mesh(
-    mesh: Mesh, result: Reconstruction, folder: Path, texture: texture.Textured | None
+def _write_scene(
+    mesh: Mesh, T_up_world: Float64, folder: Path, texture: texture.Textured | None
 ) -> None:
-    """Write `mesh.ply`, in the world frame, and `mesh.glb`, whose node makes it upright.
-
-    `mesh.glb` is an overview of at most `OVERVIEW_BYTES`, or has a texture.
-    """
-    write_ply(folder / "mesh.ply", mesh.local_record())
-    upright: dict[str, Any] = {"T_scene_node": result.T_up_world}
-    generator = f"tofuse {__version__}"
+    """Write `mesh.glb`, made upright by its node: the overview of the surface, or its texture."""
+    node: dict[str, Any] = {"generator": f"tofuse {__version__}", "T_scene_node": T_up_world}
     if texture is None:
-        displayed = overview(mesh)
+        displayed = mesh.overview
         write_glb(
             folder / "mesh.glb",
             GeometryRecord(
@@ -128,8 +129,7 @@ def _write_mesh(
                 normals=displayed.normals,
                 color=None if displayed.color is None else display_colors(displayed.color),
             ),
-            generator=generator,
-            **upright,
+            **node,
         )
         return
     atlas, image = texture.atlas, png_bytes(texture.image)
@@ -139,24 +139,10 @@ def _write_mesh(
     write_glb(
         folder / "mesh.glb",
         GeometryRecord(points, atlas.faces, normals=normals, uv=atlas.uv, texture=image),
-        generator=generator,
-        **upright,
+        **node,
     )
-    R = result.T_up_world[:3, :3].T
+    R = T_up_world[:3, :3].T
     write_obj(
         folder / "mesh.obj",
         GeometryRecord(points @ R, atlas.faces, normals=normals @ R, uv=atlas.uv, texture=image),
     )
-
-
-def overview(mesh: Mesh) -> Mesh:
-    """Return the surface, simplified until it fits into `OVERVIEW_BYTES` of glTF."""
-    faces = OVERVIEW_BYTES / (_FACE_BYTES + _VERTEX_BYTES / 2)
-    simplified = mesh
-    while (
-        _HEAD_BYTES + _VERTEX_BYTES * len(simplified) + (_FACE_BYTES * len(simplified.faces))
-        > OVERVIEW_BYTES
-    ):
-        simplified = mesh.decimated(int(faces))
-        faces *= 0.9
-    return simplified

@@ -12,6 +12,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from tofuse._version import __version__
+from tofuse.apps.results import integrity
 from tofuse.apps.results.folders import is_result
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
@@ -26,6 +27,7 @@ from tofuse.formats.poses import read_tum
 def write_run_json(path: Path, result: Reconstruction) -> None:
     """Write `run.json`, schema 1: SI units and radians, null instead of NaN.
 
+    All other files of the folder are complete: it has their digests.
     It is written frame by frame, as all frames of a long recording would need much memory.
 
     Parameters
@@ -45,7 +47,7 @@ def write_run_json(path: Path, result: Reconstruction) -> None:
                 _write_rows(file, value)
             else:
                 file.write(_indented(value, 1))
-        file.write("\n}\n")
+    integrity.seal(path)
 
 
 def _write_rows(file: TextIO, rows: Iterator[Any]) -> None:
@@ -85,6 +87,7 @@ def _content(result: Reconstruction) -> dict[str, Any]:
         "reasons": reasons_json(d.reasons),
         "frames": (_frame(f, result) for f in d.frames),
         "T_up_world": result.T_up_world,
+        "shift_m": result.shift,
         "rig": result.recording.get("rig"),
         "components": [
             _fields(c, "frames", "T_main_component", "joined") for c in result.components
@@ -231,10 +234,11 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
 
 @contextmanager
 def opened(folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield the `run.json` of a result; errors of a block that reads its fields are InputErrors."""
+    """Yield the checked `run.json` of a result; a block that reads its fields raises InputError."""
     path = folder / "run.json"
     run = read_run_json(path)
     with reading.damage_reported(path, "a run.json"):
+        integrity.check(folder, run)
         yield run
 
 
@@ -260,6 +264,8 @@ def frame_covariance(frame: Mapping[str, Any]) -> Float64 | None:
 def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
     """Return the frame indices and poses (N, 4, 4) T_world_camera of the main model of a result.
 
+    Relative to its `shift_of`.
+
     Parameters
     ----------
     folder
@@ -274,14 +280,28 @@ def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
     """
     with reading.damage_reported(folder / "run.json", "a run.json"):
         indices = [int(frame["index"]) for frame in frames_in_main_model(run)]
-    _, poses = read_tum(folder / "trajectory.txt")
+        stated = np.array([frame["timestamp"] for frame in frames_in_main_model(run)], float)
+    times, poses = read_tum(folder / "trajectory.txt")
+    problem = None
     if len(indices) != len(poses):
+        problem = f"lists {len(indices)} frames with a pose, but trajectory.txt has {len(poses)}"
+    elif not np.array_equal(times, stated):
+        problem = "has other timestamps than trajectory.txt"
+    if problem is not None:
         raise InputError(
-            f"lists {len(indices)} frames with a pose, but trajectory.txt has {len(poses)}",
+            problem,
             where=folder / "run.json",
             remedy="copy the whole folder, or run again",
         )
-    return indices, poses
+    return indices, se3.about(-shift_of(run, folder / "run.json"), poses)
+
+
+def shift_of(run: dict[str, Any], where: Path) -> Float64:
+    """Return the shift (3,) in m of a result's clouds; see `Reconstruction.shift`."""
+    shift = np.asarray(run.get("shift_m", (0, 0, 0)))
+    if shift.shape != (3,) or shift.dtype.kind not in "fi" or not np.isfinite(shift).all():
+        raise InputError("shift_m is not three numbers", where=where, remedy="run again")
+    return shift.astype(np.float64)
 
 
 def frames_in_main_model(run: dict[str, Any]) -> list[dict[str, Any]]:

@@ -17,6 +17,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
+from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import compose, retract, twist_between
 from tofuse.engine.views import residual_kernels as res
 
@@ -214,19 +215,20 @@ def iterate_level(
             step_size = max(step_size, abs(step[p] / units[p]))
         if estimates[SCALE_P] > 0:
             estimates[EXPOSURE] += step[6]
-        _rescale(total, estimates, settings.max_scale, settings.albedo_inflation)
+        _rescale(total, estimates, settings)
     return total, spurious, degenerate, step_size, iterations
 
 
 @kernel
-def _rescale(total: Float64, estimates: Float64, max_scale: float, albedo_inflation: float) -> None:
+def _rescale(total: Float64, estimates: Float64, settings: LevelSettings) -> None:
     """Estimate the sigmas from the residuals, which include both views' noise and bias."""
     scale = scale_of_distances(total[res.HISTOGRAM :])
     if not np.isnan(scale):
-        estimates[SCALE_G] = min(max(scale, 0.7), max_scale)
+        estimates[SCALE_G] = min(max(scale, 0.7), settings.max_scale)
     if estimates[SCALE_P] > 0 and total[res.WEIGHT_P] > 0:
-        variance = total[res.SQUARES_P] / total[res.WEIGHT_P] / 0.72
-        estimates[SCALE_P] = min(max(np.sqrt(variance + albedo_inflation**2), 0.005), 0.5)
+        mean_square = total[res.SQUARES_P] / total[res.WEIGHT_P]
+        variance = mean_square / tukey.consistency(settings.robust) + settings.albedo_inflation**2
+        estimates[SCALE_P] = min(max(np.sqrt(variance), 0.005), 0.5)
 
 
 @kernel

@@ -15,17 +15,15 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.clouds.cloud_pair import follow_clouds, register_clouds, with_cloud_information
 from tofuse.engine.clouds.fpfh import candidates
+from tofuse.engine.clouds.near_origin import NearOrigin
 from tofuse.engine.clouds.viewpoint import as_image, viewpoint_of
 from tofuse.engine.compute import one_blas_thread
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.parts import check_number, part
+from tofuse.engine.parts import check_number, part, registered
 from tofuse.engine.search import follow, register_pair, verification
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
-
-# Clouds with a larger distance are in different frames.
-_MAX_FRAME_DISTANCE_M = 1e4
 
 MIN_POINTS = 10
 # For recorded views with a wide baseline, which multipath distorts individually.
@@ -147,7 +145,7 @@ def register(
     target: Frame | ArrayLike,
     *,
     guess: ArrayLike | None = None,
-    method: Registrar | None = None,
+    method: Registrar | str | None = None,
     seed: int = 0,
 ) -> Registration:
     """Register two views, or two (N, 3) clouds in m.
@@ -168,7 +166,7 @@ def register(
         (4, 4) T_target_source to start from; the identity unless given. Of ambiguous poses of two
         images the one at the guess is returned.
     method
-        Registration method; the above unless given.
+        Registration method, or the name of one ("icp", "coarse-to-fine"); the above unless given.
     seed
         Seed of the random selection of points, for methods that use one.
 
@@ -184,60 +182,46 @@ def register(
     Raises
     ------
     InputError
-        If an array has the wrong shape or fewer than ten finite points, or the guess is no rigid
-        motion.
+        If an array has the wrong shape or fewer than ten finite points, the guess is no rigid
+        motion, or there is no such method.
     RegistrationError
         If too few points correspond, an image is empty, or the median depths of two images differ
         more than fourfold.
     """
     check_number(seed, Bounds(0), "seed", whole=True)
     start = None if guess is None else se3.check_pose(guess, where="guess")
+    near = NearOrigin.of(_view(source, "source"), _view(target, "target"), start)
     rng = np.random.default_rng([seed, 0])
-    if isinstance(source, RangeFrame | CloudFrame) or isinstance(target, RangeFrame | CloudFrame):
-        return _registered(_view(source, "source"), _view(target, "target"), start, method, rng)
-    return _register_arrays(_cloud(source, "source"), _cloud(target, "target"), start, method, rng)
+    registrar = _registrar(method)
+    registration = _registered(near.source, near.target, near.guess, registrar, rng)
+    return near.in_files(registration)
+
+
+def _registrar(method: Registrar | str | None) -> Registrar:
+    if method is None:
+        return AnyPair()
+    named = registered("registration")
+    if isinstance(method, str) and method in named:
+        found: Registrar = named[method]()
+        return found
+    if isinstance(method, type | str) or not hasattr(method, "register"):
+        raise InputError(
+            f"is {method!r}", where="method", remedy=f"use one of {', '.join(sorted(named))}"
+        )
+    return method
 
 
 def _registered(
     source: Frame,
     target: Frame,
     guess: Float64 | None,
-    method: Registrar | None,
+    registrar: Registrar,
     rng: np.random.Generator,
 ) -> Registration:
     with one_blas_thread():
-        if method is None:
-            return AnyPair().register(source, target, guess, rng)
-        return method.register(source, target, np.eye(4) if guess is None else guess, rng)
-
-
-def _register_arrays(
-    source: Float64,
-    target: Float64,
-    guess: Float64 | None,
-    method: Registrar | None,
-    rng: np.random.Generator,
-) -> Registration:
-    """Register about the target's median: map coordinates exceed the precision of float32.
-
-    A distant source, in a frame of its own, is shifted to its own median.
-    """
-    source_centre, target_centre = np.median(source, 0), np.median(target, 0)
-    source_centre = (
-        source_centre
-        if np.linalg.norm(source_centre - target_centre) > _MAX_FRAME_DISTANCE_M
-        else target_centre
-    )
-    data, model = (
-        CloudFrame(index, 0.0, (points - centre).astype(np.float32), origin=-centre)
-        for index, points, centre in ((1, source, source_centre), (0, target, target_centre))
-    )
-    T_target_model, T_source_data = np.eye(4), np.eye(4)
-    T_target_model[:3, 3], T_source_data[:3, 3] = target_centre, source_centre
-    T_data_source, T_model_target = se3.inverse(T_source_data), se3.inverse(T_target_model)
-    start = None if guess is None else T_model_target @ guess @ T_source_data
-    registration = _registered(data, model, start, method, rng)
-    return registration.between(T_target_model, T_data_source)
+        if guess is None and not isinstance(registrar, AnyPair):
+            guess = np.eye(4)
+        return registrar.register(source, target, guess, rng)
 
 
 def _view(view: Frame | ArrayLike, name: str) -> Frame:

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from tofuse.engine.compute.partition import median
     from tofuse.engine.compute.spill import Scratch, Spill, trim_memory
     from tofuse.engine.compute.thread_pool import (
+        ProcessLock,
         job_pool,
         one_blas_thread,
         run_all,
         run_chunks,
-        serial_chunks,
         thread_count,
         threads,
         usable_cores,

@@ -9,7 +9,6 @@ runs of the default method; `python benchmarks/compilation.py --list` records it
 from __future__ import annotations
 
 import gc
-import hashlib
 import re
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from llvmlite.binding import get_host_cpu_name
 
 from tofuse.engine.compute import jit
 from tofuse.engine.compute.thread_pool import usable_cores
@@ -72,7 +72,8 @@ def rare_garbage_collection() -> Iterator[None]:
 
 
 def _start_helpers() -> Iterator[subprocess.Popen[bytes]]:
-    if compiled_marker().exists():
+    marker = compiled_marker()
+    if marker is None or marker.exists():
         return
     count = min(usable_cores() // 2, _MAX_HELPERS)
     for k in range(count):
@@ -108,19 +109,15 @@ def compile_listed(helper: int = 0, helpers: int = 1) -> None:
     for name, types in listed[first:] + listed[:first]:
         module, function = name.rsplit(".", 1)
         getattr(import_module(f"tofuse.{module}"), function).compile(types)
-    compiled_marker().touch()
+    if marker := compiled_marker():
+        marker.touch()
 
 
-def compiled_marker() -> Path:
-    """Return the file that exists once the listed kernels of this installation are in the cache.
-
-    Its name contains what Numba's cache depends on: paths, sizes and times of the source files.
-    """
-    digest = hashlib.sha256()
-    for file in jit.kernel_files():
-        stat = file.stat()
-        digest.update(f"{file} {stat.st_size} {stat.st_mtime_ns}\n".encode())
-    return Path(jit.cache_folder()) / f"compiled-{digest.hexdigest()[:16]}"
+def compiled_marker() -> Path | None:
+    """Return the file that exists once the listed kernels are kept; None where nothing is."""
+    folder = jit.cache_folder()
+    # Compiled code is for one type of processor, and a home folder may be shared.
+    return None if folder is None else folder / f"compiled-{get_host_cpu_name()}"
 
 
 def _type_of(text: str) -> Any:

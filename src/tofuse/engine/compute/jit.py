@@ -1,24 +1,22 @@
 """Compilation of kernels, with a cache that can neither become stale nor abort a run.
 
-Numba's on-disk cache does not notice a changed callee in another file, and fails where it can't
-write. The cache folder is therefore named by a hash of all kernel sources, the `*_kernels.py` of
-all rooms, and a private temporary folder is used where the home folder is read-only.
+Numba's on-disk cache does not notice a changed callee in another file, and is fatal where it can't
+write or is damaged. Kernels are therefore kept in files of our own, in a folder named by a hash of
+all kernel sources, the `*_kernels.py` of all rooms.
 """
 
 from __future__ import annotations
 
-import atexit
 import hashlib
-import os
-import shutil
 import sys
-import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numba
+
+from tofuse.engine.compute import kernel_cache
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -42,43 +40,16 @@ def source_hash(package: Path = _PACKAGE) -> str:
     return digest.hexdigest()[:16]
 
 
-def cache_folder() -> str:
-    """Return a writable folder, which is the same in every run if the machine allows it."""
-    return _writable_folder(f"kernels-{source_hash()}")
-
-
-@cache
-def _writable_folder(name: str) -> str:
-    try:
-        folder = _cache_root() / name
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return str(folder)
-    except (OSError, RuntimeError):
-        # Private to this process: code must never be loaded from a folder that others own.
-        private = tempfile.mkdtemp(prefix="tofuse-kernels-")
-        atexit.register(shutil.rmtree, private, ignore_errors=True)
-        return private
-
-
-def _cache_root() -> Path:
-    if os.environ.get("NUMBA_CACHE_DIR"):
-        return Path(os.environ["NUMBA_CACHE_DIR"])
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", tempfile.gettempdir())) / "tofuse"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tofuse"
+def cache_folder() -> Path | None:
+    """Return the folder of compiled kernels; None where they can't be kept."""
+    return kernel_cache.trusted_folder(f"kernels-{source_hash()}")
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function over arrays: nogil, cached, with reproducible IEEE arithmetic."""
-    config: Any = numba.config
     njit: Any = numba.njit  # its type hints lack an option
-    previous = config.CACHE_DIR
-    config.CACHE_DIR = cache_folder()
-    try:
-        # Kernels are not called from C, and the wrapper for it takes time to compile.
-        decorator = njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)
-        compiled: Callable[P, R] = decorator(function)
-    finally:
-        config.CACHE_DIR = previous
-    return compiled
+    # Kernels are not called from C, and the wrapper for it takes time to compile.
+    compiled = njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
+    compiled._cache = kernel_cache.KernelCache(function, cache_folder())
+    result: Callable[P, R] = compiled
+    return result

@@ -3,6 +3,8 @@
 Work is divided into a number of chunks that depends on the work alone. Each chunk is computed by
 one call of a GIL-free kernel, and results are combined in chunk order. BLAS, whose sums depend on
 its threads, is limited to one.
+
+A child of `fork` has none of its parent's threads: pools and locks are renewed in it.
 """
 
 from __future__ import annotations
@@ -90,11 +92,31 @@ def _read(path: Path) -> str:
         return ""
 
 
+class ProcessLock:
+    """A lock that is open in a forked child, whatever its parent's threads were doing."""
+
+    def __init__(self) -> None:
+        self._renew()
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self._renew)
+
+    def _renew(self) -> None:
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
 _thread_count = usable_cores()
 # A pool for each number of threads. Pools are never shut down, as other threads may be using them.
 _pools: dict[int, ThreadPoolExecutor] = {}
-_lock = threading.Lock()
+_lock = ProcessLock()
 _thread_state = threading.local()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pools.clear)
 
 
 def thread_count() -> int:
@@ -110,14 +132,19 @@ def set_thread_count(count: int) -> None:
 
 
 @contextmanager
-def threads(count: int | None) -> Iterator[None]:
-    """Use `count` threads inside the block (None: no change)."""
-    previous = _thread_count
+def threads(count: int | None, *, serial: bool = False) -> Iterator[None]:
+    """Use `count` threads inside the block (None: no change).
+
+    `serial`: not for chunks of this thread, while other threads are busy with other work.
+    """
+    previous, inside = _thread_count, getattr(_thread_state, "inside", False)
     set_thread_count(previous if count is None else count)
+    _thread_state.inside = inside or serial
     try:
         yield
     finally:
         set_thread_count(previous)
+        _thread_state.inside = inside
 
 
 def chunk_bounds(size: int, chunks: int = 16) -> list[tuple[int, int]]:
@@ -160,24 +187,13 @@ def job_pool(count: int, name: str) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, thread_name_prefix=name, initializer=_mark_inside)
 
 
-@contextmanager
-def serial_chunks(serial: bool = True) -> Iterator[None]:
-    """Compute chunks serially inside the block, while other threads are busy with other work."""
-    previous = getattr(_thread_state, "inside", False)
-    _thread_state.inside = previous or serial
-    try:
-        yield
-    finally:
-        _thread_state.inside = previous
-
-
 def run_all(tasks: Sequence[Callable[[], R]]) -> list[R]:
     """Run independent tasks on the pool and return their results in the order given."""
     return run_chunks(lambda a, _b: tasks[a](), len(tasks), chunks=max(1, len(tasks)))
 
 
 # How many blocks limit BLAS now, and the limit to lift after the last of them.
-_blas_lock = threading.Lock()
+_blas_lock = ProcessLock()
 _active_blocks = 0
 _blas_limit: Any = None
 

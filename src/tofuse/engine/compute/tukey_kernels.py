@@ -18,6 +18,7 @@ from tofuse.engine.compute.jit import kernel
 
 _CONSTANTS: Any = [np.float32(x) for x in (0, 1, 4, 5)]
 _ZERO, _ONE, _FOUR, _FIVE = _CONSTANTS
+_STEPS = 100  # of the integration over the residuals within the cut-off, by the midpoint rule
 
 
 @kernel
@@ -43,6 +44,28 @@ def support(w: float) -> float:
 def relative_slope(w: float) -> float:
     """Return the derivative of the influence over the weight `w`; 0 without a weight."""
     return _FIVE - _FOUR / np.sqrt(w) if w > _ZERO else _ZERO
+
+
+@kernel
+def consistency(cutoff: float) -> float:
+    """Return the weighted mean square of normal residuals, in their variance.
+
+    Dividing the weighted mean square of residuals by it gives their variance. It is the mean
+    derivative of the influence over the mean weight as well (Stein 1981, lemma 1).
+
+    Parameters
+    ----------
+    cutoff
+        Residual that has no weight, in standard deviations.
+    """
+    weights, squares = 0.0, 0.0
+    for k in range(_STEPS):
+        e = (k + 0.5) / _STEPS
+        r2 = (cutoff * e) ** 2
+        expected = (1 - e * e) ** 2 * np.exp(-0.5 * r2)
+        weights += expected
+        squares += expected * r2
+    return squares / weights
 
 
 def weights(e2: Float64) -> Float64:

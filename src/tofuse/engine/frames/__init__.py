@@ -12,12 +12,14 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.frames import depth_counts, frame_ranges
     from tofuse.engine.frames.frames import (
+        MAP_COORDINATES_M,
         SATURATED_AMPLITUDE,
         AmplitudeKind,
         CloudFrame,
         DepthKind,
         Frame,
         RangeFrame,
+        map_shift,
     )
     from tofuse.engine.frames.recording import (
         NOISE_MODEL,

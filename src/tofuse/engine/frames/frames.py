@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Literal, Self, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.bounds import Bounds
@@ -146,6 +146,11 @@ class RangeFrame:
             amplitude = np.nan_to_num(amplitude, nan=np.nan, posinf=SATURATED_AMPLITUDE, neginf=0)
             object.__setattr__(self, "amplitude_image", amplitude)
 
+    @property
+    def shift(self) -> Float64:
+        """Zero (3,): the coordinates of an image are those of its camera."""
+        return np.zeros(3)
+
     @cached_property
     def valid(self) -> Bool:
         """(H, W) mask of pixels with a measurement and a known ray."""
@@ -238,6 +243,9 @@ class CloudFrame:
         (N, 3) RGB; None where not recorded.
     origin
         (3,) position of the sensor in the frame of the points, m.
+    shift
+        (3,) m, to add to the points, and to the origin, to get the coordinates of their file. Not
+        zero for map coordinates, which exceed the precision of float32; of whole kilometres.
     """
 
     index: int
@@ -248,6 +256,7 @@ class CloudFrame:
     amplitude: Float32 | None = None
     color: UInt8 | None = None
     origin: Float64 = field(default_factory=lambda: np.zeros(3))
+    shift: Float64 = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         _check_frame(self)
@@ -267,7 +276,7 @@ class CloudFrame:
 
     @classmethod
     def of(cls, points: ArrayLike, *, index: int = 0, timestamp: float = 0.0) -> Self:
-        """Make a view of points (N, 3) in m, dropping non-finite ones.
+        """Make a view of points (N, 3) in m, in any coordinates, dropping non-finite ones.
 
         Parameters
         ----------
@@ -283,8 +292,18 @@ class CloudFrame:
                 where="points",
                 remedy="pass (N, 3) numbers in metres",
             )
-        array = array[np.isfinite(array).all(1)].astype(np.float32)
-        return cls(index, timestamp, array)
+        array = array[np.isfinite(array).all(1)]
+        shift = map_shift(array)
+        array = array - shift if shift.any() else array
+        return cls(index, timestamp, array.astype(np.float32), origin=-shift, shift=shift)
+
+    def relative_to(self, shift: Float64) -> Self:
+        """Return the view with another `shift` (3,), m, of the same coordinates of the file."""
+        step = self.shift - shift
+        if not step.any():
+            return self
+        points = (self.points.astype(np.float64) + step).astype(np.float32)
+        return replace(self, points=points, origin=self.origin + step, shift=shift)
 
     @property
     def valid(self) -> Bool:
@@ -307,6 +326,26 @@ class CloudFrame:
 
 
 Frame = RangeFrame | CloudFrame
+
+# The resolution of float32 is coarser than half a millimetre beyond.
+MAP_COORDINATES_M = 8192.0
+_SHIFT_STEP_M = 1000.0
+_MAX_SAMPLED = 100_000  # points
+
+
+def map_shift(points: NDArray[np.floating]) -> Float64:
+    """Return the `shift` (3,) in m to subtract from points (N, 3): zero but for map coordinates.
+
+    By the median of the finite points, so that no stray point decides it.
+    """
+    sampled = points[:: max(1, len(points) // _MAX_SAMPLED)]
+    sampled = sampled[np.isfinite(sampled).all(1)]
+    if not len(sampled):
+        return np.zeros(3)
+    centre = np.median(sampled.astype(np.float64), axis=0)
+    if np.abs(centre).max() <= MAP_COORDINATES_M:
+        return np.zeros(3)
+    return np.asarray(np.round(centre / _SHIFT_STEP_M) * _SHIFT_STEP_M)
 
 
 def _check_frame(frame: Frame) -> None:

@@ -46,15 +46,13 @@ class Cloud(Exportable):
     Attributes
     ----------
     points
-        (N, 3) float32 in m, relative to `offset`.
+        (N, 3) float32 in m.
     normals
         (N, 3) float32 unit normals towards the cameras that observed them, or None.
     color
         (N, 3) uint8 RGB (amplitude as grey where there is no colour), or None.
     views
         (N,) int32, number of frames that observed each point.
-    offset
-        (3,) float64.
     sigma
         (N,) float32 standard deviation of each point along its normal, m; or None.
     """
@@ -63,7 +61,6 @@ class Cloud(Exportable):
     normals: Float32 | None
     color: UInt8 | None
     views: Int32
-    offset: Float64
     sigma: Float32 | None = None
 
     def __len__(self) -> int:
@@ -72,8 +69,8 @@ class Cloud(Exportable):
     def __repr__(self) -> str:
         return f"Cloud: {len(self):,} points over {self.diagonal_m:.3g} m"
 
-    def local_record(self) -> GeometryRecord:
-        """Return the record relative to `offset`, float32."""
+    def record(self) -> GeometryRecord:
+        """See `Exportable.record`."""
         scalars = {"views": self.views} | ({} if self.sigma is None else {"sigma": self.sigma})
         return GeometryRecord(self.points, normals=self.normals, color=self.color, scalars=scalars)
 
@@ -83,13 +80,18 @@ class Cloud(Exportable):
         return float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self) else 0.0
 
 
+# Percentiles that bound a cloud, whatever stray points it has.
+_EXTENT = (0.5, 99.5)
+
+
 def choose_voxel(frame: CloudFrame) -> float:
     """Return a voxel edge in m for the point spacing of a cloud: 2 mm to 10 cm."""
     points = frame.points
     if len(points) == 0:
         return 0.01
     # The spacing of N points on a surface is about the root of the area over N.
-    extent = np.sort(np.ptp(points.astype(float), axis=0))
+    low, high = np.percentile(points.astype(float), _EXTENT, axis=0)
+    extent = np.sort(high - low)
     size = float(np.sqrt(max(extent[2] * extent[1], 1e-6) / len(points)))
     return float(f"{np.clip(size, 0.002, 0.1):.2g}")
 
@@ -157,13 +159,12 @@ class CloudBuilder:
             _estimate_normals(points, sums[:, 3:6], _NORMAL_NEIGHBOURS) if normals else None,
             _colors(sums),
             np.round(views).astype(np.int32),
-            np.zeros(3),
         )
 
 
 def empty_cloud() -> Cloud:
     """Return a cloud without points."""
-    return Cloud(np.zeros((0, 3), np.float32), None, None, np.zeros(0, np.int32), np.zeros(3))
+    return Cloud(np.zeros((0, 3), np.float32), None, None, np.zeros(0, np.int32))
 
 
 def as_cloud(frame: Frame, max_points: int) -> CloudFrame:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64, Int32, UInt8
 from tofuse.engine.errors import InputError
+from tofuse.engine.frames import MAP_COORDINATES_M
 
 _AMPLITUDES = (
     "amplitude",
@@ -100,6 +101,18 @@ class GeometryRecord:
                 remedy="pass (M, 3) vertex indices",
             )
 
+    def written_points(self) -> NDArray[np.floating]:
+        """Return the points as files hold them: "<f8" for map coordinates in float64, or "<f4"."""
+        far = np.abs(self.points).max(initial=0) > MAP_COORDINATES_M
+        double = self.points.dtype == np.float64 and far
+        return np.asarray(self.points, "<f8" if double else "<f4")
+
+    def shifted(self, shift: Float64) -> GeometryRecord:
+        """Return the record with points plus a shift (3,) in m: float64, unless it is zero."""
+        if not shift.any():
+            return self
+        return replace(self, points=self.points.astype(np.float64) + shift)
+
 
 # Imported by name on use: nothing else of the engine knows a file format.
 _WRITERS = "tofuse.formats.export"
@@ -108,16 +121,9 @@ _WRITERS = "tofuse.formats.export"
 class Exportable:
     """Geometry that can be saved, and converted to the types of other packages."""
 
-    offset: Float64
-
-    def local_record(self) -> GeometryRecord:
-        """Return points relative to `offset`, float32, with faces and columns."""
-        raise NotImplementedError
-
     def record(self) -> GeometryRecord:
-        """Return points in the world frame, float64, with faces and columns."""
-        local = self.local_record()
-        return replace(local, points=local.points.astype(np.float64) + self.offset)
+        """Return points in the world frame, with faces and columns."""
+        raise NotImplementedError
 
     def save(self, path: str | Path) -> None:
         """Write a file in the format of its suffix.

@@ -1,4 +1,4 @@
-"""A surface of triangles: islands, holes, decimation.
+"""A surface of triangles: islands, decimation.
 
 Edge collapse by quadric error (Garland and Heckbert 1997), by fast-simplification.
 """
@@ -6,12 +6,13 @@ Edge collapse by quadric error (Garland and Heckbert 1997), by fast-simplificati
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from threading import Lock
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, Intp, UInt8
+from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Intp, UInt8
+from tofuse.engine.compute import ProcessLock
 from tofuse.engine.fusion.cloud import Cloud, has_color
 from tofuse.engine.fusion.clustering_kernels import (
     flatten_groups,
@@ -33,7 +34,7 @@ _UNITS_PER_SPACING = 200.0
 _UNIT_FACTOR, _MIN_REMOVED = 100.0, 0.1
 
 # The library's state is global.
-_LOCK = Lock()
+_LOCK = ProcessLock()
 
 
 def collapse_edges(
@@ -96,6 +97,8 @@ def with_distinct_corners(faces: Intp) -> Int32:
     return faces[(a != b) & (b != c) & (c != a)].astype(np.int32)
 
 
+# Of an overview: 8 MB as glTF, with 32 bytes a vertex and 12 a triangle.
+OVERVIEW_FACES, OVERVIEW_VERTICES = 250_000, 155_000
 # Damping of a merged vertex towards the centroid, relative to the planes around it.
 _DAMPING = 0.02
 # Maximum number of triangles from which the mean size is estimated.
@@ -116,7 +119,7 @@ class Mesh(Exportable):
     Attributes
     ----------
     vertices
-        (N, 3) float32 in m, relative to `offset`.
+        (N, 3) float32 in m.
     faces
         (M, 3) int32 rows of `vertices`, counter-clockwise seen from outside.
     normals
@@ -128,8 +131,6 @@ class Mesh(Exportable):
         views; and from the errors of their poses once these are estimated (`pose_errors`).
     views
         (N,) int32, number of views that observed each vertex.
-    offset
-        (3,) float64.
     """
 
     vertices: Float32
@@ -138,7 +139,6 @@ class Mesh(Exportable):
     color: UInt8 | None
     sigma: Float32
     views: Int32
-    offset: Float64
 
     @classmethod
     def of(cls, record: GeometryRecord) -> Mesh:
@@ -152,7 +152,6 @@ class Mesh(Exportable):
             record.color,
             record.scalars.get("sigma", zeros).astype(np.float32),
             record.scalars.get("views", zeros).astype(np.int32),
-            np.zeros(3),
         )
 
     def __len__(self) -> int:
@@ -161,14 +160,14 @@ class Mesh(Exportable):
     def __repr__(self) -> str:
         return f"Mesh: {len(self):,} vertices, {len(self.faces):,} faces"
 
-    def local_record(self) -> GeometryRecord:
-        """Return the record relative to `offset`, float32."""
+    def record(self) -> GeometryRecord:
+        """See `Exportable.record`."""
         scalars = {"views": self.views, "sigma": self.sigma}
         return GeometryRecord(self.vertices, self.faces, self.normals, self.color, scalars=scalars)
 
     def cloud(self) -> Cloud:
         """Return the vertices as a cloud."""
-        return Cloud(self.vertices, self.normals, self.color, self.views, self.offset, self.sigma)
+        return Cloud(self.vertices, self.normals, self.color, self.views, self.sigma)
 
     def rows(self, faces: Bool) -> Mesh:
         """Return the mesh of the faces (M,) that are True, without unused vertices."""
@@ -220,47 +219,6 @@ class Mesh(Exportable):
         flatten_groups(piece)
         return self.rows((np.bincount(piece)[piece] >= min_vertices)[self.faces[:, 0]])
 
-    def without_holes(self, max_border_m: float) -> Mesh:
-        """Return the mesh with the holes closed whose border is no longer than `max_border_m`.
-
-        Each gets a new vertex at its centroid, with 0 views, and a `sigma` of the hole's radius.
-        Outer borders are no holes.
-        """
-        half_edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-        border = half_edges[~np.isin(half_edges @ [len(self), 1], half_edges @ [1, len(self)])]
-        vertices: list[tuple[Int64, Float64, float]] = []
-        faces: list[Int64] = []
-        for rim in _loops(border):
-            p = self.vertices[rim].astype(float)
-            length = float(np.linalg.norm(p - np.roll(p, -1, 0), axis=1).sum())
-            centroid = p.mean(0)
-            fan_normal = np.cross(np.roll(p, -1, 0) - centroid, p - centroid).sum(0)
-            if length > max_border_m or fan_normal @ self.normals[rim].sum(0) <= 0:
-                continue
-            apex = np.full(len(rim), len(self) + len(vertices))
-            faces.append(np.stack([np.roll(rim, -1), rim, apex], -1))
-            vertices.append((rim, centroid, length))
-        if not vertices:
-            return self
-        normals = np.array([self.normals[loop].sum(0, dtype=float) for loop, _, _ in vertices])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-        color = self.color
-        if color is not None:
-            means = [np.round(color[loop].mean(0)) for loop, _, _ in vertices]
-            color = np.concatenate([color, np.array(means).astype(np.uint8)])
-        radii = [length / (2 * np.pi) for _, _, length in vertices]
-        return replace(
-            self,
-            vertices=np.concatenate(
-                [self.vertices, np.array([m for _, m, _ in vertices], np.float32)]
-            ),
-            faces=np.concatenate([self.faces, *faces]).astype(np.int32),
-            normals=np.concatenate([self.normals, normals.astype(np.float32)]),
-            color=color,
-            sigma=np.concatenate([self.sigma, np.array(radii, np.float32)]),
-            views=np.concatenate([self.views, np.zeros(len(vertices), np.int32)]),
-        )
-
     def decimated(self, faces: int) -> Mesh:
         """Return the mesh reduced to at most `faces` triangles by collapsing edges.
 
@@ -290,7 +248,12 @@ class Mesh(Exportable):
         return self.rows(valid)
 
     def clustered(self, faces: int) -> Mesh:
-        """Return the mesh simplified to at most `faces` triangles: faster than `decimated`."""
+        """Return the mesh simplified to at most `faces` triangles: faster than `decimated`.
+
+        Vertex clustering (Rossignac and Borrel 1993), separately for both sides of thin structures,
+        with the vertex that is closest to the planes of the adjacent triangles (Lindstrom 2000), so
+        that edges and corners stay sharp.
+        """
         if len(self.faces) <= faces:
             return self
         # Two triangles a cell, if it is flat.
@@ -299,31 +262,22 @@ class Mesh(Exportable):
             group, count = self._cluster(cell)
             remaining = with_distinct_corners(group[self.faces])
             if len(remaining) <= faces:
-                return self._merged(group, count, remaining, cell)
+                positions = self._optimal_positions(group, count, cell)
+                return self._merge_groups(group, count, remaining, positions)
             # A larger step than a flat surface would need.
             cell *= float(np.clip((len(remaining) / faces) ** 0.6, 1.02, 2.0))
 
-    def simplified(self, cell_m: float) -> Mesh:
-        """Return the mesh simplified by clustering vertices in the cells of a grid.
+    @cached_property
+    def overview(self) -> Mesh:
+        """The surface, clustered until a browser on a phone can show it.
 
-        Vertex clustering (Rossignac and Borrel 1993), separately for both sides of thin structures,
-        with the vertex that is closest to the planes of the adjacent triangles (Lindstrom 2000), so
-        that edges and corners stay sharp.
-
-        Parameters
-        ----------
-        cell_m
-            Edge of a cell, m.
+        At most `OVERVIEW_FACES` triangles and `OVERVIEW_VERTICES` vertices: 8 MB as glTF.
         """
-        if len(self) == 0:
-            return self
-        group, count = self._cluster(cell_m)
-        remaining = with_distinct_corners(group[self.faces])
-        return self._merged(group, count, remaining, cell_m)
-
-    def _merged(self, group: Intp, count: Intp, faces: Int32, cell_m: float) -> Mesh:
-        positions = self._optimal_positions(group, count, cell_m)
-        return self._merge_groups(group, count, faces, positions)
+        faces, shown = OVERVIEW_FACES, self.clustered(OVERVIEW_FACES)
+        while len(shown) > OVERVIEW_VERTICES:
+            faces = int(0.8 * faces)
+            shown = self.clustered(faces)
+        return shown
 
     def _cluster(self, cell_m: float) -> tuple[Intp, Intp]:
         """Return the group of each vertex (N,), and the size of each group (G,)."""
@@ -359,7 +313,6 @@ class Mesh(Exportable):
             self._mean_color(group, len(count)),
             np.sqrt(_means(self.sigma.astype(float) ** 2, group, count)).astype(np.float32),
             max_views,
-            self.offset,
         )
         return merged.rows(np.ones(len(faces), bool))
 
@@ -396,28 +349,3 @@ def _means(values: NDArray[np.generic], group: Intp, count: Intp) -> Float64:
     return np.stack(sums, -1).reshape(-1, *values.shape[1:]) / count.reshape(
         -1, *(1,) * (values.ndim - 1)
     )
-
-
-def _loops(edges: Int64) -> list[Int64]:
-    """Return the loops of directed edges (K, 2); several through one vertex are separated."""
-    successors: dict[int, list[int]] = {}
-    for a, b in edges.tolist():
-        successors.setdefault(a, []).append(b)
-    loops = []
-    for start in list(successors):
-        path, position = [start], {start: 0}
-        while path:
-            if not successors.get(path[-1]):
-                del position[path.pop()]
-                continue
-            successor = successors[path[-1]].pop()
-            if successor in position:
-                loop = path[position[successor] :]
-                loops.append(np.array(loop))
-                for vertex in loop[1:]:
-                    del position[vertex]
-                del path[position[successor] + 1 :]
-            else:
-                position[successor] = len(path)
-                path.append(successor)
-    return [loop for loop in loops if len(loop) > 2]

@@ -114,19 +114,14 @@ class ModelBuilder:
         T_world_camera = np.array([poses[summary.index] for summary in views.summaries], float)
         mesh = fuse_surface(views, T_world_camera, self._options, advance)
         if len(mesh):
-            model = Model(mesh.cloud(), self._postprocessed(mesh))
+            faces = self._options.faces
+            model = Model(mesh.cloud(), mesh.decimated(faces) if faces else mesh)
         else:
             clouds = (view.as_cloud() for view in views)
             model = Model(self._average(clouds, poses, self._range_voxel), mesh)
         if has_errors:
             views.drop()
         return model
-
-    def _postprocessed(self, mesh: Mesh) -> Mesh:
-        """Return the surface with small holes closed, and decimated."""
-        if self._options.holes_m:
-            mesh = mesh.without_holes(self._options.holes_m)
-        return mesh.decimated(self._options.faces) if self._options.faces else mesh
 
     def sketch(self, poses: Mapping[int, Float64]) -> Cloud:
         """Return a cloud at other poses for display, without normals for images.

@@ -26,8 +26,6 @@ class Fusion(Bounded):
         Maximum memory for the voxels: beyond it, the model is fused region by region, with the
         same result. A tenth as much may be used for stored views; those that do not fit are on
         disk until they are fused.
-    holes_m
-        Holes in the surface with a border no longer than this are closed; 0 closes none.
     faces
         Maximum number of triangles; 0 keeps all. The cloud keeps all points.
     texture
@@ -38,7 +36,6 @@ class Fusion(Bounded):
     min_views: Annotated[int, Bounds(1)] = 1
     island: Annotated[int, Bounds(0)] = 100
     memory_mb: Annotated[int, Bounds(1, 1_000_000)] = 600
-    holes_m: Annotated[float, Bounds(0, 1e6)] = 0.0
     faces: Annotated[int, Bounds(0)] = 0
     texture: int = 0
 

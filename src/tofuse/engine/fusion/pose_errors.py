@@ -46,7 +46,7 @@ def with_pose_errors(
     sigma = np.hypot(cloud.sigma, pose_sigma[cells.of_point]).astype(np.float32)
     if mesh is not None and len(mesh):
         mesh_sigma = sigma
-        if len(mesh) != len(cloud):  # holes were filled, or it has fewer faces
+        if len(mesh) != len(cloud):  # it has fewer faces
             nearest, _ = KdTree(cells.points).nearest(mesh.vertices.astype(np.float64))
             mesh_sigma = np.hypot(mesh.sigma, pose_sigma[nearest]).astype(np.float32)
         mesh = replace(mesh, sigma=mesh_sigma)
@@ -55,14 +55,10 @@ def with_pose_errors(
 
 @dataclass(frozen=True, eq=False)
 class _SurfaceCells:
-    """Non-empty cubes: their edge, a point of each (M, 3), and the cell of every point (N,).
-
-    Points are relative to `offset`.
-    """
+    """Non-empty cubes: their edge, a point of each (M, 3), and the cell of every point (N,)."""
 
     size: float
     points: Float64
-    offset: Float64
     of_point: Intp
 
     @classmethod
@@ -72,14 +68,14 @@ class _SurfaceCells:
         count = cell.max(0) + 1
         key = (cell[:, 0] * count[1] + cell[:, 1]) * count[2] + cell[:, 2]
         _, first, of_point = np.unique(key, return_index=True, return_inverse=True)
-        return cls(size, cloud.points[first].astype(np.float64), cloud.offset, of_point)
+        return cls(size, cloud.points[first].astype(np.float64), of_point)
 
 
 def _cell_sigma(
     cells: _SurfaceCells, frames: Sequence[RangeFrame], poses: Float64, covariances: Float64
 ) -> Float64 | None:
     """Return sigma (M,) of each cell, the minimum over the views; None if no cell is visible."""
-    world = cells.points + cells.offset
+    world = cells.points
     min_variance = np.full(len(world), np.inf)
     for frame, T, C in zip(frames, poses, covariances, strict=True):
         p_camera = se3.transform(se3.inverse(T), world)

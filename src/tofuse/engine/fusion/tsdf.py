@@ -135,7 +135,6 @@ def stitch(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
         None if color is None else color[used],
         np.empty(total, np.float32),
         np.empty(total, np.int32),
-        np.zeros(3),
     )
     for k in indices:
         piece = pieces.get(k)
@@ -352,7 +351,6 @@ class Volume:
             to_rgb(intensity),
             sigma,
             views,
-            np.zeros(3),
         )
 
     def piece(self, min_views: int = 1) -> Piece:

@@ -188,9 +188,12 @@ def transform(T: ArrayLike, points: ArrayLike) -> Float64:
 
 def about(centre: ArrayLike, T: ArrayLike) -> Float64:
     """Return the motions (..., 4, 4) that act about a centre (3,) as T does about the origin."""
+    centre, T = np.asarray(centre, float), np.asarray(T, float)
+    if not centre.any():
+        return T
     to, back = np.eye(4), np.eye(4)
-    to[:3, 3], back[:3, 3] = centre, -np.asarray(centre, float)
-    return np.asarray(to @ np.asarray(T, float) @ back)
+    to[:3, 3], back[:3, 3] = centre, -centre
+    return np.asarray(to @ T @ back)
 
 
 def point_jacobian(points: ArrayLike) -> Float64:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
+from tofuse.engine.geometry import se3
 from tofuse.engine.graph import LoopRecord
 from tofuse.engine.icp import algorithm_1
 from tofuse.engine.search import SearchOptions
@@ -38,6 +39,10 @@ class PriorLoop:
     j: int
     T_i_j: Float64 | None = None
     by_user: bool = True
+
+    def about(self, centre: Float64) -> PriorLoop:
+        """Return the loop with its motion in coordinates with another origin; see `se3.about`."""
+        return self if self.T_i_j is None else replace(self, T_i_j=se3.about(centre, self.T_i_j))
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,6 +94,11 @@ class Assessment:
         loops = tuple(c.record for c in closed.loops)
         cross_view = self._cross_view(graph)
         accuracy, covariances = self._accuracy(closed, refined, model, cross_view)
+        moving = tuple(
+            (e.record.index, e.moving_fraction) for e in self.tracked.posed if e.moving_fraction > 0
+        )
+        if checks.open_motion(moving):
+            accuracy = accuracy.without_bound()
         if observations.has_covariances:
             model = self._with_pose_errors(model, graph, covariances)
         records = self._records(covariances)
@@ -121,9 +126,7 @@ class Assessment:
             interruptions=tuple(self.log.interruptions),
             priors=closed.sensors.records,
             components=components,
-            moving=tuple(
-                (e.record.index, e.moving_fraction) for e in posed if e.moving_fraction > 0
-            ),
+            moving=moving,
             doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
             single_link_frames=single_link_frames(self.tracked, loops),
         )

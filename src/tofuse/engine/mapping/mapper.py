@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.compute import serial_chunks, thread_count, threads, trim_memory
+from tofuse.engine.compute import thread_count, threads, trim_memory
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.assembly import Assembly
 from tofuse.engine.mapping.config import Config, check_views, kind_of
@@ -71,6 +74,7 @@ class Mapper:
         self._sequence = FrameSequence()
         self._log = FrameLog()
         self._finished = False
+        self._shift: Float64 = np.zeros(3)
         self._start_method(tracker)
 
     def _start_method(self, tracker: Tracker | None = None) -> None:
@@ -117,13 +121,13 @@ class Mapper:
             If the frame is of another kind than those before, or of one that the configuration
             does not support, or its index is not larger than those before.
         """
-        self._check(frame)
+        frame, T_odometry = self._check(frame, T_odometry)
         repeated = self._sequence.is_repeated(frame)
         if repeated:
             self._log.repeated.append(frame.index)
         # Chunks run serially while other threads prepare frames; else relocalization uses all.
         busy = prepared is not None and prepared.filtered is not None
-        with threads(self.threads), serial_chunks(busy):
+        with threads(self.threads, serial=busy):
             filtered = self._prepare(frame, history, prepared)
             step = self._track(filtered, T_odometry, repeated)
             self._store(filtered, step, T_odometry, gravity)
@@ -251,7 +255,7 @@ class Mapper:
             seconds=dict(self.watch.seconds),
             samples=self._observations.samples.all,
         )
-        return replace(result, diagnostics=diagnostics)
+        return replace(result, diagnostics=diagnostics, shift=self._shift)
 
     def _assembly(self) -> Assembly:
         return Assembly(
@@ -264,7 +268,8 @@ class Mapper:
             self.threads,
         )
 
-    def _check(self, frame: Frame) -> None:
+    def _check(self, frame: Frame, T_odometry: Float64 | None) -> tuple[Frame, Float64 | None]:
+        """Return the frame and the odometry, those of clouds relative to the first one's shift."""
         self._check_open()
         if not isinstance(frame, RangeFrame | CloudFrame):
             raise InputError(
@@ -275,11 +280,19 @@ class Mapper:
         self._sequence.check_order(frame.index)
         kind = kind_of(frame)
         if self._sequence.check_kind(frame):
+            self._shift = frame.shift
             if self._method is not None and kind == "cloud":
                 self.config = from_method(self._method, kind)
+            if kind == "cloud":
+                self._prior_loops = tuple(p.about(-self._shift) for p in self._prior_loops)
                 self._start_method()
             check_views(self.config, kind)
         self._sequence.accept(frame.index, kind)
+        if not isinstance(frame, CloudFrame) or not self._shift.any():
+            return frame, T_odometry
+        if T_odometry is not None:
+            T_odometry = se3.about(-self._shift, T_odometry)
+        return frame.relative_to(self._shift), T_odometry
 
     def _check_open(self) -> None:
         if self._finished:

@@ -92,6 +92,10 @@ class Accuracy:
     unbounded: tuple[int, ...] = ()
     by_odometry: tuple[int, ...] = ()
 
+    def without_bound(self) -> Accuracy:
+        """Return the accuracy where an error is known that its evidence does not cover."""
+        return replace(self, position_m=np.inf, rotation_rad=np.inf, relative=np.inf, worst=None)
+
 
 @dataclass(frozen=True)
 class ObservedErrors:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.joint_alignment import DAMPING, Priors, weak_prior
 from tofuse.engine.stored_views import SampledView, pair_equations
@@ -59,22 +60,6 @@ class Response:
         return np.asarray(scatter / np.maximum(self.information.sum(0), 1e-12), np.float64)
 
 
-def _robust_curvature(limit: float) -> float:
-    """Second derivative of the biweight over its weight, both expected for normal residuals.
-
-    Reweighted least squares holds the weights constant, and their curvature exceeds that of the
-    cost. A single step with it falls short, and a sandwich estimate by it is too small (Huber 1981,
-    Robust Statistics, section 3.2: the mean of psi').
-
-    Parameters
-    ----------
-    limit
-        Residual with zero weight, in standard deviations; the tails beyond are neglected.
-    """
-    square = 1 / limit**2
-    return (1 - 6 * square + 15 * square**2) / (1 - 2 * square + 3 * square**2)
-
-
 def response(
     views: Sequence[SampledView],
     poses: Float64,
@@ -105,7 +90,7 @@ def response(
         views, poses, zero_errors, np.ones_like(estimate_all), state, stage, options
     )
     pair_equations.without_exposure(state)
-    pair_equations.rescale(state, stage)
+    pair_equations.rescale(state, stage, options)
     pair_equations.evaluate(views, poses, zero_errors, estimate_all, state, stage, options)
     H, g = pair_equations.without_exposure(state)
     prior_count = len(priors.pairs)
@@ -144,6 +129,9 @@ def response(
         )
         second[:, k] = H[:, 6 + k, 6 + k] + 2 * (mixed * relative_motion).sum(1)
         second[:, k] += np.einsum("mi,mij,mj->m", relative_motion, H[:, :6, :6], relative_motion)
-    second *= _robust_curvature(options.robust)
+    # Reweighted least squares holds the weights constant, and their curvature exceeds that of the
+    # cost. A single step with it falls short, and a sandwich estimate by it is too small (Huber
+    # 1981, Robust Statistics, section 3.2: the mean of psi').
+    second *= tukey.consistency(options.robust)
     half = len(pairs)
     return Response(first[:half] + first[half:], second[:half] + second[half:], motion)

@@ -291,7 +291,7 @@ def align_views(
             step, error_step = _solve(poses, state, system, fixed_errors, priors, bodies)
             poses = _apply_step(poses, step, bodies)
             errors = errors + error_step
-            pair_equations.rescale(state, stage)
+            pair_equations.rescale(state, stage, options)
             motions.append(float(np.abs(step / projective.UNITS).max()))
             motion_since_overlaps += motions[-1] if pairs is None else 0.0
             error_change = float(np.abs(error_step).max()) / _ERROR_UNIT
@@ -346,7 +346,7 @@ def align_pairs(
         subset = state.subset(directed)
         pair_equations.evaluate(views, poses, errors, fixed_errors, subset, stage, options)
         aligned, _ = _pairwise_measurements(poses, ends[active], subset)
-        pair_equations.rescale(subset, stage)
+        pair_equations.rescale(subset, stage, options)
         state.put(directed, subset)
         sources = 2 * active + 1
         step = se3.log(se3.inverse(poses[sources]) @ aligned) / projective.UNITS

@@ -41,6 +41,8 @@ TOLERANCE_RAD = np.radians(2)
 MAX_LOOP_CHI2 = 22.46
 # Without covariances: tolerated drift over a loop as a fraction of its path, and its minimum.
 GAP_FRACTION, GAP_FLOOR_M, GAP_FLOOR_RAD = 0.02, 0.03, np.radians(2)
+# What moves in more of the view may as well be what stands still.
+MAX_MOVING = 0.25
 # Maximum number of disconnected parts (the largest) and of loops that are named.
 MAX_LISTED = 6
 # Minimum fraction of overlapping measurements that support the poses; and its minimum ratio to that
@@ -389,6 +391,14 @@ def _scene(e: Evidence) -> Iterator[Reason]:
             f"{frame_ranges.in_words(where)}; they are excluded from tracking and from the model."
         )
         yield Reason("moving_objects", where, text)
+    if open_frames := open_motion(e.moving):
+        where = e.runs_of(open_frames)
+        text = (
+            f"What moves covers more than {_percent(MAX_MOVING)} of the image in "
+            f"{frame_ranges.in_words(where)}: whether it moves, or the camera with it, is open, so "
+            "no bound of the pose errors is stated."
+        )
+        yield Reason("open_motion", where, text)
     doubtful = e.runs_of(e.doubtful)
     if doubtful:
         description = (
@@ -398,6 +408,11 @@ def _scene(e: Evidence) -> Iterator[Reason]:
             "first."
         )
         yield Reason("doubtful_poses", doubtful, f"{_sentence(doubtful)} {description}")
+
+
+def open_motion(moving: Sequence[tuple[int, float]]) -> set[int]:
+    """Return the frames in which what moves, (frame index, fraction of the image), is too much."""
+    return {frame for frame, fraction in moving if fraction > MAX_MOVING}
 
 
 def _drift(e: Evidence) -> Iterator[Reason]:
@@ -437,7 +452,7 @@ def accuracy_reasons(
             "geometry): the recorded odometry bounds the error there."
         )
         yield Reason("bounded_by_odometry", by_odometry, text)
-    if unbounded:
+    if unbounded or not np.isfinite(a.position_m):
         return
     if a.position_m > tolerance_m or a.rotation_rad > TOLERANCE_RAD:
         error, allowed = length(a.position_m), length(tolerance_m)

@@ -333,6 +333,9 @@ class Reconstruction:
     up
         (3,) unit vector against gravity in the world frame, measured by an accelerometer; None
         without one.
+    shift
+        (3,) m, of the clouds (`CloudFrame.shift`): everything here is relative to it. Files are
+        written in the coordinates of the input's files.
     """
 
     trajectory: Float64
@@ -350,6 +353,7 @@ class Reconstruction:
     session_pairs: tuple[SessionPair, ...] = ()
     changes: tuple[SessionChange, ...] = ()
     up: Float64 | None = None
+    shift: Float64 = field(default_factory=lambda: np.zeros(3))
 
     @cached_property
     def T_up_world(self) -> Float64:

@@ -15,6 +15,7 @@ import numpy as np
 from tofuse.engine.alignment import step_kernels as steps
 from tofuse.engine.arrays import Float64, Int64, Intp
 from tofuse.engine.compute import run_chunks
+from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
@@ -302,14 +303,15 @@ def without_exposure(state: DirectedPairs) -> tuple[Float64, Float64]:
     )
 
 
-def rescale(state: DirectedPairs, stage: Round) -> None:
+def rescale(state: DirectedPairs, stage: Round, options: RefineOptions) -> None:
     """Estimate the sigmas of each pair from its residuals, as the tracker does."""
     counts = np.ascontiguousarray(state.rows[:, kernels.HISTOGRAM :])
     enough = counts.sum(1) >= _MIN_COMPARED
     distance_scale = np.array([steps.scale_of_distances(row) for row in counts[enough]])
     state.scale_g[enough] = np.clip(distance_scale, 0.7, state.max_scale[enough])
     weight = state.rows[:, kernels.WEIGHT_P]
-    albedo_scale = np.sqrt(state.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9) / 0.72)
+    mean_square = state.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9)
+    albedo_scale = np.sqrt(mean_square / tukey.consistency(options.robust))
     used = (weight > 0) & (state.scale_p > 0)
     scale = np.clip(np.hypot(albedo_scale, stage.photometric_inflation), 0.005, 0.5)
     state.scale_p[used] = scale[used]

@@ -10,12 +10,13 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.formats.cameras import camera_file, lenses
-    from tofuse.formats.cameras.correction_file import (
+    from tofuse.formats.cameras.calibration_files import (
         corrected_depth,
         read_correction,
+        read_noise,
         write_correction,
+        write_noise,
     )
-    from tofuse.formats.cameras.noise_file import read_noise, write_noise
     from tofuse.formats.cameras.rectify import Rectifier, pinhole_of
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

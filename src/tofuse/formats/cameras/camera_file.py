@@ -15,7 +15,7 @@ from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, Ray
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import AmplitudeKind, DepthKind
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import json_data, reading
+from tofuse.formats.files import npz, reading
 
 # Limits for any camera: a frame per month to a million per second; ambiguity ranges of modulation
 # at 15 GHz to 1.5 kHz.
@@ -28,20 +28,6 @@ AMPLITUDE_KINDS = ("raw", "range_compensated", "ir")
 
 _METRES = "the metres of one count, such as 0.001"
 _LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
-_KEYS = (
-    "schema",
-    *_LENS,
-    "depth_unit_m",
-    "depth_kind",
-    "frame_rate_hz",
-    "ambiguity_m",
-    "confidence_max",
-    "amplitude_kind",
-    "sigma_unit_m",
-    "sensor",
-    "color_registered",
-    "color",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +90,9 @@ class CameraFile:
         return {name: value for name, value in values.items() if value is not None}
 
 
+_KEYS = {field.name for field in fields(CameraFile)} - {"camera", "size", "unknown"}
+
+
 def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     """Read and check a camera.json.
 
@@ -119,15 +108,10 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     InputError
         Naming file and field, with a remedy.
     """
-    data = json_data.read_json(path)
+    data = reading.read_json(path)
     get = _Fields(data, str(path))
-    schema = data.get("schema")
-    if schema != SCHEMA or isinstance(schema, bool):
-        raise get.error(
-            "schema",
-            f"is {schema!r}" if "schema" in data else "is missing",
-            f"write {SCHEMA}, the only version",
-        )
+    with reading.about(path):
+        reading.check_schema(data, SCHEMA)
     camera = size = None
     color = None
     unit = 0.001
@@ -152,7 +136,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
         get.text("sensor"),
         get.flag("color_registered", default=True),
         color,
-        tuple(key for key in data if key not in _KEYS),
+        tuple(key for key in data if key not in {"schema", *_LENS, *_KEYS}),
     )
 
 
@@ -238,33 +222,21 @@ def check_size(image: NDArray[Any], camera: Camera, where: str | Path) -> None:
 
 def read_rays(path: Path) -> RayTable:
     """Read a rays.npy: (H, W, 2) float32 of x/z and y/z."""
-    try:
-        # Mapped first, so that a damaged header can't cause an allocation larger than the file.
-        table = np.load(path, mmap_mode="r", allow_pickle=False)
-        if not isinstance(table, np.ndarray) or table.dtype.kind != "f":
-            raise ValueError("not an array of floats")
-        if table.ndim != 3 or table.shape[2] != 2:
-            raise ValueError(f"shape {table.shape}, not (H, W, 2)")
-        rays = np.array(table, float)
-        finite = np.isfinite(rays)
+    table = npz.read_npy(path)
+    if table.dtype.kind != "f" or table.ndim != 3 or table.shape[2] != 2:
+        problem = f"is not a table of rays ({table.dtype} of shape {table.shape})"
+        raise InputError(problem, where=path, remedy="save (H, W, 2) float32")
+    rays = np.array(table, float)
+    finite = np.isfinite(rays)
+    directions = rays[finite.all(2)]
+    with reading.named(path, "save (H, W, 2) float32"):
         if (np.abs(rays[finite]) > MAX_SLOPE).any():
-            raise ValueError("rays at 90 degrees from the optical axis or more")
-        directions = rays[finite.all(2)]
+            raise InputError("contains rays at 90 degrees from the optical axis or more")
         if not len(directions):
-            raise ValueError("no pixel has a ray")
+            raise InputError("has no pixel with a ray")
         if len(directions) > 1 and not np.ptp(directions, axis=0).any():
-            raise ValueError("all rays are the same")
+            raise InputError("has the same ray for all pixels")
         return RayTable(np.where(finite, rays, np.nan).astype(np.float32))
-    except OSError as error:
-        raise reading.input_error(error, path) from error
-    except InputError as error:
-        raise InputError(error.problem, where=path, remedy=error.remedy) from error
-    except Exception as error:  # NumPy evaluates the header as Python, which can raise anything
-        raise InputError(
-            f"is not a table of rays ({error})",
-            where=path,
-            remedy="save (H, W, 2) float32",
-        ) from error
 
 
 def camera_fields(camera: Camera) -> dict[str, Any]:
@@ -296,7 +268,7 @@ class _Fields:
     def number(self, field: str, *, required: bool = False, hint: str = "a number") -> float | None:
         if self.data.get(field) is None and not required:
             return None
-        value = json_data.number_in(self.data, field, self.where, remedy=f"use {hint}")
+        value = reading.number_in(self.data, field, self.where, remedy=f"use {hint}")
         if not math.isfinite(value):
             raise self.error(field, f"is {value}", f"use a finite {hint.removeprefix('a ')}")
         return value
@@ -408,12 +380,8 @@ def checked_lens(
             raise InputError(
                 f"is {value}", where=f"{where}: {name}", remedy=f"use {low:g} to 1000000"
             )
-    try:
+    with reading.prefixed(where):
         return cls(size[0], size[1], **values)
-    except InputError as error:
-        raise InputError(
-            error.problem, where=f"{where}: {error.where}", remedy=error.remedy
-        ) from error
 
 
 def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pinhole:
@@ -448,11 +416,9 @@ def _color(get: _Fields) -> ColorCamera | None:
     if camera is None:
         raise get.error("color.intrinsics.model", "is 'rays'", "use a lens model")
     field = "color.T_color_depth"
-    try:
-        matrix = np.array(data.get("T_color_depth"), float)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise get.error(field, "is not a 4x4 matrix", "use four rows of four numbers") from error
-    return ColorCamera(camera, se3.check_pose(matrix, where=f"{get.where}: {field}"))
+    where = f"{get.where}: {field}"
+    matrix = reading.matrix_of(data.get("T_color_depth"), where, "use four rows of four numbers")
+    return ColorCamera(camera, se3.check_pose(matrix, where=where))
 
 
 # Columns of frames.csv that give each frame its own lens.

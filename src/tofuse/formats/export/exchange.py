@@ -83,11 +83,11 @@ def to_open3d(record: GeometryRecord) -> Any:
     o3d = reading.required_package("open3d", None, "to_open3d")
     vector = o3d.utility.Vector3dVector
     if record.faces is None:
-        geometry = o3d.geometry.PointCloud(vector(record.points))
+        geometry = o3d.geometry.PointCloud(vector(record.points.astype(float)))
         prefix = ""
     else:
         triangles = o3d.utility.Vector3iVector(record.faces)
-        geometry = o3d.geometry.TriangleMesh(vector(record.points), triangles)
+        geometry = o3d.geometry.TriangleMesh(vector(record.points.astype(float)), triangles)
         prefix = "vertex_"
     if record.normals is not None:
         setattr(geometry, f"{prefix}normals", vector(record.normals.astype(float)))

@@ -80,22 +80,22 @@ def read_pcd(path: str | Path) -> Pcd:
         x, y or z.
     """
     data = reading.read_bytes(path)
-    header = _read_header(data, path)
+    with reading.about(path, _COPY_AGAIN):
+        return _parsed(data)
+
+
+def _parsed(data: bytes) -> Pcd:
+    header = _read_header(data)
     if not all(name in header.names for name in "xyz"):
-        raise InputError(
-            f"has the fields {' '.join(header.names)}", where=path, remedy="store x y z"
-        )
-    body = memoryview(data)[header.body :]
-    columns = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[header.kind](
-        body, header, path
-    )
+        raise InputError(f"has the fields {' '.join(header.names)}", remedy="store x y z")
+    columns = _COLUMNS[header.kind](memoryview(data)[header.body :], header)
     fields: dict[str, NDArray[Any]] = {}
     for name, column in zip(header.names, columns, strict=True):
         if name != "_" and name not in fields:
             fields[name] = column
     for name in "xyz":
         if fields[name].ndim != 1:
-            raise InputError(f"has several values of {name!r} per point", where=path)
+            raise InputError(f"has several values of {name!r} per point")
     color = _unpacked_color(fields)
     points = stacked(fields, ("x", "y", "z"))
     normals: Float32 | None = None
@@ -115,14 +115,15 @@ def _unpacked_color(fields: dict[str, NDArray[Any]]) -> UInt8 | None:
     return None
 
 
-def _read_header(data: bytes, path: str | Path) -> _Header:
+def _read_header(data: bytes) -> _Header:
     values: dict[str, list[str]] = {}
     offset = 0
     while "DATA" not in values:
         end = data.find(b"\n", offset, _HEADER_LIMIT)
         if end < 0:
-            problem = "is empty" if not data else "is not a PCD file (its header has no DATA line)"
-            raise InputError(problem, where=path, remedy=_COPY_AGAIN)
+            raise InputError(
+                "is not a PCD file (its header has no DATA line)" if data else "is empty"
+            )
         cells = data[offset:end].decode("latin-1").split("#", 1)[0].split()
         offset = end + 1
         if cells:
@@ -141,61 +142,49 @@ def _read_header(data: bytes, path: str | Path) -> _Header:
         viewpoint = tuple(float(v) for v in values.get("VIEWPOINT", []))
         kind = values["DATA"][0].lower()
     except (KeyError, ValueError, IndexError) as error:
-        raise InputError(
-            f"has an invalid PCD header ({error})", where=path, remedy=_COPY_AGAIN
-        ) from error
-    if kind not in ("ascii", "binary", "binary_compressed"):
-        raise InputError(f"has PCD data of the kind {kind!r}", where=path, remedy=_COPY_AGAIN)
+        raise InputError(f"has an invalid PCD header ({error})") from error
+    if kind not in _COLUMNS:
+        raise InputError(f"has PCD data of the kind {kind!r}")
     if points != width * height or width < 0 or height < 0 or any(c < 1 for c in counts):
-        raise InputError(
-            f"declares {points} points in {width} x {height}", where=path, remedy=_COPY_AGAIN
-        )
+        raise InputError(f"declares {points} points in {width} x {height}")
     if points > MAX_POINTS or max(counts, default=1) > 65536:
-        raise InputError(f"declares {points} points", where=path, remedy=_COPY_AGAIN)
+        raise InputError(f"declares {points} points")
     if len(viewpoint) != 7 or not all(map(math.isfinite, viewpoint)):
         viewpoint = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     return _Header(names, dtypes, counts, width, height, points, viewpoint, kind, offset)
 
 
-def _truncated(header: _Header, path: str | Path) -> InputError:
+def _truncated(header: _Header) -> InputError:
     return InputError(
-        f"is cut off: its header declares {header.points} points, more than it contains",
-        where=path,
-        remedy=_COPY_AGAIN,
+        f"is cut off: its header declares {header.points} points, more than it contains"
     )
 
 
-def _binary(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[Any]]:
+def _binary(body: memoryview, header: _Header) -> list[NDArray[Any]]:
     if header.points * header.stride > len(body):
-        raise _truncated(header, path)
-    dtype = np.dtype(
-        [
-            (f"f{k}", t, (c,) if c > 1 else ())
-            for k, (t, c) in enumerate(zip(header.dtypes, header.counts, strict=True))
-        ]
-    )
+        raise _truncated(header)
+    formats = zip(header.dtypes, ((c,) if c > 1 else () for c in header.counts), strict=True)
+    dtype = np.dtype([(f"f{k}", *kind_shape) for k, kind_shape in enumerate(formats)])
     rows = np.frombuffer(body, dtype, header.points)
-    return [rows[f"f{k}"] for k in range(len(header.names))]
+    return [rows[name] for name in dtype.names or ()]
 
 
-def _compressed(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[Any]]:
+def _compressed(body: memoryview, header: _Header) -> list[NDArray[Any]]:
     from tofuse.formats.geometry.lzf_kernels import lzf_decompress
 
     if len(body) < 8:
-        raise _truncated(header, path)
+        raise _truncated(header)
     compressed, size = struct.unpack_from("<II", body)
     expected = header.points * header.stride
     # LZF expands by at most a factor of 88: 264 bytes from 3.
     if compressed > len(body) - 8 or size != expected or size > 88 * compressed + 264:
         raise InputError(
-            f"is cut off or damaged: {len(body) - 8} of {compressed} bytes for {expected}",
-            where=path,
-            remedy=_COPY_AGAIN,
+            f"is cut off or damaged: {len(body) - 8} of {compressed} bytes for {expected}"
         )
     out = np.empty(size, np.uint8)
     source = np.frombuffer(body, np.uint8, compressed, 8)
     if lzf_decompress(source, out) != size:
-        raise InputError("contains damaged compressed data", where=path, remedy=_COPY_AGAIN)
+        raise InputError("contains damaged compressed data")
     columns: list[NDArray[Any]] = []
     offset = 0
     for dtype, count in zip(header.dtypes, header.counts, strict=True):
@@ -205,21 +194,18 @@ def _compressed(body: memoryview, header: _Header, path: str | Path) -> list[NDA
     return columns
 
 
-def _ascii(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[Any]]:
+def _ascii(body: memoryview, header: _Header) -> list[NDArray[Any]]:
     lines = [line for line in bytes(body).decode("latin-1").splitlines() if line.strip()]
     if len(lines) < header.points:
-        raise _truncated(header, path)
+        raise _truncated(header)
     total = sum(header.counts)
     try:
         table = np.loadtxt(lines[: header.points], ndmin=2, comments=None)
         if header.points and table.shape[1] != total:
             raise ValueError(f"{table.shape[1]} numbers per row, not {total}")
     except (ValueError, OverflowError) as error:
-        raise InputError(
-            f"contains damaged points ({str(error).split('; use')[0]})",
-            where=path,
-            remedy=_COPY_AGAIN,
-        ) from error
+        reason = str(error).split("; use")[0]
+        raise InputError(f"contains damaged points ({reason})") from error
     table = table.reshape(header.points, total)
     columns: list[NDArray[Any]] = []
     first = 0
@@ -231,10 +217,14 @@ def _ascii(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[
     return columns
 
 
+_COLUMNS = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}
+
+
 def write_pcd(path: str | Path, cloud: GeometryRecord) -> None:
     """Write an unorganised cloud, version 0.7, binary; see `replacing` for errors.
 
-    Points and normals are written as float32, colours as PCL does (packed into the bits of a float
+    Points are written as float, and as double where they are map coordinates in float64; normals as
+    float, colours as PCL does (packed into the bits of a float
     called rgb), integer scalars with 32 bits, and other scalars as float32.
 
     Raises
@@ -244,10 +234,10 @@ def write_pcd(path: str | Path, cloud: GeometryRecord) -> None:
     """
     cloud.check(path)
     columns: dict[str, NDArray[Any]] = {}
-    for names, values in ((("x", "y", "z"), cloud.points), (_NORMALS, cloud.normals)):
+    normals = None if cloud.normals is None else np.asarray(cloud.normals, "<f4")
+    for names, values in ((("x", "y", "z"), cloud.written_points()), (_NORMALS, normals)):
         if values is not None:
-            table = np.asarray(values, "<f4")
-            columns |= {name: table[:, k] for k, name in enumerate(names)}
+            columns |= {name: values[:, k] for k, name in enumerate(names)}
     if cloud.color is not None:
         r, g, b = np.asarray(cloud.color, np.uint32).T
         columns["rgb"] = (r << 16 | g << 8 | b).astype("<u4").view("<f4")
@@ -262,7 +252,7 @@ def write_pcd(path: str | Path, cloud: GeometryRecord) -> None:
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
         f"FIELDS {' '.join(columns)}",
-        f"SIZE {' '.join('4' for _ in columns)}",
+        f"SIZE {' '.join(str(column.dtype.itemsize) for column in columns.values())}",
         f"TYPE {' '.join(kinds)}",
         f"COUNT {' '.join('1' for _ in columns)}",
         f"WIDTH {count}",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ _COLORS = (
 )
 
 _Columns = dict[str, NDArray[Any]]
+_Take = Callable[[str, int], NDArray[Any]]  # from the type and the number of values
 
 
 @dataclass
@@ -69,24 +71,27 @@ def read_ply(path: str | Path) -> GeometryRecord:
         x, y and z.
     """
     data = reading.read_bytes(path)
-    kind, elements, comments, body = _read_header(data, path)
+    with reading.about(path, _COPY_AGAIN):
+        return _parsed(data)
+
+
+def _parsed(data: bytes) -> GeometryRecord:
+    kind, elements, comments, body = _read_header(data)
     columns: dict[str, _Columns] = {}
-    reader = (
-        _Ascii(data[body:], path) if kind == "ascii" else _Binary(data, body, _FORMATS[kind], path)
-    )
+    reader = _Ascii(data[body:]) if kind == "ascii" else _Binary(data, body, _FORMATS[kind])
     for element in elements:
         columns[element.name] = reader.element(element)
         if element.name == "face" or ("vertex" in columns and not _has_later(elements, element)):
             break
     vertex = columns.get("vertex", {})
     if not all(name in vertex for name in _POINTS):
-        raise InputError(
-            "has no vertices with x, y and z", where=path, remedy="export a cloud or a mesh"
-        )
+        raise InputError("has no vertices with x, y and z", remedy="export a cloud or a mesh")
     faces = columns.get("face", {})
     indices = next((faces[n] for n in ("vertex_indices", "vertex_index") if n in faces), None)
     if indices is not None:
-        indices = _checked_faces(indices, len(vertex["x"]), path)
+        if indices.size and (indices.min() < 0 or indices.max() >= len(vertex["x"])):
+            raise InputError(f"has faces with vertex indices outside 0 to {len(vertex['x']) - 1}")
+        indices = indices.astype(np.int32)
     points = stacked(vertex, _POINTS)
     normals: Float32 | None = None
     if all(name in vertex for name in _NORMALS):
@@ -113,17 +118,13 @@ def _has_later(elements: list[_Element], element: _Element) -> bool:
     return any(e.name == "face" for e in elements[elements.index(element) + 1 :])
 
 
-def _read_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], list[str], int]:
+def _read_header(data: bytes) -> tuple[str, list[_Element], list[str], int]:
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r"):
-        raise InputError(
-            "is empty" if not data else "is not a PLY file (it doesn't begin with 'ply')",
-            where=path,
-            remedy=_COPY_AGAIN,
-        )
+        raise InputError("is not a PLY file (it doesn't begin with 'ply')" if data else "is empty")
     header_end = data.find(b"end_header", 0, _HEADER_LIMIT)
     line_end = data.find(b"\n", header_end) if header_end >= 0 else -1
     if header_end < 0 or (line_end < 0 and not data.endswith(b"end_header")):
-        raise InputError("has a PLY header without an end", where=path, remedy=_COPY_AGAIN)
+        raise InputError("has a PLY header without an end")
     kind = ""
     elements: list[_Element] = []
     comments: list[str] = []
@@ -150,91 +151,78 @@ def _read_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], li
                 case _:
                     raise ValueError
         except (ValueError, KeyError, IndexError) as error:
-            raise InputError(
-                f"has an invalid PLY header line: {line[:60]!r}",
-                where=path,
-                remedy=_COPY_AGAIN,
-            ) from error
+            raise InputError(f"has an invalid PLY header line: {line[:60]!r}") from error
         names = [p.name for e in elements[-1:] for p in e.properties]
         if len(set(names)) != len(names):
-            raise InputError(f"declares {names[-1]!r} twice", where=path, remedy=_COPY_AGAIN)
+            raise InputError(f"declares {names[-1]!r} twice")
     if kind not in _FORMATS:
-        raise InputError(f"has the unknown PLY format {kind!r}", where=path, remedy=_COPY_AGAIN)
+        raise InputError(f"has the unknown PLY format {kind!r}")
     return kind, elements, comments, line_end + 1 if line_end >= 0 else len(data)
 
 
-def _truncated(element: _Element, path: str | Path) -> InputError:
-    return InputError(
-        f"is cut off: its header declares {element.count} of {element.name!r}, "
-        "more than it contains",
-        where=path,
-        remedy=_COPY_AGAIN,
-    )
+def _truncated(element: _Element) -> InputError:
+    declared = f"{element.count} of {element.name!r}"
+    return InputError(f"is cut off: its header declares {declared}, more than it contains")
+
+
+def _lists(element: _Element, rows: Iterable[_Take]) -> _Columns:
+    """Read lists of any lengths, by functions that take values of each row; skip other columns."""
+    triangles: dict[str, list[Int32]] = {p.name: [] for p in element.properties if p.count_dtype}
+    for take in rows:
+        for p in element.properties:
+            items = take(p.dtype, int(take(p.count_dtype, 1)[0]) if p.count_dtype else 1)
+            if p.count_dtype:
+                triangles[p.name].append(_fans(items[None]))
+    none = np.zeros((0, 3), np.int32)
+    return {name: np.concatenate([none, *rows]) for name, rows in triangles.items()}
 
 
 class _Binary:
     """Reads elements sequentially from the body of a binary file."""
 
-    def __init__(self, data: bytes, offset: int, order: str, path: str | Path) -> None:
-        self.data, self.offset, self.order, self.path = data, offset, order, path
+    def __init__(self, data: bytes, offset: int, order: str) -> None:
+        self.data, self.offset, self.order = data, offset, order
 
     def element(self, element: _Element) -> _Columns:
         if not element.has_list:
             dtype = np.dtype([(p.name, self.order + p.dtype) for p in element.properties])
-            rows = self._rows(dtype, element)
-            return {p.name: _native(rows[p.name]) for p in element.properties}
-        if len(element.properties) == 1:
-            return self._equal_lists(element) or self._lists(element)
-        return self._lists(element)
+            rows = self._take(dtype, element.count, element)
+            native = {p.name: np.dtype(p.dtype) for p in element.properties}
+            return {name: rows[name].astype(kind) for name, kind in native.items()}
+        columns = self._equal_lists(element) if len(element.properties) == 1 else None
+        if columns is None:
+            rows = itertools.repeat(
+                lambda kind, n: self._take(self._dtype(kind), n, element), element.count
+            )
+            columns = _lists(element, rows)
+        return columns
 
-    def _rows(self, dtype: np.dtype, element: _Element) -> NDArray[np.void]:
-        size = dtype.itemsize * element.count
-        if self.offset + size > len(self.data):
-            raise _truncated(element, self.path)
-        rows = np.frombuffer(self.data, dtype, element.count, self.offset)
-        self.offset += size
-        return rows
+    def _dtype(self, kind: str) -> np.dtype:
+        return np.dtype(self.order + kind)
 
     def _equal_lists(self, element: _Element) -> _Columns | None:
         """Read lists that all have the length of the first, vectorised; None if they don't."""
         (p,) = element.properties
-        count_dtype = np.dtype(self.order + str(p.count_dtype))
+        count_dtype, start = self._dtype(str(p.count_dtype)), self.offset
         if element.count == 0:
             return {p.name: np.zeros((0, 3), np.int32)}
-        if self.offset + count_dtype.itemsize > len(self.data):
-            raise _truncated(element, self.path)
-        n = int(np.frombuffer(self.data, count_dtype, 1, self.offset)[0])
+        n = int(self._take(count_dtype, 1, element)[0])
+        self.offset = start
         if not 1 <= n <= 64:
             return None
-        dtype = np.dtype([("n", count_dtype), ("items", self.order + p.dtype, (n,))])
-        size = dtype.itemsize * element.count
-        if self.offset + size > len(self.data):
+        dtype = np.dtype([("n", count_dtype), ("items", self._dtype(p.dtype), (n,))])
+        if start + dtype.itemsize * element.count > len(self.data):
             return None
-        rows = np.frombuffer(self.data, dtype, element.count, self.offset)
-        if (rows["n"] != n).any():
-            return None
-        self.offset += size
-        return {p.name: _fans(rows["items"])}
+        rows = self._take(dtype, element.count, element)
+        if (rows["n"] == n).all():
+            return {p.name: _fans(rows["items"])}
+        self.offset = start
+        return None
 
-    def _lists(self, element: _Element) -> _Columns:
-        """Read lists of any lengths, row by row; other properties are skipped."""
-        polygons: dict[str, list[NDArray[np.generic]]] = {
-            p.name: [] for p in element.properties if p.count_dtype
-        }
-        for _ in range(element.count):
-            for p in element.properties:
-                n = 1
-                if p.count_dtype:
-                    n = int(self._take(np.dtype(self.order + p.count_dtype), 1, element)[0])
-                items = self._take(np.dtype(self.order + p.dtype), n, element)
-                if p.count_dtype:
-                    polygons[p.name].append(items)
-        return {name: _triangulated(rows) for name, rows in polygons.items()}
-
-    def _take(self, dtype: np.dtype, n: int, element: _Element) -> NDArray[np.generic]:
+    def _take(self, dtype: np.dtype, n: int, element: _Element) -> NDArray[Any]:
         size = dtype.itemsize * n
         if n < 0 or self.offset + size > len(self.data):
-            raise _truncated(element, self.path)
+            raise _truncated(element)
         items = np.frombuffer(self.data, dtype, n, self.offset)
         self.offset += size
         return items
@@ -243,18 +231,18 @@ class _Binary:
 class _Ascii:
     """Reads elements sequentially from the lines of a text body."""
 
-    def __init__(self, body: bytes, path: str | Path) -> None:
+    def __init__(self, body: bytes) -> None:
         self.lines = [line for line in body.decode("latin-1").splitlines() if line.strip()]
-        self.offset, self.path = 0, path
+        self.offset = 0
 
     def element(self, element: _Element) -> _Columns:
         lines = self.lines[self.offset : self.offset + element.count]
         if len(lines) < element.count:
-            raise _truncated(element, self.path)
+            raise _truncated(element)
         self.offset += element.count
         try:
             if element.has_list:
-                return self._lists(element, lines)
+                return _lists(element, map(_taking, lines))
             width = len(element.properties)
             table = np.loadtxt(lines, ndmin=2) if lines else np.zeros((0, width))
             if table.shape[1] < width:
@@ -264,35 +252,19 @@ class _Ascii:
                     p.name: table[:, k].astype(p.dtype) for k, p in enumerate(element.properties)
                 }
         except (ValueError, IndexError, OverflowError) as error:
-            raise InputError(
-                f"has damaged data of element {element.name!r} ({error})",
-                where=self.path,
-                remedy=_COPY_AGAIN,
-            ) from error
-
-    def _lists(self, element: _Element, lines: list[str]) -> _Columns:
-        polygons: dict[str, list[NDArray[np.generic]]] = {
-            p.name: [] for p in element.properties if p.count_dtype
-        }
-        for line in lines:
-            cells = line.split()
-            position = 0
-            for p in element.properties:
-                n = 1
-                if p.count_dtype:
-                    n, position = int(cells[position]), position + 1
-                if n < 0 or position + n > len(cells):
-                    raise ValueError("a row is too short")
-                if p.count_dtype:
-                    polygons[p.name].append(
-                        np.array([float(w) for w in cells[position : position + n]])
-                    )
-                position += n
-        return {name: _triangulated(rows) for name, rows in polygons.items()}
+            raise InputError(f"has damaged data of element {element.name!r} ({error})") from error
 
 
-def _native(column: NDArray[np.generic]) -> NDArray[np.generic]:
-    return column.astype(column.dtype.newbyteorder("="))
+def _taking(line: str) -> _Take:
+    cells = iter(line.split())
+
+    def take(_kind: str, n: int) -> NDArray[Any]:
+        values = [float(cell) for cell in itertools.islice(cells, n)]
+        if len(values) < n:
+            raise ValueError("a row is too short")
+        return np.array(values)
+
+    return take
 
 
 def _fans(polygons: NDArray[np.generic]) -> Int32:
@@ -308,25 +280,10 @@ def _fans(polygons: NDArray[np.generic]) -> Int32:
     return np.clip(triangles.reshape(-1, 3), -1, 2**31 - 1).astype(np.int32)
 
 
-def _triangulated(polygons: list[NDArray[np.generic]]) -> Int32:
-    """Triangles (K, 3) of polygons with any number of corners each."""
-    triangles = [_fans(polygon[None]) for polygon in polygons]
-    return np.concatenate([np.zeros((0, 3), np.int32), *triangles])
-
-
-def _checked_faces(faces: NDArray[np.generic], vertices: int, path: str | Path) -> Int32:
-    if faces.size and (faces.min() < 0 or faces.max() >= vertices):
-        raise InputError(
-            f"has faces with vertex indices outside 0 to {vertices - 1}",
-            where=path,
-            remedy=_COPY_AGAIN,
-        )
-    return faces.astype(np.int32)
-
-
-def write_ply(path: str | Path, record: GeometryRecord, *, double: bool = False) -> None:
+def write_ply(path: str | Path, record: GeometryRecord) -> None:
     """Write a cloud or a mesh, binary little-endian, without its texture.
 
+    Points are written as float, and as double where they are map coordinates in float64.
     Normals are written as float nx ny nz, colours as uchar red green blue, scalars in their own
     type (64-bit integers as int, booleans as uchar).
 
@@ -336,8 +293,6 @@ def write_ply(path: str | Path, record: GeometryRecord, *, double: bool = False)
         The file; see `replacing` for errors.
     record
         The cloud or mesh.
-    double
-        Whether to write the points as float64 instead of float32, as map coordinates require.
 
     Raises
     ------
@@ -345,10 +300,10 @@ def write_ply(path: str | Path, record: GeometryRecord, *, double: bool = False)
         If the shapes disagree.
     """
     record.check(path)
-    points = np.asarray(record.points, np.float64 if double else np.float32)
+    points = record.written_points()
     columns: dict[str, tuple[NDArray[Any], str]] = {}
     groups: list[tuple[NDArray[Any] | None, str, tuple[str, ...]]] = [
-        (points, "<f8" if double else "<f4", _POINTS),
+        (points, points.dtype.str, _POINTS),
         (record.normals, "<f4", _NORMALS),
         (record.color, "u1", _COLORS[0]),
     ]

@@ -15,14 +15,16 @@ if TYPE_CHECKING:
         as_color,
         check_first_size,
         first_size,
+        jpeg_bytes,
         parse_image,
+        png_bytes,
         read_color,
         read_header,
         read_image,
         read_raw,
+        read_tiff,
+        write_png,
     )
-    from tofuse.formats.images.tiff import read_tiff
     from tofuse.formats.images.video import Video
-    from tofuse.formats.images.writing import jpeg_bytes, png_bytes, write_png
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

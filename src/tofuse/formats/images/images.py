@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import reading
+from tofuse.formats.files import atomic, reading
 
 MAX_PIXELS = 1 << 26  # 8192 x 8192: far beyond any depth camera, and 400 MB of colour
 MAX_IMAGE_BYTES = 1 << 29
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
+_COPY_AGAIN = "copy the file again"
 _NOT_SOF = {0xC4, 0xC8, 0xCC}
 
 
@@ -51,55 +52,52 @@ def read_header(path: str | Path) -> ImageHeader:
         If it is neither, is cut off within its header, or declares an absurd size.
     """
     head = reading.read_head(path, 64)
-    return _header(
-        head if head.startswith(_PNG) else reading.read_bytes(path, limit=MAX_IMAGE_BYTES), path
-    )
+    with reading.about(path, _COPY_AGAIN):
+        return _header(
+            head if head.startswith(_PNG) else reading.read_bytes(path, limit=MAX_IMAGE_BYTES)
+        )
 
 
-def _header(data: bytes, path: str | Path) -> ImageHeader:
+def _header(data: bytes) -> ImageHeader:
     if data.startswith(_PNG):
-        header = _png_header(data, path)
+        header = _png_header(data)
     elif data.startswith(b"\xff\xd8"):
-        header = _jpeg_header(data, path)
+        header = _jpeg_header(data)
     else:
         problem = "is empty" if not data else "is neither a PNG nor a JPEG image"
-        raise InputError(problem, where=path, remedy="check the file")
-    check_pixels(header.width, header.height, path)
+        raise InputError(problem)
+    check_pixels(header.width, header.height)
     return header
 
 
-def check_pixels(width: int, height: int, path: str | Path) -> None:
-    """Raise InputError, naming `path`, unless an image may have this size."""
+def check_pixels(width: int, height: int) -> None:
+    """Raise InputError unless an image may have this size."""
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
         raise InputError(
             f"declares {width} x {height} pixels",
-            where=path,
             remedy=f"use an image of 1 to {MAX_PIXELS} pixels",
         )
 
 
-def check_camera_size(
-    width: int, height: int, size: tuple[int, int] | None, path: str | Path
-) -> None:
-    """Raise InputError, naming `path`, unless an image has the size of its camera, if known."""
+def check_camera_size(width: int, height: int, size: tuple[int, int] | None) -> None:
+    """Raise InputError unless an image has the size of its camera, if known."""
     if size is not None and (width, height) != size:
         raise InputError(
             f"is {width} x {height} pixels, the camera {size[0]} x {size[1]}",
-            where=path,
             remedy="use the camera description of these images",
         )
 
 
-def _png_header(data: bytes, path: str | Path) -> ImageHeader:
+def _png_header(data: bytes) -> ImageHeader:
     if len(data) < 33 or data[12:16] != b"IHDR":
-        raise InputError("is cut off within its header", where=path, remedy="copy the file again")
+        raise InputError("is cut off within its header")
     width, height, bits, color = struct.unpack(">IIBB", data[16:26])
     if color not in _PNG_CHANNELS:
-        raise InputError("is a damaged PNG (no such colour type)", where=path)
+        raise InputError("is a damaged PNG (no such colour type)")
     return ImageHeader("png", width, height, _PNG_CHANNELS[color], bits)
 
 
-def _jpeg_header(data: bytes, path: str | Path) -> ImageHeader:
+def _jpeg_header(data: bytes) -> ImageHeader:
     offset = 2
     while offset + 9 < len(data):
         if data[offset] != 0xFF:
@@ -113,10 +111,10 @@ def _jpeg_header(data: bytes, path: str | Path) -> ImageHeader:
             bits, height, width, channels = struct.unpack(">BHHB", data[offset + 4 : offset + 10])
             return ImageHeader("jpeg", width, height, channels, bits)
         offset += 2 + length
-    raise InputError("is a damaged or cut off JPEG", where=path, remedy="copy the file again")
+    raise InputError("is a damaged or cut off JPEG")
 
 
-def _check_complete(data: bytes, path: str | Path) -> None:
+def _check_complete(data: bytes) -> None:
     """Raise InputError unless a PNG has all its chunks, each with its checksum."""
     view = memoryview(data)
     offset = len(_PNG)
@@ -127,11 +125,11 @@ def _check_complete(data: bytes, path: str | Path) -> None:
             break
         (checksum,) = struct.unpack_from(">I", data, end - 4)
         if zlib.crc32(view[offset + 4 : end - 4]) != checksum:
-            raise InputError("is damaged (wrong checksum of a PNG chunk)", where=path)
+            raise InputError("is damaged (wrong checksum of a PNG chunk)")
         if data[offset + 4 : offset + 8] == b"IEND":
             return
         offset = end
-    raise InputError("is cut off before its end", where=path, remedy="copy the file again")
+    raise InputError("is cut off before its end")
 
 
 def check_first_size(files: Sequence[Path], size: tuple[int, int], where: str, remedy: str) -> None:
@@ -201,22 +199,26 @@ def parse_image(
     dtype: str | None = None,
 ) -> NDArray[Any]:
     """Decode a PNG or JPEG in memory; `path` names it in errors. See `read_image`."""
-    header = _header(data, path)
-    check_camera_size(header.width, header.height, size, path)
+    with reading.about(path, _COPY_AGAIN):
+        return _parsed(data, size, dtype)
+
+
+def _parsed(data: bytes, size: tuple[int, int] | None, dtype: str | None) -> NDArray[Any]:
+    header = _header(data)
+    check_camera_size(header.width, header.height, size)
     if dtype is not None and (header.channels != 1 or f"uint{header.bits}" != dtype):
         raise InputError(
             f"has {header.channels} channels of {header.bits} bits",
-            where=path,
             remedy=f"store one channel of {dtype}",
         )
     if header.format == "png":
-        _check_complete(data, path)
+        _check_complete(data)
     elif data.rfind(b"\xff\xd9") < 0:
-        raise InputError("is cut off before its end", where=path, remedy="copy the file again")
-    return _decode(data, header, path)
+        raise InputError("is cut off before its end")
+    return _decode(data, header)
 
 
-def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
+def _decode(data: bytes, header: ImageHeader) -> NDArray[Any]:
     import cv2
 
     grey = header.channels < 3
@@ -226,17 +228,17 @@ def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
         if grey
         else cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     )
-    image = decoded(data, flags, (header.height, header.width), path)
+    image = decoded(data, flags, (header.height, header.width))
     return image if grey else np.ascontiguousarray(image[..., ::-1])
 
 
-def decoded(data: bytes, flags: int, shape: tuple[int, int], path: str | Path) -> NDArray[Any]:
+def decoded(data: bytes, flags: int, shape: tuple[int, int]) -> NDArray[Any]:
     """Decode an image by OpenCV with its `flags`.
 
     Raises
     ------
     InputError
-        Naming `path`, if that fails, or the image has another (height, width).
+        If that fails, or the image has another (height, width).
     """
     import cv2
 
@@ -245,7 +247,7 @@ def decoded(data: bytes, flags: int, shape: tuple[int, int], path: str | Path) -
     except cv2.error:
         image = None
     if image is None or image.shape[:2] != shape:
-        raise InputError("can't be decoded", where=path, remedy="copy the file again")
+        raise InputError("can't be decoded")
     return image
 
 
@@ -291,3 +293,133 @@ def read_raw(path: str | Path, dtype: str, size: tuple[int, int], remedy: str) -
             remedy=remedy,
         )
     return np.frombuffer(data, pixel).reshape(height, width, *pixel.shape)
+
+
+# Tags of the TIFF 6.0 specification.
+_WIDTH, _HEIGHT, _SAMPLES = 256, 257, 277
+_PIECES = ((273, 279), (324, 325))  # offsets and sizes of strips, or of tiles
+_CODES = {1: "B", 3: "H", 4: "I"}  # of the integer types
+_MAX_TAGS = 256
+
+
+def read_tiff(path: str | Path, size: tuple[int, int] | None = None) -> NDArray[Any]:
+    """Read the first image of a TIFF file: (H, W) of uint8, uint16, float32 or float64.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size
+        Expected (width, height).
+
+    Raises
+    ------
+    InputError
+        If it is not a TIFF of one channel, is cut off or damaged, or of another size.
+    """
+    import cv2
+
+    data = reading.read_bytes(path, limit=MAX_IMAGE_BYTES)
+    with reading.about(path, "copy the file again"):
+        width, height = tiff_size(data)
+        check_camera_size(width, height, size)
+        image = decoded(data, cv2.IMREAD_UNCHANGED, (height, width))
+        if image.ndim != 2 or image.dtype.kind not in "uf":
+            raise InputError("can't be decoded", remedy="store one channel as TIFF")
+    return image
+
+
+def tiff_size(data: bytes) -> tuple[int, int]:
+    """Return width and height of the first image, after checking that its data is complete.
+
+    Raises
+    ------
+    InputError
+        See `read_tiff`.
+    """
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    if order is None:
+        problem = "is empty" if not data else "is not a TIFF image"
+        raise InputError(problem)
+    try:
+        tags = _tags(data, order)
+        width, height = tags[_WIDTH][0], tags[_HEIGHT][0]
+        channels = tags.get(_SAMPLES, [1])[0]
+        pieces = [(tags[a], tags[b]) for a, b in _PIECES if a in tags and b in tags]
+        complete = bool(pieces) and all(
+            len(starts) == len(sizes)
+            and all(start + count <= len(data) for start, count in zip(starts, sizes, strict=True))
+            for starts, sizes in pieces
+        )
+    except (struct.error, KeyError, IndexError, ValueError) as error:
+        raise InputError("is a damaged TIFF") from error
+    check_pixels(width, height)
+    if channels != 1:
+        raise InputError(f"has {channels} channels", remedy="store one channel")
+    if not complete:
+        raise InputError("is cut off before its end")
+    return width, height
+
+
+def _tags(data: bytes, order: str) -> dict[int, list[int]]:
+    """The integer values of the tags of the first directory."""
+    (directory,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, directory)
+    if count > _MAX_TAGS:
+        raise ValueError(count)
+    tags = {}
+    for k in range(count):
+        tag, kind, number = struct.unpack_from(order + "HHI", data, directory + 2 + 12 * k)
+        if kind not in _CODES:
+            continue
+        start = directory + 2 + 12 * k + 8
+        size = struct.calcsize(order + _CODES[kind]) * number
+        if size > 4:
+            (start,) = struct.unpack_from(order + "I", data, start)
+        if start + size > len(data):
+            raise ValueError(number)
+        tags[tag] = list(struct.unpack_from(f"{order}{number}{_CODES[kind]}", data, start))
+    return tags
+
+
+def png_bytes(image: NDArray[np.generic]) -> bytes:
+    """Encode (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB, as PNG."""
+    import cv2
+
+    image = np.asarray(image)
+    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
+        raise InputError(
+            f"is an array of shape {image.shape} and type {image.dtype}",
+            where="image",
+            remedy="pass (H, W) uint8 or uint16, or (H, W, 3) uint8",
+        )
+    if image.ndim == 3:
+        image = np.ascontiguousarray(image[..., ::-1])
+    pixels: NDArray[Any] = image
+    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not ok:
+        raise InputError(f"of shape {image.shape} can't be encoded as PNG", where="image")
+    return bytes(data)
+
+
+def jpeg_bytes(image: UInt8, quality: int = 92) -> bytes:
+    """Encode (H, W, 3) uint8 RGB as JPEG."""
+    import cv2
+
+    pixels: NDArray[Any] = np.ascontiguousarray(np.asarray(image, np.uint8)[..., ::-1])
+    ok, data = cv2.imencode(
+        ".jpg",
+        pixels,
+        [
+            *(cv2.IMWRITE_JPEG_QUALITY, quality),
+            *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+        ],
+    )
+    if not ok:
+        raise InputError(f"of shape {image.shape} can't be encoded as JPEG", where="image")
+    return bytes(data)
+
+
+def write_png(path: str | Path, image: NDArray[np.generic]) -> None:
+    """Write (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB; see `replacing` for errors."""
+    atomic.write_bytes(path, png_bytes(image))

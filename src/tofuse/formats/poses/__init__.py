@@ -10,8 +10,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.formats.poses.g2o import read_g2o, write_g2o
-    from tofuse.formats.poses.given_loops import read_loops
-    from tofuse.formats.poses.pose import pose_text, read_pose
+    from tofuse.formats.poses.pose import pose_text, read_loops, read_pose
     from tofuse.formats.poses.trajectory import (
         associate,
         associated_poses,

@@ -51,24 +51,22 @@ def read_g2o(path: str | Path) -> PoseGraph:
         words = line.split()
         if not words or words[0].startswith("#") or words[0] in IGNORED:
             continue
-        where = f"{path}, line {number}"
-        if words[0] == VERTEX:
-            (vertex,), values = _numbers(words, 1, 7, where)
-            if vertex in position:
-                raise InputError(f"vertex {vertex} is given twice", where=where)
-            position[vertex] = len(vertices)
-            vertices.append(values)
-        elif words[0] == EDGE:
-            (i, j), values = _numbers(words, 2, 28, where)
-            if i == j:
-                raise InputError(f"an edge joins vertex {i} to itself", where=where)
-            ends.append((i, j))
-            edges.append(values)
-            edge_lines.append(number)
-        else:
-            raise InputError(
-                f"holds {words[0]!r}", where=where, remedy=f"only {VERTEX} and {EDGE} are read"
-            )
+        with reading.about(f"{path}, line {number}"):
+            if words[0] == VERTEX:
+                (vertex,), values = _numbers(words, 1, 7)
+                if vertex in position:
+                    raise InputError(f"vertex {vertex} is given twice")
+                position[vertex] = len(vertices)
+                vertices.append(values)
+            elif words[0] == EDGE:
+                (i, j), values = _numbers(words, 2, 28)
+                if i == j:
+                    raise InputError(f"an edge joins vertex {i} to itself")
+                ends.append((i, j))
+                edges.append(values)
+                edge_lines.append(number)
+            else:
+                raise InputError(f"holds {words[0]!r}", remedy=f"only {VERTEX} and {EDGE} are read")
     if not vertices:
         raise InputError("contains no vertex", where=path, remedy=f"use {VERTEX} lines")
     for (i, j), number in zip(ends, edge_lines, strict=True):
@@ -120,28 +118,22 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
         file.writelines(f"{EDGE} {i} {j} {_text(row)}\n" for (i, j), row in edges)
 
 
-def _numbers(words: list[str], ids: int, count: int, where: str) -> tuple[list[int], list[float]]:
+def _numbers(words: list[str], ids: int, count: int) -> tuple[list[int], list[float]]:
     if len(words) != 1 + ids + count:
         raise InputError(
             f"{words[0]} has {len(words) - 1} numbers, not {ids + count}",
-            where=where,
             remedy="write the whole line",
         )
     try:
         vertices = [int(word) for word in words[1 : 1 + ids]]
-    except ValueError as error:
-        raise InputError(f"an id is not a whole number ({error})", where=where) from error
-    try:
         values = [float(word) for word in words[1 + ids :]]
     except ValueError as error:
-        raise InputError(f"contains a value that is not a number ({error})", where=where) from error
+        raise InputError(f"contains a value that is not a number ({error})") from error
     if not np.isfinite(values).all():
-        raise InputError(f"{words[0]} contains a number that is not finite", where=where)
+        raise InputError(f"{words[0]} contains a number that is not finite")
     length = float(quaternion.length(values[3:7]))
     if abs(length - 1) > _UNIT:
-        raise InputError(
-            f"the quaternion has length {length:.4g}, not 1", where=where, remedy="normalise it"
-        )
+        raise InputError(f"the quaternion has length {length:.4g}, not 1", remedy="normalise it")
     return vertices, values
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import reading
+from tofuse.formats.files import npz, reading
 from tofuse.formats.poses.trajectory import associated_poses, poses_of_rows, read_tum, rows_of
 
 # Files with the poses in a folder; the first that exists is used.
@@ -112,19 +112,20 @@ def read_poses(path: str | Path) -> TimedPoses:
     if suffix == ".npy":
         return _numpy(path)
     text = reading.read_text(path)
-    if suffix == ".json":
-        return _transforms(text, path)
-    rows = list(rows_of(text))
-    if not rows:
-        raise InputError("contains no poses", where=path, remedy=f"use {_SUPPORTED}")
-    return _reader(rows, path)(rows, path)
+    with reading.about(path, f"use {_SUPPORTED}"):
+        if suffix == ".json":
+            return _transforms(text, path)
+        rows = list(rows_of(text))
+        if not rows:
+            raise InputError("contains no poses")
+        return _reader(rows)(rows, path)
 
 
 _Rows = Sequence[tuple[int, list[str]]]
 _Reader = Callable[[_Rows, Path], TimedPoses]
 
 
-def _reader(rows: _Rows, path: Path) -> _Reader:
+def _reader(rows: _Rows) -> _Reader:
     """The reader of a text format, detected from the number of cells per line."""
     first = rows[0][1]
     count = len(first)
@@ -138,11 +139,7 @@ def _reader(rows: _Rows, path: Path) -> _Reader:
         return _euroc
     if count == 8:
         return _tum
-    raise InputError(
-        f"is not a trajectory of a known format: its first line has {count} columns",
-        where=path,
-        remedy=f"use {_SUPPORTED}",
-    )
+    raise InputError(f"is not a trajectory of a known format: its first line has {count} columns")
 
 
 def _is_number(cell: str) -> bool:
@@ -162,16 +159,13 @@ def _numbers(rows: _Rows, path: Path, count: int) -> tuple[Float64, list[int]]:
     """(N, count) first numbers of the rows, and their lines."""
     table, lines = [], []
     for number, cells in rows:
+        where = f"{path}, line {number}"
         try:
-            row = [float(cell) for cell in cells[:count]]
+            table.append([float(cell) for cell in cells[:count]])
         except ValueError as error:
-            raise InputError(str(error), where=f"{path}, line {number}") from error
-        if len(row) < count:
-            raise InputError(
-                f"has {len(row)} numbers, the first line {count} or more",
-                where=f"{path}, line {number}",
-            )
-        table.append(row)
+            raise InputError(str(error), where=where) from error
+        if len(cells) < count:
+            raise InputError(f"has {len(cells)} numbers, not {count} or more", where=where)
         lines.append(number)
     return np.array(table, float).reshape(-1, count), lines
 
@@ -218,7 +212,7 @@ def _kitti(rows: _Rows, path: Path) -> TimedPoses:
 def _log(rows: _Rows, path: Path) -> TimedPoses:
     """A line of three numbers, the first the frame, and four of a matrix, for each pose."""
     if len(rows) % 5:
-        raise InputError(f"has {len(rows)} lines, not 5 for each pose", where=path)
+        raise InputError(f"has {len(rows)} lines, not 5 for each pose")
     poses, frames = [], []
     for k in range(0, len(rows), 5):
         _, head = rows[k]
@@ -238,7 +232,7 @@ def _colmap(rows: _Rows, path: Path) -> TimedPoses:
     table, lines = _numbers(images, path, 8)
     T_camera_world = poses_of_rows(table[:, [2, 3, 4, 1]], table[:, 5:8], path, lines)
     names = [cells[9] for _, cells in images]
-    return _known(se3.inverse(T_camera_world), frames=_frame_numbers(names, path))
+    return _known(se3.inverse(T_camera_world), frames=_frame_numbers(names))
 
 
 def _transforms(text: str, path: Path) -> TimedPoses:
@@ -246,29 +240,21 @@ def _transforms(text: str, path: Path) -> TimedPoses:
     data = reading.parsed(json.loads, text, where=path, format_name="valid JSON")
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise InputError("has no list 'frames'", where=path, remedy=f"use {_SUPPORTED}")
+        raise InputError("has no list 'frames'")
     poses, names = [], []
     for k, frame in enumerate(frames):
-        where = f"{path}, frame {k}"
-        matrix = frame.get("transform_matrix") if isinstance(frame, dict) else None
-        try:
-            T = np.array(matrix, float)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InputError("has no 'transform_matrix' of 4 x 4", where=where) from error
+        if not isinstance(frame, dict):
+            raise InputError(f"frame {k} is not an object")
+        where = f"{path}, frame {k}: transform_matrix"
+        T = reading.matrix_of(frame.get("transform_matrix"), where)
         poses.append(_rigid(T, where) @ OPENGL)
         names.append(str(frame.get("file_path", k)))
-    return _known(poses, frames=_frame_numbers(names, path))
+    return _known(poses, frames=_frame_numbers(names))
 
 
 def _numpy(path: Path) -> TimedPoses:
     """(N, 4, 4) or (N, 3, 4), one for each frame, NaN where there is none."""
-    try:
-        # Mapped, so that a damaged header can't cause an allocation larger than the file.
-        table = np.load(path, mmap_mode="r", allow_pickle=False)
-    except OSError as error:
-        raise reading.input_error(error, path) from error
-    except Exception as error:  # NumPy evaluates the header as Python, which can raise anything
-        raise InputError("is not an array", where=path, remedy="write it by numpy.save") from error
+    table = npz.read_npy(path)
     if table.ndim != 3 or table.shape[1:] not in ((4, 4), (3, 4)) or table.dtype.kind not in "fiu":
         raise InputError(f"is of shape {table.shape}", where=path, remedy="write (N, 4, 4)")
     out = np.tile(np.eye(4), (len(table), 1, 1))
@@ -277,17 +263,16 @@ def _numpy(path: Path) -> TimedPoses:
     return _known(poses, frames=range(len(out)))
 
 
-def _frame_numbers(names: Sequence[str], path: Path) -> Intp:
+def _frame_numbers(names: Sequence[str]) -> Intp:
     """The last number in each file name: the frame number."""
     digits_in = [re.findall(r"[0-9]+", Path(name).stem) for name in names]
     if not all(digits_in):
         missing = names[[bool(digits) for digits in digits_in].index(False)]
         raise InputError(
             f"has an image without a number in its name, {missing!r}",
-            where=path,
             remedy="name images by the number of their frame",
         )
     numbers = np.array([int(digits[-1][-_DIGITS:]) for digits in digits_in], np.intp)
     if len(np.unique(numbers)) != len(numbers):
-        raise InputError("has two images with the same number", where=path)
+        raise InputError("has two images with the same number")
     return numbers

@@ -19,7 +19,7 @@ from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
-from tofuse.formats.files import json_data
+from tofuse.formats.files import reading
 from tofuse.formats.images import as_color, matroska, parse_image
 from tofuse.formats.poses import associate
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
@@ -277,7 +277,7 @@ def _calibration(data: bytes | None, where: str) -> dict[str, Any]:
             "is missing", where=where, remedy="pass the depth camera with --camera camera.json"
         )
     remedy = "pass the depth camera with --camera"
-    return json_data.parse_json(data.rstrip(b"\0"), where, remedy)
+    return reading.parse_json(data.rstrip(b"\0"), where, remedy)
 
 
 def _lens(

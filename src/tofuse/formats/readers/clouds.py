@@ -29,12 +29,7 @@ class PlyClouds(cloud_sequence.CloudReader):
 
     def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
         """See `CloudReader.source`."""
-        return cloud_sequence.CloudFileSource(
-            path,
-            files,
-            cloud_frames.ply_frame,
-            cloud_frames.ply_frame,
-        )
+        return cloud_sequence.CloudFileSource(path, files, cloud_frames.ply_frame, deproject=True)
 
 
 @part("reader", "pcd", label="validated")
@@ -47,7 +42,7 @@ class PcdClouds(cloud_sequence.CloudReader):
         """See `CloudReader.source`."""
         camera = _camera(files)
         if camera is None:
-            return cloud_sequence.CloudFileSource(path, files, pcd_cloud, pcd_cloud)
+            return cloud_sequence.CloudFileSource(path, files, pcd_cloud, deproject=True)
         source = cloud_sequence.CloudFileSource(
             path, files, lambda file, index, time: pcd_image(file, index, time, camera)
         )
@@ -55,8 +50,8 @@ class PcdClouds(cloud_sequence.CloudReader):
         return source
 
 
-def pcd_cloud(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
-    """Read a file as a cloud, minus `shift` (3,) in m; its viewpoint is the sensor's position."""
+def pcd_cloud(path: Path, index: int, timestamp: float) -> CloudFrame:
+    """Read a file as a cloud; its viewpoint is the sensor's position."""
     pcd = read_pcd(path)
     cloud = pcd.cloud
     return cloud_frames.cloud_frame(
@@ -67,7 +62,6 @@ def pcd_cloud(path: Path, index: int, timestamp: float, shift: Float64 | None = 
         amplitude=cloud.amplitude,
         color=cloud.color,
         origin=pcd.viewpoint[:3],
-        shift=shift,
     )
 
 
@@ -131,15 +125,14 @@ class XyzClouds(cloud_sequence.CloudReader):
 
     def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
         """See `CloudReader.source`."""
-        return cloud_sequence.CloudFileSource(path, files, xyz_frame, xyz_frame)
+        return cloud_sequence.CloudFileSource(path, files, xyz_frame, deproject=True)
 
 
-def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
-    """Read one file; `shift` (3,) in m is subtracted from the coordinates."""
+def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
+    """Read one file."""
     table = tables.read_numbers(path)
     if table.shape[1] < 3:
         raise InputError(f"has {table.shape[1]} numbers per line", where=path, remedy="write x y z")
-    points = _float32(table[:, :3]) if shift is None else table[:, :3]
     amplitude = normals = color = None
     if table.shape[1] == 4:
         amplitude = _float32(table[:, 3])
@@ -152,7 +145,7 @@ def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = 
         elif ((columns >= 0) & (columns <= 255) & (columns == np.rint(columns))).all():
             color = columns.astype(np.uint8)
     return cloud_frames.cloud_frame(
-        index, timestamp, points, normals, amplitude=amplitude, color=color, shift=shift
+        index, timestamp, table[:, :3], normals, amplitude=amplitude, color=color
     )
 
 
@@ -201,7 +194,7 @@ def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     if table.shape[1] < 3:
         raise InputError(f"has {table.shape[1]} numbers per line", where=path)
     with np.errstate(over="ignore"):
-        points = (table[:, :3] * np.diag(FLIP) * CENTIMETRE).astype(np.float32)
+        points = table[:, :3] * np.diag(FLIP) * CENTIMETRE
     # The scanner writes (0, 0, 0) for missing measurements.
     points[(points == 0).all(1)] = np.nan
     amplitude = table[:, 3].astype(np.float32) if table.shape[1] == 4 else None

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.arrays import Float32, Float64, UInt8, UInt16
 from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
@@ -17,7 +17,6 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import read_raw
-from tofuse.formats.readers.pgm import parse_pgm
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, per_frame
 
 # The streams by preference, with their ambiguity range in m.
@@ -42,9 +41,7 @@ class HoloLens2(Reader):
         inputs.refuse_camera(options, "hololens2", inputs.PER_FRAME)
         streams = _streams(path)
         if not streams:
-            raise InputError(
-                "has no 'Depth Long Throw_lut.bin' with images", where=path, remedy=_REMEDY
-            )
+            raise InputError("has no 'Depth Long Throw_lut.bin' with images", where=path)
         source = HoloLens2Source(path, streams[0])
         if len(streams) > 1:
             source.warnings.append(f"{streams[1]} is ignored: {streams[0]} reaches farther")
@@ -62,7 +59,7 @@ class HoloLens2Source(FileSource):
         self.images, complete = _images(folder, stream)
         self.ticks = sorted(tick for tick, bright in self.images if not bright)
         if not self.ticks:
-            raise InputError("contains no images", where=folder / f"{stream}.tar", remedy=_REMEDY)
+            raise InputError("contains no images", where=folder / f"{stream}.tar")
         super().__init__(np.array(self.ticks, float) / _TICKS)
         if not complete:
             archive = folder / f"{stream}.tar"
@@ -108,7 +105,7 @@ class HoloLens2Source(FileSource):
             )
             table = tables.read_numbers(trajectory)
             if table.shape[-1] != 17:
-                raise InputError("has no rows of 17 numbers", where=trajectory, remedy=_REMEDY)
+                raise InputError("has no rows of 17 numbers", where=trajectory)
         except (InputError, ValueError) as error:
             self.warnings.append(f"no reference poses: {error}")
             return
@@ -141,7 +138,6 @@ class HoloLens2Source(FileSource):
                     f"is {image.shape[1]} x {image.shape[0]} pixels, the first image "
                     f"{self.camera.width} x {self.camera.height}",
                     where=f"{tick}.pgm",
-                    remedy=_REMEDY,
                 )
         amplitude = None if bright is None else bright.astype(np.float32)
         return self.image(
@@ -152,10 +148,10 @@ class HoloLens2Source(FileSource):
         path, begin, size = self.images[tick, bright]
         where = f"{path}: {tick}{'_ab' if bright else ''}.pgm"
         if size > _MAX_BYTES:
-            raise InputError("is too large", where=where, remedy=_REMEDY)
+            raise InputError("is too large", where=where)
         image = parse_pgm(reading.read_part(path, begin, size), where)
         if image.dtype != np.uint16 or min(image.shape) < 2:
-            raise InputError("is not a 16-bit image", where=where, remedy=_REMEDY)
+            raise InputError("is not a 16-bit image", where=where)
         return image
 
 
@@ -204,7 +200,7 @@ def _images(folder: Path, stream: str) -> tuple[_Images, bool]:
         raise reading.input_error(error, path) from error
     except (tarfile.TarError, ValueError, EOFError) as error:
         if not images:
-            raise InputError("is a damaged archive", where=path, remedy=_REMEDY) from error
+            raise InputError("is a damaged archive", where=path) from error
         complete = False
     return images, complete
 
@@ -216,3 +212,34 @@ def _rays(path: Path, shape: tuple[int, int]) -> Float32:
         rays = table[..., :2] / table[..., 2:]
         valid = np.isfinite(rays).all(-1) & (table[..., 2] > 0) & (np.abs(rays) < 1e4).all(-1)
     return np.where(valid[..., None], rays, np.nan).astype(np.float32)
+
+
+_SPACE = rb"(?:\s+(?:#[^\n]*\n)?)+"
+_HEADER = re.compile(rb"P5" + (_SPACE + rb"(\d{1,5})") * 3 + rb"\s")
+
+
+def parse_pgm(data: bytes, where: str | Path) -> UInt8 | UInt16:
+    """Decode (H, W) uint8 or uint16.
+
+    Raises
+    ------
+    InputError
+        Naming `where`, if it is not such an image, or is cut off.
+    """
+    with reading.about(where, "copy the file again"):
+        return _parsed(data)
+
+
+def _parsed(data: bytes) -> UInt8 | UInt16:
+    header = _HEADER.match(data)
+    if header is None:
+        raise InputError("is not a binary PGM image")
+    width, height, max_value = (int(text) for text in header.groups())
+    if not (width and height and 0 < max_value < 65536):
+        raise InputError(f"declares {width} x {height} pixels with values up to {max_value}")
+    dtype = np.dtype(">u2" if max_value > 255 else "u1")
+    size = width * height * dtype.itemsize
+    if len(data) < header.end() + size:
+        raise InputError("is cut off before its end")
+    image = np.frombuffer(data, dtype, width * height, header.end()).reshape(height, width)
+    return image.astype(dtype.newbyteorder("="))

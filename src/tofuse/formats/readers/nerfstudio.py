@@ -15,7 +15,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
-from tofuse.formats.files import json_data, reading
+from tofuse.formats.files import npz, reading
 from tofuse.formats.images import read_color, read_image
 from tofuse.formats.poses import OPENGL
 from tofuse.formats.sources import (
@@ -67,7 +67,7 @@ class NerfstudioSource(FileSource):
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        document = json_data.read_json(file)
+        document = reading.read_json(file)
         entries = document.get("frames")
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
             raise InputError("has no list of frames", where=file, remedy=_REMEDY)
@@ -85,7 +85,7 @@ class NerfstudioSource(FileSource):
         timed = bool(np.isfinite(times).all())
         super().__init__(times if timed else np.arange(len(self.frames), dtype=float))
         self.unit_m = _unit(document, file, any("depth_file_path" in f.entry for f in self.frames))
-        self.sigma_unit_m = json_data.number_in(
+        self.sigma_unit_m = reading.number_in(
             document, "sigma_unit_scale_factor", file, 1e-4, _REMEDY
         )
         self.metadata |= {"depth_kind": "z", "depth_unit_m": self.unit_m}
@@ -170,18 +170,16 @@ class _Frame:
 
     def pose(self) -> Float64:
         where = f"{self.where}: transform_matrix"
-        try:
-            table = np.array(self.entry.get("transform_matrix"), float)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InputError("isn't made of numbers", where=where, remedy=_REMEDY) from error
-        if table.shape == (3, 4):
-            table = np.concatenate([table, [[0, 0, 0, 1]]])
-        return per_frame.read_matrix_pose(np.atleast_2d(table), where) @ OPENGL
+        rows = self.entry.get("transform_matrix")
+        if isinstance(rows, list) and len(rows) == 3:
+            rows = [*rows, [0, 0, 0, 1]]
+        table = reading.matrix_of(rows, where, _REMEDY)
+        return per_frame.read_matrix_pose(table, where) @ OPENGL
 
     def number_of(self, name: str, default: float | None = None) -> float:
         if name in self.entry:
-            return json_data.number_in(self.entry, name, self.where, default, _REMEDY)
-        return json_data.number_in(self.common, name, self.file, default, _REMEDY)
+            return reading.number_in(self.entry, name, self.where, default, _REMEDY)
+        return reading.number_in(self.common, name, self.file, default, _REMEDY)
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
         """Return the camera scaled from the file's image size to the depth's (width, height)."""
@@ -242,7 +240,7 @@ def _unit(document: dict[str, Any], file: Path, nerfstudio: bool) -> float:
     """Metres per count: as stated in the file, or nerfstudio's millimetre."""
     for name in ("depth_unit_scale_factor", "integer_depth_scale"):
         if name in document:
-            unit = json_data.number_in(document, name, file, remedy=_REMEDY)
+            unit = reading.number_in(document, name, file, remedy=_REMEDY)
             if not 1e-9 <= unit <= 1:
                 raise InputError(f"is {unit:g}", where=f"{file}: {name}", remedy="use metres")
             return unit
@@ -257,10 +255,7 @@ def _unit(document: dict[str, Any], file: Path, nerfstudio: bool) -> float:
 
 def _array(path: Path) -> Float32:
     """Depth (H, W) of a .npy file."""
-    try:
-        table = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # NumPy evaluates the header as Python: any exception
-        raise InputError("is not an array", where=path, remedy="write it by numpy.save") from error
+    table = npz.read_npy(path)
     if table.ndim == 3 and table.shape[2] == 1:
         table = table[..., 0]
     if table.ndim != 2 or table.dtype.kind not in "fiu" or min(table.shape) < 2:

@@ -12,7 +12,7 @@ from tofuse.engine.cameras import Pinhole
 from tofuse.engine.frames import POSES_BY
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
-from tofuse.formats.files import json_data, reading
+from tofuse.formats.files import reading
 from tofuse.formats.images import first_size
 from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, per_frame, phones
 
@@ -56,7 +56,7 @@ class PolycamSource(phones.PhoneSource):
         )
         paths = [folder / "cameras" / f"{file.stem}.json" for file in files]
         self.cameras = per_frame.cameras_of(
-            paths, lambda path: _lens(json_data.read_json(path), size, path)
+            paths, lambda path: _lens(reading.read_json(path), size, path)
         )
         self._read_poses(folder)
 
@@ -68,7 +68,7 @@ class PolycamSource(phones.PhoneSource):
         else:
             paths = [folder / "cameras" / path.name for path in paths]
         self.reference = per_frame.poses_from_files(
-            self, paths, lambda path: _pose(json_data.read_json(path), path)
+            self, paths, lambda path: _pose(reading.read_json(path), path)
         )
 
     def read_confidence(self, path: Path, size: tuple[int, int]) -> UInt8:
@@ -104,5 +104,5 @@ def _pose(metadata: dict[str, Any], path: Path) -> Float64:
 
 def _numbers(metadata: dict[str, Any], names: tuple[str, ...] | list[str], path: Path) -> Float64:
     return np.array(
-        [json_data.number_in(metadata, n, path, remedy="export 'raw data' again") for n in names]
+        [reading.number_in(metadata, n, path, remedy="export 'raw data' again") for n in names]
     )

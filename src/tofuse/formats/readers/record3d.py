@@ -17,9 +17,8 @@ from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
-from tofuse.formats.files import json_data, reading
+from tofuse.formats.files import reading
 from tofuse.formats.images import as_color, parse_exr, parse_image
-from tofuse.formats.readers.lzfse import lzfse_decompress
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, phones, pixels
 
 MAX_MEMBER_BYTES = 1 << 26
@@ -109,7 +108,7 @@ class _Folder:
         self.numbers = inputs.required(sorted(self.files), ".exr files", path / "depth", _REMEDY)
 
     def metadata(self) -> dict[str, Any]:
-        return json_data.read_json(self.where)
+        return reading.read_json(self.where)
 
     def depth(self, number: int, size: tuple[int, int]) -> Float32:
         path = self.files[number]
@@ -156,7 +155,7 @@ class _Archive:
         self.has_confidence = f"rgbd/{self.numbers[0]}.conf" in self.names
 
     def metadata(self) -> dict[str, Any]:
-        return json_data.parse_json(self._member("metadata"), self.where, _REMEDY)
+        return reading.parse_json(self._member("metadata"), self.where, _REMEDY)
 
     def depth(self, number: int, size: tuple[int, int]) -> Float32:
         name = f"rgbd/{number}.depth"
@@ -217,7 +216,7 @@ class _Metadata:
         return camera_file.image_size(self._number("dw"), self._number("dh"), f"{self.where}: dw")
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
-        K = json_data.numbers_in(self.data, "K", self.where, (3, 3), _REMEDY).T
+        K = reading.numbers_in(self.data, "K", self.where, (3, 3), _REMEDY).T
         full_size = camera_file.image_size(self._number("w"), self._number("h"), f"{self.where}: w")
         return phones.phone_lens(K, full_size, size, f"{self.where}: K")
 
@@ -229,14 +228,14 @@ class _Metadata:
         """Return the timestamps in s of all frames, or None if they aren't given."""
         if "frameTimestamps" not in self.data:
             return None
-        times = json_data.numbers_in(self.data, "frameTimestamps", self.where, (-1,), _REMEDY)
+        times = reading.numbers_in(self.data, "frameTimestamps", self.where, (-1,), _REMEDY)
         return times if len(times) else None
 
     def poses(self) -> Float64 | None:
         """T_world_camera (N, 4, 4) of all frames, NaN where tracking was lost; or None."""
         if "poses" not in self.data:
             return None
-        table = json_data.numbers_in(self.data, "poses", self.where, (-1, 7), _REMEDY, finite=False)
+        table = reading.numbers_in(self.data, "poses", self.where, (-1, 7), _REMEDY, finite=False)
         norms = quaternion.length(table[:, :4])
         valid = (np.abs(norms - 1) < 0.01) & (np.abs(table[:, 4:]) < 1e6).all(1)
         poses = np.full((len(table), 4, 4), np.nan)
@@ -244,7 +243,7 @@ class _Metadata:
         return poses @ phones.ARKIT_AXES
 
     def _number(self, field: str, default: float | None = None) -> float:
-        return json_data.number_in(self.data, field, self.where, default, _REMEDY)
+        return reading.number_in(self.data, field, self.where, default, _REMEDY)
 
 
 def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
@@ -260,3 +259,37 @@ def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float3
             remedy="export the recording again",
         )
     return depth_counts.depth_from_numbers(depth, 1.0)
+
+
+# Each block begins with these letters. It has at most 40,000 literals and 10,000 copies of up to
+# 2359 bytes, and the encoder fills it with at least a few kilobytes.
+_MAGIC = b"bvx"
+_MIN_BLOCK_BYTES, _MORE_BLOCKS, _HEADERS = 8192, 8, 1024
+
+
+def lzfse_decompress(data: bytes, size: int, path: str | Path) -> bytes:
+    """Decompress a stream of exactly `size` bytes; `path` names it in errors.
+
+    Raises
+    ------
+    InputError
+        If it is damaged, cut off, or of another size, or the package `lzfse` is not installed.
+    """
+    lzfse = reading.required_package("lzfse", "phones", path)
+    # The package has no limit of the size.
+    if (
+        len(data) > 2 * size + _HEADERS
+        or data.count(_MAGIC) > _MORE_BLOCKS + size // _MIN_BLOCK_BYTES
+    ):
+        raise InputError(f"has more than {size} bytes", where=path, remedy="copy it again")
+    try:
+        out: bytes = lzfse.decompress(data)
+    except (lzfse.error, MemoryError) as error:
+        raise InputError(
+            "is a damaged or cut off LZFSE stream", where=path, remedy="copy it again"
+        ) from error
+    if len(out) != size:
+        raise InputError(
+            f"decompresses to {len(out)} bytes, not {size}", where=path, remedy="copy it again"
+        )
+    return out

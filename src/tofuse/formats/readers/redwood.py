@@ -12,7 +12,7 @@ from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
-from tofuse.formats.files import json_data, reading
+from tofuse.formats.files import reading
 from tofuse.formats.images import first_size
 from tofuse.formats.poses import read_poses
 from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs
@@ -95,11 +95,11 @@ def _camera_file(path: Path) -> Path | None:
 
 
 def _read_intrinsics(path: Path) -> Pinhole:
-    data = json_data.read_json(path)
+    data = reading.read_json(path)
     remedy = "write it as Open3D does, column by column"
-    K = json_data.numbers_in(data, "intrinsic_matrix", path, (3, 3), remedy).T
+    K = reading.numbers_in(data, "intrinsic_matrix", path, (3, 3), remedy).T
     width, height = (
-        json_data.number_in(data, name, path, remedy=remedy) for name in ("width", "height")
+        reading.number_in(data, name, path, remedy=remedy) for name in ("width", "height")
     )
     return camera_file.checked_pinhole(K, camera_file.image_size(width, height, path), path)
 

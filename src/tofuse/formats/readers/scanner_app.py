@@ -13,7 +13,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import json_data, reading
+from tofuse.formats.files import reading
 from tofuse.formats.images import first_size
 from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, per_frame, phones
 
@@ -75,15 +75,15 @@ class _FrameMetadata:
 
     @classmethod
     def read(cls, path: Path) -> _FrameMetadata:
-        data = json_data.read_json(path)
-        return cls(path, data, float(json_data.numbers_in(data, "time", path, (1,), _REMEDY)[0]))
+        data = reading.read_json(path)
+        return cls(path, data, float(reading.numbers_in(data, "time", path, (1,), _REMEDY)[0]))
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
-        K = json_data.numbers_in(self.data, "intrinsics", self.path, (3, 3), _REMEDY)
+        K = reading.numbers_in(self.data, "intrinsics", self.path, (3, 3), _REMEDY)
         image = phones.IMAGE_SIZE
         if "projectionMatrix" in self.data:
             # Its diagonal is 2 * focal length / image size.
-            P = json_data.numbers_in(self.data, "projectionMatrix", self.path, (4, 4), _REMEDY)
+            P = reading.numbers_in(self.data, "projectionMatrix", self.path, (4, 4), _REMEDY)
             with np.errstate(all="ignore"):
                 width, height = 2 * np.diag(K)[:2] / np.diag(P)[:2]
             if 100 < width < 16384 and 100 < height < 16384:
@@ -93,7 +93,7 @@ class _FrameMetadata:
     def pose(self) -> Float64 | None:
         if "cameraPoseARFrame" not in self.data:
             return None
-        table = json_data.numbers_in(
+        table = reading.numbers_in(
             self.data, "cameraPoseARFrame", self.path, (4, 4), _REMEDY, finite=False
         )
         return phones.arkit_pose(table, f"{self.path}: cameraPoseARFrame")

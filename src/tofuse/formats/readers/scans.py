@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import struct
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +41,7 @@ class LasScans(cloud_sequence.CloudReader):
 
     def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
         """See `CloudReader.source`."""
-        shift = _shift(files[0])
-        source = cloud_sequence.CloudFileSource(
-            path, files, lambda f, k, t: _las_frame(f, k, t, shift)
-        )
-        cloud_sequence.note_shift(source, path, shift)
-        return source
+        return cloud_sequence.CloudFileSource(path, files, _las_frame)
 
 
 def _las_header(path: Path) -> Any:
@@ -135,15 +129,6 @@ def _check_chunks(path: Path, header: Any) -> None:
         )
 
 
-def _shift(path: Path) -> Float64:
-    """The offset (3,) subtracted from map coordinates so that float32 suffices."""
-    header = _las_header(path)
-    low, high = np.asarray(header.mins, float), np.asarray(header.maxs, float)
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        return np.zeros(3)
-    return cloud_sequence.map_shift(low, high)
-
-
 def read_las(path: Path) -> Any:
     """Return the `laspy.LasData` of a file, whose header is checked first.
 
@@ -159,7 +144,7 @@ def read_las(path: Path) -> Any:
         return laspy.read(path)
 
 
-def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> CloudFrame:
+def _las_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     points = read_las(path)
     with reading.library_errors(path, _COPY):
         xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1)
@@ -176,7 +161,6 @@ def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> Clou
         xyz,
         amplitude=amplitude if amplitude.any() else None,
         color=color if color is not None and color.any() else None,
-        shift=shift,
     )
 
 
@@ -220,16 +204,9 @@ class E57Source(FileSource):
             range(len(poses)),
             lambda k: per_frame.read_matrix_pose(poses[k], f"{path}: scan {k}"),
         )
-        read_unshifted = partial(self._read, shift=np.zeros(3))
-        self._shift, self._cached = cloud_sequence.find_shift(read_unshifted, len(self.counts))
-        cloud_sequence.note_shift(self, path, self._shift)
 
     def load(self, index: int) -> CloudFrame:
         """See `FileSource.load`."""
-        cached = self._cached.pop(index, None)
-        return self._read(index, self._shift) if cached is None else cached
-
-    def _read(self, index: int, shift: Float64) -> CloudFrame:
         where = f"{self.path}: scan {index}"
         if self.counts[index] > MAX_POINTS:
             raise InputError(
@@ -253,7 +230,6 @@ class E57Source(FileSource):
             points,
             amplitude=None if amplitude is None else np.asarray(amplitude, np.float32),
             color=color,
-            shift=shift,
         )
 
     def _pose(self, header: Any) -> Float64:

@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
-from tofuse.formats.files import json_data, reading
+from tofuse.formats.files import reading
 from tofuse.formats.images import first_size
 from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs
 
@@ -38,10 +38,10 @@ class Zense(Reader):
         rate = FRAME_RATE_HZ
         if settings is not None:
             values = _read(settings)
-            rate = json_data.number_in(values, "capture_fps", settings, FRAME_RATE_HZ)
+            rate = reading.number_in(values, "capture_fps", settings, FRAME_RATE_HZ)
             if options.camera is None:
                 lens = {
-                    name: json_data.number_in(values, key, settings) for name, key in _LENS.items()
+                    name: reading.number_in(values, key, settings) for name, key in _LENS.items()
                 }
                 camera = camera_file.checked_lens(
                     Pinhole, _size(values, files, settings), lens, settings
@@ -88,6 +88,6 @@ def _size(values: dict[str, Any], files: list[Path], path: Path) -> tuple[int, i
     if "image_width" not in values or "image_height" not in values:
         return first_size(files)
     width, height = (
-        json_data.number_in(values, key, path) for key in ("image_width", "image_height")
+        reading.number_in(values, key, path) for key in ("image_width", "image_height")
     )
     return camera_file.image_size(width, height, f"{path}: image_width")

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import NOISE_MODEL, Frame, Recording, Source
 from tofuse.engine.parts import discover, name_of, registered
@@ -21,7 +20,7 @@ from tofuse.formats.poses import TimedPoses, read_poses
 from tofuse.formats.recordings.joined import JoinedSource, LimitedSource
 from tofuse.formats.recordings.still import average_still
 from tofuse.formats.rigs import RigSource, read_rig, recordings_of, rig_file_in
-from tofuse.formats.sources import Reader, ReaderOptions, Sniff, cloud_sequence
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff
 
 # Proprietary recordings: problem and remedy by suffix.
 CLOSED = {
@@ -448,9 +447,6 @@ class SingleView:
         The recording, its reader, and the index of the frame.
     frame
         The view.
-    shift
-        (3,) m, to add to coordinates of the frame to get those of the file. Nonzero only for clouds
-        in map coordinates.
     warnings
         Notes for the user on how it was read.
     """
@@ -460,7 +456,6 @@ class SingleView:
     format: str
     index: int
     frame: Frame
-    shift: Float64
     warnings: tuple[str, ...] = ()
 
 
@@ -499,11 +494,7 @@ def open_view(
             where=name,
             remedy=f"use a view with {MIN_POINTS} or more",
         )
-    shift = np.asarray(recording.metadata.get("shift_m", np.zeros(3)), float)
-    # The shift is returned with the view, so a warning about it would mislead.
-    shift_note = cloud_sequence.describe_shift(shift)
-    warnings = tuple(line for line in recording.warnings if not line.endswith(shift_note))
-    return SingleView(name, path, recording.format, index, frame, shift, warnings)
+    return SingleView(name, path, recording.format, index, frame, tuple(recording.warnings))
 
 
 def split_name(name: str) -> tuple[str, int | None]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.formats.files import atomic, json_data, reading
+from tofuse.formats.files import atomic, reading
 
 SCHEMA = 1
 FILE_NAME = "rig.json"
@@ -92,10 +92,7 @@ class Rig:
         data: dict[str, Any] = {
             "schema": SCHEMA,
             "cameras": [_camera_data(c) for c in self.cameras],
-            "disagreement": [
-                {"a": d.a, "b": d.b, "median_m": d.median_m, "pixels": d.pixels}
-                for d in self.disagreement
-            ],
+            "disagreement": [asdict(pair) for pair in self.disagreement],
         }
         if self.unplaced:
             data["unplaced"] = [{"name": n, "reason": r} for n, r in self.unplaced.items()]
@@ -129,28 +126,28 @@ def read_rig(path: str | Path) -> Rig:
     InputError
         Naming the invalid field.
     """
-    data = json_data.read_json(path)
-    schema = data.get("schema")
-    if schema != SCHEMA or isinstance(schema, bool):
-        problem = f"schema is {schema!r}" if "schema" in data else "schema is missing"
-        raise InputError(problem, where=path, remedy=f"write {SCHEMA}, the only version")
-    rows = data.get("cameras")
-    if not isinstance(rows, list) or not rows:
-        raise InputError("cameras is not a list of cameras", where=path, remedy=_REMEDY)
-    cameras = tuple(_camera(row, k, path) for k, row in enumerate(rows))
-    names = [camera.name for camera in cameras]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"has two cameras called {name!r}", where=path, remedy=_REMEDY)
-    if not np.allclose(cameras[0].T_rig_camera, np.eye(4), atol=1e-6):
-        raise InputError(
-            f"the first camera, {names[0]!r}, is not the identity", where=path, remedy=_REMEDY
+    data = reading.read_json(path)
+    with reading.about(path, _REMEDY):
+        reading.check_schema(data, SCHEMA)
+        cameras = tuple(
+            _camera(row, f"{path}: cameras[{k}]")
+            for k, row in enumerate(reading.rows_in(data, "cameras", path))
         )
-    rows = data.get("disagreement", [])
-    if not isinstance(rows, list):
-        raise InputError("disagreement is not a list", where=path, remedy=_REMEDY)
-    pairs = tuple(_disagreement(row, k, names, path) for k, row in enumerate(rows))
-    return Rig(cameras, pairs, _unplaced(data.get("unplaced", []), path))
+        names = [camera.name for camera in cameras]
+        twice = [name for k, name in enumerate(names) if name in names[:k]]
+        if twice or not names:
+            raise InputError(f"has two cameras called {twice[0]!r}" if twice else "has no cameras")
+        if not np.allclose(cameras[0].T_rig_camera, np.eye(4), atol=1e-6):
+            raise InputError(f"the first camera, {names[0]!r}, is not the identity")
+        pairs = tuple(
+            _disagreement(row, names, f"{path}: disagreement[{k}]")
+            for k, row in enumerate(reading.rows_in(data, "disagreement", path, []))
+        )
+        unplaced = {
+            str(row.get("name", "")): str(row.get("reason", ""))
+            for row in reading.rows_in(data, "unplaced", path, [])
+        }
+    return Rig(cameras, pairs, unplaced)
 
 
 def rig_file_in(folder: str | Path) -> Path | None:
@@ -168,65 +165,51 @@ def _is_plain_name(name: str) -> bool:
     return name not in (".", "..") and not any(c in "/\\:" or ord(c) < 32 for c in name)
 
 
-def _camera(row: object, k: int, path: str | Path) -> RigCamera:
-    location = f"cameras[{k}]"
-    if not isinstance(row, dict):
-        raise InputError(f"{location} is not an object", where=path, remedy=_REMEDY)
+def _camera(row: dict[str, Any], where: str) -> RigCamera:
     name, recording = row.get("name"), row.get("recording", "")
-    if not isinstance(name, str) or not name.strip():
-        raise InputError(f"{location}.name is {name!r}, not a name", where=path, remedy=_REMEDY)
-    if not _is_plain_name(name):
-        raise InputError(
-            f"{location}.name is {name!r:.80}, which is not a folder name",
-            where=path,
-            remedy="choose one without / \\ : and not . or ..",
-        )
-    if not isinstance(recording, str):
-        raise InputError(f"{location}.recording is not a path", where=path, remedy=_REMEDY)
-    where = f"{path}: {location}"
-    T = se3.check_pose(
-        json_data.numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY), where=str(path)
-    )
-    C = _covariance(row, "covariance", where) if "covariance" in row else np.zeros((6, 6))
+    with reading.about(where):
+        if not isinstance(name, str) or not name.strip() or not _is_plain_name(name):
+            raise InputError(
+                f"name is {name!r:.80}, which is not a folder name",
+                remedy="choose one without / \\ : and not . or ..",
+            )
+        if not isinstance(recording, str):
+            raise InputError("recording is not a path")
+    matrix = reading.numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY)
     random = None
     if row.get("random_covariance") is not None:
         random = _covariance(row, "random_covariance", where)
-    time = _number(row, "time_offset_s", _MAX_SECONDS, where, 0.0)
-    depth = _number(row, "depth_offset_m", _MAX_METRES, where, 0.0)
-    return RigCamera(name, recording, T, C, time, depth, random)
+    return RigCamera(
+        name,
+        recording,
+        se3.check_pose(matrix, where=where),
+        _covariance(row, "covariance", where) if "covariance" in row else np.zeros((6, 6)),
+        _number(row, "time_offset_s", _MAX_SECONDS, where, 0.0),
+        _number(row, "depth_offset_m", _MAX_METRES, where, 0.0),
+        random,
+    )
 
 
 def _covariance(row: dict[str, Any], name: str, where: str) -> Float64:
-    C = json_data.numbers_in(row, name, where, (6, 6), _REMEDY)
+    C = reading.numbers_in(row, name, where, (6, 6), _REMEDY)
     min_eigenvalue = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
     tolerance = 1e-6 * max(np.abs(C).max(), 1e-9)
     if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or min_eigenvalue < -tolerance:
-        raise InputError("is not a covariance", where=f"{where}: {name}", remedy=_REMEDY)
+        raise InputError("is not a covariance", where=f"{where}: {name}")
     return np.asarray(0.5 * (C + C.T), np.float64)
 
 
-def _disagreement(row: object, k: int, names: list[str], path: str | Path) -> Disagreement:
-    location = f"disagreement[{k}]"
-    if not isinstance(row, dict) or row.get("a") not in names or row.get("b") not in names:
-        raise InputError(f"{location} does not name two cameras", where=path, remedy=_REMEDY)
-    where = f"{path}: {location}"
+def _disagreement(row: dict[str, Any], names: list[str], where: str) -> Disagreement:
+    if row.get("a") not in names or row.get("b") not in names:
+        raise InputError("does not name two cameras", where=where)
     median = _number(row, "median_m", 1e6, where)
-    pixels = _number(row, "pixels", 1e15, where, 0.0)
-    return Disagreement(str(row["a"]), str(row["b"]), median, int(pixels))
-
-
-def _unplaced(rows: object, path: str | Path) -> dict[str, str]:
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise InputError("unplaced is not a list of cameras", where=path, remedy=_REMEDY)
-    return {str(row.get("name", "")): str(row.get("reason", "")) for row in rows}
+    return Disagreement(row["a"], row["b"], median, int(_number(row, "pixels", 1e15, where, 0.0)))
 
 
 def _number(
     row: dict[str, Any], name: str, limit: float, where: str, default: float | None = None
 ) -> float:
-    value = json_data.number_in(row, name, where, default, _REMEDY)
+    value = reading.number_in(row, name, where, default, _REMEDY)
     if not abs(value) <= limit:
-        raise InputError(
-            f"is {value:g}, not at most {limit:g}", where=f"{where}: {name}", remedy=_REMEDY
-        )
+        raise InputError(f"is {value:g}, not at most {limit:g}", where=f"{where}: {name}")
     return value

@@ -9,26 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.frames import (
-    CloudFrame,
-)
+from tofuse.engine.frames import CloudFrame, map_shift
 from tofuse.engine.geometry import se3
 from tofuse.formats.geometry import read_ply
 
 
-def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
-    """Read a PLY cloud; non-finite points are dropped, and `shift` (3,) in m is subtracted."""
+def ply_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
+    """Read a PLY cloud; non-finite points are dropped."""
     ply = read_ply(path)
-    with np.errstate(invalid="ignore"):  # signalling NaN
-        points = to_float32(ply.points) if shift is None else ply.points.astype(np.float64)
     return cloud_frame(
-        index,
-        timestamp,
-        points,
-        ply.normals,
-        amplitude=ply.amplitude,
-        color=ply.color,
-        shift=shift,
+        index, timestamp, ply.points, ply.normals, amplitude=ply.amplitude, color=ply.color
     )
 
 
@@ -47,19 +37,16 @@ def cloud_frame(
     amplitude: Float32 | None = None,
     color: UInt8 | None = None,
     origin: Float64 | None = None,
-    shift: Float64 | None = None,
 ) -> CloudFrame:
     """Return a cloud of (N, 3) points in m with columns (N, ...), without invalid points.
 
-    `shift` (3,) is subtracted from the points, in their own precision, and from the `origin` (3,).
+    Map coordinates are shifted in the precision of the points, and so is the `origin` (3,).
     """
-    # False for NaN; the squares of the remaining coordinates fit into float32.
-    measured = np.asarray((np.abs(points) < se3.MAX_COORDINATE_M).all(1))
-    if shift is not None:
-        with np.errstate(over="ignore", invalid="ignore"):
-            points = points - shift
-        measured &= (np.abs(points) < se3.MAX_COORDINATE_M).all(1)
-        origin = None if origin is None else origin - shift
+    with np.errstate(over="ignore", invalid="ignore"):  # signalling NaN as well
+        shift = map_shift(points)
+        points = points - shift if shift.any() else points
+        # False for NaN; the squares of the remaining coordinates fit into float32.
+        measured = np.asarray((np.abs(points) < se3.MAX_COORDINATE_M).all(1))
     if not measured.all():
         points = np.where(measured[:, None], points, 0)
     frame = CloudFrame(
@@ -69,6 +56,7 @@ def cloud_frame(
         normals,
         amplitude=amplitude,
         color=color,
-        origin=np.zeros(3) if origin is None else origin,
+        origin=(np.zeros(3) if origin is None else origin) - shift,
+        shift=shift,
     )
     return frame if measured.all() else frame.keep(measured)

@@ -6,10 +6,9 @@ import re
 from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
@@ -22,14 +21,7 @@ from tofuse.formats.sources.file_source import FileSource
 from tofuse.formats.sources.organised import SAMPLES, Deprojection, find_deprojection
 from tofuse.formats.sources.reader import Reader, ReaderOptions, Sniff
 
-# The resolution of float32 is coarser than half a millimetre beyond.
-MAP_COORDINATES_M = 8192.0
-
-_STEP_M = 1000.0  # map coordinates are shifted by whole kilometres
-
-F = TypeVar("F", bound=Frame)
 LoadFrame = Callable[[Path, int, float], Frame]
-LoadShifted = Callable[[Path, int, float, Float64], Frame]
 
 
 class CloudFileSource(FileSource):
@@ -43,10 +35,8 @@ class CloudFileSource(FileSource):
         In the order of frames.
     load_frame
         Reads a file, given its index and timestamp.
-    load_shifted
-        Reads in double precision and subtracts a shift (3,) from the coordinates, as map
-        coordinates don't fit into float32. The shift is determined from the first readable file,
-        and is `shift_m` in `metadata`.
+    deproject
+        Whether clouds that were deprojected from images become images again.
     """
 
     def __init__(
@@ -54,25 +44,20 @@ class CloudFileSource(FileSource):
         path: Path,
         files: list[Path],
         load_frame: LoadFrame,
-        load_shifted: LoadShifted | None = None,
+        *,
+        deproject: bool = False,
     ) -> None:
         super().__init__(np.arange(len(files), dtype=float))
         self.files = files
-        self.load_frame, self.load_shifted = load_frame, load_shifted
-        self._warned_rounding = False
-        self._cached: dict[int, Frame] = {}  # read to determine shift and camera
-        self._deprojection: Deprojection | None = None
+        self.load_frame = load_frame
+        self._cached: dict[int, Frame] = {}  # read to determine the camera
         if reading.is_folder(path):
             self.read_sidecars(path)
             if self.reference is None and reading.is_file(path / "poses.txt"):
                 self.reference = self._numbered_poses(path / "poses.txt")
-        self._shift = np.zeros(3)
-        if load_shifted is not None:
-            self._shift, self._cached = find_shift(self._read, len(files))
-            note_shift(self, path, self._shift)
-            self._deprojection = self._find_deprojection()
-            if self._deprojection is not None:
-                self.metadata["depth_kind"] = "z"
+        self._deprojection = self._find_deprojection() if deproject else None
+        if self._deprojection is not None:
+            self.metadata["depth_kind"] = "z"
 
     def load(self, index: int) -> Frame:
         """See `FileSource.load`."""
@@ -80,26 +65,13 @@ class CloudFileSource(FileSource):
         frame = self._read(index) if cached is None else cached
         if self._deprojection is not None and isinstance(frame, CloudFrame):
             return self._deprojection.image(frame)
-        farthest = float(np.abs(frame.points).max(initial=0))
-        if farthest > MAP_COORDINATES_M and not self._warned_rounding:
-            self._warned_rounding = True
-            step = float(np.spacing(np.float32(farthest)))
-            self.warnings.append(
-                f"{self.files[index]}: coordinates of up to {farthest:.3g} m are rounded to "
-                f"{step:.2g} m; move the clouds near the origin"
-            )
         return frame
 
     def _read(self, index: int) -> Frame:
-        file, time = self.files[index], float(self.timestamps[index])
-        if self.load_shifted is not None and self._shift.any():
-            return self.load_shifted(file, index, time, self._shift)
-        return self.load_frame(file, index, time)
+        return self.load_frame(self.files[index], index, float(self.timestamps[index]))
 
     def _find_deprojection(self) -> Deprojection | None:
         """The camera from which all clouds were deprojected, determined from a few of them."""
-        if self._shift.any():
-            return None
         clouds: list[CloudFrame] = []
         candidate: Deprojection | None = None
         for index in range(0, len(self.files), max(1, len(self.files) // SAMPLES)):
@@ -143,51 +115,6 @@ class CloudFileSource(FileSource):
                 out[k] = quaternion.to_pose(row[[5, 6, 7, 4]], row[1:4])
         self.warnings.append(f"{path}: read as index x y z qw qx qy qz, used only as reference")
         return out
-
-
-def find_shift(read: Callable[[int], F], count: int) -> tuple[Float64, dict[int, F]]:
-    """Return the shift (3,) in m to subtract from all coordinates, from the first readable frame.
-
-    Also that frame by its index if the shift is zero, so that it need not be read again.
-    """
-    for index in range(count):
-        try:
-            frame = read(index)
-        except InputError:
-            continue
-        if len(frame):
-            shift = map_shift(frame.points.min(0), frame.points.max(0))
-            return shift, {} if shift.any() else {index: frame}
-    return np.zeros(3), {}
-
-
-def map_shift(low: ArrayLike, high: ArrayLike) -> Float64:
-    """Return the shift (3,) in m that brings coordinates in a box into the precision of float32.
-
-    `low` and `high` (3,) are the corners of the box. Zero except for map coordinates.
-    """
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    if max(np.abs(low).max(), np.abs(high).max()) <= MAP_COORDINATES_M:
-        return np.zeros(3)
-    return np.round((low + high) / 2 / _STEP_M) * _STEP_M
-
-
-def describe_shift(shift: Float64) -> str:
-    """Return the note on a shift (3,) of coordinates."""
-    text = ", ".join(f"{value:.0f}" for value in shift)
-    return f"coordinates are those of the files minus ({text}) m"
-
-
-def note_shift(source: FileSource, path: Path, shift: Float64) -> None:
-    """Record a shift (3,) of coordinates in a source, and apply it to its poses."""
-    if not shift.any():
-        return
-    source.metadata["shift_m"] = shift.tolist()
-    source.warnings.append(f"{path}: {describe_shift(shift)}")
-    T_file_frame = np.eye(4)
-    T_file_frame[:3, 3] = shift
-    source.reference = None if source.reference is None else source.reference @ T_file_frame
-    source.odometry = None if source.odometry is None else source.odometry @ T_file_frame
 
 
 class CloudReader(Reader):

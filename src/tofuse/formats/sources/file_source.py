@@ -31,6 +31,8 @@ class FileSource(ABC):
     ----------
     concurrent
         Whether several threads can read frames concurrently: `load` has no side effects.
+    path, remedy
+        The file, and the remedy, for errors of frames that state none.
     camera, unit, kind, amplitude_kind, ambiguity_m
         Of depth images: the common camera, metres per count, and those of `RangeFrame`.
     color_camera
@@ -38,6 +40,8 @@ class FileSource(ABC):
     """
 
     concurrent = False
+    path: Path | None = None
+    remedy: str | None = None
     camera: Camera
     unit: float = 0.001
     kind: DepthKind = "z"
@@ -52,6 +56,10 @@ class FileSource(ABC):
         self.gravity: Float64 | None = None
         self.warnings: list[str] = []
         self.metadata: dict[str, Any] = {}
+
+    def where(self, index: int) -> str:
+        """Return the name of a frame for errors."""
+        return f"{self.path}: frame {index}" if self.path else f"frame {index}"
 
     @abstractmethod
     def load(self, index: int) -> Frame:
@@ -101,9 +109,8 @@ class FileSource(ABC):
     def read(self, index: int) -> Frame:
         """See `Source.read`."""
         try:
-            return self.load(index)
-        except UnreadableFrameError:
-            raise
+            with reading.about(self.where(index), self.remedy):
+                return self.load(index)
         except InputError as error:
             raise UnreadableFrameError(
                 error.problem, where=error.where, remedy=error.remedy

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import Camera, depth_conversion
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import DepthKind
+from tofuse.engine.noise import NoiseModel
 from tofuse.engine.sensor import DepthCorrection
 from tofuse.formats.files import atomic, npz, reading
 
@@ -52,3 +54,13 @@ def corrected_depth(
     return depth_conversion.z_from_range(
         camera, correction.correct(depth_conversion.range_from_z(camera, depth))
     )
+
+
+def write_noise(path: str | Path, model: NoiseModel) -> None:
+    """Write a noise.json; raise OutputError if that's impossible."""
+    atomic.write_text(path, json.dumps(model.to_dict(), indent=1) + "\n")
+
+
+def read_noise(path: str | Path) -> NoiseModel:
+    """Read a noise.json; raise InputError if it can't be read, or is invalid."""
+    return NoiseModel.from_dict(reading.read_json(path), where=str(path))
