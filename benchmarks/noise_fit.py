@@ -60,7 +60,7 @@ def show(title: str, recording: Recording) -> None:
             f"| {item.low:.3g}-{item.high:.3g} | {item.pixels} | {1000 * item.measured_m:.1f} | "
             f"{1000 * family_sigma(prior, fit, k):.1f} | {1000 * item.predicted_m:.1f} |"
         )
-    print(f"\nrms log error: family {fit.before:.3f}, fitted {fit.rms_log_error:.3f}")
+    print(f"\nrms log error: family {fit.rms_log_error_before:.3f}, fitted {fit.rms_log_error:.3f}")
     print(f"fitted: {fit.model.to_dict()}")
     averaged = average_still(recording)
     first, mean = recording[0], averaged[0]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tofuse.apps.batch.jobs import Job, parse_bytes, read_jobs
+from tofuse.apps.batch.jobs import Job, read_jobs
 from tofuse.apps.cli.run_arguments import run_arguments
 from tofuse.engine.errors import InputError
 
@@ -43,26 +43,15 @@ def test_names_are_stable_when_list_grows(recordings: Path) -> None:
     assert jobs_of(recordings, "a/frames9\nb/frames9\n")[0] == before[0]
 
 
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        (
-            "list.csv",
-            "recording,name,every,max-depth,object,config,memory\n"
-            "a/frames9,,2,,yes,c.toml,\na/frames9,far,,4.5,no,,2GB\n",
-        ),
-        (
-            "list.toml",
-            '[[job]]\nrecording = "a/frames9"\nevery = 2\nobject = true\nconfig = "c.toml"\n'
-            '[[job]]\nrecording = "a/frames9"\nname = "far"\nmax_depth = 4.5\nmemory = "2GB"\n',
-        ),
-    ],
-)
-def test_tables_set_options_per_job(name: str, text: str, recordings: Path) -> None:
-    one, other = jobs_of(recordings, text, name)
+def test_table_sets_options_per_job(recordings: Path) -> None:
+    text = (
+        "recording,name,every,max-depth,object,config\n"
+        "a/frames9,,2,,yes,c.toml\na/frames9,far,,4.5,no,\n"
+    )
+    one, other = jobs_of(recordings, text, "list.csv")
     assert set(one.arguments) == {"--every=2", "--object", f"--config={recordings / 'c.toml'}"}
-    assert (one.name, one.memory) == ("frames9", None)
-    assert other == Job("far", one.recording, ("--max-depth=4.5",), 2_000_000_000)
+    assert one.name == "frames9"
+    assert other == Job("far", one.recording, ("--max-depth=4.5",))
 
 
 @pytest.mark.parametrize(
@@ -81,15 +70,10 @@ def test_tables_set_options_per_job(name: str, text: str, recordings: Path) -> N
         ("list.csv", "recording,threads\na,1\n", "row 1: threads is not an option"),
         ("list.csv", "recording,every\na,none\n", "row 1: argument --every: 'none' is not"),
         ("list.csv", "recording,object\na,perhaps\n", "row 1: object is 'perhaps'; use yes or no"),
-        ("list.csv", "recording,memory\na,much\n", "'much' is not an amount of memory"),
         ("list.csv", "recording,name\na,../b\n", "row 1: '../b' can't be used as the name"),
         ("list.csv", "recording,name\na,jobs\n", "row 1: 'jobs' can't be used as the name"),
         ("list.csv", "recording,name\na,x\nb,X\n", "row 2: the name X is used twice"),
         ("list.csv", "recording,name\na/*,x\n", "a/* matches 2 recordings, but there is one name"),
-        ("list.toml", "recording = 1\n", "has recording where only [all] and [[job]] are allowed"),
-        ("list.toml", "[[job]]\nrecording = [1]\n", "job 1: recording is [1]"),
-        ("list.toml", "job = [1]\n", "job 1: is not a table"),
-        ("list.toml", "[[job\n", "is not TOML"),
     ],
 )  # fmt: skip
 def test_invalid_lists_are_rejected(name: str, text: str, message: str, recordings: Path) -> None:
@@ -141,16 +125,3 @@ def test_job_key_depends_on_recording_and_options(tmp_path: Path) -> None:
     (out / "batch.csv").write_text("")
     assert folder.key(out) == before
     assert Job("none", "/nothing").key(out)
-
-
-@pytest.mark.parametrize(
-    ("text", "size"), [("4GB", 4_000_000_000), ("1.5 mb", 1_500_000), ("2GiB", 2 << 30), ("7", 7)]
-)
-def test_memory_sizes_are_parsed(text: str, size: int) -> None:
-    assert parse_bytes(text) == size
-
-
-@pytest.mark.parametrize("text", ["", "0", "-1GB", "4 PB", "nan", "1e3", "9" * 400 + "GB"])
-def test_invalid_memory_sizes_are_rejected(text: str) -> None:
-    with pytest.raises(ValueError, match="not an amount of memory"):
-        parse_bytes(text)

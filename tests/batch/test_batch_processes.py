@@ -157,7 +157,7 @@ def test_unreachable_scheduler_is_reported(
         assert output.count("\n") == 1
     words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", str(listed)]
     assert main(words) == 2
-    assert "is not a file of a Dask scheduler" in capsys.readouterr().err
+    assert f"{listed}: no Dask scheduler answers" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

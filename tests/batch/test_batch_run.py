@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import errno
 import json
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import replace
@@ -18,8 +17,7 @@ from tofuse.apps.batch.cluster import DaskWorkers
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.table import COLUMNS, write_table
-from tofuse.apps.batch.work import Task
-from tofuse.apps.batch.workers import LocalWorkers, Workers
+from tofuse.apps.batch.work import Task, Workers
 from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError, OutputError
 
@@ -59,28 +57,30 @@ class Scripted(Workers):
         self.script = {name: list(steps) for name, steps in (script or {}).items()}
         self.started: list[str] = []
         self.gone: InputError | None = None
+        self.waiting: list[tuple[Task, Future[Record]]] = []
         self.busy = False
-
-    def check(self, job: Job) -> None:
-        pass
-
-    def accepts(self, task: Task) -> bool:
-        return not self.busy
 
     def start(self, task: Task) -> Future[Record]:
         self.started.append(task.job.name)
-        self.busy = True
-        steps = self.script.get(task.job.name) or [done]
-        future: Future[Record] = Future()
-        try:
-            future.set_result(steps.pop(0)(task))
-        except CancelledError:
-            future.cancel()
-            future.set_running_or_notify_cancel()
+        self.waiting.append((task, Future()))
+        future = self.waiting[-1][1]
+        if not self.busy:
+            self.finish_one()
         return future
 
+    def finish_one(self) -> None:
+        self.busy = bool(self.waiting)
+        for task, future in self.waiting[:1]:
+            self.waiting = self.waiting[1:]
+            steps = self.script.get(task.job.name) or [done]
+            try:
+                future.set_result(steps.pop(0)(task))
+            except CancelledError:
+                future.cancel()
+                future.set_running_or_notify_cancel()
+
     def lost(self) -> InputError | None:
-        self.busy = False  # the loop asks this after it has received the outcome
+        self.finish_one()  # the loop asks this after it has received the outcome
         return self.gone
 
     def close(self) -> None:
@@ -139,9 +139,8 @@ def test_degraded_job_sets_exit_status(folder: BatchFolder) -> None:
     assert status_of(JOBS[2:], folder) == 3  # not 2, as there is a result
 
 
-def test_batch_resumes_after_lost_workers(folder: BatchFolder, monkeypatch) -> None:
+def test_batch_resumes_after_lost_workers(folder: BatchFolder) -> None:
     workers = Scripted({"b": [cancelled], "c": [cancelled]})
-    monkeypatch.setattr(workers, "accepts", lambda _: True)  # all at once
     workers.gone = InputError("the scheduler went away")
     with pytest.raises(InputError, match="went away"):
         run(folder, workers)
@@ -231,40 +230,6 @@ def test_full_disk_is_reported(folder: BatchFolder, monkeypatch) -> None:
         run(folder, Scripted())
 
 
-def test_memory_limits_concurrent_jobs(monkeypatch) -> None:
-    go_on = threading.Event()
-
-    def wait(task: Task, _: object) -> Record:
-        go_on.wait(60)
-        return failed(task)
-
-    monkeypatch.setattr("tofuse.apps.batch.workers.machine_memory", lambda: 100)
-    monkeypatch.setattr("tofuse.apps.batch.workers.work", wait)
-    half = Task(replace(JOBS[0], memory=50), "/out", 1)
-    unstated = Task(JOBS[0], "/out", 1)
-    workers = LocalWorkers(4)
-    try:
-        with pytest.raises(InputError, match="needs 101 bytes, but this machine has 100"):
-            workers.check(replace(JOBS[0], memory=101))
-        running = []
-        for _ in range(2):
-            assert workers.accepts(half)
-            running.append(workers.start(half))
-        assert not workers.accepts(half)
-        # Jobs that state no memory are limited by their number only.
-        for _ in range(2):
-            assert workers.accepts(unstated)
-            running.append(workers.start(unstated))
-        assert not workers.accepts(unstated)
-        go_on.set()
-        for future in running:
-            future.result(60)
-        assert workers.accepts(half)
-    finally:
-        go_on.set()
-        workers.close()
-
-
 class Remote:
     """A future of Dask."""
 
@@ -315,7 +280,6 @@ def test_dask_outcomes_are_translated() -> None:
     [
         (["--workers", "0"], "'0' is not 1 or more"),
         (["--workers", "1", "--scheduler", "x"], "not allowed with"),
-        (["--memory", "much"], "not an amount of memory"),
         (["--only", "b"], "there is no job b"),
         (["--wrkers=2"], "unknown option --wrkers (did you mean --workers?)"),
     ],

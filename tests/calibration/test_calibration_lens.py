@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from tofuse.apps.calibration import lens
-from tofuse.apps.calibration.board import Board, find_corners
-from tofuse.apps.calibration.board_pose import board_pose
+from tofuse.apps.calibration.board import Board, board_pose, find_corners
 from tofuse.apps.calibration.lens import BoardView, LensFit, calibrate_lens
 from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Camera, Fisheye, Pinhole, Rational
@@ -69,7 +68,7 @@ def test_standard_deviations_bound_errors() -> None:
     not_estimated = {"k1", "k2", "p1", "p2", "k3"} - found.sigma.keys()
     assert all(getattr(found.camera, name) == 0 for name in not_estimated)
     assert found.rms_px < 0.1
-    assert found.before_px == pytest.approx(found.rms_px, abs=0.02)
+    assert found.rms_px_before == pytest.approx(found.rms_px, abs=0.02)
 
 
 def test_corners_follow_pixel_centre_convention() -> None:

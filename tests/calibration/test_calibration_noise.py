@@ -208,7 +208,7 @@ def test_real_sr4000_noise_agrees_with_data_description(shared_data: Path) -> No
     assert (fit.law, fit.stretches, fit.frames) == ("amplitude", 2, 8)
     assert fit.rms_log_error < 0.1
     # The error of the family's built-in model, which was not fitted to these bins.
-    assert fit.before < 0.15
+    assert fit.rms_log_error_before < 0.15
     assert fit.model.confidence is not None
     # Medians of deviations of z over four frames, from the description of the data; the median
     # of chi with three degrees of freedom is 0.89 of the deviation.

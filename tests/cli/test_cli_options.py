@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentTypeError
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from cli_calls import refuses
 from tofuse.apps.cli.commands import run_options
 from tofuse.apps.cli.parser import make_parser
+from tofuse.apps.cli.values import _size
 from tofuse.apps.jobs.run_options import Options, resolve, seed_of
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.parts import name_of
@@ -91,3 +93,16 @@ def test_invalid_numbers_name_their_option(words: str, capfd) -> None:
     refuses(
         capfd, "run", "rec", "--out", "out", option, value, says=(option,), prefix="tofuse run: "
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("4GB", 4_000_000_000), ("1.5 mb", 1_500_000), ("2GiB", 2 << 30), ("7", 7)]
+)
+def test_memory_sizes_are_parsed(text: str, size: int) -> None:
+    assert _size(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1GB", "4 PB", "4ib", "nan", "1e3", "9" * 400 + "GB"])
+def test_invalid_memory_sizes_are_rejected(text: str) -> None:
+    with pytest.raises(ArgumentTypeError, match="not an amount of memory"):
+        _size(text)

@@ -12,12 +12,12 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from tofuse.formats.cameras.correction_file import corrected_depth
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.background import Background
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.sensor.scattering import LensScattering
+from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 

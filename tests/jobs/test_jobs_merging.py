@@ -25,7 +25,6 @@ from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion import texture
 from tofuse.engine.fusion.texture import textured
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.progress import Silent
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.native import RecordingWriter
@@ -235,35 +234,3 @@ def test_damaged_result_is_refused(session_results, tmp_path, changes) -> None:
     again = copied(session_results["there"], tmp_path)
     changed_run_json(again, **changes)
     refused([session_results["here"], again], "damaged")
-
-
-@pytest.mark.nightly
-def test_recording_is_added_to_map(session_results, tmp_path, monkeypatch, capsys) -> None:
-    """And one that cannot be located in the map leaves it unchanged."""
-    monkeypatch.setattr(merging, "merged_config", quick_merge)
-    monkeypatch.setattr(merging, "_report", lambda result, folder: None)
-    into = copied(session_results["here"], tmp_path)
-    (session, _) = read_sessions(
-        [session_results["there"], session_results["elsewhere"]], 1, Silent()
-    )
-    shortened = reconstruct(session.recording.select(end=2), quick())
-
-    def runs_to(folder: Path) -> None:
-        """Every run returns this result, whatever the arguments."""
-        shutil.rmtree(tmp_path / "new", ignore_errors=True)
-        shutil.copytree(folder, tmp_path / "new")
-        monkeypatch.setattr("tofuse.apps.jobs.run", lambda *_: shortened)
-
-    runs_to(session_results["there"])
-    words = ["run", "recording", "--out", str(tmp_path / "new"), "--into", str(into)]
-    assert main(words) == 0
-    data = json.loads((into / "run.json").read_text())
-    assert [s["name"] for s in data["sessions"]] == ["out", "new"]
-    before = (into / "run.json").read_bytes()
-    runs_to(session_results["elsewhere"])
-    assert main(words) == 3
-    assert (into / "run.json").read_bytes() == before
-    assert "is not joined" in capsys.readouterr().out
-    assert main([*words[:-1], str(tmp_path / "new")]) == 2
-    assert "same folder as --out" in capsys.readouterr().err
-    assert main([*words[:-1], str(tmp_path / "nothing")]) == 2

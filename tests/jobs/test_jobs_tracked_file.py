@@ -188,8 +188,8 @@ def test_invalid_file_is_never_fatal(data: bytes | str, tmp_path: Path) -> None:
         "empty": {},
         "no steps": {name: a for name, a in arrays.items() if name != "steps"},
         "other steps": arrays | {"steps": np.frombuffer(b"[[1, 2], null, 3]", np.uint8)},
-        "short": arrays | {"poses": arrays["poses"][:-1]},
-        "objects": arrays | {"poses": np.array([{}], object)},
+        "short": arrays | {"steps": arrays["steps"][:-9]},
+        "objects": arrays | {"steps": np.array([{}], object)},
     }
     if isinstance(data, bytes):
         path.write_bytes(data)
@@ -207,7 +207,7 @@ def test_full_disk_does_not_stop_run(tmp_path: Path, monkeypatch) -> None:
         raise OSError(28, "No space left on device")
 
     notes: list[str] = []
-    monkeypatch.setattr(np, "savez", full)
+    monkeypatch.setattr(np, "savez_compressed", full)
     stored(tmp_path / TRACKED, notes)
     assert "no space left" in notes[0].lower()
     assert os.listdir(tmp_path) == []

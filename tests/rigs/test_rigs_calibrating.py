@@ -13,8 +13,8 @@ from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
 from tofuse.apps.cli.program import main
 from tofuse.apps.report.scene import CAMERA_COLORS
-from tofuse.apps.rigs.calibrating import Calibration, calibrate_cameras, moves
-from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.calibrating import calibrate_cameras, moves
+from tofuse.apps.rigs.inputs import Calibration, Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
@@ -52,7 +52,7 @@ def written(folder: Path, count: int = 2, cameras: int = 3) -> Path:
 
 @pytest.fixture(scope="module")
 def calibrated() -> Calibration:
-    return calibrate_cameras([camera(k, images(k)) for k in range(3)], ["a", "b", "c"])
+    return calibrate_cameras([camera(k, images(k)) for k in range(3)])
 
 
 def test_static_cameras_are_calibrated_from_one_instant(calibrated: Calibration) -> None:
@@ -70,7 +70,7 @@ def test_static_cameras_are_calibrated_from_one_instant(calibrated: Calibration)
 def test_camera_without_overlap_is_named() -> None:
     wall = RangeFrame(0, 0.0, CAMERA, np.full((72, 96), 1.7, np.float32), "z", None)
     cameras = [camera(0, images(0)), camera(1, images(1)), camera(2, [wall])]
-    found = calibrate_cameras(cameras, ["a", "b", "c"])
+    found = calibrate_cameras(cameras)
     assert [c.name for c in found.rig.cameras] == ["cam0", "cam1"]
     assert found.rig.unplaced["cam2"]
 

@@ -7,9 +7,9 @@ import pytest
 
 from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
-from tofuse.apps.rigs.calibrating import Calibration, calibrate_cameras
+from tofuse.apps.rigs.calibrating import calibrate_cameras
 from tofuse.apps.rigs.hand_eye import HandEye, Track, hand_eye
-from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.inputs import Calibration, Camera
 from tofuse.apps.rigs.moving_rig import _initial_offset, _JointViews, _too_uncertain
 from tofuse.apps.rigs.rig_trajectory import refined
 from tofuse.apps.rigs.run import reconstruct_rig
@@ -64,7 +64,7 @@ def cameras() -> tuple[Camera, Camera]:
 
 @cache
 def calibrated() -> Calibration:
-    return calibrate_cameras(cameras(), ["a", "b"])
+    return calibrate_cameras(cameras())
 
 
 @pytest.mark.nightly
@@ -87,7 +87,7 @@ def test_each_instant_of_moving_rig_has_one_pose() -> None:
     source = RigSource(rig, [camera.recording for camera in cameras()])
     recording = Recording.of(source, "rig", "rig")
     config = changed(from_method("default"), {"fusion": {"voxel_m": 0.1}}, where="test")
-    found = reconstruct_rig(rig, cameras(), recording, config)
+    found = reconstruct_rig(cameras(), recording, config)
     assert len(found.times) == len(found.poses) == len(recording) // 2
     truth = np.stack([path(t) for t in found.times])
     off = se3.inverse(se3.inverse(truth[0]) @ truth) @ found.poses
@@ -155,7 +155,7 @@ def test_split_half_reveals_systematic_errors() -> None:
     def tracks(by: np.ndarray) -> dict[int, Track]:
         return {0: Track(times, world), 1: Track(times, world @ mounted() @ se3.exp(by))}
 
-    together = _JointViews({}, {})
+    together = _JointViews({})
     together._halves = [(tracks(error), tracks(-error))]
     found = together.systematic(1, fit)
     np.testing.assert_allclose(found, np.outer(error, error), atol=1e-7)

@@ -9,8 +9,8 @@ import pytest
 
 from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
-from tofuse.apps.rigs.calibrating import Calibration, calibrate_cameras
-from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.calibrating import calibrate_cameras
+from tofuse.apps.rigs.inputs import Calibration, Camera
 from tofuse.apps.rigs.static_rig import minimum_cost_lag
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
@@ -58,7 +58,7 @@ def filmed(k: int, clock_s: float, moving: Callable[[float], Board]) -> Camera:
 
 
 def calibrated(clock_s: float, moving: Callable[[float], Board]) -> Calibration:
-    return calibrate_cameras([filmed(0, 0.0, moving), filmed(1, clock_s, moving)], ["a", "b"])
+    return calibrate_cameras([filmed(0, 0.0, moving), filmed(1, clock_s, moving)])
 
 
 @pytest.mark.nightly

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tofuse.formats.images.writing import write_png
 
 import tofuse
 from tofuse.engine.cameras.depth_conversion import range_from_z
@@ -20,6 +19,7 @@ from tofuse.engine.sensor.unwrap import (
     on_surface,
 )
 from tofuse.engine.sensor.unwrap_kernels import NEIGHBOURS, pass_messages
+from tofuse.formats.images.images import write_png
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from tofuse.apps.batch.batch import pending, run_batch, status_of
     from tofuse.apps.batch.cluster import DaskWorkers
     from tofuse.apps.batch.folder import BatchFolder, Record
-    from tofuse.apps.batch.jobs import Job, parse_bytes, read_jobs
+    from tofuse.apps.batch.jobs import Job, read_jobs
     from tofuse.apps.batch.table import write_table
-    from tofuse.apps.batch.workers import LocalWorkers, Workers
+    from tofuse.apps.batch.work import LocalWorkers, Workers
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import replace
-from math import inf
-from time import monotonic, sleep
 
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.table import write_table
-from tofuse.apps.batch.work import Task
-from tofuse.apps.batch.workers import Workers
+from tofuse.apps.batch.work import Task, Workers
 
-_POLL_S = 0.5  # interval at which workers are checked
-_NO_WORKER_S = 10.0  # time without any worker before a note
+_POLL_S = 0.5  # interval at which it is checked whether there are workers at all
 
 OnEnded = Callable[[Job, Record], None]
 
@@ -77,45 +73,33 @@ def run_batch(
     Raises
     ------
     InputError
-        If the workers are lost or can't run the jobs; finished jobs are in the table.
+        If the workers are lost; finished jobs are in the table.
     OutputError
         If a record or the table can't be written.
     """
-    for job in remaining:
-        workers.check(job)
     for job in remaining:  # earlier outcomes no longer count
         record = folder.record(job)
         if record is not None and record.ended:
             folder.write(job, replace(record, state="waiting"))
     write_table(jobs, folder)
-    queue = deque(Task(job, str(folder.path), threads) for job in remaining)
+    tasks = [Task(job, str(folder.path), threads) for job in remaining]
     running: dict[Future[Record], Task] = {}
     killed: Counter[str] = Counter()
-    idle_since = monotonic()
-    while queue or running:
-        while queue and workers.accepts(queue[0]):
-            task = queue.popleft()
-            running[workers.start(task)] = task
-        if running:
-            idle_since = monotonic()
-            done, _ = wait(running, _POLL_S, FIRST_COMPLETED)
-        else:
-            if monotonic() - idle_since > _NO_WORKER_S:
-                note(f"no worker is available for {queue[0].job.name}: waiting for one")
-                idle_since = inf
-            sleep(_POLL_S)
-            done = set()
+    while tasks or running:
+        running |= {workers.start(task): task for task in tasks}
+        tasks = []
+        done, _ = wait(running, _POLL_S, FIRST_COMPLETED)
         for future in done:
             task = running.pop(future)
             if future.cancelled():
-                queue.append(task)
+                tasks.append(task)
                 continue
             record = _completed(future.result(), task.job, folder)
             if record.state == "killed":
                 killed[task.job.name] += 1
                 if killed[task.job.name] <= retries:
                     note(f"{task.job.name}: {record.reason}; restarting it")
-                    queue.append(task)
+                    tasks.append(task)
                     continue
                 record = _failed(record, killed[task.job.name])
             if folder.record(task.job) != record:

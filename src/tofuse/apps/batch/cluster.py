@@ -5,19 +5,15 @@ from __future__ import annotations
 import json
 import os
 from concurrent.futures import Future
-from time import monotonic
 from typing import Any
 from uuid import uuid4
 
 from tofuse.apps.batch.folder import Record
-from tofuse.apps.batch.jobs import Job
-from tofuse.apps.batch.work import Task, work
-from tofuse.apps.batch.workers import Workers
+from tofuse.apps.batch.work import Task, Workers, work
 from tofuse.engine.errors import InputError
 from tofuse.formats.files import reading
 
 _TIMEOUT_S = 10.0  # of requests to a scheduler
-_POLL_S = 1.0  # interval at which the workers are counted
 
 
 class DaskWorkers(Workers):
@@ -37,46 +33,13 @@ class DaskWorkers(Workers):
         """
         self._address = address
         self._client: Any = _connect(address)
-        self._running: set[Future[Record]] = set()
-        self._worker_infos: list[dict[str, Any]] = []
-        self._polled_at = -_POLL_S
-
-    def check(self, job: Job) -> None:
-        """See `Workers`. A cluster without workers may get some later."""
-        if job.memory is None:
-            return
-        declared = [w["resources"].get("memory", 0) for w in self._workers()]
-        if declared and max(declared) < job.memory:
-            raise InputError(
-                f"{job.name} needs {job.memory} bytes, but none of the {len(declared)} workers "
-                f"declares more than {max(declared):.0f}",
-                where=self._address,
-                remedy=f'start them with --resources "memory={job.memory}"',
-            )
-
-    def accepts(self, task: Task) -> bool:
-        """See `Workers`. No more tasks are submitted than workers can do at a time.
-
-        Dask counts a queued task as failed whenever its worker dies, even if it had not started.
-        """
-        self._running = {f for f in self._running if not f.done()}
-        if monotonic() - self._polled_at >= _POLL_S:
-            self._worker_infos, self._polled_at = self._workers(), monotonic()
-        return len(self._running) < sum(_slots(worker, task.job) for worker in self._worker_infos)
 
     def start(self, task: Task) -> Future[Record]:
         """See `Workers`."""
-        memory = task.job.memory
-        remote = self._client.submit(
-            work,
-            task,
-            key=f"{task.job.name}-{uuid4().hex}",
-            pure=False,
-            resources={} if memory is None else {"memory": memory},
-        )
+        key = f"{task.job.name}-{uuid4().hex}"
+        remote = self._client.submit(work, task, key=key, pure=False)
         future: Future[Record] = Future()
         remote.add_done_callback(lambda done: self._transfer(done, future))
-        self._running.add(future)
         return future
 
     def lost(self) -> InputError | None:
@@ -92,12 +55,6 @@ class DaskWorkers(Workers):
     def close(self) -> None:
         """See `Workers`. Workers finish jobs that they have started, and write their records."""
         self._client.close(timeout=_TIMEOUT_S)
-
-    def _workers(self) -> list[dict[str, Any]]:
-        try:
-            return list(self._client.scheduler_info(n_workers=-1)["workers"].values())
-        except OSError:  # `lost` reports it
-            return []
 
     def _transfer(self, remote: Any, future: Future[Record]) -> None:
         """Copy the outcome of a remote future to a local one."""
@@ -119,7 +76,7 @@ class DaskWorkers(Workers):
             elif _cannot_deserialize(error):
                 future.set_exception(
                     InputError(
-                        f"can't load the jobs of this version ({_first_line(error)})",
+                        f"can't load the jobs of this version ({str(error).partition(chr(10))[0]})",
                         where=self._address,
                         remedy="install this version of tofuse on its scheduler and its workers",
                     )
@@ -131,32 +88,28 @@ class DaskWorkers(Workers):
             future.set_running_or_notify_cancel()
 
 
-def _slots(worker: dict[str, Any], job: Job) -> int:
-    """The number of such jobs that a worker can run at a time."""
-    threads = int(worker["nthreads"])
-    if job.memory is None:
-        return threads
-    return min(threads, int(worker["resources"].get("memory", 0) // job.memory))
-
-
 def _connect(address: str) -> Any:
     """Return a client of the scheduler at an address, or of the one that wrote a file."""
     try:
         import dask
-    except ImportError as error:
-        raise _not_installed() from error
-    # Dask would log errors that are reported here. It reads this when distributed is imported.
-    levels = {"distributed": "critical", "distributed.client": "critical"}
-    with dask.config.set({"logging": levels}):
-        try:
+
+        # Dask would log errors that are reported here; it reads this when it is imported.
+        levels = {"distributed": "critical", "distributed.client": "critical"}
+        with dask.config.set({"logging": levels}):
             import distributed
-        except ImportError as error:
-            raise _not_installed() from error
+    except ImportError as error:
+        raise InputError(
+            "needs Dask distributed",
+            where="--scheduler",
+            remedy="pip install 'tofuse[dask]', or use --workers to stay on this machine",
+        ) from error
     client: Any = distributed.Client
-    target = _from_file(address) if os.path.isfile(address) else address
     try:
+        # A file that a scheduler wrote, or its address.
+        is_file = os.path.isfile(address)
+        target = json.loads(reading.read_text(address))["address"] if is_file else address
         return client(target, timeout=_TIMEOUT_S, set_as_default=False, name="tofuse")
-    except (OSError, ValueError, TypeError, RuntimeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
         raise InputError(
             "no Dask scheduler answers",
             where=address,
@@ -167,28 +120,3 @@ def _connect(address: str) -> Any:
 def _cannot_deserialize(error: BaseException) -> bool:
     """Whether a scheduler or worker could not load the objects of a task."""
     return isinstance(error, ImportError | AttributeError) or "deserializ" in str(error)
-
-
-def _first_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or its type."""
-    return next(iter(str(error).splitlines()), type(error).__name__)
-
-
-def _from_file(path: str) -> str:
-    """The address in a file that a scheduler wrote."""
-    try:
-        return str(json.loads(reading.read_text(path))["address"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            "is not a file of a Dask scheduler",
-            where=path,
-            remedy="pass the address that it prints",
-        ) from error
-
-
-def _not_installed() -> InputError:
-    return InputError(
-        "needs Dask distributed",
-        where="--scheduler",
-        remedy="pip install 'tofuse[dask]', or use --workers to stay on this machine",
-    )

@@ -12,18 +12,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import escape, glob, has_magic
 from pathlib import Path
-from typing import Any
 
 from tofuse.engine.errors import InputError
 from tofuse.formats.files import reading, stamps
 
 RESERVED = ("batch.csv", "batch.html", "jobs")  # names in the output folder not for jobs
 # Other files are recordings if they are binary, or a reader recognises them.
-_LISTS = (".csv", ".toml", ".txt")
+_LISTS = (".csv", ".txt")
 _HEAD_BYTES = 4096
 _MAX_NAME_LENGTH = 100  # characters of a name
-_UNITS = {"": 1, "k": 1000, "m": 1000**2, "g": 1000**3, "t": 1000**4}
-_BINARY = {"ki": 1 << 10, "mi": 1 << 20, "gi": 1 << 30, "ti": 1 << 40}
 
 RunArguments = Callable[[Mapping[str, str], Path, str], tuple[str, ...]]
 
@@ -40,14 +37,11 @@ class Job:
         Absolute path.
     arguments
         Options of `tofuse run`, each ``--name`` or ``--name=value``.
-    memory
-        Stated memory requirement in bytes; None without one.
     """
 
     name: str
     recording: str
     arguments: tuple[str, ...] = ()
-    memory: int | None = None
 
     def key(self, out: Path) -> str:
         """Return a digest of the inputs of the result: the recording's files and the options.
@@ -73,7 +67,7 @@ class _Row:
 def read_jobs(paths: Sequence[Path], run_arguments: RunArguments) -> tuple[Job, ...]:
     """Return the jobs of recordings, globs of recordings, and lists.
 
-    A list is a table (.csv, .toml), or text with one path or glob per line; relative ones refer to
+    A list is a table (.csv), or text with one path or glob per line; relative ones refer to
     its folder. Folders, binary files and files that a reader recognises are recordings. Duplicates
     of a recording with the same options are ignored.
 
@@ -94,8 +88,7 @@ def read_jobs(paths: Sequence[Path], run_arguments: RunArguments) -> tuple[Job, 
     seen: set[tuple[object, ...]] = set()
     for base, row in (each for path in paths for each in _rows(path)):
         options = dict(row.options)
-        name, memory = options.pop("name", ""), options.pop("memory", "")
-        memory_bytes = _bytes_of(memory, row.where) if memory else None
+        name = options.pop("name", "")
         arguments = run_arguments(options, base, row.where)
         matches = _matches(row, base)
         if name and len(matches) > 1:
@@ -110,7 +103,7 @@ def read_jobs(paths: Sequence[Path], run_arguments: RunArguments) -> tuple[Job, 
                 continue
             job_name = _check_name(name, jobs, row.where) if name else _unique_name(recording, jobs)
             seen.add(identity)
-            jobs[job_name.lower()] = Job(job_name, recording, arguments, memory_bytes)
+            jobs[job_name.lower()] = Job(job_name, recording, arguments)
     if not jobs:
         names = ", ".join(map(str, paths))
         raise InputError("lists no recording", where=names, remedy="add a path or glob per line")
@@ -122,8 +115,8 @@ def _rows(path: Path) -> Iterator[tuple[Path, _Row]]:
     if not _is_list(path):
         yield Path.cwd(), _Row(str(path), str(path))
         return
-    readers = {".csv": _csv_rows, ".toml": _toml_rows}
-    for row in readers.get(path.suffix.lower(), _text_rows)(reading.read_text(path), path):
+    rows = _csv_rows if path.suffix.lower() == ".csv" else _text_rows
+    for row in rows(reading.read_text(path), path):
         yield path.absolute().parent, row
 
 
@@ -169,30 +162,6 @@ def _csv_rows(text: str, path: Path) -> Iterator[_Row]:
                 remedy="use one cell per column, and quote cells that contain a comma",
             )
         yield _row(dict(zip(header, (cell.strip() for cell in cells), strict=True)), where)
-
-
-def _toml_rows(text: str, path: Path) -> Iterator[_Row]:
-    data = reading.parse_toml(text, where=path)
-    shared, tables = data.pop("all", {}), data.pop("job", [])
-    if data or not isinstance(shared, dict) or not isinstance(tables, list):
-        raise InputError(
-            f"has {', '.join(data) or 'something else'} where only [all] and [[job]] are allowed",
-            where=path,
-            remedy="use a [[job]] table per recording, and an [all] table for common options",
-        )
-    for k, table in enumerate(tables):
-        where = f"{path}: job {k + 1}"
-        if not isinstance(table, dict):
-            raise InputError("is not a table", where=where, remedy="write it below [[job]]")
-        yield _row({n: _plain(v, n, where) for n, v in {**shared, **table}.items()}, where)
-
-
-def _plain(value: Any, name: str, where: str) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str | int | float):
-        return str(value)
-    raise InputError(f"{name} is {value!r}", where=where, remedy="use a text, number or boolean")
 
 
 def _row(cells: Mapping[str, str], where: str) -> _Row:
@@ -263,26 +232,3 @@ def _safe(name: str) -> str:
     """The name with characters replaced that are special in a path, in HTML or in a shell."""
     name = re.sub(r"[^\w.-]+", "_", name)[-_MAX_NAME_LENGTH:]
     return re.sub(r"^[.-]+|[.]+$", "_", name) or "_"
-
-
-def parse_bytes(text: str) -> int:
-    """Return the number of bytes of a text such as 4GB, 500 MB or 2GiB.
-
-    Raises
-    ------
-    ValueError
-        If it is not a positive amount.
-    """
-    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)\s*([kmgt]?i?)b?", text.strip().lower())
-    unit = {**_UNITS, **_BINARY}.get(match[2]) if match else None
-    size = 0.0 if match is None or unit is None else float(match[1]) * unit
-    if not 1 <= size < 1 << 60:
-        raise ValueError(f"{text!r} is not an amount of memory, such as 4GB")
-    return int(size)
-
-
-def _bytes_of(text: str, where: str) -> int:
-    try:
-        return parse_bytes(text)
-    except ValueError as error:
-        raise InputError(f"memory: {error}", where=where) from error

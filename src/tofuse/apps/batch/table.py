@@ -44,12 +44,11 @@ def write_table(jobs: Sequence[Job], folder: BatchFolder) -> None:
 
 def _csv(ended: Sequence[tuple[Job, Record]]) -> str:
     buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    writer = csv.DictWriter(buffer, COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
     for job, record in ended:
-        values = {**vars(record), "name": job.name, "recording": job.recording}
-        values["options"] = " ".join(job.arguments)
-        writer.writerow(["" if values[c] is None else values[c] for c in COLUMNS])
+        about = {"recording": job.recording, "options": " ".join(job.arguments)}
+        writer.writerow({**vars(record), "name": job.name, **about})
     return buffer.getvalue()
 
 

@@ -1,8 +1,9 @@
-"""Detection of the inner corners of a checkerboard in an image."""
+"""Detection of the inner corners of a checkerboard in an image, and its pose."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Self
 
@@ -10,8 +11,10 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame, Recording
+from tofuse.engine.geometry import se3
 
 # Small images are enlarged to this width, by at most this factor, as the detector needs large
 # squares.
@@ -88,18 +91,39 @@ class Board:
         return np.array([[left, left], [right, left], [right, low], [left, low]])
 
 
-def board_image(frame: RangeFrame, channel: str) -> Float32 | None:
-    """Return the image (H, W) of a frame to detect a board in, "amplitude" or "color", or None.
+def search_board(
+    recording: Recording, board: Board, channel: str, max_frames: int
+) -> Iterator[tuple[RangeFrame, Float64 | None]]:
+    """Yield evenly spaced frames of a recording, each with the corners of the board, or None.
 
-    Colour that is not registered to depth is from another lens and is not used.
+    Parameters
+    ----------
+    recording
+        Depth images with amplitude, or with colour that is registered to depth.
+    board
+        The checkerboard.
+    channel
+        The image in which it is searched: "amplitude" or "color".
+    max_frames
+        Their maximum number.
+
+    Raises
+    ------
+    InputError
+        If a frame has no such image.
     """
-    if channel == "color":
-        image = frame.color_image
+    for frame in recording.images(max_frames):
+        image = frame.color_image if channel == "color" else frame.amplitude_image
+        # Colour that is not registered to depth is from another lens.
         if image is None or image.shape[:2] != frame.depth.shape:
-            return None
+            other = "color" if channel == "amplitude" else "amplitude"
+            raise InputError(
+                f"frame {frame.index} has no {channel} on the pixels of its depth",
+                where=recording.path,
+                remedy=f"use --image {other}, or record it",
+            )
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
-        return np.asarray(grey, np.float32)
-    return None if frame.amplitude_image is None else frame.amplitude_image.astype(np.float32)
+        yield frame, find_corners(np.asarray(grey, np.float32), board)
 
 
 def find_corners(image: Float32, board: Board) -> Float64 | None:
@@ -137,3 +161,34 @@ def _flatten_illumination(image: Float32) -> Float32:
     bright = np.maximum(np.nan_to_num(image), 0) + 1.0
     local_mean = cv2.GaussianBlur(bright, (0, 0), _WINDOW * image.shape[1] / 2)
     return np.asarray(bright / local_mean, np.float32)
+
+
+def board_pose(camera: Camera, corners: Float64, board: Board) -> tuple[Float64, float] | None:
+    """Return T_camera_board (4, 4) from corners (N, 2) in pixels, and their rms error in pixels.
+
+    By infinitesimal plane-based pose estimation (Collins and Bartoli 2014), refined by
+    Levenberg-Marquardt. None if corners lie outside the valid area of the lens.
+    """
+    rays = cv2.remap(
+        np.asarray(camera.rays(), np.float32),
+        corners[:, 0].astype(np.float32),
+        corners[:, 1].astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    ).reshape(-1, 2)
+    if not np.isfinite(rays).all():
+        return None
+    points = board.points.astype(float)
+    observed = rays.astype(float)
+    try:
+        found, rvec, tvec = cv2.solvePnP(points, observed, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+        if not found:
+            return None
+        rvec, tvec = cv2.solvePnPRefineLM(points, observed, np.eye(3), None, rvec, tvec)
+    except cv2.error:
+        return None
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rvec)[0], tvec.ravel()
+    errors = camera.project(se3.transform(T, points)) - corners
+    rms = float(np.sqrt((errors**2).sum(1).mean()))
+    return (T, rms) if np.isfinite(rms) else None

@@ -6,9 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from tofuse.engine.cameras import Camera, RayTable
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.formats.cameras import camera_file
@@ -38,41 +36,25 @@ def recording_fields(recording: Recording) -> dict[str, Any]:
     return present
 
 
-def write_camera_json(
-    path: str | Path, camera: Camera, about: dict[str, Any], *, overwrite: bool = False
-) -> list[Path]:
-    """Write a camera.json, and a rays.npy in the same folder for a table of rays.
+def write_camera_json(path: Path, camera: Pinhole, about: dict[str, Any]) -> None:
+    """Write a camera.json, for `--camera` or the folder of a native recording.
 
     Parameters
     ----------
     path
-        The file, for `--camera` or the folder of a native recording.
+        The file.
     camera
         The lens.
     about
         Other fields; by default `depth_unit_m` is 0.001 and `depth_kind` is "z".
-    overwrite
-        Whether existing files are replaced.
-
-    Returns
-    -------
-    The files that were written.
 
     Raises
     ------
     OutputError
-        If a file exists already, or a rays.npy in the same folder would override the lens.
-    InputError
-        If the lens is of no known model.
+        If a rays.npy in the same folder would override the lens.
     """
-    path = Path(path)
     table = path.with_name("rays.npy")
-    files = [table, path] if isinstance(camera, RayTable) else [path]
-    if not overwrite and (existing := [file for file in files if file.exists()]):
-        raise OutputError(
-            "exists already", where=existing[0], remedy="use --overwrite to replace it"
-        )
-    if table.exists() and table not in files:
+    if table.exists():
         raise OutputError(
             "would override the lens that is written to the same folder",
             where=table,
@@ -81,12 +63,7 @@ def write_camera_json(
     fields = {"schema": camera_file.SCHEMA} | camera_file.camera_fields(camera)
     content = fields | {"depth_unit_m": 0.001, "depth_kind": "z"} | about
     atomic.make_folder(path.parent)
-    if isinstance(camera, RayTable):
-        with atomic.replacing(table) as part:
-            np.save(part, camera.rays(), allow_pickle=False)
-    with atomic.replacing(path) as part:
-        part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    return files
+    atomic.write_text(path, json.dumps(content, indent=2) + "\n")
 
 
 def check_new(path: Path, *, overwrite: bool) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.sparse import csr_array, diags_array
 
 from tofuse.apps.calibration.plane_views import PlaneView
@@ -36,6 +37,7 @@ _CURVE_M, _BEND_M, _OFFSET_M = 0.1, 0.004, 0.02
 # priors of thousands of pixels would outweigh the poses.
 _ANY_OFFSET_M, _MEAN_OFFSET_M = 1.0, 1e-4
 _MEAN_M, _SLOPE = 0.002, 0.001
+_FIXED_M = 1e-7  # prior of curve and offsets that are fixed to 0
 _FLOOR_M = 0.001  # lower limit of the noise
 _MIN_SPREAD_M = 0.3
 _MAX_SHAPE_M = 0.004  # standard deviation of the curve without mean and slope
@@ -127,10 +129,11 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
     shape = camera.height, camera.width
     subsampled = [_subsampled(view, shape) for view in views]
     state = _solve(subsampled, knots)
-    if not state.shape_sigma < _MAX_SHAPE_M:
+    constant, scale, shape_sigma = _sigmas(state, knots, ranges)
+    if not shape_sigma < _MAX_SHAPE_M:
         raise InputError(
             f"shows {len(views)} planes, which determine the curve only to "
-            f"{1000 * state.shape_sigma:.0f} mm",
+            f"{1000 * shape_sigma:.0f} mm",
             where=where,
             remedy="record a wall from 20 places or more, at all distances, tilted to all sides",
         )
@@ -142,9 +145,7 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
     offsets -= mean
     curve = state.curve + mean
     after = [r - offsets.ravel()[v.pixels] - mean for r, v in zip(residuals, views, strict=True)]
-    zero_curve = np.zeros_like(curve)
-    before = _residuals(views, knots, _solve(subsampled, knots, zero_curve))
-    constant, scale = state.sigma
+    before = _residuals(views, knots, _solve(subsampled, knots, fixed=True))
     return DepthFit(
         DepthCorrection(knots, curve, offsets.astype(np.float32)),
         len({view.frame for view in views}),
@@ -178,12 +179,11 @@ def compose(first: DepthCorrection, second: DepthCorrection) -> DepthCorrection:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Curve (K,) in m, planes (V, 3), and the sigmas of the curve's mean, slope and shape."""
+    """Curve (K,) in m, planes (V, 3), and the covariance (K, K) of the curve."""
 
     curve: Float64
     planes: Float64
-    sigma: tuple[float, float]
-    shape_sigma: float
+    covariance: Float64
 
 
 def _subsampled(view: PlaneView, shape: tuple[int, int]) -> PlaneView:
@@ -195,27 +195,22 @@ def _subsampled(view: PlaneView, shape: tuple[int, int]) -> PlaneView:
     return replace(view, **{name: getattr(view, name)[keep] for name in names})
 
 
-def _solve(
-    views: Sequence[PlaneView],
-    knots: Float64,
-    fixed: Float64 | None = None,
-) -> _State:
-    """Run Gauss-Newton over planes and curve, unless the curve is `fixed`."""
+def _solve(views: Sequence[PlaneView], knots: Float64, *, fixed: bool = False) -> _State:
+    """Run Gauss-Newton over planes and curve; a `fixed` curve and the offsets stay 0."""
     knot_count = len(knots)
-    counts = [len(view.pixels) for view in views]
     measured = np.concatenate([view.measured_m for view in views])
     sigma = np.hypot(np.concatenate([view.sigma_m for view in views]), _FLOOR_M)
     directions = np.concatenate([view.directions for view in views])
-    view_of = np.repeat(np.arange(len(views)), counts)
+    view_of = np.repeat(np.arange(len(views)), [len(view.pixels) for view in views])
     pixels, pixel = np.unique(np.concatenate([view.pixels for view in views]), return_inverse=True)
     start = np.stack([view.plane for view in views])
-    planes, curve = start.copy(), np.zeros(knot_count) if fixed is None else fixed.copy()
-    offsets = np.zeros(len(pixels))
-    prior = _prior(knots, has_pose=_has_known_pose(views))
-    offset_sigma = _ANY_OFFSET_M if _has_known_pose(views) else _OFFSET_M
-    size = knot_count + 3 * len(views)
-    n = len(measured)
-    scale = 1.0
+    planes, curve, offsets = start.copy(), np.zeros(knot_count), np.zeros(len(pixels))
+    has_pose = _has_known_pose(views)
+    prior, offset_sigma = _prior(knots, has_pose=has_pose), _ANY_OFFSET_M if has_pose else _OFFSET_M
+    if fixed:
+        prior, offset_sigma = _FIXED_M**-2 * np.eye(knot_count), _FIXED_M
+    size, n = knot_count + 3 * len(views), len(measured)
+    information = block_diag(prior, *(view.information for view in views))
     for _ in range(_ROUNDS):
         true = 1 / np.einsum("nc,nc->n", planes[view_of], directions)
         knot, fraction = _interval(_measured_of_true(true, knots, curve), knots)
@@ -230,65 +225,43 @@ def _solve(
         values = np.concatenate([np.stack([1 - fraction, fraction], 1), slope], 1)
         A = csr_array((values.ravel(), columns.ravel(), np.arange(0, 5 * n + 1, 5)), (n, size))
         AtW = (diags_array(weight) @ A).T.tocsr()
-        normal = (AtW @ A).toarray()
-        # The offsets are solved for afterwards.
+        # The offsets are eliminated, and solved for afterwards.
         target = residual + offsets[pixel]
-        rhs = AtW @ target
         by_pixel = csr_array((weight, (pixel, np.arange(n))), (len(pixels), n))
         total = by_pixel.sum(1) + 1 / offset_sigma**2
-        if fixed is None:
-            coupled = by_pixel @ A
-            normal -= (coupled.T @ (diags_array(1 / total) @ coupled)).toarray()
-            own_offsets = (by_pixel @ target) / total
-            rhs -= coupled.T @ own_offsets
-            # The mean of the offsets is part of the curve and fixed to 0 (Sherman-Morrison).
-            mean_weight = 1 / ((len(total) * _MEAN_OFFSET_M) ** 2 + (1 / total).sum())
-            coupled_mean = coupled.T @ (1 / total)
-            normal += mean_weight * np.outer(coupled_mean, coupled_mean)
-            rhs += mean_weight * coupled_mean * own_offsets.sum()
-            normal[:knot_count, :knot_count] += prior
-            rhs[:knot_count] -= prior @ curve
-        for k, view in enumerate(views):
-            block = slice(knot_count + 3 * k, knot_count + 3 * k + 3)
-            normal[block, block] += view.information
-            rhs[block] += view.information @ (start[k] - planes[k])
-        free = slice(0, None) if fixed is None else slice(knot_count, None)
-        step = np.zeros(size)
+        coupled = by_pixel @ A
+        own_offsets = (by_pixel @ target) / total
+        normal = (AtW @ A - coupled.T @ (diags_array(1 / total) @ coupled)).toarray() + information
+        rhs = AtW @ target - coupled.T @ own_offsets
+        rhs -= information @ np.concatenate([curve, (planes - start).ravel()])
+        # The mean of the offsets is part of the curve and fixed to 0 (Sherman-Morrison).
+        mean_weight = 1 / ((len(total) * _MEAN_OFFSET_M) ** 2 + (1 / total).sum())
+        coupled_mean = coupled.T @ (1 / total)
+        normal += mean_weight * np.outer(coupled_mean, coupled_mean)
+        rhs += mean_weight * coupled_mean * own_offsets.sum()
         # Scale the columns, as those of planes and curve have different units.
-        unit = 1 / np.sqrt(np.maximum(np.diag(normal)[free], 1e-12))
-        scaled = normal[free, free] * unit[:, None] * unit
-        step[free] = unit * np.linalg.solve(scaled + 1e-10 * np.eye(len(unit)), unit * rhs[free])
+        unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-12))
+        scaled = normal * unit[:, None] * unit + 1e-10 * np.eye(size)
+        step = unit * np.linalg.solve(scaled, unit * rhs)
         curve = curve + step[:knot_count]
         planes = planes + step[knot_count:].reshape(-1, 3)
-        if fixed is None:
-            own_offsets = (by_pixel @ (target - A @ step)) / total
-            offsets = own_offsets - mean_weight * own_offsets.sum() / total
-    covariance = np.zeros((knot_count, knot_count))
-    if fixed is None:
-        inverse = np.linalg.inv(scaled + 1e-10 * np.eye(len(unit)))
-        covariance = (inverse * unit[:, None] * unit)[:knot_count, :knot_count]
-    weights = (np.bincount(knot, minlength=knot_count) + 1e-9).astype(np.float64)
-    shape_projector = np.eye(knot_count) - _mean_and_slope_basis(knots) @ _mean_and_slope_projector(
-        knots, np.ones(knot_count)
+        own_offsets = (by_pixel @ (target - A @ step)) / total
+        offsets = own_offsets - mean_weight * own_offsets.sum() / total
+    covariance = np.linalg.inv(scaled) * unit[:, None] * unit
+    return _State(curve, planes, covariance[:knot_count, :knot_count])
+
+
+def _sigmas(state: _State, knots: Float64, ranges: Float64) -> tuple[float, float, float]:
+    """Return the sigmas of the curve's mean and slope, and of its shape, over observed ranges."""
+    counts: Float64 = np.full(len(knots), 1e-9)
+    counts += np.bincount(_interval(ranges, knots)[0], minlength=len(knots))
+    basis = np.stack([np.ones_like(knots), knots - knots.mean()], 1)
+    shape = np.eye(len(knots)) - basis @ _mean_and_slope_projector(knots, np.ones(len(knots)))
+    (constant, slope), shapes = (
+        np.diag(P @ state.covariance @ P.T).clip(0)
+        for P in (_mean_and_slope_projector(knots, counts), shape)
     )
-    variances = np.diag(shape_projector @ covariance @ shape_projector.T)
-    shape_sigma = float(np.sqrt(max(np.average(variances, weights=weights), 0)))
-    return _State(curve, planes, _mean_and_slope_sigma(knots, weights, covariance), shape_sigma)
-
-
-def _mean_and_slope_sigma(
-    knots: Float64, weights: Float64, covariance: Float64
-) -> tuple[float, float]:
-    """Return the sigmas of the curve's mean and slope over the observed ranges."""
-    functionals = _mean_and_slope_projector(knots, weights)
-    variances = np.diag(functionals @ covariance @ functionals.T)
-    constant, slope = np.sqrt(np.maximum(variances, 0))
-    return float(constant), float(slope)
-
-
-def _mean_and_slope_basis(knots: Float64) -> Float64:
-    """Return a constant and a centred slope as curves, (K, 2)."""
-    return np.stack([np.ones_like(knots), knots - knots.mean()], 1)
+    return constant**0.5, slope**0.5, float(np.average(shapes, weights=counts)) ** 0.5
 
 
 def _mean_and_slope_projector(knots: Float64, weights: Float64) -> Float64:

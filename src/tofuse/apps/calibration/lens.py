@@ -1,4 +1,4 @@
-"""Calibration of intrinsics and distortion from images of a checkerboard (Zhang 2000, OpenCV)."""
+"""Calibration of intrinsics and distortion from images of a checkerboard (Zhang 2000)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
-from tofuse.apps.calibration.board import Board, board_image, find_corners
-from tofuse.apps.calibration.board_pose import board_pose, pose_of
+from tofuse.apps.calibration.board import Board, board_pose, search_board
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Fisheye, Pinhole
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording, evenly_spaced
 from tofuse.engine.geometry import se3
@@ -27,7 +27,8 @@ _MIN_OUTLIER_PX = 0.3
 _MIN_SPREAD = np.radians(6)  # of the board's normals
 _MAX_SIGMA = 0.01  # of the focal length
 _MIN_COVERED = 0.5
-_CELLS = 8
+_CELLS = 64
+_STEP = 1e-6  # of derivatives
 _INTRINSIC = ("fx", "fy", "cx", "cy")
 
 
@@ -59,7 +60,7 @@ class LensFit:
         Standard deviation of each parameter by name, without those fixed to 0.
     rms_px
         Rms reprojection error of the corners.
-    before_px
+    rms_px_before
         The same for the recording's original lens.
     views, rms_by_view_px
         Frames that were used, and the rms reprojection error of each.
@@ -74,7 +75,7 @@ class LensFit:
     camera: Pinhole
     sigma: dict[str, float]
     rms_px: float
-    before_px: float
+    rms_px_before: float
     views: tuple[int, ...]
     rms_by_view_px: tuple[float, ...]
     left_out: tuple[tuple[int, str], ...]
@@ -83,20 +84,12 @@ class LensFit:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        lens = {name: getattr(self.camera, name) for name in names_of(self.camera.model)}
+        camera = self.camera
         return {
-            "model": self.camera.model,
-            "width": self.camera.width,
-            "height": self.camera.height,
-            "lens": lens,
-            "sigma": dict(self.sigma),
-            "rms_px": self.rms_px,
-            "rms_px_before": self.before_px,
-            "views": list(self.views),
-            "rms_by_view_px": list(self.rms_by_view_px),
+            **{name: getattr(camera, name) for name in ("model", "width", "height")},
+            "lens": {name: getattr(camera, name) for name in names_of(camera.model)},
+            **{name: value for name, value in vars(self).items() if name != "camera"},
             "left_out": [{"frame": k, "reason": reason} for k, reason in self.left_out],
-            "covered": self.covered,
-            "warnings": list(self.warnings),
         }
 
 
@@ -108,16 +101,7 @@ def names_of(model: str) -> tuple[str, ...]:
 def board_views(
     recording: Recording, board: Board, image: str = "amplitude"
 ) -> tuple[list[BoardView], list[tuple[int, str]], Camera]:
-    """Detect the board in up to 160 evenly spaced frames of a recording.
-
-    Parameters
-    ----------
-    recording
-        Depth images with amplitude, or with colour that is registered to depth.
-    board
-        The checkerboard.
-    image
-        "amplitude" or "color".
+    """Detect the board in up to 160 frames of a recording, see `search_board`.
 
     Returns
     -------
@@ -131,21 +115,12 @@ def board_views(
     views: list[BoardView] = []
     left_out: list[tuple[int, str]] = []
     camera: Camera | None = None
-    for item in recording.images(_MAX_FRAMES):
-        grey = board_image(item, image)
-        if grey is None:
-            other = "color" if image == "amplitude" else "amplitude"
-            raise InputError(
-                f"frame {item.index} has no {image} on the pixels of its depth",
-                where=recording.path,
-                remedy=f"use --image {other}, or record it",
-            )
-        camera = camera or item.camera
-        corners = find_corners(grey, board)
+    for frame, corners in search_board(recording, board, image, _MAX_FRAMES):
+        camera = camera or frame.camera
         if corners is None:
-            left_out.append((item.index, "the board was not found"))
+            left_out.append((frame.index, "the board was not found"))
         else:
-            views.append(BoardView(item.index, corners))
+            views.append(BoardView(frame.index, corners))
     if camera is None:
         raise InputError("has no readable frame", where=recording.path)
     return views, left_out, camera
@@ -172,12 +147,6 @@ def calibrate_lens(
     InputError
         If too few views show the board, or they are too similar to determine the lens.
     """
-    if model not in MODELS:
-        raise InputError(
-            f"there is no lens model {model!r}",
-            where="--model",
-            remedy=f"use one of {', '.join(MODELS)}",
-        )
     views, left_out, before = board_views(recording, board, image)
     detected = len(views)
     views, similar = _distinct(views)
@@ -270,13 +239,12 @@ def _check_spread(recording: Recording, fit: _Fit) -> None:
 
 def _covered(views: Sequence[BoardView], size: tuple[int, int]) -> float:
     """Return the fraction of a grid's cells that lie within the corners of a view."""
-    covered = np.zeros((_CELLS, _CELLS), bool)
-    v, u = (np.mgrid[0:_CELLS, 0:_CELLS] + 0.5) / _CELLS
+    covered = np.zeros((_CELLS, _CELLS), np.uint8)
     for view in views:
-        hull = cv2.convexHull(view.corners.astype(np.float32))
-        for i, j in np.ndindex(covered.shape):
-            at = (float(u[i, j] * size[0]), float(v[i, j] * size[1]))
-            covered[i, j] |= cv2.pointPolygonTest(hull, at, False) >= 0
+        cells = cv2.convexHull(
+            ((view.corners + 0.5) / size * _CELLS - 0.5).round().astype(np.int32)
+        )
+        cv2.fillConvexPoly(covered, cells, 1)
     return float(covered.mean())
 
 
@@ -298,24 +266,18 @@ def _rms(values: Float64) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-_NO_RATIONAL = cv2.CALIB_FIX_K4 | cv2.CALIB_FIX_K5 | cv2.CALIB_FIX_K6
-# Flags that fix coefficients to 0, and the names of the free ones; the last variant is the full
-# one.
-_VARIANTS: dict[str, tuple[tuple[int, tuple[str, ...]], ...]] = {
-    "pinhole": (
-        (
-            cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
-            (),
-        ),
-    ),
+# The free coefficients of each variant of a model, the full one last; the others are 0.
+_VARIANTS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "pinhole": ((),),
     "brown": (
-        (cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST, ("k1",)),
-        (cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST, ("k1", "k2")),
-        (cv2.CALIB_FIX_K3, ("k1", "k2", "p1", "p2")),
-        (cv2.CALIB_ZERO_TANGENT_DIST, ("k1", "k2", "k3")),
-        (0, ("k1", "k2", "p1", "p2", "k3")),
+        ("k1",),
+        ("k1", "k2"),
+        ("k1", "k2", "p1", "p2"),
+        ("k1", "k2", "k3"),
+        ("k1", "k2", "p1", "p2", "k3"),
     ),
-    "rational": ((cv2.CALIB_RATIONAL_MODEL, DISTORTION_ORDER["rational"]),),
+    "rational": (DISTORTION_ORDER["rational"],),
+    "fisheye": (DISTORTION_ORDER["fisheye"],),
 }
 
 
@@ -324,17 +286,16 @@ def _fit_lens(
 ) -> _Fit:
     """Fit a lens to views, selecting the variant with the smallest information criterion."""
     try:
-        if model == "fisheye":
-            return _fit_fisheye(views, board, size)
+        start = _initial_fit(views, board, size)
         count = 2 * sum(len(view.corners) for view in views)
         best: tuple[float, _Fit] | None = None
-        for flags, names in _VARIANTS[model]:
-            fit = _fit_opencv(model, flags, names, views, board, size)
+        for names in _VARIANTS[model]:
+            fit = _least_squares(MODELS[model], names, start, views, board)
             parameters = len(_INTRINSIC) + len(names) + 6 * len(views)
             score = count * np.log(fit.squares / count) + parameters * np.log(count)
             if best is None or score < best[0]:
                 best = score, fit
-    except (cv2.error, InputError, np.linalg.LinAlgError) as error:
+    except (cv2.error, InputError, np.linalg.LinAlgError, ValueError) as error:
         raise InputError(
             f"shows the board from {len(views)} viewpoints that no {model} lens fits",
             where=path,
@@ -344,96 +305,60 @@ def _fit_lens(
     return best[1]
 
 
-def _fit_opencv(
-    model: str,
-    flags: int,
+def _initial_fit(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> _Fit:
+    """Return a fit with one radial coefficient, from which all models converge."""
+    corners = [view.corners.astype(np.float32) for view in views]
+    points = [board.points] * len(views)
+    K = cv2.initCameraMatrix2D(points, corners, size)
+    camera = Pinhole(*size, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+    poses = [board_pose(camera, view.corners, board) for view in views]
+    if any(pose is None for pose in poses):
+        raise ValueError("a view has no pose")
+    start = _Fit(camera, {}, [pose[0] for pose in poses if pose is not None], np.zeros(0), 0.0)
+    return _least_squares(MODELS["brown"], ("k1",), start, views, board)
+
+
+def _least_squares(
+    model: type[Pinhole],
     names: tuple[str, ...],
-    views: Sequence[BoardView],
-    board: Board,
-    size: tuple[int, int],
-) -> _Fit:
-    all_flags = flags if model == "rational" else flags | _NO_RATIONAL
-    out = cv2.calibrateCameraExtended(
-        [board.points] * len(views),
-        [view.corners.astype(np.float32) for view in views],
-        size,
-        np.eye(3),
-        np.zeros(8),
-        flags=all_flags,
-    )
-    K, distortion, rvecs, tvecs, deviations = out[1], out[2].ravel(), out[3], out[4], out[5].ravel()
-    order = DISTORTION_ORDER["rational"]
-    values = {n: float(v) for n, v in zip(order, distortion, strict=False) if n in names}
-    camera = MODELS[model](
-        size[0], size[1], float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), **values
-    )
-    deviation = dict(zip((*_INTRINSIC, *order), deviations.tolist(), strict=False))
-    sigma = {name: deviation[name] for name in (*_INTRINSIC, *names)}
-    poses = [pose_of(r, t) for r, t in zip(rvecs, tvecs, strict=True)]
-    return _evaluate(camera, sigma, poses, views, board)
-
-
-def _evaluate(
-    camera: Pinhole,
-    sigma: dict[str, float],
-    poses: list[Float64],
+    start: _Fit,
     views: Sequence[BoardView],
     board: Board,
 ) -> _Fit:
-    errors = [_reprojection_errors(camera, T, v, board) for T, v in zip(poses, views, strict=True)]
-    squares = np.array([(m**2).sum() for m in errors])
-    return _Fit(camera, sigma, poses, np.sqrt(squares / len(board.points)), float(squares.sum()))
+    """Fit the named coefficients, intrinsics and all poses, from other intrinsics and poses."""
+    free = (*_INTRINSIC, *names)
+    width, height = start.camera.width, start.camera.height
+    lens = np.array([*(getattr(start.camera, n) for n in _INTRINSIC), *[0.0] * len(names)])
+    # Parameters are scaled to steps of similar effect: ratios, radians.
+    scale = np.array([*lens[:2], *lens[:2], *[1.0] * len(names)])
+    first_poses, points = np.array(start.poses), board.points.astype(float)
 
-
-def _reprojection_errors(camera: Pinhole, T: Float64, view: BoardView, board: Board) -> Float64:
-    return camera.project(se3.transform(T, board.points.astype(float))) - view.corners
-
-
-def _fit_fisheye(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> _Fit:
-    """Run least squares over lens and poses, initialised by a lens with one radial coefficient.
-
-    OpenCV's function needs a good initial value, and returns no standard deviations.
-    """
-    flags, names = _VARIANTS["brown"][1]
-    start = _fit_opencv("brown", flags, names, views, board, size)
-    order = names_of("fisheye")
-    lens = np.array([*(getattr(start.camera, n) for n in _INTRINSIC), 0.0, 0.0, 0.0, 0.0])
-    # Parameters are scaled to steps of similar effect: pixels, ratios, radians.
-    scale = np.array([*lens[:2], *lens[:2], 1.0, 1.0, 1.0, 1.0])
-
-    def camera_of(x: Float64) -> Fisheye:
-        return Fisheye(*size, *(float(v) for v in lens + x[:8] * scale))
-
-    def poses_of(x: Float64) -> list[Float64]:
-        steps = x[8:].reshape(-1, 6)
-        return [T @ se3.exp(step) for T, step in zip(start.poses, steps, strict=True)]
+    def unpacked(x: Float64) -> tuple[Pinhole, Float64]:
+        values = (lens + x[: len(free)] * scale).tolist()
+        camera = model(width, height, **dict(zip(free, values, strict=True)))
+        return camera, first_poses @ se3.exp(x[len(free) :].reshape(-1, 6))
 
     def errors(x: Float64) -> Float64:
-        camera = camera_of(x)
-        parts = [
-            _reprojection_errors(camera, T, v, board)
-            for T, v in zip(poses_of(x), views, strict=True)
-        ]
-        return np.concatenate(parts).ravel()
+        camera, poses = unpacked(x)
+        seen = camera.project(np.concatenate([se3.transform(T, points) for T in poses]))
+        return (seen - np.concatenate([view.corners for view in views])).ravel()
+
+    # A pose affects the corners of its own view only, so all poses are perturbed at once.
+    count = len(views)
+    own = np.kron(np.eye(count), np.ones((2 * len(points), 6)))
+    axes = block_diag(np.eye(len(free)), np.tile(np.eye(6), count))
 
     def jacobian(x: Float64) -> Float64:
-        base, step = errors(x), 1e-6
-        J = np.zeros((base.size, x.size))
-        for k in range(8):
-            J[:, k] = (errors(x + step * np.eye(x.size)[k]) - base) / step
-        rows = 2 * len(board.points)
-        # A pose affects the corners of its own view only, so all poses are perturbed at once.
-        for axis in range(6):
-            perturbed = x.copy()
-            perturbed[8 + axis :: 6] += step
-            derivatives = ((errors(perturbed) - base) / step).reshape(-1, rows)
-            for view in range(len(views)):
-                J[view * rows : (view + 1) * rows, 8 + 6 * view + axis] = derivatives[view]
-        return J
+        base = errors(x)
+        J = np.stack([(errors(x + _STEP * axis) - base) / _STEP for axis in axes], 1)
+        return np.hstack([J[:, : len(free)], own * np.tile(J[:, len(free) :], count)])
 
-    solution = least_squares(errors, np.zeros(8 + 6 * len(views)), jac=jacobian, method="lm")
+    solution = least_squares(errors, np.zeros(axes.shape[1]), jacobian, method="lm")
     freedom = max(solution.fun.size - solution.x.size, 1)
-    covariance = np.linalg.inv(solution.jac.T @ solution.jac)[:8, :8] * 2 * solution.cost / freedom
-    deviations = np.sqrt(np.diag(covariance)) * scale
-    sigma = dict(zip(order, deviations.tolist(), strict=True))
-    return _evaluate(camera_of(solution.x), sigma, poses_of(solution.x), views, board)
+    information = solution.jac.T @ solution.jac
+    covariance = np.linalg.inv(information) * 2 * solution.cost / freedom
+    deviations = np.sqrt(np.diag(covariance)[: len(free)]) * scale
+    camera, poses = unpacked(solution.x)
+    squares = (solution.fun**2).reshape(count, -1).sum(1)
+    sigma = dict(zip(free, deviations.tolist(), strict=True))
+    return _Fit(camera, sigma, list(poses), np.sqrt(squares / len(points)), float(squares.sum()))

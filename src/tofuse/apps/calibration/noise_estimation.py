@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.optimize import nnls
 from scipy.stats import chi2
 
-from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame, Recording
+from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame, Recording
 from tofuse.engine.noise import (
     AmplitudeLaw,
     ConfidenceLaw,
@@ -72,7 +73,7 @@ class NoiseFit:
         Numbers of frames in static segments, of segments, and of pixels in all segments.
     rms_log_error
         Rms, over the bins, of the log ratio of predicted to measured sigma: 0.1 is about 10 %.
-    before
+    rms_log_error_before
         The same of the model that is used without a fit.
     bins
         Of the law that applies.
@@ -86,23 +87,14 @@ class NoiseFit:
     stretches: int
     pixels: int
     rms_log_error: float
-    before: float
+    rms_log_error_before: float
     bins: tuple[NoiseBin, ...] = field(repr=False)
     warnings: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        return {
-            "model": self.model.to_dict(),
-            "law": self.law,
-            "frames": self.frames,
-            "stretches": self.stretches,
-            "pixels": self.pixels,
-            "rms_log_error": self.rms_log_error,
-            "rms_log_error_before": self.before,
-            "bins": [vars(item) for item in self.bins],
-            "warnings": list(self.warnings),
-        }
+        bins = [vars(item) for item in self.bins]
+        return {**vars(self), "model": self.model.to_dict(), "bins": bins}
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,10 +127,11 @@ class _Samples:
     slant: Float64
     before: Float64
 
+    @cached_property
     def median_unbiased(self) -> Float64:
-        """Return variances scaled so that their median instead of their mean is unbiased."""
+        """Variances scaled so that their median instead of their mean is unbiased."""
         values, index = np.unique(self.freedom, return_inverse=True)
-        return self.variance / (chi2.median(values) / values)[index]
+        return np.asarray(self.variance / (chi2.median(values) / values)[index], np.float64)
 
 
 def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
@@ -161,16 +154,18 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
     InputError
         If no three frames are static, the frames are copies, or the depths are implausible.
     """
-    if not isinstance(_first_frame(recording), RangeFrame):
-        raise InputError(
-            "contains clouds", where=recording.path, remedy="pass a recording of depth images"
-        )
+    if not recording.images(1):
+        raise InputError("has no readable frame", where=recording.path)
     prior = noise_model_for(recording)
     stretches = [
         (a, b) for a, b in still.stationary_intervals(recording, prior) if b - a >= MIN_FRAMES
     ]
     if not stretches:
-        raise _not_static_error(recording)
+        raise InputError(
+            f"has {len(recording)} frames, and no {MIN_FRAMES} consecutive static frames",
+            where=recording.path,
+            remedy="record ten frames or more with the camera on a stand, nothing moving",
+        )
     samples = _concatenate([_segment_samples(recording, a, b, prior) for a, b in stretches])
     if len(samples.variance) < 10 * _MIN_PIXELS:
         raise InputError(
@@ -193,74 +188,39 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
     return _fit(recording, samples, prior, name or prior.name, stretches)
 
 
-def _first_frame(recording: Recording) -> Frame:
-    frame = recording.first_readable()
-    if frame is None:
-        raise InputError("has no readable frame", where=recording.path)
-    return frame
-
-
-def _not_static_error(recording: Recording) -> InputError:
-    if len(recording) < MIN_FRAMES:
-        return InputError(
-            f"has {len(recording)} frames; at least {MIN_FRAMES} are needed",
-            where=recording.path,
-            remedy="record ten frames or more with the camera on a stand",
-        )
-    return InputError(
-        f"has no {MIN_FRAMES} consecutive static frames",
-        where=recording.path,
-        remedy="record ten frames or more with the camera on a stand, nothing moving",
-    )
-
-
-class _Moments:
-    """Incremental mean and variance of each pixel over the frames of a segment (Welford 1962)."""
-
-    def __init__(self, first: RangeFrame) -> None:
-        shape = first.depth.shape
-        self.slant = ray_lengths(first.camera).astype(float)
-        self.frames = 0
-        self.mean, self.moment, self.before = (np.zeros(shape) for _ in range(3))
-        self.counts, self.level = np.zeros(shape), np.zeros(shape)
-        # Intermittently valid pixels are at the detection limit or at edges, and are excluded.
-        self.valid = np.isfinite(self.slant)
-
-    def add(self, frame: RangeFrame, prior: NoiseModel) -> None:
-        """Add the next frame."""
-        self.frames += 1
-        self.valid &= frame.valid
-        distance = frame.radial_range.astype(float)
-        step = distance - self.mean
-        self.mean += step / self.frames
-        self.moment += step * (distance - self.mean)
-        self.before += prior.sigma(frame).astype(float) ** 2
-        self.counts += _raw_counts(frame)
-        level = frame.confidence_image
-        self.level += np.nan if level is None else level
-
-    def samples(self) -> _Samples:
-        """Return the pixels that were valid in all frames."""
-        n, valid = self.frames, self.valid
-        return _Samples(
-            self.moment[valid] / (n - 1),
-            np.full(int(valid.sum()), n - 1.0),
-            self.mean[valid],
-            self.counts[valid] / n,
-            np.rint(self.level[valid] / n),
-            self.slant[valid],
-            self.before[valid] / n,
-        )
-
-
 def _segment_samples(recording: Recording, start: int, stop: int, prior: NoiseModel) -> _Samples:
-    moments: _Moments | None = None
+    first: RangeFrame | None = None
     for frame in recording.select(start, stop):
         assert isinstance(frame, RangeFrame)
-        moments = moments or _Moments(frame)
-        moments.add(frame, prior)
-    assert moments is not None
-    return moments.samples()
+        if first is None:
+            first, count = frame, 0
+            slant = ray_lengths(frame.camera).astype(float)
+            valid = np.isfinite(slant)
+            sums, squares = np.zeros((4, *slant.shape)), np.zeros(slant.shape)
+        # Intermittently valid pixels are at the detection limit or at edges, and are excluded.
+        valid &= frame.valid
+        count += 1
+        step = frame.radial_range.astype(float) - first.radial_range
+        level = frame.confidence_image
+        sums += [
+            step,
+            _raw_counts(frame),
+            np.full(step.shape, np.nan) if level is None else level,
+            prior.sigma(frame).astype(float) ** 2,
+        ]
+        squares += step**2
+    assert first is not None
+    mean_step, counts, levels, before = sums[:, valid] / count
+    variance = (squares[valid] - count * mean_step**2) / (count - 1)
+    return _Samples(
+        np.maximum(variance, 0.0),
+        np.full(len(variance), count - 1.0),
+        first.radial_range[valid] + mean_step,
+        counts,
+        np.rint(levels),
+        slant[valid],
+        before,
+    )
 
 
 def _concatenate(parts: Sequence[_Samples]) -> _Samples:
@@ -279,20 +239,24 @@ def _raw_counts(frame: RangeFrame) -> Float64:
     return np.where(valid, counts, np.nan)
 
 
+# Columns of a table of bins: the limits of a bin, medians of its pixels, and their number.
+_LOW, _HIGH, _CENTRE, _PIXELS, _VARIANCE, _BEFORE = range(6)
+
+
 @dataclass(frozen=True, eq=False)
-class _Binned:
-    """Medians over bins; (K,) each, `edges` (K, 2)."""
+class _Candidate:
+    """A fitted law: the variance that it predicts for each pixel (NaN: none) and for each bin."""
 
-    edges: Float64
-    centre: Float64
-    pixels: Float64
+    kind: Law
+    law: AmplitudeLaw | ConfidenceLaw | RangeLaw
     variance: Float64
-    before: Float64
+    bins: Float64
+    predicted: Float64
 
 
-def _bin(key: Float64, samples: _Samples, edges: Float64) -> _Binned:
-    """Return the medians of the pixels whose key lies between consecutive edges."""
-    variances = samples.median_unbiased()
+def _bin(key: Float64, samples: _Samples, edges: Float64) -> Float64:
+    """Return the table (K, 6) of the pixels whose key lies between consecutive edges."""
+    variances = samples.median_unbiased
     bin_of = np.searchsorted(edges, key, side="right") - 1
     rows = []
     for k in range(len(edges) - 1):
@@ -305,8 +269,7 @@ def _bin(key: Float64, samples: _Samples, edges: Float64) -> _Binned:
         if variance > 0:
             centre, before = np.median(key[inside]), np.median(samples.before[inside])
             rows.append((edges[k], edges[k + 1], centre, inside.sum(), variance, before))
-    table = np.array(rows, float).reshape(-1, 6)
-    return _Binned(table[:, :2], *table[:, 2:].T)
+    return np.array(rows, float).reshape(-1, 6)
 
 
 def _quantile_edges(key: Float64, *, log: bool) -> Float64:
@@ -335,82 +298,76 @@ def _nonnegative_fit(columns: Float64, target: Float64, pixels: Float64) -> Floa
     return x
 
 
-def _fit_amplitude(
-    samples: _Samples, falloff: float, ceiling: float
-) -> tuple[AmplitudeLaw, _Binned] | None:
-    """Return the law and the bins it was fitted to; None without amplitude."""
-    with np.errstate(invalid="ignore"):
+def _amplitude_candidates(
+    samples: _Samples, falloffs: Sequence[float], ceiling: float
+) -> Iterator[_Candidate]:
+    """Yield a law for each falloff; none without amplitude."""
+    for falloff in falloffs:
         key = samples.counts * samples.slant**-falloff
-    valid = np.isfinite(key) & (key > 0)
-    if valid.sum() < 10 * _MIN_PIXELS:
-        return None
-    bins = _bin(np.where(valid, key, -1), samples, _quantile_edges(key[valid], log=True))
-    bins = _select(bins, bins.variance < (_MAX_LINEAR * ceiling) ** 2)
-    if len(bins.centre) < 3:
-        return None
-    amplitude = bins.centre
-    columns = np.stack([np.ones_like(amplitude), 1 / amplitude, 1 / amplitude**2], 1)
-    floor2, shot2, dark2 = _nonnegative_fit(columns, bins.variance, bins.pixels)
-    if shot2 == 0 and dark2 == 0:
-        return None
-    law = AmplitudeLaw(math.sqrt(shot2), math.sqrt(dark2), math.sqrt(floor2), falloff)
-    return law, bins
+        valid = np.isfinite(key) & (key > 0)
+        if valid.sum() < 10 * _MIN_PIXELS:
+            continue
+        bins = _bin(np.where(valid, key, -1), samples, _quantile_edges(key[valid], log=True))
+        bins = bins[bins[:, _VARIANCE] < (_MAX_LINEAR * ceiling) ** 2]
+        if len(bins) < 3:
+            continue
+        columns = bins[:, [_CENTRE]] ** [0, -1, -2]
+        floor2, shot2, dark2 = _nonnegative_fit(columns, bins[:, _VARIANCE], bins[:, _PIXELS])
+        if shot2 == 0 and dark2 == 0:
+            continue
+        law = AmplitudeLaw(math.sqrt(shot2), math.sqrt(dark2), math.sqrt(floor2), falloff)
+        counts = np.where(valid, key, np.nan)
+        variance = floor2 + shot2 / counts + dark2 / counts**2
+        yield _Candidate("amplitude", law, variance, bins, columns @ [floor2, shot2, dark2])
 
 
-def _fit_confidence(samples: _Samples) -> tuple[ConfidenceLaw, _Binned] | None:
+def _confidence_candidates(samples: _Samples) -> Iterator[_Candidate]:
+    """Yield laws with several powers of the range; none without confidence."""
     valid = np.isfinite(samples.level)
     if valid.sum() < 10 * _MIN_PIXELS:
-        return None
-    max_level = int(samples.level[valid].max())
-    edges: Float64 = np.arange(max_level + 2, dtype=float) - 0.5
-    key = np.where(valid, samples.level, -1)
-    best: tuple[float, ConfidenceLaw] | None = None
+        return
+    key = np.where(valid, samples.level, -1).astype(int)
+    edges: Float64 = np.arange(key.max() + 2, dtype=float) - 0.5
     bins = _bin(key, samples, edges)
-    if len(bins.centre) < 2:
-        return None
+    if len(bins) < 2:
+        return
+    levels = bins[:, _CENTRE].astype(int)
+    ranges = np.array([np.median(samples.range_m[key == level]) for level in levels])
     for power in (0.0, 1.0, 2.0):
         at_1_m = replace(samples, variance=samples.variance / samples.range_m ** (2 * power))
-        bins_at_1_m = _bin(key, at_1_m, edges)
-        table = np.interp(
-            np.arange(max_level + 1), bins_at_1_m.centre, np.sqrt(bins_at_1_m.variance)
-        )
+        known = _bin(key, at_1_m, edges)
+        table = np.interp(np.arange(key.max() + 1), known[:, _CENTRE], known[:, _VARIANCE] ** 0.5)
         # Enforce monotony: higher levels have less noise.
         table = np.minimum(np.minimum.accumulate(table), _MAX_NOISE_M)
         law = ConfidenceLaw(tuple(float(f"{v:.4g}") for v in table), power)
-        sigma = table[np.clip(np.nan_to_num(samples.level), 0, max_level).astype(int)]
-        score = _log_misfit(samples, (sigma * samples.range_m**power) ** 2, valid)
-        if best is None or score < 0.99 * best[0]:
-            best = score, law
-    assert best is not None
-    return best[1], bins
+        variance = np.where(valid, (table[key] * samples.range_m**power) ** 2, np.nan)
+        yield _Candidate("confidence", law, variance, bins, (table[levels] * ranges**power) ** 2)
 
 
-def _fit_range(samples: _Samples) -> tuple[RangeLaw, _Binned]:
+def _range_candidate(samples: _Samples) -> _Candidate:
     bins = _bin(samples.range_m, samples, _quantile_edges(samples.range_m, log=False))
-    if len(bins.centre) == 0:
+    if len(bins) == 0:
         edges = np.array([samples.range_m.min(), np.nextafter(samples.range_m.max(), np.inf)])
         bins = _bin(samples.range_m, samples, edges)
-    columns = np.stack([np.ones_like(bins.centre), bins.centre**2], 1)
+    columns = bins[:, [_CENTRE]] ** [0, 2]
     if not _has_range_variation(samples):
         # a and b are not separable; the quadratic law is conservative for farther surfaces.
         columns[:, 0] = 0
-    a, b = _nonnegative_fit(columns, np.sqrt(bins.variance), bins.pixels)
-    return RangeLaw(min(float(a), _MAX_NOISE_M), min(float(b), 1.0)), bins
+    a, b = _nonnegative_fit(columns, np.sqrt(bins[:, _VARIANCE]), bins[:, _PIXELS])
+    law = RangeLaw(min(float(a), _MAX_NOISE_M), min(float(b), 1.0))
+    variance = (law.a + law.b * samples.range_m**2) ** 2
+    return _Candidate("range", law, variance, bins, (law.a + law.b * bins[:, _CENTRE] ** 2) ** 2)
 
 
-def _select(bins: _Binned, mask: Bool) -> _Binned:
-    return _Binned(**{f.name: getattr(bins, f.name)[mask] for f in fields(_Binned)})
-
-
-def _log_misfit(samples: _Samples, predicted: Float64, mask: Bool) -> float:
+def _log_misfit(samples: _Samples, predicted: Float64) -> float:
     """Return the median absolute difference between pixels' log variances and the prediction.
 
     It is above 0 even for a perfect law, due to the small number of frames.
     """
-    valid = mask & (samples.variance > 0) & (predicted > 0)
+    valid = (samples.variance > 0) & (predicted > 0)
     if not valid.any():
         return math.inf
-    return float(np.median(np.abs(np.log(samples.median_unbiased()[valid] / predicted[valid]))))
+    return float(np.median(np.abs(np.log(samples.median_unbiased[valid] / predicted[valid]))))
 
 
 def _fit(
@@ -424,69 +381,33 @@ def _fit(
     ambiguity = recording.metadata.get("ambiguity_m")
     if isinstance(ambiguity, int | float) and 0 < ambiguity <= _MAX_RANGE_M:
         ceiling = float(ambiguity) / math.sqrt(12)
-    range_law, range_bins = _fit_range(samples)
-    all_pixels = np.ones(len(samples.variance), bool)
-    variance = (range_law.a + range_law.b * samples.range_m**2) ** 2
-    best_misfit = _log_misfit(samples, variance, all_pixels)
-    law: Law = "range"
-    bins, predicted = range_bins, (range_law.a + range_law.b * range_bins.centre**2) ** 2
-
-    confidence = None
-    table = _fit_confidence(samples)
-    if table is not None:
-        confidence, levels = table
-        sigma = np.array(confidence.sigma_m)
-        pixel_sigma = sigma[np.clip(np.nan_to_num(samples.level), 0, len(sigma) - 1).astype(int)]
-        valid_level = np.isfinite(samples.level)
-        score = _log_misfit(
-            samples, (pixel_sigma * samples.range_m**confidence.power) ** 2, valid_level
-        )
-        if score > _EQUIVALENT_RATIO * best_misfit:
-            confidence = None
-        else:
-            best_misfit, law, bins = min(best_misfit, score), "confidence", levels
-            mean_range = [
-                float(np.median(samples.range_m[samples.level == k])) for k in levels.centre
-            ]
-            bin_sigma = sigma[levels.centre.astype(int)] * np.array(mean_range) ** confidence.power
-            predicted = bin_sigma**2
-
-    amplitude = None
-    for falloff in _falloffs(recording, prior):
-        fitted = _fit_amplitude(samples, falloff, ceiling)
-        if fitted is None:
-            continue
-        counts = samples.counts * samples.slant**-falloff
-        valid = np.isfinite(counts) & (counts > 0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            score = _log_misfit(samples, _amplitude_variance(fitted[0], counts), valid)
-        if score <= (_EQUIVALENT_RATIO if amplitude is None else 0.99) * best_misfit:
-            best_misfit, law, bins = min(best_misfit, score), "amplitude", fitted[1]
-            amplitude = fitted[0]
-            predicted = _amplitude_variance(amplitude, bins.centre)
-
-    model = NoiseModel(
-        name,
-        range_law,
-        amplitude,
-        confidence,
-        ceiling_m=ceiling,
-        footprint=prior.footprint,
-    )
-    error = _log_error(predicted, bins)
+    best_misfit = math.inf
+    laws: dict[str, Any] = {}
+    best = by_range = _range_candidate(samples)
+    for candidate in (
+        by_range,
+        *_confidence_candidates(samples),
+        *_amplitude_candidates(samples, _falloffs(recording, prior), ceiling),
+    ):
+        misfit = _log_misfit(samples, candidate.variance)
+        if misfit <= (0.99 if candidate.kind in laws else _EQUIVALENT_RATIO) * best_misfit:
+            best_misfit, best = min(best_misfit, misfit), candidate
+            laws[candidate.kind] = candidate.law
+    model = NoiseModel(name, **laws, ceiling_m=ceiling, footprint=prior.footprint)
+    error = _log_error(best.predicted, best.bins)
     frames = sum(b - a for a, b in stretches)
     return NoiseFit(
         model,
-        law,
+        best.kind,
         frames,
         len(stretches),
         len(samples.variance),
         error,
-        _log_error(bins.before, bins),
+        _log_error(best.bins[:, _BEFORE], best.bins),
         tuple(
-            NoiseBin(float(low), float(high), int(n), math.sqrt(v), math.sqrt(p))
-            for (low, high), n, v, p in zip(
-                bins.edges, bins.pixels, bins.variance, predicted, strict=True
+            NoiseBin(low, high, int(pixels), math.sqrt(variance), math.sqrt(predicted))
+            for (low, high, _, pixels, variance, _), predicted in zip(
+                best.bins.tolist(), best.predicted.tolist(), strict=True
             )
         ),
         tuple(_warnings(recording, samples, frames, error)),
@@ -500,18 +421,14 @@ def _falloffs(recording: Recording, prior: NoiseModel) -> list[float]:
     return [4.0 if prior.amplitude is None else prior.amplitude.falloff, 0.0]
 
 
-def _amplitude_variance(law: AmplitudeLaw, counts: Float64) -> Float64:
-    return law.floor**2 + law.shot**2 / counts + (law.dark / counts) ** 2
-
-
 def _has_range_variation(samples: _Samples) -> bool:
     """Whether the pixels' ranges vary enough to determine how noise grows with range."""
     low, high = np.quantile(samples.range_m, _RANGE_QUANTILES)
     return bool(high >= 1.5 * low)
 
 
-def _log_error(predicted: Float64, bins: _Binned) -> float:
-    return float(np.sqrt((np.log(predicted / bins.variance) ** 2).mean()) / 2)
+def _log_error(predicted: Float64, bins: Float64) -> float:
+    return float(np.sqrt((np.log(predicted / bins[:, _VARIANCE]) ** 2).mean()) / 2)
 
 
 def _warnings(recording: Recording, samples: _Samples, frames: int, error: float) -> list[str]:

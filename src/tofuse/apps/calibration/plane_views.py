@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from tofuse.apps.calibration.board import Board, board_image, find_corners
-from tofuse.apps.calibration.board_pose import board_pose
+from tofuse.apps.calibration.board import Board, board_pose, search_board
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.cameras import Camera, depth_conversion, ray_lengths
 from tofuse.engine.errors import InputError
@@ -80,16 +79,8 @@ def board_planes(
     """
     noise = noise_model_for(recording)
     views, camera = [], None
-    for frame in recording.images(_MAX_FRAMES):
+    for frame, corners in search_board(recording, board, image, _MAX_FRAMES):
         camera = camera or frame.camera
-        grey = board_image(frame, image)
-        if grey is None:
-            raise InputError(
-                f"frame {frame.index} has no {image} on the pixels of its depth",
-                where=recording.path,
-                remedy="use --image, or omit --board to use planes of the scene",
-            )
-        corners = find_corners(grey, board)
         pose = None if corners is None else board_pose(frame.camera, corners, board)
         if pose is None or pose[1] > _MAX_BOARD_PX:
             continue
@@ -142,19 +133,10 @@ def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[Pla
         rng = np.random.default_rng([seed, frame.index])
         assigned = np.zeros(frame.depth.shape, bool)
         view = prepare_view(frame, SurfaceOptions())
-        for detected in detect_planes(
-            view,
-            rng,
-            max_planes=planes,
-            min_fraction=0.1,
-            thickness=0.01,
-        ):
-            plane = detected.normal / detected.offset
-            mask = (
-                _near_plane(frame, plane, noise)
-                & _parallel_surfaces(frame, view, plane)
-                & ~assigned
-            )
+        found = detect_planes(view, rng, max_planes=planes, min_fraction=0.1, thickness=0.01)
+        for plane in (detected.normal / detected.offset for detected in found):
+            mask = _near_plane(frame, plane, noise) & _parallel_surfaces(frame, view, plane)
+            mask &= ~assigned
             assigned |= mask
             views += _plane_views(frame, plane, np.eye(3) * _NO_INFORMATION, mask, noise)
     if camera is None or not views:
@@ -198,8 +180,6 @@ def _plane_views(
     sigma = noise.sigma(frame).astype(float)
     rays = frame.camera.rays().astype(float)
     pixels = np.flatnonzero(mask & (sigma > 0) & np.isfinite(rays).all(-1))
-    if len(pixels) < _MIN_PIXELS:
-        return []
     homogeneous = np.concatenate([rays.reshape(-1, 2)[pixels], np.ones((len(pixels), 1))], 1)
     directions = homogeneous / ray_lengths(frame.camera).ravel()[pixels, None]
     frontal = directions @ plane > _MIN_COSINE * np.linalg.norm(plane)

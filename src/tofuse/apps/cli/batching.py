@@ -6,11 +6,11 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from difflib import get_close_matches
+from dataclasses import asdict
 
 from tofuse.apps.batch import (
     BatchFolder,
+    DaskWorkers,
     Job,
     LocalWorkers,
     Record,
@@ -21,9 +21,9 @@ from tofuse.apps.batch import (
     status_of,
     write_table,
 )
-from tofuse.apps.cli.commands import VERDICT_COLORS, make_console
+from tofuse.apps.cli.commands import VERDICT_COLORS, show
 from tofuse.apps.cli.options import Batch
-from tofuse.apps.cli.progress import emit, progress_for
+from tofuse.apps.cli.progress import emit, escaped, progress_for
 from tofuse.apps.cli.run_arguments import run_arguments
 from tofuse.engine.compute import usable_cores
 from tofuse.engine.errors import Ended, InputError, TofuseError
@@ -35,8 +35,9 @@ _MAX_LISTED = 10  # recordings without a result that the summary names
 def batch(arguments: Batch) -> int:
     """Do all pending jobs, and print a summary."""
     jobs = read_jobs(arguments.recordings, run_arguments)
-    jobs = tuple(replace(j, memory=j.memory or arguments.memory) for j in jobs)
-    selected = _selected(jobs, arguments)
+    for name in set(arguments.only or ()) - {job.name for job in jobs}:
+        raise InputError(f"there is no job {name}", where="--only", remedy="see --print-jobs")
+    selected = [job for job in jobs if arguments.only is None or job.name in arguments.only]
     folder = BatchFolder(arguments.out.absolute())
     remaining = pending(selected, folder, overwrite=arguments.overwrite)
     if arguments.print_jobs:
@@ -60,23 +61,7 @@ def batch(arguments: Batch) -> int:
             if status_of(selected, folder) == 2:
                 raise
             print(f"tofuse: {error}", file=sys.stderr)  # there are results: status 3, not 2
-    return _print_summary(selected, folder, as_json=arguments.json)
-
-
-def _selected(jobs: Sequence[Job], arguments: Batch) -> list[Job]:
-    """The jobs of --only, or all."""
-    if arguments.only is None:
-        return list(jobs)
-    names = [job.name for job in jobs]
-    for name in arguments.only:
-        if name not in names:
-            suggestions = get_close_matches(name, names, 1)
-            raise InputError(
-                f"there is no job {name}",
-                where="--only",
-                remedy=f"did you mean {suggestions[0]}?" if suggestions else "see --print-jobs",
-            )
-    return [job for job in jobs if job.name in arguments.only]
+    return _summary(arguments, selected, folder)
 
 
 def _command_line(arguments: Batch, job: Job) -> str:
@@ -95,7 +80,13 @@ def _run(
     remaining: Sequence[Job],
     folder: BatchFolder,
 ) -> None:
-    workers, threads = _workers(arguments, len(remaining))
+    if arguments.scheduler is None:
+        count = min(arguments.workers or 1, len(remaining))
+        workers: Workers = LocalWorkers(count)
+        threads = max(1, usable_cores() // count)
+    else:
+        # A worker has a thread per core that it may use, and each thread does one job.
+        workers, threads = DaskWorkers(arguments.scheduler), 1
     try:
         folder.prepare()
         with progress_for(as_json=arguments.json) as progress:
@@ -111,7 +102,7 @@ def _run(
                 remaining,
                 folder,
                 workers,
-                threads=threads,
+                threads=arguments.threads or threads,
                 retries=_RETRIES if arguments.retries is None else arguments.retries,
                 on_ended=on_ended,
                 note=progress.note,
@@ -120,18 +111,7 @@ def _run(
         workers.close()
 
 
-def _workers(arguments: Batch, jobs: int) -> tuple[Workers, int]:
-    """The workers, and the number of threads of each job."""
-    if arguments.scheduler is not None:
-        from tofuse.apps.batch import DaskWorkers
-
-        # A worker has a thread per core that it may use, and each thread does one job.
-        return DaskWorkers(arguments.scheduler), arguments.threads or 1
-    count = min(arguments.workers or 1, jobs)
-    return LocalWorkers(count), arguments.threads or max(1, usable_cores() // count)
-
-
-def _print_summary(selected: Sequence[Job], folder: BatchFolder, *, as_json: bool) -> int:
+def _summary(arguments: Batch, selected: Sequence[Job], folder: BatchFolder) -> int:
     """Print a summary, and return the exit status."""
     records = {job.name: folder.record(job) for job in selected}
     verdicts = Counter(r.verdict for r in records.values() if r is not None and r.state == "done")
@@ -142,29 +122,18 @@ def _print_summary(selected: Sequence[Job], folder: BatchFolder, *, as_json: boo
         raise InputError(
             f"none of {len(selected)} recordings gave a result; {name}: {reason}", where=folder.html
         )
-    if as_json:
-        emit(
-            {
-                "event": "result",
-                "out": str(folder.path),
-                "jobs": len(selected),
-                "done": done,
-                "failed": len(failed),
-                "verdicts": dict(verdicts),
-            }
-        )
-        return status
-    console = make_console()
-    counts = [
-        f"[{VERDICT_COLORS[v]}]{verdicts[v]} {v}[/]"
-        for v in ("good", "degraded", "failed")
-        if verdicts[v]
-    ]
-    verdict_counts = f": {', '.join(counts)}" if counts else ""
-    console.print(f"{done} of {len(selected)} recordings have a result{verdict_counts}")
-    for name, reason in list(failed.items())[:_MAX_LISTED]:
-        console.print(f"  {name}: {reason}", markup=False)
-    if len(failed) > _MAX_LISTED:
-        console.print(f"  and {len(failed) - _MAX_LISTED} more")
-    console.print(f"see {folder.html}", markup=False)
-    return status
+    facts = {"jobs": len(selected), "done": done, "failed": len(failed), "verdicts": dict(verdicts)}
+    colors = VERDICT_COLORS.items()
+    counts = [f"[{color}]{verdicts[v]} {v}[/]" for v, color in colors if verdicts[v]]
+    listed = [f"  {name}: {reason}" for name, reason in failed.items()][:_MAX_LISTED]
+    others = len(failed) - len(listed)
+    return show(
+        arguments,
+        {"event": "result", "out": str(folder.path), **facts},
+        f"{done} of {len(selected)} recordings have a result"
+        + (f": {', '.join(counts)}" if counts else ""),
+        *map(escaped, listed),
+        *([f"  and {others} more"] if others else []),
+        escaped(f"see {folder.html}"),
+        status=status,
+    )

@@ -1,37 +1,79 @@
-"""``tofuse calibrate``: its subjects, and their summaries."""
+"""``tofuse calibrate`` and ``tofuse noise``: the subjects of calibration, and their summaries."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+from rich.table import Table
+
 from tofuse.apps.calibration import (
     Board,
     board_planes,
     calibrate_depth,
     calibrate_lens,
+    check_new,
     compose,
+    estimate_noise,
     read_lens_file,
     recording_fields,
     scene_planes,
     write_camera_json,
 )
-from tofuse.apps.cli.options import Calibrate
+from tofuse.apps.cli.commands import show, warning_lines
+from tofuse.apps.cli.options import Calibrate, Noise
+from tofuse.apps.cli.progress import escaped
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.cameras import camera_file, read_correction, write_correction
+from tofuse.formats.cameras import camera_file, read_correction, write_correction, write_noise
 from tofuse.formats.files import atomic
 from tofuse.formats.recordings import Opening, open_recording
 
 # Data for JSON, lines to print, and warnings.
 Summary = tuple[dict[str, Any], list[str], list[str]]
 _MAX_LISTED = 8
-_MAX_PLANES = 20
 
 
-def lens(arguments: Calibrate) -> Summary:
+_NOISE_UNITS = {"amplitude": "raw amplitude", "confidence": "confidence", "range": "range (m)"}
+
+
+def calibrate(arguments: Calibrate) -> int:
+    """``tofuse calibrate``."""
+    if arguments.out is not None:
+        check_new(arguments.out, overwrite=arguments.overwrite)
+    subjects = {"lens": _lens, "depth": _depth, "import": _import_lens}
+    data, lines, warnings = subjects[arguments.subject](arguments)
+    return show(arguments, data, *map(escaped, lines), *warning_lines(warnings))
+
+
+def noise(arguments: Noise) -> int:
+    """``tofuse noise``."""
+    if arguments.out is not None:
+        check_new(arguments.out, overwrite=arguments.overwrite)
+    fit = estimate_noise(Opening.of(arguments.inputs, arguments).open(), arguments.name)
+    if arguments.out is not None:
+        write_noise(arguments.out, fit.model)
+    table = Table(_NOISE_UNITS[fit.law], "pixels", "measured (mm)", "model (mm)", box=None)
+    for item in fit.bins:
+        low_high = f"{item.low:.4g} to {item.high:.4g}"
+        label = f"{(item.low + item.high) / 2:.0f}" if fit.law == "confidence" else low_high
+        measured, predicted = 1000 * item.measured_m, 1000 * item.predicted_m
+        table.add_row(label, str(item.pixels), f"{measured:.2f}", f"{predicted:.2f}")
+    return show(
+        arguments,
+        fit.to_dict(),
+        table,
+        f"{escaped(fit.model.name)}, {fit.frames} frames in {fit.stretches} static "
+        f"segment{'' if fit.stretches == 1 else 's'}: the noise model over {fit.law} deviates by "
+        f"{100 * fit.rms_log_error:.0f} % rms "
+        f"(built-in model: {100 * fit.rms_log_error_before:.0f} %)",
+        *warning_lines(fit.warnings),
+    )
+
+
+def _lens(arguments: Calibrate) -> Summary:
     """``tofuse calibrate lens``."""
     board = _board(arguments)
     recording = Opening.of(arguments.inputs, arguments).open()
@@ -39,19 +81,19 @@ def lens(arguments: Calibrate) -> Summary:
     lines = [_number(fit.camera, name, fit.sigma.get(name)) for name in fit.to_dict()["lens"]]
     lines.append(
         f"{len(fit.views)} views, reprojection error {fit.rms_px:.3f} px rms (with the recording's "
-        f"own intrinsics: {fit.before_px:.3f})"
+        f"own intrinsics: {fit.rms_px_before:.3f})"
     )
     lines += [f"left out: frame {frame} {reason}" for frame, reason in fit.left_out[:_MAX_LISTED]]
     if len(fit.left_out) > _MAX_LISTED:
         lines.append(f"left out: {len(fit.left_out) - _MAX_LISTED} more frames (--json lists all)")
     if arguments.out is not None:
         metadata = recording_fields(recording)
-        write_camera_json(arguments.out, fit.camera, metadata, overwrite=arguments.overwrite)
+        write_camera_json(arguments.out, fit.camera, metadata)
         lines.append(f"written to {arguments.out}")
     return fit.to_dict(), lines, list(fit.warnings)
 
 
-def depth(arguments: Calibrate) -> Summary:
+def _depth(arguments: Calibrate) -> Summary:
     """``tofuse calibrate depth``."""
     recording = Opening.of(arguments.inputs, arguments).open()
     previous = _previous_correction(arguments, recording)
@@ -61,10 +103,6 @@ def depth(arguments: Calibrate) -> Summary:
     else:
         if arguments.wall:
             raise InputError("requires --board", where="--wall", remedy="pass --board as well")
-        if arguments.planes > _MAX_PLANES:
-            raise InputError(
-                f"is {arguments.planes}", where="--planes", remedy=f"use at most {_MAX_PLANES}"
-            )
         views, camera = scene_planes(recording, arguments.planes, arguments.seed or 0)
     fit = calibrate_depth(views, camera, recording.path)
     low, high = fit.range_m
@@ -102,7 +140,7 @@ def _previous_correction(arguments: Calibrate, recording: Recording) -> DepthCor
     return read_correction(path)
 
 
-def import_lens(arguments: Calibrate) -> Summary:
+def _import_lens(arguments: Calibrate) -> Summary:
     """``tofuse calibrate import``."""
     if len(arguments.inputs) != 1:
         raise InputError("takes one file", where="calibrate import", remedy="pass one INPUT")
@@ -120,10 +158,8 @@ def import_lens(arguments: Calibrate) -> Summary:
     lines = [f"{name} {value}" for name, value in fields.items()]
     lines.append(f"read as a file of {lens_file.format}")
     if arguments.out is not None:
-        written = write_camera_json(
-            arguments.out, lens_file.camera, metadata, overwrite=arguments.overwrite
-        )
-        lines += [f"written to {path}" for path in written]
+        write_camera_json(arguments.out, lens_file.camera, metadata)
+        lines.append(f"written to {arguments.out}")
     return {"format": lens_file.format, "warnings": warnings} | fields, lines, warnings
 
 

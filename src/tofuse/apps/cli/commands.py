@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import fields
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -23,8 +24,8 @@ from tofuse.apps.cli.progress import (
     escaped,
     progress_for,
 )
+from tofuse.engine.errors import InputError
 from tofuse.engine.results import Reason, Reconstruction
-from tofuse.formats.cameras import write_noise
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -38,7 +39,7 @@ _SEVERITY_COLORS = {"severe": "red", "warning": "yellow", "note": "cyan"}
 _NAME_WIDTH = 14  # width of the column of names
 _STATUS_COLORS = {True: "green", False: "red", None: "yellow"}
 _NOT_WITH_RIG = (
-    *("view", "into", "loops", "guess", "object"),
+    *("view", "loops", "guess", "object"),
     *("average_still", "camera", "topic", "no_report"),
 )
 VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
@@ -58,7 +59,32 @@ def make_console() -> Console:
     return Console(highlight=False, soft_wrap=True)
 
 
-def _progress_unless_json(
+def show(
+    arguments: cli.Json | cli.JsonLines | cli.Batch,
+    data: dict[str, Any],
+    *lines: Any,
+    status: int = 0,
+) -> int:
+    """Print a result, with --json `data` and else `lines`, and return the exit status."""
+    if arguments.json:
+        emit(data)
+    else:
+        _print_lines(*lines)
+    return status
+
+
+def _print_lines(*lines: Any) -> None:
+    console = make_console()
+    for line in lines:
+        console.print(line)
+
+
+def warning_lines(warnings: Iterable[str]) -> list[str]:
+    """Return warnings as lines to print."""
+    return [f"[yellow]warning:[/] {escaped(warning)}" for warning in warnings]
+
+
+def progress_unless_json(
     arguments: cli.Json,
 ) -> AbstractContextManager[TerminalProgress | JsonProgress | QuietProgress | None]:
     """The progress of a command whose --json prints a single object."""
@@ -68,7 +94,6 @@ def _progress_unless_json(
 def run(arguments: cli.Run) -> int:
     """``tofuse run``."""
     from tofuse.apps.jobs import run as run_pipeline
-    from tofuse.engine.errors import InputError
     from tofuse.formats.rigs import recordings_of, rig_file_in
 
     options = run_options(arguments)
@@ -78,8 +103,6 @@ def run(arguments: cli.Run) -> int:
             arguments.inputs = [str(path) for path in recordings_of(arguments.rig).values()]
     if arguments.rig is not None:
         return _run_rig(arguments.rig, arguments, options)
-    if arguments.into is not None:
-        return _run_into(arguments.into, arguments, options)
     if arguments.view:
         return _run_live(arguments, options)
     for is_set, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
@@ -105,39 +128,9 @@ def run_options(arguments: cli.Run) -> Options:
     return from_arguments(Options, arguments)
 
 
-def _run_into(into: Path, arguments: cli.Run, options: Options) -> int:
-    """Run, then merge the result into an earlier one, which stays unchanged if that fails."""
-    from tofuse.apps.jobs import merging
-    from tofuse.apps.jobs import run as run_pipeline
-    from tofuse.engine.errors import InputError
-
-    if arguments.view:
-        raise InputError(
-            "can't be combined with --into", where="--view", remedy="view the result afterwards"
-        )
-    if into.resolve() == options.out.resolve():
-        raise InputError("is the same folder as --out", where="--into", remedy="use two folders")
-    merging.check_result(into)  # before hours of work
-    with progress_for(as_json=arguments.json) as progress:
-        result = run_pipeline(arguments.inputs, options, progress)
-    print_result(result, options.out, as_json=arguments.json)
-    map_options = from_arguments(
-        merging.MergeOptions,
-        arguments,
-        out=into,
-        overwrite=True,
-        seed=options.seed or 0,
-        only_joined=True,
-    )
-    with progress_for(as_json=arguments.json) as progress:
-        merged = merging.merge_files([into, options.out], map_options, progress)
-    return _finished(merged, into, arguments)
-
-
 def _run_rig(rig: Path, arguments: cli.Run, options: Options) -> int:
     """``tofuse run --rig``."""
     from tofuse.apps.rigs import run_rig
-    from tofuse.engine.errors import InputError
 
     for name in _NOT_WITH_RIG:
         if getattr(arguments, name):
@@ -182,7 +175,6 @@ def view(arguments: cli.View) -> int:
 def _report_server(folder: Path, port: int | None = None) -> ReportServer:
     """Serve the report of a result, with the images of its recording where it still exists."""
     from tofuse.apps.viewer import FrameImages, ReportServer, report_pages
-    from tofuse.engine.errors import InputError
 
     pages, images = report_pages(folder), None
     try:
@@ -221,81 +213,35 @@ def register(arguments: cli.Register) -> int:
 
     _check_overwrite(arguments)
     options = from_arguments(PairOptions, arguments)
-    with _progress_unless_json(arguments) as progress:
+    with progress_unless_json(arguments) as progress:
         result = register_files(arguments.source, arguments.target, options, progress)
-    if arguments.json:
-        emit({**pair_json(result), "out": None if options.out is None else str(options.out)})
-        return pair_exit_status(result)
-    console = make_console()
+    data = pair_json(result)
     head, tail = pair_words.decision(result)
     color = _STATUS_COLORS[result.registration.believed]
-    console.print(f"[bold {color}]{head.lower()}[/]" + (f": {escaped(tail)}" if tail else ""))
     found = pair_words.lines(result)
     width = max(_NAME_WIDTH, *(len(name) for name, _ in found))
-    for name, value in found:
-        first, *others = value.split("\n")
-        for title, row in ((name, first), *(("", other) for other in others)):
-            console.print(f"{title:<{width}}  {row}".rstrip(), markup=False)
-    _print_warnings(console, pair_json(result)["warnings"])
-    if options.out is not None:
-        console.print(f"see {options.out / 'report.html'}", markup=False)
-    return pair_exit_status(result)
+    return show(
+        arguments,
+        {**data, "out": _out_json(options.out)},
+        f"[bold {color}]{head.lower()}[/]" + (f": {escaped(tail)}" if tail else ""),
+        *(
+            escaped(f"{title:<{width}}  {row}".rstrip())
+            for name, value in found
+            for title, row in zip_longest([name], value.split("\n"), fillvalue="")
+        ),
+        *warning_lines(data["warnings"]),
+        *_see(options.out),
+        status=pair_exit_status(result),
+    )
 
 
-def rig_calibrate(arguments: cli.RigCalibrate) -> int:
-    """``tofuse rig calibrate``."""
-    from tofuse.apps.calibration import check_new
-    from tofuse.apps.cli import rigging
-    from tofuse.apps.rigs import calibrate as calibrate_rig
-    from tofuse.formats.rigs import write_rig
-
-    check_new(arguments.out, overwrite=arguments.overwrite)
-    with _progress_unless_json(arguments) as progress:
-        calibration = calibrate_rig(
-            arguments.inputs,
-            motion=arguments.motion,
-            format=arguments.format,
-            threads=arguments.threads,
-            progress=progress,
-        )
-    write_rig(arguments.out, calibration.rig)
-    if arguments.json:
-        emit(
-            {**calibration.rig.to_dict(), "how": calibration.how, "notes": list(calibration.notes)}
-        )
-        return rigging.exit_status(calibration)
-    console = make_console()
-    for table in rigging.tables(calibration.rig):
-        console.print(table)
-    _print_warnings(console, rigging.notes(calibration))
-    console.print(f"from {calibration.how}; see {arguments.out}", markup=False)
-    return rigging.exit_status(calibration)
+def _out_json(out: Path | None) -> str | None:
+    return None if out is None else str(out)
 
 
-def rig_check(arguments: cli.RigCheck) -> int:
-    """``tofuse rig check``."""
-    from tofuse.apps.cli import rigging
-    from tofuse.apps.rigs import check
-    from tofuse.formats.rigs import read_rig
-
-    rig = read_rig(arguments.rig)
-    with _progress_unless_json(arguments) as progress:
-        calibration, cameras = check(
-            rig,
-            arguments.inputs,
-            motion=arguments.motion,
-            format=arguments.format,
-            threads=arguments.threads,
-            progress=progress,
-        )
-    if arguments.json:
-        emit(rigging.check_json(cameras))
-        return rigging.check_status(cameras)
-    console = make_console()
-    for line in rigging.check_lines(cameras):
-        console.print(line, markup=False)
-    _print_warnings(console, calibration.notes)
-    return rigging.check_status(cameras)
+def _see(out: Path | None) -> list[str]:
+    """Return the line that names the report in an output folder, if there is one."""
+    return [] if out is None else [escaped(f"see {_page_of(out)}")]
 
 
 def judge(arguments: cli.Judge) -> int:
@@ -305,34 +251,25 @@ def judge(arguments: cli.Judge) -> int:
 
     _check_overwrite(arguments)
     options = from_arguments(judging.JudgeOptions, arguments)
-    with _progress_unless_json(arguments) as progress:
+    with progress_unless_json(arguments) as progress:
         judgement = judging.judge_files(
             [arguments.recording], arguments.trajectory, options, progress
         )
-    status = 3 if judgement.verdict == "failed" else 0
-    if arguments.json:
-        emit(
-            {
-                **run_json.plain(judgement.to_dict()),
-                "out": None if options.out is None else str(options.out),
-            }
-        )
-        return status
-    console = make_console()
-    console.print(f"[bold {VERDICT_COLORS[judgement.verdict]}]{judgement.verdict}[/]")
-    _print_reasons(console, judgement.reasons)
-    console.print(judging.sentence(judgement, arguments.trajectory.name), markup=False)
     consistencies = (("given", judgement.consistency), ("refined", judgement.refined_consistency))
     texts = [
         f"{name} {1e3 * c.rms_m:.1f} mm rms, {c.inlier_ratio:.1%} inliers"
         for name, c in consistencies
         if c is not None
     ]
-    if texts:
-        console.print(f"map consistency: {'; '.join(texts)}", markup=False)
-    if options.out is not None:
-        console.print(f"see {options.out / 'report.html'}", markup=False)
-    return status
+    return show(
+        arguments,
+        {**run_json.plain(judgement.to_dict()), "out": _out_json(options.out)},
+        *_verdict_lines(judgement.verdict, judgement.reasons),
+        escaped(judging.sentence(judgement, arguments.trajectory.name)),
+        *([f"map consistency: {'; '.join(texts)}"] if texts else []),
+        *_see(options.out),
+        status=3 if judgement.verdict == "failed" else 0,
+    )
 
 
 def merge(arguments: cli.Merge) -> int:
@@ -347,7 +284,6 @@ def merge(arguments: cli.Merge) -> int:
 
 def _check_overwrite(arguments: cli.Register | cli.Judge) -> None:
     """Refuse --overwrite without --out, where that is optional."""
-    from tofuse.engine.errors import InputError
 
     if arguments.overwrite and arguments.out is None:
         raise InputError("requires --out", where="--overwrite", remedy="pass --out as well")
@@ -364,6 +300,7 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     sessions = session_words.session_sentences(result)
     counts = {s: sum(f.status == s for f in d.frames) for s in ("tracked", "predicted", "lost")}
     skipped = sum(f.status == "skipped" for f in d.frames)
+    closures = sum(p.accepted for p in d.loops)
     if as_json:
         emit(
             {
@@ -373,33 +310,30 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
                 "accuracy": run_json.plain(run_json.accuracy_json(d.accuracy)),
                 "reasons": run_json.reasons_json(d.reasons),
                 "frames": {**counts, "skipped": skipped},
-                "loops": sum(p.accepted for p in d.loops),
+                "loops": closures,
                 "sessions": sessions,
                 "points": len(result.cloud),
                 "seconds": round(sum(d.seconds.values()), 2),
             }
         )
         return
-    console = make_console()
-    console.print(f"[bold {VERDICT_COLORS[d.verdict]}]{d.verdict}[/]")
-    _print_reasons(console, d.reasons)
-    for line in sessions:
-        console.print(line, markup=False)
-    console.print(accuracy_card.SEPARATOR.join(accuracy_card.card(result)), markup=False)
     parts = [f"{counts['tracked']} of {len(d.frames)} frames tracked"]
     parts += [f"{counts[s]} {s}" for s in ("predicted", "lost") if counts[s]]
     parts += [f"{skipped} unreadable"] if skipped else []
-    closures = sum(p.accepted for p in d.loops)
-    parts.append(f"{closures} loop{'' if closures == 1 else 's'} closed")
-    parts.append(f"{len(result.cloud):,} points")
-    console.print(", ".join(parts), markup=False)
-    console.print(f"see {_page_of(out)}", markup=False)
-    for number, component in enumerate(result.components):
-        if component.result is not None and not component.connected:
-            path = _page_of(out / folders.component_name(number))
-            console.print(
-                f"and {path}, for {frame_ranges.in_words(component.frames)}", markup=False
-            )
+    parts += [f"{closures} loop{'' if closures == 1 else 's'} closed"]
+    parts += [f"{len(result.cloud):,} points"]
+    components = [
+        f"and {_page_of(out / folders.component_name(number))}, for "
+        f"{frame_ranges.in_words(component.frames)}"
+        for number, component in enumerate(result.components)
+        if component.result is not None and not component.connected
+    ]
+    card = accuracy_card.SEPARATOR.join(accuracy_card.card(result))
+    console = make_console()
+    for line in _verdict_lines(d.verdict, d.reasons):
+        console.print(line)
+    for line in (*sessions, card, ", ".join(parts), f"see {_page_of(out)}", *components):
+        console.print(line, markup=False)
 
 
 def _page_of(folder: Path) -> Path:
@@ -408,19 +342,17 @@ def _page_of(folder: Path) -> Path:
     return page if page.is_file() else folder
 
 
-def _print_warnings(console: Console, warnings: Iterable[str]) -> None:
-    for warning in warnings:
-        console.print(f"[yellow]warning:[/] {escaped(warning)}")
-
-
-def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
+def _verdict_lines(verdict: str, reasons: Sequence[Reason]) -> list[str]:
+    """Return the verdict, and its reasons with what to do about them."""
     from tofuse.engine.results import verdicts
 
+    lines = [f"[bold {VERDICT_COLORS[verdict]}]{verdict}[/]"]
     for reason in verdicts.ranked(reasons):
         level = verdicts.REASONS[reason.code][0]
-        console.print(f"  [{VERDICT_COLORS[level]}]{level}:[/] {escaped(reason.text)}")
+        lines.append(f"  [{VERDICT_COLORS[level]}]{level}:[/] {escaped(reason.text)}")
         if reason.code in verdicts.ADVICE:
-            console.print(f"    {verdicts.ADVICE[reason.code]}", markup=False, style="dim")
+            lines.append(f"    [dim]{escaped(verdicts.ADVICE[reason.code])}[/]")
+    return lines
 
 
 def inspect(arguments: cli.Inspect) -> int:
@@ -432,24 +364,18 @@ def inspect(arguments: cli.Inspect) -> int:
     inspection = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
     if arguments.sheet is not None:
         inspection.save_sheet(arguments.sheet)
-    if arguments.json:
-        emit(inspection.to_dict())
-        return 0
-    console = make_console()
     width = max(map(len, inspection.facts))
-    for name, value in inspection.facts.items():
-        console.print(f"[bold]{name:<{width}}[/]  {escaped(value)}")
-    _print_warnings(console, inspection.notes)
+    lines = [f"[bold]{n:<{width}}[/]  {escaped(value)}" for n, value in inspection.facts.items()]
+    lines += warning_lines(inspection.notes)
     for finding in inspection.findings:
         color = _SEVERITY_COLORS[finding.severity]
-        console.print(f"[{color}]{finding.severity}:[/] {finding.code}: {escaped(finding.text)}")
-        console.print(f"  {escaped(finding.remedy)}")
+        lines.append(f"[{color}]{finding.severity}:[/] {finding.code}: {escaped(finding.text)}")
+        lines.append(f"  {escaped(finding.remedy)}")
     if not inspection.findings:
-        other = " other" if inspection.notes else ""
-        console.print(f"[green]No{other} problems found.[/]")
+        lines.append(f"[green]No{' other' if inspection.notes else ''} problems found.[/]")
     if arguments.sheet is not None:
-        console.print(f"see {escaped(str(arguments.sheet))}")
-    return 0
+        lines.append(f"see {escaped(str(arguments.sheet))}")
+    return show(arguments, inspection.to_dict(), *lines)
 
 
 def convert(arguments: cli.Convert) -> int:
@@ -463,9 +389,10 @@ def convert(arguments: cli.Convert) -> int:
         conversion = convert_recording(recording, arguments.out)
     else:
         conversion = convert_to(recording, arguments.out, arguments.to)
-    console = make_console()
-    console.print(f"{conversion.frames} frames in {escaped(str(conversion.folder))}")
-    _print_warnings(console, (*recording.warnings, *conversion.warnings))
+    _print_lines(
+        f"{conversion.frames} frames in {escaped(str(conversion.folder))}",
+        *warning_lines((*recording.warnings, *conversion.warnings)),
+    )
     return 0
 
 
@@ -473,15 +400,13 @@ def record(arguments: cli.Record) -> int:
     """``tofuse record``."""
     from tofuse.apps.live import device_named, is_installed, known_devices
     from tofuse.apps.live import record as record_stream
-    from tofuse.engine.errors import InputError
 
-    console = make_console()
     if arguments.device is None:
         table = Table("camera", "needs", "")
         for name, kind in known_devices().items():
             installed = "installed" if is_installed(kind) else "not installed"
             table.add_row(name, f"pip install {kind.package[0]}", installed)
-        console.print(table)
+        _print_lines(table)
         return 0
     if arguments.out is None:
         raise InputError("is missing", where="--out", remedy="pass a new folder")
@@ -500,13 +425,12 @@ def record(arguments: cli.Record) -> int:
             stopped=stopped.is_set,
             progress=lambda _: progress.advance(),
         )
-    console.print(f"{recorded.frames} frames in {escaped(str(recorded.folder))}")
-    if recorded.dropped:
-        console.print(
-            f"[yellow]warning:[/] {recorded.dropped} frames dropped: the disk was too slow"
-        )
-    if recorded.ended_by != "asked":
-        console.print(f"[yellow]warning:[/] {escaped(recorded.ended_by)}")
+    warnings = [f"{recorded.dropped} frames dropped: the disk was too slow"]
+    _print_lines(
+        f"{recorded.frames} frames in {escaped(str(recorded.folder))}",
+        *warning_lines(warnings if recorded.dropped else []),
+        *warning_lines([recorded.ended_by] if recorded.ended_by != "asked" else []),
+    )
     return 0
 
 
@@ -528,61 +452,6 @@ def _stop_on_signal() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def calibrate(arguments: cli.Calibrate) -> int:
-    """``tofuse calibrate``."""
-    from tofuse.apps.calibration import check_new
-    from tofuse.apps.cli import calibrating
-
-    if arguments.out is not None:
-        check_new(arguments.out, overwrite=arguments.overwrite)
-    console = make_console()
-    subjects = {
-        "lens": calibrating.lens,
-        "depth": calibrating.depth,
-        "import": calibrating.import_lens,
-    }
-    data, lines, warnings = subjects[arguments.subject](arguments)
-    if arguments.json:
-        emit(data)
-        return 0
-    for line in lines:
-        console.print(escaped(line))
-    _print_warnings(console, warnings)
-    return 0
-
-
-def noise(arguments: cli.Noise) -> int:
-    """``tofuse noise``."""
-    from tofuse.apps.calibration import check_new, estimate_noise
-    from tofuse.formats.recordings import Opening
-
-    if arguments.out is not None:
-        check_new(arguments.out, overwrite=arguments.overwrite)
-    recording = Opening.of(arguments.inputs, arguments).open()
-    fit = estimate_noise(recording, arguments.name)
-    if arguments.out is not None:
-        write_noise(arguments.out, fit.model)
-    if arguments.json:
-        emit(fit.to_dict())
-        return 0
-    units = {"amplitude": "raw amplitude", "confidence": "confidence", "range": "range (m)"}
-    table = Table(units[fit.law], "pixels", "measured (mm)", "model (mm)", box=None)
-    for item in fit.bins:
-        low_high = f"{item.low:.4g} to {item.high:.4g}"
-        label = f"{(item.low + item.high) / 2:.0f}" if fit.law == "confidence" else low_high
-        measured, predicted = 1000 * item.measured_m, 1000 * item.predicted_m
-        table.add_row(label, str(item.pixels), f"{measured:.2f}", f"{predicted:.2f}")
-    console = make_console()
-    console.print(table)
-    console.print(
-        f"{escaped(fit.model.name)}, {fit.frames} frames in {fit.stretches} static "
-        f"segment{'' if fit.stretches == 1 else 's'}: the noise model over {fit.law} deviates by "
-        f"{100 * fit.rms_log_error:.0f} % rms (built-in model: {100 * fit.before:.0f} %)"
-    )
-    _print_warnings(console, fit.warnings)
-    return 0
-
-
 def evaluate(arguments: cli.Evaluate) -> int:
     """``tofuse evaluate``."""
     from tofuse.apps.jobs import evaluate as evaluate_poses
@@ -602,9 +471,6 @@ def evaluate(arguments: cli.Evaluate) -> int:
             "check that both files have the same clock",
             file=sys.stderr,
         )
-    if arguments.json:
-        emit(data)
-        return 0
     table = Table.grid(padding=(0, 2))
     table.add_row("poses compared", f"{error.associated} ({error.coverage:.1%} of the reference)")
     table.add_row("ATE rms", f"{error.ate_rms_m:.4f} m, {data['rotation_rms_deg']:.3f} deg")
@@ -623,8 +489,7 @@ def evaluate(arguments: cli.Evaluate) -> int:
         if m["rms_m"] is not None:
             value = f"{m['rms_m']:.5f} m rms, {m['inlier_share']:.4f} inliers, {m['pairs']} pairs"
         table.add_row("map consistency", value)
-    make_console().print(table)
-    return 0
+    return show(arguments, data, table)
 
 
 def optimize(arguments: cli.Optimize) -> int:

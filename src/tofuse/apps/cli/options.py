@@ -9,7 +9,7 @@ Imports nothing heavy, so that ``--help`` is instant.
 
 import argparse
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from tofuse.apps.cli.values import (
     Count,
@@ -17,6 +17,7 @@ from tofuse.apps.cli.values import (
     Length,
     Metres,
     NonNegative,
+    Planes,
     Port,
     Ratio,
     Seconds,
@@ -27,7 +28,6 @@ REQUIRED: Any = ...
 _LAB = "tofuse.lab.commands"
 
 DemoScene = Literal["room", "empty-room", "rail", "torso", "box", "peaks"]
-DEMO_SCENES = get_args(DemoScene)
 
 
 class Command(argparse.Namespace):
@@ -149,8 +149,6 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
         folder for the result
     overwrite
         replace an existing result in --out
-    into : RESULT
-        merge the recording into the map of an existing result, if they overlap
     no_report
         don't draw report.html, which takes up to half of a short run
     texture
@@ -210,7 +208,6 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     inputs: list[str]
     out: Path = REQUIRED
     overwrite: bool = False
-    into: Path | None = None
     no_report: bool = False
     texture: bool = False
     faces: Count | None = None
@@ -234,7 +231,7 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
 class Batch(Command):
     """Reconstruct many recordings, each as a separate job.
 
-    A list is a text file with one path or glob per line, or a table (.csv, .toml) with a column
+    A list is a text file with one path or glob per line, or a table (.csv) with a column
     `recording` and further columns for options of `tofuse run`; see docs/batch.md. Run the same
     command again to resume.
 
@@ -261,8 +258,6 @@ class Batch(Command):
         Dask scheduler: tcp://HOST:8786, or its scheduler file
     threads : N
         threads per job (default: all cores shared by the jobs; on Dask: 1)
-    memory : SIZE
-        memory per job, e.g. 4GB (not limited)
     retries : N
         how often a job whose process was killed is restarted (3)
 
@@ -285,7 +280,6 @@ class Batch(Command):
     workers: Count | None = None
     scheduler: str | None = None
     threads: Count | None = None
-    memory: Size | None = None
     retries: NonNegative | None = None
 
 
@@ -405,6 +399,8 @@ class RigOptions(Json, Threads):
     format : F
         input format, if not recognised
     """
+
+    home = "tofuse.apps.cli.rigging"
 
     motion: Literal["auto", "still", "moving"] = "auto"
     format: str | None = None
@@ -662,6 +658,8 @@ class Calibrate(Json, Seed, Selection):
         take depth unit and kind from this recording
     """
 
+    home = "tofuse.apps.cli.calibrating"
+
     subject: Literal["lens", "depth", "import"]
     inputs: list[str]
     out: Path | None = None
@@ -669,7 +667,7 @@ class Calibrate(Json, Seed, Selection):
     board: str | None = None
     image: Literal["amplitude", "color"] = "amplitude"
     wall: bool = False
-    planes: Count = 4
+    planes: Planes = 4
     model: Literal["pinhole", "brown", "rational", "fisheye"] = "brown"
     recording: str | None = None
 
@@ -688,6 +686,8 @@ class Noise(Json, Source):
     name : NAME
         name of the camera
     """
+
+    home = "tofuse.apps.cli.calibrating"
 
     inputs: list[str]
     out: Path | None = None

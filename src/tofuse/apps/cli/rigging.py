@@ -1,17 +1,20 @@
-"""``tofuse rig``: summaries of rigs as lines and tables."""
+"""``tofuse rig``: calibration and check of rigs, with their summaries."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from rich.table import Table
 
+from tofuse.apps.calibration import check_new
+from tofuse.apps.cli.commands import progress_unless_json, show, warning_lines
+from tofuse.apps.cli.options import RigCalibrate, RigCheck
+from tofuse.apps.cli.progress import escaped
 from tofuse.apps.results import run_json
-from tofuse.apps.rigs import Calibration, CameraMotion
+from tofuse.apps.rigs import Calibration, CameraMotion, calibrate, compare_in_scene
 from tofuse.engine.geometry import se3
-from tofuse.formats.rigs import Rig
+from tofuse.formats.rigs import Rig, read_rig, write_rig
 
 # Fields of the JSON of a check.
 _CHECKED = (
@@ -20,7 +23,57 @@ _CHECKED = (
 )
 
 
-def tables(rig: Rig) -> list[Table]:
+def _calibrated(
+    arguments: RigCalibrate | RigCheck, names: Sequence[str] | None = None
+) -> Calibration:
+    with progress_unless_json(arguments) as progress:
+        return calibrate(
+            arguments.inputs,
+            names=names,
+            motion=arguments.motion,
+            format=arguments.format,
+            threads=arguments.threads,
+            progress=progress,
+        )
+
+
+def rig_calibrate(arguments: RigCalibrate) -> int:
+    """``tofuse rig calibrate``."""
+    check_new(arguments.out, overwrite=arguments.overwrite)
+    calibration = _calibrated(arguments)
+    rig, notes = calibration.rig, calibration.notes
+    write_rig(arguments.out, rig)
+    return show(
+        arguments,
+        {**rig.to_dict(), "how": calibration.how, "notes": list(notes)},
+        *_tables(rig),
+        *warning_lines(f"{name} has no pose: {reason}" for name, reason in rig.unplaced.items()),
+        *warning_lines(notes),
+        escaped(f"from {calibration.how}; see {arguments.out}"),
+        status=3 if rig.unplaced else 0,
+    )
+
+
+def rig_check(arguments: RigCheck) -> int:
+    """``tofuse rig check``."""
+    rig = read_rig(arguments.rig)
+    calibration = _calibrated(arguments, [camera.name for camera in rig.cameras])
+    cameras = compare_in_scene(rig, calibration.rig)
+    rows = [
+        {"name": c.name, "checked": not c.reason} | {name: getattr(c, name) for name in _CHECKED}
+        for c in cameras
+    ]
+    width = max(len(camera.name) for camera in cameras)
+    return show(
+        arguments,
+        run_json.plain({"cameras": rows}),
+        *(escaped(f"{camera.name:<{width}}  {_outcome(camera)}") for camera in cameras),
+        *warning_lines(calibration.notes),
+        status=3 if any(camera.moved or camera.reason for camera in cameras) else 0,
+    )
+
+
+def _tables(rig: Rig) -> list[Table]:
     """Return tables of the cameras' poses, and of the distances between overlapping surfaces."""
     poses = Table(box=None)
     for title in ("camera", "x y z (m)"):
@@ -54,25 +107,6 @@ def tables(rig: Rig) -> list[Table]:
     return [poses, pairs] if rig.disagreement else [poses]
 
 
-def notes(calibration: Calibration) -> list[str]:
-    """Return warnings, those about cameras without a pose first."""
-    unplaced = [
-        f"{name} has no pose: {reason}" for name, reason in calibration.rig.unplaced.items()
-    ]
-    return [*unplaced, *calibration.notes]
-
-
-def exit_status(calibration: Calibration) -> int:
-    """Return 3 if the pose of some camera is unknown, else 0."""
-    return 3 if calibration.rig.unplaced else 0
-
-
-def check_lines(cameras: Sequence[CameraMotion]) -> list[str]:
-    """Return one line for each camera."""
-    width = max(len(camera.name) for camera in cameras)
-    return [f"{camera.name:<{width}}  {_outcome(camera)}" for camera in cameras]
-
-
 def _outcome(camera: CameraMotion) -> str:
     if camera.reason:
         return f"not checked: {camera.reason}"
@@ -86,18 +120,3 @@ def _outcome(camera: CameraMotion) -> str:
     if camera.sigma_m == 0:
         return "unchanged: reference for the others"
     return f"unchanged, within {motion} ({sigma})"
-
-
-def check_json(cameras: Sequence[CameraMotion]) -> dict[str, Any]:
-    """Return the check as plain data."""
-    rows = [
-        {"name": c.name, "checked": not c.reason} | {name: getattr(c, name) for name in _CHECKED}
-        for c in cameras
-    ]
-    data: dict[str, Any] = run_json.plain({"cameras": rows})
-    return data
-
-
-def check_status(cameras: Sequence[CameraMotion]) -> int:
-    """Return 3 if some camera has moved or could not be checked, else 0."""
-    return 3 if any(camera.moved or camera.reason for camera in cameras) else 0

@@ -14,18 +14,7 @@ from tofuse.apps.cli.parser import Parser, make_parser
 from tofuse.engine.errors import InputError
 
 # Options that the batch sets itself, and interactive ones.
-_EXCLUDED = {
-    "out",
-    "overwrite",
-    "into",
-    "rig",
-    "json",
-    "view",
-    "port",
-    "no-open",
-    "threads",
-    "help",
-}
+_EXCLUDED = {*("out", "overwrite", "rig", "json", "view", "port", "no-open", "threads", "help")}
 _YES, _NO = {"true", "yes", "1", "x"}, {"false", "no", "0"}
 
 

@@ -63,15 +63,17 @@ def _length(text: str) -> float:
 
 def _size(text: str) -> int:
     """Read an amount of memory in bytes, given as 4GB or 2GiB."""
-    from tofuse.apps.batch import parse_bytes
-
-    try:
-        return parse_bytes(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)\s*([kmgt]?)(i?)b?", text.strip().lower())
+    size = 0.0
+    if match and (match[2] or not match[3]):
+        size = float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " ")
+    if not 1 <= size < 1 << 60:
+        raise argparse.ArgumentTypeError(f"{text!r} is not an amount of memory, such as 4GB")
+    return int(size)
 
 
 Count = Annotated[int, Bounds(1)]
+Planes = Annotated[int, Bounds(1, 20)]
 NonNegative = Annotated[int, Bounds(0)]
 Port = Annotated[int, Bounds(1, 65535)]
 Ratio = Annotated[float, Bounds(0, 1, exclusive=True)]

@@ -16,6 +16,7 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -115,9 +116,7 @@ class Judgement:
         }
 
 
-def _dict(
-    figures: map_agreement.Consistency | pose_deviation.Deviation | None,
-) -> dict[str, Any] | None:
+def _dict(figures: Any) -> dict[str, Any] | None:
     return None if figures is None else figures.to_dict()
 
 
@@ -162,32 +161,40 @@ def judge(
     )
     given_config = replace(config, odometry=given.GivenPoses())
     check_views(given_config, kind)
-    compared_images = _Images(recording)
+
+    @cache
+    def view(k: int) -> PreparedView | None:
+        frame = recording.image(k)
+        return None if frame is None else cross_view_agreement.prepare_for_comparison(frame)
+
+    def compared_at(poses: Float64) -> cross_view_agreement.CrossViewConsistency:
+        posed = evenly_spaced(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
+        views = {k: found for k in posed if (found := view(k)) is not None}
+        return cross_view_agreement.compare_views(list(views.values()), poses[list(views)])
 
     def reconstructed(
         source: Recording, config_used: Config
-    ) -> tuple[Reconstruction, Views, ViewSupport]:
+    ) -> tuple[Reconstruction, Views, cross_view_agreement.CrossViewConsistency]:
         result, views = reconstructing.reconstruct_with_views(
             source, config_used, threads=threads, progress=progress
         )
-        return result, views, compared_images.support_at(result.trajectory)
+        return result, views, compared_at(result.trajectory)
 
     progress.stage("comparing images")
-    initial_support = compared_images.support_at(poses)
+    as_given = compared_at(poses)
     started = reconstructed(adaptation.with_odometry(recording, poses), given_config)
     best = started
-    if not started[2].is_supported:
-        best = max(started, reconstructed(recording, config), key=lambda found: found[2].support)
-    refined, views, refined_support = best
+    if _support(started[2]) < _SUPPORTED:
+        best = max(started, reconstructed(recording, config), key=lambda found: _support(found[2]))
+    refined, views, as_refined = best
     progress.stage("registering pairs")
     with use_threads(threads), threadpool_limits(1):
         deviation = _deviation(poses, refined, views)
     distances = _distances(poses, refined.trajectory)
     accuracy = _accuracy(distances, poses, refined)
-    found = _reasons(
-        poses, accuracy, deviation, initial_support, refined_support, refined, tolerance_m
+    reasons = verdicts.ranked(
+        [*_reasons(poses, accuracy, deviation, as_given, as_refined, refined, tolerance_m)]
     )
-    reasons = verdicts.ranked([*found])
     return Judgement(
         poses,
         accuracy,
@@ -202,53 +209,18 @@ def judge(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class ViewSupport:
-    """Cross-view consistency of overlapping images under given poses."""
-
-    cross_view: cross_view_agreement.CrossViewConsistency
-
-    @property
-    def overlapping(self) -> float:
-        """Fraction of the views that overlap with another one."""
-        support = self.cross_view.support_of_views()
-        return float(np.isfinite(support).mean()) if len(support) else 0.0
-
-    @property
-    def support(self) -> float:
-        """Fraction of the overlapping measurements that support the poses, times `overlapping`."""
-        return float(np.nan_to_num(self.cross_view.support())) * self.overlapping
-
-    @property
-    def is_supported(self) -> bool:
-        """Whether almost all views overlap, and almost no measurement contradicts the poses."""
-        return self.support >= _SUPPORTED
+def _overlapping(compared: cross_view_agreement.CrossViewConsistency) -> float:
+    """Return the fraction of the views that overlap with another one."""
+    support = compared.support_of_views()
+    return float(np.isfinite(support).mean()) if len(support) else 0.0
 
 
-class _Images:
-    """A sample of frames, read and prepared once, to be compared under different poses."""
+def _support(compared: cross_view_agreement.CrossViewConsistency) -> float:
+    """Return the fraction of the overlapping measurements that support the poses.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-        self._views: dict[int, PreparedView | None] = {}
-
-    def support_at(self, poses: Float64) -> ViewSupport:
-        """Compare the frames under their poses (N, 4, 4), NaN where there is none."""
-        rows = evenly_spaced(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
-        views = [(k, view) for k in rows if (view := self._view(k)) is not None]
-        used_rows = [k for k, _ in views]
-        return ViewSupport(
-            cross_view_agreement.compare_views([view for _, view in views], poses[used_rows])
-        )
-
-    def _view(self, k: int) -> PreparedView | None:
-        """Return the k-th frame as a prepared view; None if it can't be read."""
-        if k not in self._views:
-            frame = self._recording.image(k)
-            self._views[k] = (
-                None if frame is None else cross_view_agreement.prepare_for_comparison(frame)
-            )
-        return self._views[k]
+    It is reduced by the fraction of views that overlap with none.
+    """
+    return float(np.nan_to_num(compared.support())) * _overlapping(compared)
 
 
 @dataclass(frozen=True)
@@ -460,21 +432,22 @@ def _reasons(
     poses: Float64,
     accuracy: pose_accuracy.Accuracy,
     deviation: pose_deviation.Deviation | None,
-    initial_support: ViewSupport,
-    refined_support: ViewSupport,
+    as_given: cross_view_agreement.CrossViewConsistency,
+    as_refined: cross_view_agreement.CrossViewConsistency,
     refined: Reconstruction,
     tolerance_m: float | None,
 ) -> Iterator[Reason]:
     frames = refined.diagnostics.frames
     indices = [f.index for f in frames]
     full_range = ((indices[0], indices[-1]),)
-    if initial_support.overlapping < _MIN_OVERLAPPING * refined_support.overlapping:
+    before, after = _overlapping(as_given), _overlapping(as_refined)
+    if before < _MIN_OVERLAPPING * after:
         text = (
-            f"Only {initial_support.overlapping:.0%} of the images overlap with another under "
-            f"these poses; under the refined ones {refined_support.overlapping:.0%} do."
+            f"Only {before:.0%} of the images overlap with another under these poses; under the "
+            f"refined ones {after:.0%} do."
         )
         yield Reason("images_disagree", full_range, text)
-    yield from checks.cross_view_reasons(initial_support.cross_view, full_range)
+    yield from checks.cross_view_reasons(as_given, full_range)
     allowed_m = checks.tolerance_of(tolerance_m, refined.cloud.diagonal_m)
     contradictions = (
         [] if deviation is None else [*_contradiction(deviation, allowed_m, full_range)]

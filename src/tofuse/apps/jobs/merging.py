@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.apps.jobs.run_options import ModelOptions
 from tofuse.apps.jobs.session_pairs import SessionModel, session_changes, session_pairs
-from tofuse.apps.jobs.sessions import Session, read_sessions, sessions_of
+from tofuse.apps.jobs.sessions import Session, read_sessions
 from tofuse.apps.report import session_words
 from tofuse.apps.results import folders, write_result
 from tofuse.engine.arrays import Float64
@@ -45,19 +45,12 @@ _MIN_PROBABILITY = 0.99
 
 @dataclass(frozen=True)
 class MergeOptions(ModelOptions):
-    """The options of ``tofuse merge``; see its ``--help``.
-
-    Attributes
-    ----------
-    only_joined
-        Whether nothing is written if the last session can't be joined to the first.
-    """
+    """The options of ``tofuse merge``; see its ``--help``."""
 
     out: Path
     overwrite: bool = False
     seed: int = 0
     threads: int | None = None
-    only_joined: bool = False
 
 
 def merge(
@@ -138,12 +131,22 @@ def merge_sessions(
     """Join, refine and fuse sessions; see `merge`."""
     progress = progress or Silent()
     recording, offsets = joined_recording(sessions)
-    links = _earlier_links(sessions, offsets)
+    # The loops that earlier merges closed between sessions, to be registered again: the loop search
+    # selects the pairs with the largest overlap, which need not connect all sessions.
+    links = [
+        PriorLoop(i + offset, j + offset, by_user=False)
+        for session, offset in zip(sessions, offsets, strict=True)
+        for i, j in session.links
+    ]
     mapper = Mapper(config, seed=seed, threads=threads, loops=links, progress=progress)
     progress.stage("reading sessions", len(recording))
     with threadpool_limits(1):
         for session, offset in zip(sessions, offsets, strict=True):
-            mapper.interrupt(_config_of(session, offset))
+            odometry = session.config.odometry
+            assert isinstance(odometry, given.GivenPoses)
+            stated = {k + offset: pose for k, pose in session.stated.items()}
+            with_poses = given.StatedPoses(stated, odometry)
+            mapper.interrupt(replace(session.config, odometry=with_poses))
             session_recording = replace(recording, indices=session.recording.indices + offset)
             reconstructing.push_frames(mapper, session_recording, session.config.window)
         result = mapper.finish()
@@ -172,26 +175,6 @@ def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]
     path = " ".join(s.recording.path for s in sessions)
     joined = JoinedSource(sources, names)
     return Recording(joined, path, "+".join(formats), np.concatenate(indices)), offsets
-
-
-def _earlier_links(sessions: Sequence[Session], offsets: Sequence[int]) -> list[PriorLoop]:
-    """Return the loops that earlier merges closed between sessions, to be registered again.
-
-    The loop search selects the pairs with the largest overlap, which need not connect all sessions.
-    """
-    return [
-        PriorLoop(i + offset, j + offset, by_user=False)
-        for session, offset in zip(sessions, offsets, strict=True)
-        for i, j in session.links
-    ]
-
-
-def _config_of(session: Session, offset: int) -> Config:
-    """Return the configuration of a session, with its stated poses as odometry."""
-    odometry = session.config.odometry
-    assert isinstance(odometry, given.GivenPoses)
-    stated = {k + offset: pose for k, pose in session.stated.items()}
-    return replace(session.config, odometry=given.StatedPoses(stated, odometry))
 
 
 def _with_sessions(
@@ -282,11 +265,6 @@ def _covers_most(result: Reconstruction) -> bool:
     return 2 * sum(in_main_model(f, result.components) for f in frames) >= len(frames)
 
 
-def check_result(folder: Path) -> None:
-    """Raise InputError if a result can't be merged with a later one; see `merge`."""
-    sessions_of(folder, 0, None, Silent())
-
-
 def merge_files(
     results: Sequence[str | Path], options: MergeOptions, progress: Progress | None = None
 ) -> Reconstruction:
@@ -299,35 +277,24 @@ def merge_files(
     OutputError
         If the result can't be written; an existing folder is then unchanged.
     """
+    progress = progress or Silent()
     # Claimed before the results are read: it may be one of them.
     with folders.OutputFolder(options.out, overwrite=options.overwrite) as folder:
-        return _merge_into(folder, results, options, progress or Silent())
-
-
-def _merge_into(
-    folder: folders.OutputFolder,
-    results: Sequence[str | Path],
-    options: MergeOptions,
-    progress: Progress,
-) -> Reconstruction:
-    progress.stage("opening")
-    sessions = read_sessions(results, options.threads, progress)
-    config = options.applied(merged_config(sessions))
-    result = merge_sessions(
-        sessions, config, seed=options.seed, threads=options.threads, progress=progress
-    )
-    if options.only_joined and result.sessions[-1].T_main_session is None:
-        progress.note(f"{options.out} is left as it was")
-        return result
-    texture = None
-    if config.fusion.texture:
-        recording, _ = joined_recording(sessions)
-        texture = texturing.make_texture(
-            recording, result, config.fusion.texture, options.threads, progress
+        progress.stage("opening")
+        sessions = read_sessions(results, options.threads, progress)
+        config = options.applied(merged_config(sessions))
+        result = merge_sessions(
+            sessions, config, seed=options.seed, threads=options.threads, progress=progress
         )
-    progress.stage("writing")
-    with threadpool_limits(1):
-        write_result(result, folder, _report, texture)
+        texture = None
+        if config.fusion.texture:
+            recording, _ = joined_recording(sessions)
+            texture = texturing.make_texture(
+                recording, result, config.fusion.texture, options.threads, progress
+            )
+        progress.stage("writing")
+        with threadpool_limits(1):
+            write_result(result, folder, _report, texture)
     return result
 
 

@@ -50,14 +50,16 @@ class ModelOptions:
 
     def applied(self, config: Config) -> Config:
         """Return the configuration with these options."""
-        if self.texture and not config.fusion.texture:
-            config = changed(config, {"fusion": {"texture": texturing.TEXTURE}}, where="--texture")
-        if self.faces is not None:
-            config = changed(config, {"fusion": {"faces": self.faces}}, where="--faces")
-        if self.voxel is not None:
-            config = changed(config, {"fusion": {"voxel_m": self.voxel}}, where="--voxel")
-        if self.tolerance is not None:
-            config = changed(config, {"tolerance_m": self.tolerance}, where="--tolerance")
+        texture = texturing.TEXTURE if self.texture and not config.fusion.texture else None
+        options: tuple[tuple[str, object, dict[str, Any]], ...] = (
+            ("texture", texture, {"fusion": {"texture": texture}}),
+            ("faces", self.faces, {"fusion": {"faces": self.faces}}),
+            ("voxel", self.voxel, {"fusion": {"voxel_m": self.voxel}}),
+            ("tolerance", self.tolerance, {"tolerance_m": self.tolerance}),
+        )
+        for option, value, changes in options:
+            if value is not None:
+                config = changed(config, changes, where=f"--{option}")
         return config
 
 

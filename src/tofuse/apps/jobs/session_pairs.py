@@ -46,37 +46,6 @@ class SessionModel:
         members = [v for v in views if session.has(v.index) and v.index in self.poses]
         return [members[k] for k in evenly_spaced(np.arange(len(members)), _COMPARED)]
 
-    def links(self, first: SessionRecord, second: SessionRecord) -> set[tuple[int, int]]:
-        """Return frame pairs (i < j) of two sessions with accepted registrations."""
-        diagnostics = self.result.diagnostics
-        ends = [(join.link.i, join.link.j) for join in diagnostics.joins]
-        ends += [(loop.i, loop.j) for loop in diagnostics.loops if loop.accepted]
-        return {
-            (min(i, j), max(i, j))
-            for i, j in ends
-            if (first.has(i) and second.has(j)) or (first.has(j) and second.has(i))
-        }
-
-    def join_probability(self, first: SessionRecord, second: SessionRecord) -> float | None:
-        """Return the probability that the join of two sessions is correct; None if indirect."""
-        probabilities = [
-            join.probability
-            for join in self.result.diagnostics.joins
-            if join.probability is not None
-            and any(first.has(k) for k in (join.link.i, join.link.j))
-            and any(second.has(k) for k in (join.link.i, join.link.j))
-        ]
-        return (
-            min(max(probabilities), session_words.MAX_STATED_PROBABILITY) if probabilities else None
-        )
-
-    def cross_view(
-        self, first: Sequence[View], second: Sequence[View]
-    ) -> cross_view_agreement.CrossViewConsistency:
-        """Return the cross-view consistency between views of two sessions."""
-        sessions = [0] * len(first) + [1] * len(second)
-        return cross_view_agreement.compare_views(*self.posed([*first, *second]), sessions)
-
     def posed(self, views: Sequence[View]) -> tuple[list[PreparedView], Float64]:
         """Return prepared views and their poses (N, 4, 4)."""
         poses = np.array([self.poses[v.index] for v in views]).reshape(-1, 4, 4)
@@ -122,7 +91,9 @@ def _pair(
         views_a, views_b = model.views(first, views), model.views(second, views)
         if not views_a or not views_b:
             continue
-        cross_view = model.cross_view(views_a, views_b)
+        session_of = [0] * len(views_a) + [1] * len(views_b)
+        posed = model.posed([*views_a, *views_b])
+        cross_view = cross_view_agreement.compare_views(*posed, session_of)
         overlap = np.isfinite(cross_view.support_of_views())
         support = cross_view.support()
         return SessionPair(
@@ -130,12 +101,31 @@ def _pair(
             b,
             True,
             bool(set(components_before[a]) & set(components_before[b])),
-            len(model.links(first, second)),
-            model.join_probability(first, second),
+            *_links(model.result, first, second),
             float(min(overlap[: len(views_a)].mean(), overlap[len(views_a) :].mean())),
             float(support) if np.isfinite(support) else None,
         )
     return SessionPair(a, b, joined=False)
+
+
+def _links(
+    result: Reconstruction, first: SessionRecord, second: SessionRecord
+) -> tuple[int, float | None]:
+    """Return the number of frame pairs of two sessions with accepted registrations.
+
+    Also the probability that the join of the sessions is correct; None if it is indirect.
+    """
+
+    def between(i: int, j: int) -> bool:
+        return (first.has(i) and second.has(j)) or (first.has(j) and second.has(i))
+
+    d = result.diagnostics
+    joins = [join for join in d.joins if between(join.link.i, join.link.j)]
+    ends = [(join.link.i, join.link.j) for join in joins]
+    ends += [(loop.i, loop.j) for loop in d.loops if loop.accepted and between(loop.i, loop.j)]
+    probabilities = [join.probability for join in joins if join.probability is not None]
+    probability = min(max(probabilities, default=0.0), session_words.MAX_STATED_PROBABILITY)
+    return len(set(map(frozenset, ends))), probability if probabilities else None
 
 
 def session_changes(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, count
 from pathlib import Path
 from typing import Any, get_args
 
@@ -106,27 +106,17 @@ def sessions_of(
     InputError
         If the result can't be merged with any other; see `read_sessions`.
     """
-    parts, links = _read_parts(folder, components)
-    sessions = [_session(part, stated, folder, threads, progress) for part, stated in parts]
-    return [replace(sessions[0], links=links), *sessions[1:]]
-
-
-def _read_parts(
-    folder: Path, components: int
-) -> tuple[
-    list[tuple[reopening.StoredRecording, dict[int, given.StatedPose]]], tuple[tuple[int, int], ...]
-]:
-    """Read the recordings of a result and the poses of their frames, by index in the recording.
-
-    Also the loop closures between them, see `Session`. Its components are numbered from
-    `components`.
-    """
     folders.check_result(folder)
     with run_json.opened(folder) as run:
         stated = _stated(folder, run, components)
         parts = list(reopening.stored_recordings(folder, run))
-        posed = [(p, {k: stated[p.first + k] for k in p.frames}) for p in parts]
-        return posed, _links(run, parts)
+        posed = [{k: stated[part.first + k] for k in part.frames} for part in parts]
+        links = _links(run, parts)
+    sessions = [
+        _session(part, poses, folder, threads, progress)
+        for part, poses in zip(parts, posed, strict=True)
+    ]
+    return [replace(sessions[0], links=links), *sessions[1:]]
 
 
 def _links(
@@ -167,7 +157,9 @@ def _stated(folder: Path, run: dict[str, Any], components: int) -> dict[int, giv
     for number, k in enumerate(separate, components + 1):
         component_folder = folder / folders.component_name(k)
         if folders.is_result(component_folder):
-            main |= {i: (T, number) for i, T in _poses(component_folder).items()}
+            component_run = run_json.read_run_json(component_folder / "run.json")
+            poses = _poses(component_folder, component_run)
+            main |= {i: (T, number) for i, T in poses.items()}
     stated = {}
     for frame in run["frames"]:
         index, status = int(frame["index"]), frame["status"]
@@ -183,11 +175,9 @@ def _stated(folder: Path, run: dict[str, Any], components: int) -> dict[int, giv
     return stated
 
 
-def _poses(folder: Path, run: dict[str, Any] | None = None) -> dict[int, Float64]:
+def _poses(folder: Path, run: dict[str, Any]) -> dict[int, Float64]:
     """Return (4, 4) T_world_camera by index, of the frames in a folder's main model."""
-    run = run or run_json.read_run_json(folder / "run.json")
-    indices, poses = run_json.main_poses(folder, run)
-    return dict(zip(indices, poses, strict=True))
+    return dict(zip(*run_json.main_poses(folder, run), strict=True))
 
 
 def _config(
@@ -201,8 +191,7 @@ def _config(
     where = f"{folder / 'run.json'}: config"
     config = changed(from_method("default"), stored, where=where)
     given_poses = given.GivenPoses()
-    if isinstance(config.odometry, Keyframes | given.GivenPoses):
-        odometry = config.odometry
+    if isinstance(odometry := config.odometry, Keyframes | given.GivenPoses):
         given_poses = given.GivenPoses(
             odometry.views, odometry.keyframe_angle, odometry.keyframe_distance
         )
@@ -229,13 +218,11 @@ def _check_different(first: Session, second: Session) -> None:
 def _uniquely_named(sessions: list[Session]) -> list[Session]:
     """Return the sessions with unique names."""
     names = [session.name for session in sessions]
-    taken: set[str] = set()
-    out = []
-    for session, name in zip(sessions, names, strict=True):
-        unique, number = name, 1
-        while unique in taken or (number > 1 and unique in names):
-            number += 1
-            unique = f"{name} ({number})"
-        taken.add(unique)
+    out: list[Session] = []
+    for session in sessions:
+        taken = {*names[len(out) :], *(earlier.name for earlier in out)}
+        numbered = (f"{session.name} ({number})" for number in count(2))
+        is_first = session.name not in names[: len(out)]
+        unique = session.name if is_first else next(n for n in numbered if n not in taken)
         out.append(replace(session, name=unique))
     return out

@@ -9,18 +9,16 @@ the result has the same bytes.
 from __future__ import annotations
 
 import json
-import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse.engine.alignment import Link, Registration
-from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.mapping import FrameLog
@@ -30,9 +28,13 @@ from tofuse.formats.files import atomic, npz
 
 # Tracking that took less, in s, is repeated.
 _MIN_TRACKING_S = 10.0
-# Attributes of steps that are plain data, and those of registrations that are arrays.
-_PLAIN_STEP = ("status", "reason", "reference", "component", "doubtful", "inflation")
+# Attributes of steps that are stored, and those of registrations that are arrays.
+_STORED = (
+    *("status", "reason", "T_component_camera", "registration", "links", "reference"),
+    *("component", "doubtful", "inflation"),
+)
 _ARRAYS = ("T_target_source", "information", "unobservable", "runner_up")
+_MOVING = "moving-"  # prefix of the masks, by frame index
 _NOT_TRACKED = Step("lost", "not tracked before", None)
 
 
@@ -132,7 +134,7 @@ class TrackedFile:
     def _store(self, arrays: npz.Arrays) -> None:
         try:
             with atomic.replacing(self._path, durable=False) as part, part.open("wb") as file:
-                np.savez(file, allow_pickle=False, key=np.array(self._key), **arrays)
+                np.savez_compressed(file, allow_pickle=False, key=np.array(self._key), **arrays)
         except OutputError as error:
             self._note(
                 f"the tracked frames {error.problem}; if the run is interrupted and repeated, "
@@ -148,12 +150,12 @@ class LoggingTracker(Tracker):
     predicted
         (4, 4) predicted poses by frame index.
     moving
-        Masks of moving objects by frame index, of the prepared views, as compressed bits.
+        Masks of moving objects by frame index, of the prepared views, as bits.
     """
 
     def __init__(self, tracker: Tracker) -> None:
         self.predicted: dict[int, Float64] = {}
-        self.moving: dict[int, bytes] = {}
+        self.moving: dict[int, UInt8] = {}
         self._tracker = tracker
 
     def push(
@@ -165,7 +167,7 @@ class LoggingTracker(Tracker):
             rows, columns = step.surface.z.shape
             size = step.moving.shape[1] // columns
             mask = step.moving[: rows * size : size, : columns * size : size]
-            self.moving[frame.index] = zlib.compress(np.packbits(mask).tobytes())
+            self.moving[frame.index] = np.packbits(mask)
         return step
 
     def prepare(self, frame: Frame) -> PreparedView | None:
@@ -202,12 +204,15 @@ class ReplayingTracker(Tracker):
 
     def __init__(self, tracker: Tracker, arrays: npz.Arrays) -> None:
         self._prepare = tracker.prepare
-        self._steps = dict(_unpacked_steps(arrays))
-        self.indices = list(self._steps)
-        poses = map(_matrix, arrays["predicted"])
-        self._predicted = dict(zip(self.indices, poses, strict=True))
-        masks = np.split(arrays["moving"], np.cumsum(arrays["n_moving"]))[:-1]
-        self._moving = dict(zip(arrays["moving_index"].tolist(), masks, strict=True))
+        rows = json.loads(arrays["steps"].tobytes())
+        self.indices = [index for index, _, _ in rows]
+        self._predicted = {index: _array(T) for index, T, _ in rows}
+        self._steps = {index: _step(stored) for index, _, stored in rows}
+        self._moving = {
+            int(name.removeprefix(_MOVING)): bits
+            for name, bits in arrays.items()
+            if name.startswith(_MOVING)
+        }
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
@@ -220,7 +225,7 @@ class ReplayingTracker(Tracker):
         bits = self._moving.get(frame.index)
         if bits is None or view is None or not isinstance(frame, RangeFrame):
             return replace(step, surface=view)
-        mask = _unpacked_mask(bits, view.z.shape)
+        mask = np.unpackbits(bits, count=view.z.size).astype(np.bool_).reshape(view.z.shape)
         return replace(
             step,
             surface=moving_objects.without_pixels(view, mask),
@@ -238,71 +243,48 @@ class ReplayingTracker(Tracker):
 
 def _packed(log: FrameLog, tracker: LoggingTracker) -> npz.Arrays:
     """Return the steps of a log as arrays."""
-    steps = [(e.record.index, e.step) for e in log.entries if e.step is not None]
-    masks = [np.frombuffer(bits, np.uint8) for bits in tracker.moving.values()]
+    rows = [
+        (e.record.index, tracker.predicted.get(e.record.index), e.step)
+        for e in log.entries
+        if e.step is not None
+    ]
     # JSON has all digits of the numbers.
-    text = json.dumps([_plain_step(index, step) for index, step in steps], default=_plain)
-    return {
-        "steps": np.frombuffer(text.encode(), np.uint8),
-        "poses": _matrices([step.T_component_camera for _, step in steps]),
-        "predicted": _matrices([tracker.predicted.get(index) for index, _ in steps]),
-        "moving": np.concatenate([np.zeros(0, np.uint8), *masks]),
-        "n_moving": np.array([len(mask) for mask in masks], np.int64),
-        "moving_index": np.array(list(tracker.moving), np.int64),
-    }
-
-
-def _plain_step(index: int, step: Step) -> list[Any]:
-    """Return a frame's index, registration, links and plain attributes."""
-    links = [vars(link) for link in step.links]
-    return [index, step.registration, links, *(getattr(step, name) for name in _PLAIN_STEP)]
+    text = json.dumps(rows, default=_plain)
+    masks = {f"{_MOVING}{index}": bits for index, bits in tracker.moving.items()}
+    return {"steps": np.frombuffer(text.encode(), np.uint8), **masks}
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON can't represent as plain data: registrations, arrays, NumPy's numbers."""
-    if isinstance(value, Registration):
+    """Return what JSON can't represent as plain data: steps, arrays, NumPy's numbers."""
+    if isinstance(value, Step):
+        return {name: getattr(value, name) for name in _STORED}
+    if isinstance(value, Registration | Link):
         return {name: x for name, x in vars(value).items() if name != "errors"}
     return value.tolist()
 
 
-def _unpacked_steps(arrays: npz.Arrays) -> Iterator[tuple[int, Step]]:
-    """Yield the steps in arrays of `_packed`, by frame index."""
-    steps = json.loads(arrays["steps"].tobytes())
-    for (index, registration, links, *plain), pose in zip(steps, arrays["poses"], strict=True):
-        yield (
-            index,
-            Step(
-                T_component_camera=_matrix(pose),
-                registration=None if registration is None else _registration(registration),
-                links=tuple(
-                    Link(**(link | {"registration": _registration(link["registration"])}))
-                    for link in links
-                ),
-                **dict(zip(_PLAIN_STEP, plain, strict=True)),
+def _step(stored: dict[str, Any]) -> Step:
+    """Return a step from plain data."""
+    return Step(
+        **stored
+        | {
+            "T_component_camera": _array(stored["T_component_camera"]),
+            "registration": _registration(stored["registration"]),
+            "links": tuple(
+                Link(**link | {"registration": _registration(link["registration"])})
+                for link in stored["links"]
             ),
-        )
+        }
+    )
 
 
-def _registration(plain: dict[str, Any]) -> Registration:
-    arrays: dict[str, Any] = {
-        name: None if plain[name] is None else np.array(plain[name], float) for name in _ARRAYS
-    }
+def _registration(stored: dict[str, Any] | None) -> Registration | None:
+    if stored is None:
+        return None
+    arrays: dict[str, Any] = {name: _array(stored[name]) for name in _ARRAYS}
     arrays["unobservable"] = arrays["unobservable"].reshape(-1, 6)
-    return Registration(**(plain | arrays))
+    return Registration(**(stored | arrays))
 
 
-def _unpacked_mask(bits: NDArray[Any], shape: tuple[int, ...]) -> Bool:
-    """Return a mask (H, W) from its compressed bits."""
-    rows, columns = shape
-    packed = np.frombuffer(zlib.decompress(bits.tobytes()), np.uint8)
-    return np.unpackbits(packed, count=rows * columns).astype(np.bool_).reshape(rows, columns)
-
-
-def _matrices(items: Sequence[Float64 | None]) -> Float64:
-    """Return matrices (4, 4) as one array (N, 4, 4); NaN for None."""
-    unknown = np.full((4, 4), np.nan)
-    return np.array([unknown if T is None else T for T in items], float).reshape(-1, 4, 4)
-
-
-def _matrix(row: Float64) -> Float64 | None:
-    return None if np.isnan(row).all() else row.copy()
+def _array(values: Any) -> Float64 | None:
+    return None if values is None else np.array(values, float)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.apps.rigs.calibrating import Calibration, calibrate, check
-    from tofuse.apps.rigs.checking import CameraMotion
+    from tofuse.apps.rigs.calibrating import calibrate
+    from tofuse.apps.rigs.checking import CameraMotion, compare_in_scene
+    from tofuse.apps.rigs.inputs import Calibration
     from tofuse.apps.rigs.run import run_rig
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import fftconvolve, find_peaks
 
 from tofuse.engine.arrays import Float64
 
@@ -64,23 +65,13 @@ def lag_between(
         return None
     best = int(np.nanargmax(correlation))
     peak = float(correlation[best])
+    window = correlation[max(best - 1, 0) : best + 2]
     subsample = 0.0
-    if 0 < best < len(correlation) - 1:
-        left, right = correlation[best - 1], correlation[best + 1]
-        curvature = left - 2 * peak + right
-        subsample = (
-            float(np.clip(0.5 * (left - right) / curvature, -0.5, 0.5)) if curvature < 0 else 0.0
-        )
-        subsample = subsample if np.isfinite(subsample) else 0.0
-    # The peak extends to the nearest minima of the correlation.
-    low = high = best
-    while low > 0 and correlation[low - 1] <= correlation[low]:
-        low -= 1
-    while high < len(correlation) - 1 and correlation[high + 1] <= correlation[high]:
-        high += 1
-    elsewhere = np.concatenate([correlation[:low], correlation[high + 1 :]])
-    elsewhere = elsewhere[np.isfinite(elsewhere)]
-    rival = float(elsewhere.max()) if len(elsewhere) else 0.0
+    if len(window) == 3 and np.isfinite(window).all():
+        curvature = window[0] - 2 * peak + window[2]
+        subsample = 0.5 * (window[0] - window[2]) / min(curvature, -1e-12)
+    peaks, _ = find_peaks(np.nan_to_num(correlation, nan=-1.0))
+    rival = float(correlation[peaks[peaks != best]].max(initial=0.0))
     shift = (best + subsample - (len(second) - 1)) * step
     seconds = float(times[0] + shift - other_times[0])
     certain = peak >= _MIN_CORRELATION and rival <= _MAX_RIVAL * peak
@@ -98,8 +89,6 @@ def _correlations(a: Float64, b: Float64, min_overlap: int) -> Float64:
 
     NaN where fewer than `min_overlap` samples overlap.
     """
-    from scipy.signal import fftconvolve
-
     ones_a, ones_b = np.ones_like(a), np.ones_like(b)
     a, b = a - a.mean(), b - b.mean()
 

@@ -16,7 +16,7 @@ from scipy import stats
 
 from tofuse.apps.rigs.clocks import Lag, lag_between
 from tofuse.engine.alignment import projective
-from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.geometry import se3
@@ -116,7 +116,7 @@ def hand_eye(a: Track, b: Track, time_offset_s: float, *, common_world: bool = F
         If there are too few common poses.
     """
     X, Y = _initial_estimate(a, b, time_offset_s, common_world=common_world)
-    return _Fit(a, b, common_world).solve(X, Y, time_offset_s)
+    return _Fit(a, b, X, Y, time_offset_s).solve(common_world=common_world)
 
 
 def combined(a: HandEye, b: HandEye) -> HandEye:
@@ -191,57 +191,56 @@ def median_pose(poses: Float64) -> Float64:
 class _Fit:
     """Gauss-Newton over X, Y and the clock, with robust weights."""
 
-    def __init__(self, a: Track, b: Track, common_world: bool) -> None:
-        self.a, self.b, self.common_world = a, b, common_world
-        span = min(a.interval, b.interval)
-        self.half_step = 0.5 * span  # for the derivative by time
+    def __init__(self, a: Track, b: Track, X: Float64, Y: Float64, offset: float) -> None:
+        self.a, self.b = a, b
+        self.X, self.Y, self.offset = X, Y, offset
+        # Steps of derivatives: by the time, to the poses before and after.
+        half_interval = 0.5 * min(a.interval, b.interval) / _TIME_UNIT
+        self.steps = np.array([*[0.01] * 12, half_interval])
 
-    def residuals(self, X: Float64, Y: Float64, offset: float) -> Float64:
-        """Return (N, 6) log((T_a X)^-1 Y T_b) at the common times."""
-        _, T_a, T_b = _common(self.a, self.b, offset)
-        return np.asarray(se3.log(se3.inverse(T_a @ X) @ Y @ T_b), np.float64)
+    def moved(self, step: Float64) -> tuple[Float64, Float64, float]:
+        """Return X, Y and the time offset after a step (13,), in units."""
+        X = se3.orthonormalise(self.X @ se3.exp(step[:6] * projective.UNITS))
+        Y = se3.orthonormalise(self.Y @ se3.exp(step[6:12] * projective.UNITS))
+        return X, Y, self.offset + float(step[12]) * _TIME_UNIT
 
-    def solve(self, X: Float64, Y: Float64, offset: float) -> HandEye:
+    def linearised(self, free: Intp) -> tuple[Float64, Float64, Float64]:
+        """Return derivatives (N, 6, F) by the free unknowns, residuals (N, 6) in units, and times.
+
+        The residuals are log((T_a X)^-1 Y T_b) at the common times.
+        """
+        times, T_a, _ = _common(self.a, self.b, self.offset)
+
+        def residuals(step: Float64) -> Float64:
+            X, Y, offset = self.moved(step)
+            T_b, _ = self.b.at(times - offset)
+            return np.asarray(se3.log(se3.inverse(T_a @ X) @ Y @ T_b) / projective.UNITS)
+
+        steps = np.diag(self.steps)[free]
+        both = [residuals(step) - residuals(-step) for step in steps]
+        J = np.stack(both, axis=2) / (2 * self.steps[free])
+        return J, residuals(np.zeros(13)), times
+
+    def solve(self, *, common_world: bool) -> HandEye:
         """Iterate to convergence."""
+        free = np.r_[0:6, 12] if common_world else np.arange(13)
         for _ in range(_ITERATIONS):
-            J, e, _ = self.linearised(X, Y, offset)
+            J, e, _ = self.linearised(free)
             sigma = _sigma(e)
-            w = _weights(e, sigma)
-            H = _weighted_product(J, w / sigma**2, J)
-            g = _weighted_product(J, w / sigma**2, e[..., None])[:, 0]
-            H += np.diag(1e-9 * H.diagonal() + 1e-6)
-            step = -np.linalg.solve(H, g)
-            X = se3.orthonormalise(X @ se3.exp(step[:6] * projective.UNITS))
-            if not self.common_world:
-                Y = se3.orthonormalise(Y @ se3.exp(step[6:12] * projective.UNITS))
-            offset += float(np.clip(step[-1] * _TIME_UNIT, -self.half_step, self.half_step))
+            w = _weights(e, sigma) / sigma**2
+            H = _weighted_product(J, w, J)
+            g = _weighted_product(J, w, e[..., None])[:, 0]
+            step = np.zeros(13)
+            step[free] = -np.linalg.solve(H + np.diag(1e-9 * H.diagonal() + 1e-6), g)
+            step[12] = np.clip(step[12], -self.steps[12], self.steps[12])
+            self.X, self.Y, self.offset = self.moved(step)
             if np.abs(step).max() < _CONVERGENCE:
                 break
-        J, e, times = self.linearised(X, Y, offset)
-        sigma = _sigma(e)
-        C = _covariance(J, e, times, sigma)
+        J, e, times = self.linearised(free)
+        C = _covariance(J, e, times, _sigma(e))
         units = np.outer(projective.UNITS, projective.UNITS)
         time_sigma_s = float(np.sqrt(C[-1, -1])) * _TIME_UNIT
-        return HandEye(X, C[:6, :6] * units, Y, offset, time_sigma_s)
-
-    def linearised(self, X: Float64, Y: Float64, offset: float) -> tuple[Float64, Float64, Float64]:
-        """Return derivatives (N, 6, 13) or (N, 6, 7), residuals (N, 6) in units, and times."""
-        times, T_a, T_b = _common(self.a, self.b, offset)
-        e = se3.log(se3.inverse(T_a @ X) @ Y @ T_b)
-        right = se3.jacobian_inverse(e)
-        left = se3.jacobian_inverse(-e)
-        by_x = -left
-        columns = [by_x * projective.UNITS]
-        if not self.common_world:
-            columns.append(right @ se3.adjoint(se3.inverse(T_b)) * projective.UNITS)
-        # The velocity of b: a larger offset selects an earlier pose.
-        T_after, valid_after = self.b.at(times - offset + self.half_step)
-        T_before, valid_before = self.b.at(times - offset - self.half_step)
-        velocity = se3.log(se3.inverse(T_before) @ T_after) / (2 * self.half_step)
-        velocity = np.where((valid_after & valid_before)[:, None], velocity, 0.0)
-        columns.append((-(right @ velocity[..., None])) * _TIME_UNIT)
-        J = np.concatenate(columns, axis=2) / projective.UNITS[:, None]
-        return np.asarray(J, np.float64), np.asarray(e / projective.UNITS, np.float64), times
+        return HandEye(self.X, C[:6, :6] * units, self.Y, self.offset, time_sigma_s)
 
 
 def _sigma(e: Float64) -> Float64:

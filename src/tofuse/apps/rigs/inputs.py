@@ -1,8 +1,8 @@
-"""The recordings of a rig's cameras: named, checked, and prepared for comparison."""
+"""The recordings of a rig's cameras, checked and prepared for comparison; a calibration of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +13,7 @@ from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.mapping import Config, adaptation, from_method
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 from tofuse.formats.recordings import open_recording
+from tofuse.formats.rigs import Disagreement, Rig
 
 _MAX_CAMERAS = 64
 
@@ -55,23 +56,14 @@ class Camera:
         """Read image `k`; None if it can't be read, or is empty."""
         return measured_image(self.recording, k)
 
-    def every_image(self) -> Iterator[RangeFrame]:
-        """Read all images that can be read."""
-        for item in self.recording.read_all():
-            if isinstance(item, RangeFrame):
-                yield item
-
-    def corrected(self, frame: RangeFrame) -> RangeFrame:
-        """Return an image after corrections and filters."""
+    def surface(self, frame: RangeFrame) -> PreparedView:
+        """Return an image prepared for comparison, after corrections and filters."""
         for correction in self.config.corrections:
             corrected = correction.start().apply(frame)
             frame = corrected if isinstance(corrected, RangeFrame) else frame
         filtered, _ = apply_filters(self.config.filters, frame, ())
-        return filtered if isinstance(filtered, RangeFrame) else frame
-
-    def surface(self, frame: RangeFrame) -> PreparedView:
-        """Return an image prepared for comparison."""
-        return prepare_view(self.corrected(frame), SurfaceOptions())
+        frame = filtered if isinstance(filtered, RangeFrame) else frame
+        return prepare_view(frame, SurfaceOptions())
 
 
 def measured_image(recording: Recording, k: int) -> RangeFrame | None:
@@ -80,28 +72,36 @@ def measured_image(recording: Recording, k: int) -> RangeFrame | None:
     return frame if frame is not None and len(frame) else None
 
 
-def open_cameras(paths: Sequence[str | Path], format: str | None = None) -> list[Camera]:  # noqa: A002
-    """Open the recordings of a rig's cameras, each named after its file or folder.
+def open_cameras(
+    paths: Sequence[str | Path],
+    format: str | None = None,  # noqa: A002
+    names: Sequence[str] | None = None,
+) -> list[Camera]:
+    """Open the recordings of a rig's cameras, by default named after their files or folders.
 
     Raises
     ------
     InputError
-        If there are fewer than two or too many, one can't be opened, or one is given twice.
+        If there are fewer than two, too many, or not as many as names; if one can't be opened, or
+        is given twice.
     """
-    if len(paths) < 2:
-        raise InputError("is one camera", where="a rig", remedy="pass two recordings or more")
-    if len(paths) > _MAX_CAMERAS:
+    if names is not None and len(paths) != len(names):
         raise InputError(
-            f"has {len(paths)} cameras", where="a rig", remedy=f"pass at most {_MAX_CAMERAS}"
+            f"has {len(names)} cameras ({', '.join(names)}), and {len(paths)} recordings are given",
+            where="the rig",
+            remedy="pass one recording for each, in this order",
+        )
+    if not 2 <= len(paths) <= _MAX_CAMERAS:
+        raise InputError(
+            f"has {len(paths)} cameras", where="a rig", remedy=f"pass 2 to {_MAX_CAMERAS}"
         )
     resolved = [Path(path).resolve() for path in paths]
     for k, path in enumerate(resolved):
         if path in resolved[:k]:
             raise InputError("is given twice", where=paths[k], remedy="pass each camera once")
-    names = unique_names(resolved)
     return [
         Camera(name, open_recording(path, format=format))
-        for name, path in zip(names, paths, strict=True)
+        for name, path in zip(names or unique_names(resolved), paths, strict=True)
     ]
 
 
@@ -112,3 +112,32 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     return [f"camera {k}" for k in range(len(paths))]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The result of a rig calibration.
+
+    Attributes
+    ----------
+    rig
+        The placed cameras; those that could not be placed are in its `unplaced`.
+    how
+        "one instant", "n instants", or "a walk".
+    notes
+        Notes for the user.
+    """
+
+    rig: Rig
+    how: str
+    notes: tuple[str, ...] = ()
+
+
+def disagreement_rows(
+    names: Sequence[str], distances: Mapping[tuple[int, int], tuple[float, int]]
+) -> tuple[Disagreement, ...]:
+    """Return the distances between the surfaces of pairs of cameras with their names, in order."""
+    return tuple(
+        Disagreement(names[a], names[b], median, pixels)
+        for (a, b), (median, pixels) in sorted(distances.items())
+    )

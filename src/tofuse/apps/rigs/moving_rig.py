@@ -7,14 +7,14 @@ a joint refinement of all views, once the trajectories are in one world frame.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from tofuse.apps.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
-from tofuse.apps.rigs.inputs import Camera
-from tofuse.apps.rigs.joint import disagreements_of
-from tofuse.engine.arrays import Float64, Intp
+from tofuse.apps.rigs.inputs import Calibration, Camera, disagreement_rows
+from tofuse.apps.rigs.joint import SurfaceDistances, disagreements_of
+from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
@@ -22,6 +22,7 @@ from tofuse.engine.mapping import reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import Priors, joint_alignment, propagate_poses, refined_by_halves
 from tofuse.engine.stored_views import SampledView, pair_equations
+from tofuse.formats.rigs import Rig, RigCamera
 
 # Number of views of each camera that are refined jointly, and of their points.
 _VIEWS, _POINTS = 70, 1500
@@ -32,30 +33,7 @@ _MAX_SIGMA_FRACTION, _MAX_SIGMA_RAD = 0.05, float(np.radians(4.0))
 _OPTIONS = pair_equations.RefineOptions(neighbours=16)
 
 
-@dataclass(frozen=True, eq=False)
-class MovingRig:
-    """The calibration of a moving rig.
-
-    Attributes
-    ----------
-    fits
-        Calibration of each camera but the first relative to the first, by camera.
-    reasons
-        Why a camera is not placed, by camera.
-    disagreement
-        By pair of cameras (a, b), a < b: median distance between their surfaces, at any time, in
-        m, and the number of compared pixels.
-    notes
-        Messages for the user.
-    """
-
-    fits: dict[int, HandEye]
-    reasons: dict[int, str]
-    disagreement: dict[tuple[int, int], tuple[float, int]]
-    notes: tuple[str, ...]
-
-
-def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig:
+def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> Calibration:
     """Track each camera, fit the trajectories to each other, and refine all views jointly.
 
     Raises
@@ -100,13 +78,22 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig
         if reason:
             reasons[k] = reason
             del fits[k]
+    rows = [RigCamera(cameras[0].name, cameras[0].recording.path, np.eye(4), np.zeros((6, 6)))]
+    rows += [
+        RigCamera(
+            cameras[k].name,
+            cameras[k].recording.path,
+            fit.T_a_b,
+            fit.covariance,
+            fit.time_offset_s,
+        )
+        for k, fit in sorted(fits.items())
+    ]
     placed = {0, *fits}
-    return MovingRig(
-        fits,
-        reasons,
-        {ends: distance for ends, distance in joint.disagreement().items() if set(ends) <= placed},
-        tuple(notes),
-    )
+    distances = {ends: d for ends, d in joint.disagreement().items() if set(ends) <= placed}
+    pairs = disagreement_rows([camera.name for camera in cameras], distances)
+    unplaced = {cameras[k].name: reason for k, reason in sorted(reasons.items())}
+    return Calibration(Rig(tuple(rows), pairs, unplaced), "a walk", tuple(notes))
 
 
 def _initial_offset(
@@ -159,21 +146,22 @@ def _too_uncertain(fit: HandEye, depth: float) -> str:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _CameraViews:
-    """Views of one camera, and the rows (N,) of their poses in its track."""
-
-    rows: Intp
-    views: tuple[SampledView, ...]
-
-
 class _JointViews:
-    """Views of all cameras in the world of the first one."""
+    """Views of all cameras in the world of the first one.
 
-    def __init__(self, tracks: dict[int, Track], camera_views: dict[int, _CameraViews]) -> None:
-        self.tracks, self._views = tracks, camera_views
+    `rows` are the rows of the views' poses in the tracks of their cameras.
+    """
+
+    def __init__(
+        self,
+        tracks: dict[int, Track],
+        camera: Sequence[int] = (),
+        rows: Sequence[int] = (),
+        views: Sequence[SampledView] = (),
+    ) -> None:
+        self.tracks, self._views = tracks, views
+        self._camera, self._rows = np.array(camera, np.intp), np.array(rows, np.intp)
         self.improved = False
-        views = [v for k in sorted(camera_views) for v in camera_views[k].views]
         self.depth = float(np.median([v.depth for v in views])) if views else 1.0
         self._halves: list[tuple[dict[int, Track], ...]] = []
         self._pairs = np.zeros((0, 2), np.intp)
@@ -185,57 +173,49 @@ class _JointViews:
     ) -> _JointViews:
         """Prepare views of the calibrated cameras."""
         world = {0: tracks[0]}
-        for k, fit in fits.items():
+        for k, fit in sorted(fits.items()):
             world[k] = replace(tracks[k], poses=fit.T_world_other @ tracks[k].poses)
-        camera_views = {}
+        camera, rows, views = [], [], []
         for k, track in world.items():
-            rows, sampled = [], []
             for p in evenly_spaced(np.arange(len(track.times)), _VIEWS):
                 row = int(np.searchsorted(cameras[k].recording.timestamps, track.times[p]))
                 frame = cameras[k].image(row)
                 if frame is not None:
+                    camera.append(k)
                     rows.append(p)
-                    sampled.append(SampledView.of(cameras[k].surface(frame), _POINTS))
-            camera_views[k] = _CameraViews(np.array(rows, np.intp), tuple(sampled))
-        return cls(world, camera_views)
+                    views.append(SampledView.of(cameras[k].surface(frame), _POINTS))
+        return cls(world, camera, rows, views)
 
     def refined(self) -> dict[int, Track]:
         """Return the tracks in one world, after a joint refinement if that improved them."""
-        order = sorted(self._views)
-        views = [v for k in order for v in self._views[k].views]
-        poses = np.concatenate([self.tracks[k].poses[self._views[k].rows] for k in order])
-        first = poses[0]
-        refinement = joint_alignment.refine(views, np.asarray(se3.inverse(first) @ poses), _OPTIONS)
-        count = len(views)
+        ends = zip(self._camera, self._rows, strict=True)
+        self._poses = np.stack([self.tracks[k].poses[row] for k, row in ends])
+        first, count = self._poses[0], len(self._views)
+        start = np.asarray(se3.inverse(first) @ self._poses)
+        refinement = joint_alignment.refine(self._views, start, _OPTIONS)
         before, after = refinement.before.of_views(count), refinement.after.of_views(count)
-        camera = np.repeat(order, [len(self._views[k].views) for k in order])
+        self._pairs = refinement.pairs
         # The cameras are in one world frame only if views of each and the first were compared.
-        compared = {tuple(sorted(ends)) for ends in camera[refinement.pairs].tolist()}
-        connected = all((0, k) in compared for k in order if k)
-        self._pairs, self._poses = refinement.pairs, first @ refinement.poses
-        self._camera = camera
+        compared = {tuple(sorted(ends)) for ends in self._camera[self._pairs].tolist()}
+        connected = all((0, k) in compared for k in self.tracks if k)
         if after.mean() < before.mean() or not connected:
-            self._poses = poses
             return dict(self.tracks)
-        self.improved = True
+        self.improved, self._poses = True, first @ refinement.poses
         self._halves = [
             tuple(self._propagated(first @ poses) for poses in pair)
-            for pair in refined_by_halves(views, refinement, _OPTIONS, Priors.none())
+            for pair in refined_by_halves(self._views, refinement, _OPTIONS, Priors.none())
         ]
         return self._propagated(self._poses)
 
     def _propagated(self, poses: Float64) -> dict[int, Track]:
         """Return the tracks that follow the refined poses of all views."""
-        start, tracks = 0, {}
-        for k in sorted(self._views):
-            camera_views = self._views[k]
-            new_poses = poses[start : start + len(camera_views.views)]
-            start += len(camera_views.views)
-            tracks[k] = replace(
-                self.tracks[k],
-                poses=propagate_poses(self.tracks[k].poses, camera_views.rows, new_poses),
+        return {
+            k: replace(
+                track, poses=propagate_poses(track.poses, self._rows[of_camera], poses[of_camera])
             )
-        return tracks
+            for k, track in self.tracks.items()
+            for of_camera in [self._camera == k]
+        }
 
     def systematic(self, k: int, fit: HandEye) -> Float64:
         """Return the covariance (6, 6) of camera k from halves of the images (`split_half`).
@@ -255,7 +235,6 @@ class _JointViews:
         values, vectors = np.linalg.eigh(C)
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, np.float64)
 
-    def disagreement(self) -> dict[tuple[int, int], tuple[float, int]]:
-        """See `MovingRig`."""
-        views = [v for k in sorted(self._views) for v in self._views[k].views]
-        return disagreements_of(views, self._camera, self._poses, self._pairs)
+    def disagreement(self) -> SurfaceDistances:
+        """Return the distances between the surfaces of pairs of cameras, at any time."""
+        return disagreements_of(self._views, self._camera, self._poses, self._pairs)

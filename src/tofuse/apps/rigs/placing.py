@@ -11,14 +11,14 @@ score.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 
 import numpy as np
 
-from tofuse.apps.rigs.joint import JointOptions, RigView, refined_poses
+from tofuse.apps.rigs.joint import RigView, refined_poses
 from tofuse.engine.alignment import PROBABLE
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_all
@@ -52,7 +52,7 @@ _SIDE_BY_SIDE = SearchOptions(mode="full")
 # Minimum difference between distinct poses, as a fraction of the depth.
 _DISTINCT = 0.04
 _POINTS = 1500
-_REFINEMENT = JointOptions(offset_sigma_m=1e-4)
+_OFFSET_SIGMA_M = 1e-4  # depth offsets are not estimated yet
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,14 +82,8 @@ def place(cameras: Sequence[Sequence[PreparedView | None]]) -> Placement:
     return _Placer(cameras).placement()
 
 
-@dataclass(frozen=True)
-class _PairAgreement:
-    """Agreement of the views of two cameras at a pose: means over instants, see `Agreement`."""
-
-    score: float = 0.0
-    support: float = 0.0
-    overlap: float = 0.0
-    contradiction: float = 0.0
+# Rows of the agreement of two cameras' views at a pose: means over instants, see `Agreement`.
+_SCORE, _SUPPORT, _OVERLAP, _CONTRADICTION = range(4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,10 +115,9 @@ class _Placer:
     def _views_to_refine(self) -> list[RigView]:
         instants = range(max(map(len, self._views), default=0))
         full = [m for m in instants if all(self._views[c][m] is not None for c in self._depth)]
-        selected = _evenly(full or list(instants), _REFINED)
         return [
             RigView(c, m, SampledView.of(view, _POINTS))
-            for m in selected
+            for m in _evenly(full or list(instants), _REFINED)
             for c, views in enumerate(self._views)
             if (view := views[m]) is not None
         ]
@@ -143,12 +136,10 @@ class _Placer:
         ]
         proposals = [self._propose(t, s) for t, s in _evenly(pairs, _SEARCHED)]
         poses = np.concatenate([np.zeros((0, 4, 4)), *proposals])
-        scores = np.array([self._agreement_at(a, b, T).score for T in poses])
-        distinct: list[Float64] = []
-        for k in np.argsort(-scores, kind="stable"):
-            if scores[k] > 0 and self._is_distinct(poses[k], distinct):
-                distinct.append(poses[k])
-        self._proposals[a, b] = np.array(distinct[:_PROPOSALS]).reshape(-1, 4, 4)
+        scores = np.array([self._agreement_at(a, b, T)[_SCORE] for T in poses])
+        order = [k for k in np.argsort(-scores, kind="stable") if scores[k] > 0]
+        distinct = list(itertools.islice(self._distinct(poses[order]), _PROPOSALS))
+        self._proposals[a, b] = poses[order][distinct]
 
     def _propose(self, target: PreparedView, source: PreparedView) -> Float64:
         """Return candidate poses T_target_source (N, 4, 4) for a pair of views."""
@@ -163,15 +154,13 @@ class _Placer:
                 poses += [candidate.T_target_source for candidate in match.candidates]
         return np.array(poses).reshape(-1, 4, 4)
 
-    def _agreement_at(self, a: int, b: int, T_a_b: Float64) -> _PairAgreement:
-        """Return the mean agreement over instants at the pose of b in the frame of a."""
+    def _agreement_at(self, a: int, b: int, T_a_b: Float64) -> Float64:
+        """Return the mean agreement (4,) over instants at the pose of b in the frame of a."""
         if (a, b) not in self._comparisons:
             a, b, T_a_b = b, a, se3.inverse(T_a_b)
         agreements = [comparison.at(T_a_b) for comparison in self._comparisons[a, b]]
-        if not agreements:
-            return _PairAgreement()
         rows = [(s.score, s.support, s.overlap, s.violation + s.clash) for s in agreements]
-        return _PairAgreement(*(float(mean) for mean in np.mean(rows, axis=0)))
+        return np.mean(rows, axis=0) if rows else np.zeros(4)
 
     def _proposed(self, a: int, b: int) -> Float64:
         """Return the proposed poses (N, 4, 4) of b in the frame of a."""
@@ -179,13 +168,19 @@ class _Placer:
             return self._proposals[a, b]
         return np.asarray(se3.inverse(self._proposals[b, a]), np.float64)
 
-    def _gain(self, poses: Mapping[int, Float64], camera: int, T: Float64) -> float:
-        """Return the score of a camera at T (4, 4) against the placed ones."""
-        return sum(
-            self._agreement_at(c, camera, se3.inverse(T_first_c) @ T).score
+    def _agreement_with(self, poses: Mapping[int, Float64], camera: int, T: Float64) -> Float64:
+        """Return the sums (4,) of a camera's agreement at T (4, 4) with the other placed ones."""
+        rows = [
+            self._agreement_at(c, camera, se3.inverse(T_first_c) @ T)
             for c, T_first_c in poses.items()
             if c != camera
-        )
+        ]
+        return np.sum([np.zeros(4), *rows], axis=0)
+
+    def _gains(self, jobs: Sequence[tuple[Mapping[int, Float64], int, Float64]]) -> list[float]:
+        """Return the scores of cameras at poses (4, 4) against those of placed ones."""
+        sums = run_all([partial(self._agreement_with, *job) for job in jobs])
+        return [float(row[_SCORE]) for row in sums]
 
     def _candidates(self, poses: Mapping[int, Float64], camera: int) -> list[Float64]:
         """Return candidate poses of a camera, from its proposals with each placed camera."""
@@ -200,9 +195,7 @@ class _Placer:
             if camera not in hypothesis.poses
             for T in self._candidates(hypothesis.poses, camera)
         ]
-        gains = run_all(
-            [partial(self._gain, hypothesis.poses, camera, T) for hypothesis, camera, T in jobs]
-        )
+        gains = self._gains([(hypothesis.poses, camera, T) for hypothesis, camera, T in jobs])
         extended = [
             _Hypothesis({**hypothesis.poses, camera: T}, hypothesis.score + gain)
             for (hypothesis, camera, T), gain in zip(jobs, gains, strict=True)
@@ -219,20 +212,24 @@ class _Placer:
     ) -> list[_Hypothesis]:
         distinct: list[_Hypothesis] = []
         for hypothesis in sorted(hypotheses, key=lambda s: -s.score):
-            if all(self._differ(hypothesis.poses, other.poses) for other in distinct):
+            a = hypothesis.poses
+            if len(distinct) < max_count and not any(
+                a.keys() == b.keys() and not any(self._differ(a[c], b[c]) for c in a)
+                for b in (other.poses for other in distinct)
+            ):
                 distinct.append(hypothesis)
-                if len(distinct) == max_count:
-                    break
         return distinct
 
-    def _differ(self, a: Mapping[int, Float64], b: Mapping[int, Float64]) -> bool:
-        return a.keys() != b.keys() or any(
-            are_distinct_poses(a[c], b[c], self._distinct_m) for c in a
-        )
+    def _differ(self, a: Float64, b: Float64) -> bool:
+        return are_distinct_poses(a, b, self._distinct_m)
 
-    def _is_distinct(self, T: Float64, others: Sequence[Float64]) -> bool:
-        """Whether a pose (4, 4) differs from all others."""
-        return all(are_distinct_poses(T, other, self._distinct_m) for other in others)
+    def _distinct(self, poses: Iterable[Float64], *known: Float64) -> Iterator[int]:
+        """Yield the positions of the poses (4, 4) that differ from all earlier and known ones."""
+        earlier = list(known)
+        for k, T in enumerate(poses):
+            if all(self._differ(T, other) for other in earlier):
+                earlier.append(T)
+                yield k
 
     def _refine(self, hypothesis: _Hypothesis) -> _Hypothesis:
         """Refine all cameras of a hypothesis jointly, if that improves its score."""
@@ -247,23 +244,23 @@ class _Placer:
         views = [
             replace(v, camera=row[v.camera]) for v in self._refinement_views if v.camera in row
         ]
-        refined = refined_poses(views, np.stack([poses[c] for c in order]), _REFINEMENT)
+        refined = refined_poses(views, np.stack([poses[c] for c in order]), _OFFSET_SIGMA_M)
         return dict(zip(order, refined, strict=True))
 
     def _score(self, poses: Mapping[int, Float64]) -> float:
         return sum(
-            self._agreement_at(a, b, se3.inverse(poses[a]) @ poses[b]).score
+            self._agreement_at(a, b, se3.inverse(poses[a]) @ poses[b])[_SCORE]
             for a, b in itertools.combinations(sorted(poses), 2)
         )
 
     def placement(self) -> Placement:
         """Search hypotheses, and keep the unambiguous poses of the best one."""
-        hypotheses = [_Hypothesis({0: np.eye(4)}, 0.0)] if 0 in self._depth else []
+        best = _Hypothesis({}, 0.0)
+        rivals = [_Hypothesis({0: np.eye(4)}, 0.0)] if 0 in self._depth else []
         reasons: dict[int, str] = {}
-        rivals: list[_Hypothesis] = hypotheses
-        while hypotheses:
-            rivals, hypotheses = hypotheses, self._extend(hypotheses)
-        best = rivals[0] if rivals else _Hypothesis({}, 0.0)
+        extended = rivals
+        while extended:
+            rivals, best, extended = extended, extended[0], self._extend(extended)
         poses = dict(best.poses)
         while len(poses) > 1:
             assessments = {c: self._pose_probability(poses, c, rivals) for c in poses if c}
@@ -284,16 +281,11 @@ class _Placer:
 
         A pose that converges to the current one is not an alternative.
         """
-        pose = poses[camera]
-        distinct: list[Float64] = [pose]
-        for gain, T in sorted(candidates, key=lambda pair: -pair[0]):
-            if gain <= 0:
-                break
-            if not self._is_distinct(T, distinct):
-                continue
-            distinct.append(T)
+        ranked = sorted((c for c in candidates if c[0] > 0), key=lambda pair: -pair[0])
+        for k in self._distinct([T for _, T in ranked], poses[camera]):
+            gain, T = ranked[k]
             refined = self._align({**poses, camera: T})
-            if are_distinct_poses(pose, refined[camera], self._distinct_m):
+            if self._differ(poses[camera], refined[camera]):
                 yield gain
 
     def _pose_probability(
@@ -307,25 +299,20 @@ class _Placer:
         (Renyi, 1953; Weissman, 1978).
         """
         others = {c: T for c, T in poses.items() if c != camera}
-        pose = poses[camera]
-        agreements = [
-            self._agreement_at(c, camera, se3.inverse(T) @ pose) for c, T in others.items()
-        ]
-        score = sum(s.score for s in agreements)
+        agreement = self._agreement_with(others, camera, poses[camera])
+        score, total = float(agreement[_SCORE]), self._score(poses)
         alternatives = self._candidates(others, camera)
-        gains = run_all([partial(self._gain, others, camera, T) for T in alternatives])
-        total = self._score(poses)
+        gains = self._gains([(others, camera, T) for T in alternatives])
         candidates = list(zip(gains, alternatives, strict=True)) + [
             (score - (total - other.score), other.poses[camera])
             for other in rivals
             if other.poses.keys() == poses.keys()
         ]
-        rival_scores = self._rivals({**others, camera: pose}, camera, candidates)
+        rival_scores = self._rivals({**others, camera: poses[camera]}, camera, candidates)
         rival = next(rival_scores, 0.0)
-        overlap = max(sum(s.overlap for s in agreements), 1e-9)
         evidence = pose_probability.PoseEvidence(
-            support=min(sum(s.support for s in agreements), 1.0),
-            contradiction=sum(s.contradiction for s in agreements) / overlap,
+            support=min(float(agreement[_SUPPORT]), 1.0),
+            contradiction=float(agreement[_CONTRADICTION] / max(agreement[_OVERLAP], 1e-9)),
             margin=score - rival,
         )
         if evidence.probability >= pose_probability.ACCEPTED:

@@ -11,11 +11,11 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.apps.jobs import Options, resolve
 from tofuse.apps.results import folders, write_result
-from tofuse.apps.rigs.calibrating import cameras_of, disagreement_rows, moves
+from tofuse.apps.rigs.calibrating import moves
 from tofuse.apps.rigs.checking import CameraMotion, compare
-from tofuse.apps.rigs.inputs import Camera
-from tofuse.apps.rigs.joint import RigView, disagreements, refine_together
-from tofuse.apps.rigs.rig_trajectory import track_rig
+from tofuse.apps.rigs.inputs import Camera, disagreement_rows, open_cameras
+from tofuse.apps.rigs.joint import RigView, SurfaceDistances, disagreements, refine_together
+from tofuse.apps.rigs.rig_trajectory import RigTrajectory, track_rig
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.compute import threads as using_threads
 from tofuse.engine.errors import InputError
@@ -81,19 +81,17 @@ def run_rig(
         If the result can't be written.
     """
     progress = progress or Silent()
-    names = list(recordings_of(rig_file))
     with using_threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
-        cameras = cameras_of(names, inputs, options.format)
+        cameras = open_cameras(inputs, options.format, list(recordings_of(rig_file)))
         recordings = [camera.recording for camera in cameras]
-        rig = read_rig(rig_file)
-        source = RigSource(rig, recordings)
+        source = RigSource(read_rig(rig_file), recordings)
         full_recording = Recording.of(source, " ".join(map(str, inputs)), "rig")
         recording = _selected(full_recording, source, options)
         config = resolve(options)
         with folders.OutputFolder(options.out, overwrite=options.overwrite) as folder:
             result = reconstruct_rig(
-                rig, cameras, recording, config, seed=options.seed or 0, progress=progress
+                cameras, recording, config, seed=options.seed or 0, progress=progress
             )
             progress.stage("writing")
             _write(result, recording, folder)
@@ -114,7 +112,6 @@ def _selected(full_recording: Recording, source: RigSource, options: Options) ->
 
 
 def reconstruct_rig(
-    rig: Rig,
     cameras: Sequence[Camera],
     recording: Recording,
     config: Config,
@@ -126,8 +123,8 @@ def reconstruct_rig(
 
     Parameters
     ----------
-    rig, cameras
-        The calibrated rig, and its opened cameras in the same order.
+    cameras
+        The opened cameras of the rig, in its order.
     recording
         Of a `RigSource`.
     config, seed
@@ -136,22 +133,21 @@ def reconstruct_rig(
     progress = progress or Silent()
     source = recording.source
     assert isinstance(source, RigSource)
+    rig = source.rig
     instants, first = np.unique(source.instant[recording.indices], return_index=True)
-    times = recording.timestamps[first]
-    poses = np.tile(np.eye(4), (len(instants), 1, 1))
-    T_rig_frame = source.T_rig_camera[recording.indices]
     displaced: list[CameraMotion] = []
-    measured: tuple[Measured, ...] = ()
-    tracked: tuple[Measured, ...] = ()
     if moves(cameras, "auto"):
         trajectory = track_rig(cameras, recording, progress)
-        poses, T_rig_frame = trajectory.poses, trajectory.T_rig_frame
-        distances = trajectory.disagreement
-        measured, tracked = trajectory.measured, trajectory.tracked
     else:
-        displaced, distances = _check_calibration(rig, cameras, recording)
+        poses = np.tile(np.eye(4), (len(instants), 1, 1))
+        displaced, distances = _check_calibration(cameras, recording)
+        T_rig_frame = source.T_rig_camera[recording.indices]
+        trajectory = RigTrajectory(poses, T_rig_frame, distances, ())
     instant = np.searchsorted(instants, source.instant[recording.indices])
-    frame_poses = poses[instant] @ T_rig_frame
+    frame_poses = trajectory.poses[instant] @ trajectory.T_rig_frame
+    is_moving = bool(trajectory.measured or trajectory.tracked)
+    edges = _calibration_edges(recording, instant, frame_poses, follow=not is_moving)
+    refined = AlreadyRefined(trajectory.measured, (*trajectory.tracked, *edges))
     fusion_config = replace(
         config,
         odometry=given.GivenPoses(),
@@ -160,33 +156,24 @@ def reconstruct_rig(
         priors=(),
         self_calibration=False,
     )
-    is_moving = bool(measured or tracked)
-    calibration_edges = _calibration_edges(
-        rig, source, recording, instant, frame_poses, follow=not is_moving
-    )
-    refined_config = replace(
-        fusion_config, refinement=AlreadyRefined(measured, (*tracked, *calibration_edges))
-    )
     result = reconstructing.reconstruct(
         adaptation.with_odometry(recording, frame_poses),
-        refined_config,
+        replace(fusion_config, refinement=refined),
         seed=seed,
         progress=progress,
     )
     names = [camera.name for camera in rig.cameras]
     rig_fields = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}
     result = replace(
-        _without_tracking_diagnostics(result, names, source.camera, moves=is_moving),
+        _with_reasons_of_rig(result, names, source.camera, displaced, moves=is_moving),
         config=fusion_config.to_dict(),
         recording={**result.recording, "rig": rig_fields},
     )
-    measured_rig = replace(rig, disagreement=disagreement_rows(names, distances))
-    return RigResult(_with_rig_reason(result, displaced), times, poses, measured_rig)
+    measured_rig = replace(rig, disagreement=disagreement_rows(names, trajectory.disagreement))
+    return RigResult(result, recording.timestamps[first], trajectory.poses, measured_rig)
 
 
 def _calibration_edges(
-    rig: Rig,
-    source: RigSource,
     recording: Recording,
     instant: Intp,
     T_world_frame: Float64,
@@ -198,24 +185,25 @@ def _calibration_edges(
     Calibration errors are the same at all instants: if the rig is static (`follow`), later frames
     are tied to the first frame of their camera.
     """
+    source = recording.source
+    assert isinstance(source, RigSource)
     # The bound on the errors is enlarged for systematic ones, which these covariances include.
     covariances = [
         c.covariance / pose_accuracy.UNOBSERVED_ERROR_FACTOR**2 + np.diag(_MIN_VARIANCES)
-        for c in rig.cameras
+        for c in source.rig.cameras
     ]
     covariances[0] = np.diag(_MIN_VARIANCES)
     posed = np.flatnonzero(np.isfinite(T_world_frame[:, 0, 0]))
     cameras = source.camera[recording.indices]
     edges: list[Measured] = []
-    reference: dict[int, int] = {}
+    first: dict[int, int] = {}  # frame of each instant, or if static of all instants
     first_of_camera: dict[int, int] = {}
-    for k in posed:
+    for k in map(int, posed):
         c = int(cameras[k])
-        i = reference.setdefault(0 if follow else int(instant[k]), int(k))
-        C = covariances[c]
+        C, i = covariances[c], first.setdefault(0 if follow else int(instant[k]), k)
         if follow and c in first_of_camera:
             C, i = np.diag(_MIN_VARIANCES), first_of_camera[c]
-        first_of_camera.setdefault(c, int(k))
+        first_of_camera.setdefault(c, k)
         if i != k:
             T = se3.inverse(T_world_frame[i]) @ T_world_frame[k]
             ends = int(recording.indices[i]), int(recording.indices[k])
@@ -223,23 +211,35 @@ def _calibration_edges(
     return edges
 
 
-def _without_tracking_diagnostics(
-    result: Reconstruction, names: Sequence[str], cameras: Intp, *, moves: bool
+def _with_reasons_of_rig(
+    result: Reconstruction,
+    names: Sequence[str],
+    cameras: Intp,
+    displaced: Sequence[CameraMotion],
+    *,
+    moves: bool,
 ) -> Reconstruction:
-    """Return the result without diagnostics that apply only to single-camera tracking.
+    """Return the result with reasons for a rig instead of a single camera.
 
-    `cameras` (F,) are the cameras of all frames, as indices into `names`.
+    `cameras` (F,) are the cameras of all frames, as indices into `names`; `displaced` those that
+    differ from the calibration.
     """
     d = result.diagnostics
-    reasons = verdicts.ranked([r for r in d.reasons if r.code not in _TRACKING_REASONS])
+    reasons = [r for r in d.reasons if r.code not in _TRACKING_REASONS]
     worst = d.accuracy.worst
     if not moves and worst is not None:
         name = names[cameras[worst.frame]]
-        reasons = verdicts.ranked([_calibration_reason(r, worst.frame, name) for r in reasons])
-    d = replace(
-        d, reasons=reasons, verdict=verdicts.verdict_of(reasons), refinement=None, cloud_before=None
-    )
-    return replace(result, diagnostics=d)
+        reasons = [_calibration_reason(r, worst.frame, name) for r in reasons]
+    if displaced:
+        changes = ", ".join(
+            f"{m.name} by {1000 * m.distance_m:.0f} mm and {np.degrees(m.angle_rad):.1f} degrees"
+            for m in displaced
+        )
+        text = f"Camera poses differ from those of the rig: {changes}."
+        reasons.append(Reason("rig_changed", ((d.frames[0].index, d.frames[-1].index),), text))
+    ranked = verdicts.ranked(reasons)
+    d = replace(d, reasons=ranked, verdict=verdicts.verdict_of(ranked))
+    return replace(result, diagnostics=replace(d, refinement=None, cloud_before=None))
 
 
 def _calibration_reason(reason: Reason, worst: int, name: str) -> Reason:
@@ -249,17 +249,17 @@ def _calibration_reason(reason: Reason, worst: int, name: str) -> Reason:
     """
     if reason.code != "uncertain_poses":
         return reason
-    text = reason.text.replace(f"Frame {worst} is", f"Camera {name!r} is")
-    text += (
-        " The bound follows from the covariances in rig.json, which include systematic errors such "
-        "as multipath."
+    text = (
+        reason.text.replace(f"Frame {worst} is", f"Camera {name!r} is")
+        + " The bound follows from the covariances in rig.json, which include systematic errors "
+        "such as multipath."
     )
     return replace(reason, code="uncertain_rig", text=text)
 
 
 def _check_calibration(
-    rig: Rig, cameras: Sequence[Camera], recording: Recording
-) -> tuple[list[CameraMotion], dict[tuple[int, int], tuple[float, int]]]:
+    cameras: Sequence[Camera], recording: Recording
+) -> tuple[list[CameraMotion], SurfaceDistances]:
     """Return the cameras that differ from the calibration, after aligning their views.
 
     Also the distances between the surfaces of each pair at the calibrated poses, see `JointPoses`.
@@ -273,6 +273,7 @@ def _check_calibration(
         if isinstance(frame, RangeFrame):
             c = int(source.camera[index])
             views.append(RigView(c, 0, SampledView.of(cameras[c].surface(frame), _POINTS)))
+    rig = source.rig
     calibrated = np.stack([camera.T_rig_camera for camera in rig.cameras])
     refined = refine_together(views, calibrated)
     recalibrated = tuple(
@@ -281,22 +282,6 @@ def _check_calibration(
     )
     displaced = [motion for motion in compare(rig, Rig(recalibrated)) if motion.moved]
     return displaced, disagreements(views, calibrated)
-
-
-def _with_rig_reason(result: Reconstruction, displaced: Sequence[CameraMotion]) -> Reconstruction:
-    """Return the result with a reason for the cameras that differ from the calibration."""
-    if not displaced:
-        return result
-    d = result.diagnostics
-    changes = ", ".join(
-        f"{m.name} by {1000 * m.distance_m:.0f} mm and {np.degrees(m.angle_rad):.1f} degrees"
-        for m in displaced
-    )
-    text = f"Camera poses differ from those of the rig: {changes}."
-    all_frames = ((d.frames[0].index, d.frames[-1].index),)
-    reasons = verdicts.ranked((*d.reasons, Reason("rig_changed", all_frames, text)))
-    verdict = verdicts.verdict_of(reasons)
-    return replace(result, diagnostics=replace(d, reasons=reasons, verdict=verdict))
 
 
 def _write(rig_result: RigResult, recording: Recording, folder: folders.OutputFolder) -> None:

@@ -7,22 +7,21 @@ moving objects at each instant, and all instants are used jointly.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import stdtr
 
 from tofuse.apps.rigs.clocks import lag_between
-from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.inputs import Calibration, Camera, disagreement_rows
 from tofuse.apps.rigs.joint import (
-    JointPoses,
     RigView,
     distances_between,
     refine_together,
     refined_poses,
 )
-from tofuse.apps.rigs.placing import Placement, place
-from tofuse.engine.arrays import Float64
+from tofuse.apps.rigs.placing import place
+from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters import BackgroundSurface, background_surface
 from tofuse.engine.frames import RangeFrame, evenly_spaced
@@ -33,6 +32,7 @@ from tofuse.engine.progress import Progress
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.views import PreparedView
 from tofuse.formats.recordings import still
+from tofuse.formats.rigs import Rig, RigCamera
 
 # A camera is static if this fraction of its pixels measure the same surface in this fraction of the
 # sampled frames.
@@ -51,34 +51,6 @@ _MAX_LAG, _COMPARED_INSTANTS, _MAX_DISTANCE = 6, 10, 0.03
 # Minimum number of instants to compare two lags, and the significance level: about a dozen lags
 # are compared with the best one.
 _MIN_INSTANTS, _SIGNIFICANCE = 5, 0.001
-
-
-@dataclass(frozen=True, eq=False)
-class StaticRig:
-    """The calibration of static cameras.
-
-    Attributes
-    ----------
-    placement
-        The placed cameras, and why others are not.
-    refined
-        Refined poses of the placed cameras, in the order of `cameras`.
-    cameras
-        (M,) the placed cameras, ascending.
-    time_offsets
-        (K,) of all cameras, s.
-    instants
-        Number of instants.
-    notes
-        Notes for the user.
-    """
-
-    placement: Placement
-    refined: JointPoses
-    cameras: tuple[int, ...]
-    time_offsets: Float64
-    instants: int
-    notes: tuple[str, ...]
 
 
 def is_static(camera: Camera) -> bool:
@@ -103,7 +75,7 @@ def _static_fraction(frames: Sequence[RangeFrame]) -> float:
     )
 
 
-def calibrate_static(cameras: Sequence[Camera], progress: Progress) -> StaticRig:
+def calibrate_static(cameras: Sequence[Camera], progress: Progress) -> Calibration:
     """Place and refine static cameras relative to each other."""
     notes: list[str] = []
     progress.stage("instants")
@@ -112,53 +84,69 @@ def calibrate_static(cameras: Sequence[Camera], progress: Progress) -> StaticRig
     placement = place(instants)
     order = tuple(sorted(placement.poses))
     progress.stage("refining")
-    refined = refine_together(
-        _views(instants, order), np.stack([placement.poses[c] for c in order])
-    )
-    count = max((len(row) for row in instants), default=0)
+    start = np.stack([placement.poses[c] for c in order])
+    refined = refine_together(_views(instants, order), start)
+    count = len(instants[0])
     if count > 1:
         progress.stage("clocks")
-        new_offsets = _refined_offsets(cameras, order, refined, offsets, notes)
+        times = _common_times(cameras, offsets)
+        new_offsets = _refined_offsets(cameras, order, refined.poses, offsets, times, notes)
         if (new_offsets != offsets).any():
             offsets = new_offsets
             times = _common_times(cameras, offsets)
             instants = [_views_at(c, o, times) for c, o in zip(cameras, offsets, strict=True)]
             refined = refine_together(_views(instants, order), refined.poses)
-        refined = _with_clock_uncertainty(cameras, order, refined, offsets, instants)
-    return StaticRig(placement, refined, order, offsets, count, tuple(notes))
+        C = _clock_covariance(cameras, order, refined.poses, offsets, instants, times)
+        random = refined.random_covariance + C
+        refined = replace(refined, covariance=refined.covariance + C, random_covariance=random)
+    rows = tuple(
+        RigCamera(
+            cameras[c].name,
+            cameras[c].recording.path,
+            refined.poses[k],
+            refined.covariance[k][:6, :6],
+            float(offsets[c]),
+            -float(refined.offsets[k]),
+            refined.random_covariance[k][:6, :6],
+        )
+        for k, c in enumerate(order)
+    )
+    pairs = disagreement_rows([row.name for row in rows], refined.disagreement)
+    unplaced = {cameras[c].name: reason for c, reason in sorted(placement.reasons.items())}
+    how = "one instant" if count == 1 else f"{count} instants"
+    return Calibration(Rig(rows, pairs, unplaced), how, tuple(notes))
 
 
-def _with_clock_uncertainty(
+def _clock_covariance(
     cameras: Sequence[Camera],
     order: Sequence[int],
-    refined: JointPoses,
+    poses: Float64,
     offsets: Float64,
     instants: Sequence[Sequence[PreparedView | None]],
-) -> JointPoses:
-    """Add the uncertainty of the clocks to the covariances, by the change of poses per frame."""
-    times = _common_times(cameras, offsets)
-    clock_covariance = np.zeros_like(refined.covariance)
+    times: Float64,
+) -> Float64:
+    """Return the covariances (K, 7, 7) due to the clocks, by the change of poses per frame."""
+    C = np.zeros((len(order), 7, 7))
     for c in order[1:]:
-        interval = float(np.median(np.diff(cameras[c].recording.timestamps)))
         delayed = list(instants)
-        delayed[c] = _views_at(cameras[c], offsets[c] + interval, times)
-        shifted = refined_poses(_views(delayed, order), refined.poses)
-        for k in range(1, len(order)):
-            xi = _CLOCK_SIGMA * se3.log(se3.inverse(refined.poses[k]) @ shifted[k])
-            clock_covariance[k, :6, :6] += np.outer(xi, xi)
-    return replace(
-        refined,
-        covariance=refined.covariance + clock_covariance,
-        random_covariance=refined.random_covariance + clock_covariance,
-    )
+        delayed[c] = _views_at(cameras[c], offsets[c] + _interval(cameras[c]), times)
+        shifted = refined_poses(_views(delayed, order), poses)
+        xi = _CLOCK_SIGMA * se3.log(se3.inverse(poses[1:]) @ shifted[1:])
+        C[1:, :6, :6] += xi[:, :, None] * xi[:, None]
+    return C
+
+
+def _interval(camera: Camera) -> float:
+    """Return the time between the images of a camera, s; inf for a single one."""
+    times = camera.recording.timestamps
+    return float(np.median(np.diff(times))) if len(times) > 1 else np.inf
 
 
 def _views(
     instants: Sequence[Sequence[PreparedView | None]], order: Sequence[int]
 ) -> list[RigView]:
     """Return the views of the placed cameras, numbered in their order."""
-    count = max((len(row) for row in instants), default=1)
-    points = int(np.clip(_TOTAL_POINTS / count, _MIN_POINTS, _POINTS))
+    points = int(np.clip(_TOTAL_POINTS / max(len(instants[0]), 1), _MIN_POINTS, _POINTS))
     return [
         RigView(k, m, SampledView.of(view, points))
         for k, c in enumerate(order)
@@ -170,8 +158,9 @@ def _views(
 def _refined_offsets(
     cameras: Sequence[Camera],
     order: Sequence[int],
-    refined: JointPoses,
+    poses: Float64,
     offsets: Float64,
+    times: Float64,
     notes: list[str],
 ) -> Float64:
     """Return time offsets (K,) at which moving surfaces of all placed cameras coincide.
@@ -181,49 +170,52 @@ def _refined_offsets(
     A clock is corrected only if most instants agree on the lag (`minimum_cost_lag`).
     """
     corrected = offsets.copy()
-    instants = _common_times(cameras, offsets)
-    instants = evenly_spaced(instants, _COMPARED_INSTANTS)
-    views_of = {
-        0: [_sampled(v) for v in _views_at(cameras[order[0]], corrected[order[0]], instants)]
-    }
+    times = evenly_spaced(times, _COMPARED_INSTANTS)
+    before: list[list[SampledView | None]] = []  # views of the preceding cameras
     for k, c in enumerate(order):
-        if k == 0:
-            continue
-        times = cameras[c].recording.timestamps
-        interval = float(np.median(np.diff(times)))
-        cached: dict[int, SampledView | None] = {}
-        costs = np.full((len(instants), 2 * _MAX_LAG + 1), np.nan)
-        lags = np.full(2 * _MAX_LAG + 1, np.nan)
-        for column, shift in enumerate(range(-_MAX_LAG, _MAX_LAG + 1)):
-            differences: list[float] = []
-            for m, t in enumerate(instants):
-                row = int(np.abs(times + corrected[c] - t).argmin()) + shift
-                if not 0 <= row < len(times):
-                    continue
-                if row not in cached:
-                    frame = cameras[c].image(row)
-                    cached[row] = None if frame is None else _sampled(cameras[c].surface(frame))
-                view = cached[row]
-                parts = [np.zeros(0)]
-                for camera, views in views_of.items():
-                    target = views[m]
-                    if view is not None and target is not None:
-                        T = se3.inverse(refined.poses[camera]) @ refined.poses[k]
-                        distance = distances_between(target, view, T)
-                        parts.append(np.minimum(distance, _MAX_DISTANCE * target.depth))
-                distances = np.concatenate(parts)
-                if len(distances):
-                    costs[m, column] = distances.mean()
-                    differences.append(float(times[row] + corrected[c] - t))
-            if differences:
-                lags[column] = np.mean(differences)
-        lag = minimum_cost_lag(lags, costs)
-        if lag is None:
-            notes.append(f"{cameras[c].name}: its clock can't be estimated from the motion")
-        elif abs(lag) > 0.02 * interval:
-            corrected[c] -= lag
-        views_of[k] = [_sampled(v) for v in _views_at(cameras[c], corrected[c], instants)]
+        if before:
+            lags, costs = _costs_of_lags(cameras[c], corrected[c], times, before, poses[: k + 1])
+            lag = minimum_cost_lag(lags, costs)
+            if lag is None:
+                notes.append(f"{cameras[c].name}: its clock can't be estimated from the motion")
+            elif abs(lag) > 0.02 * _interval(cameras[c]):
+                corrected[c] -= lag
+        before.append([_sampled(view) for view in _views_at(cameras[c], corrected[c], times)])
     return corrected
+
+
+def _costs_of_lags(
+    camera: Camera,
+    offset: float,
+    times: Float64,
+    before: Sequence[Sequence[SampledView | None]],
+    poses: Float64,
+) -> tuple[Float64, Float64]:
+    """Return the lags (L,) of a camera, and its mean distances (M, L) from the preceding ones.
+
+    `poses` are those of the preceding cameras and of this one.
+    """
+    stamps = camera.recording.timestamps + offset
+    shifts = np.arange(-_MAX_LAG, _MAX_LAG + 1)
+    rows = np.abs(stamps - times[:, None]).argmin(1)[:, None] + shifts
+    inside = (rows >= 0) & (rows < len(stamps))
+    views: dict[int, SampledView | None] = {}
+    for row in np.unique(rows[inside]).tolist():
+        frame = camera.image(row)
+        views[row] = None if frame is None else _sampled(camera.surface(frame))
+    lags = stamps[rows.clip(0, len(stamps) - 1)] - times[:, None]
+    costs = np.full(rows.shape, np.nan)
+    for m, column in np.argwhere(inside):
+        view = views[int(rows[m, column])]
+        distances = [
+            np.minimum(distances_between(target, view, T), _MAX_DISTANCE * target.depth)
+            for T_rig_camera, instants in zip(poses, before, strict=False)
+            if view is not None and (target := instants[m]) is not None
+            for T in [se3.inverse(T_rig_camera) @ poses[-1]]
+        ]
+        if sum(map(len, distances)):
+            costs[m, column] = np.concatenate(distances).mean()
+    return np.ma.masked_where(np.isnan(costs), lags).mean(0).filled(np.nan), costs
 
 
 def _sampled(surface: PreparedView | None) -> SampledView | None:
@@ -249,32 +241,24 @@ def minimum_cost_lag(lags: Float64, costs: Float64) -> float | None:
         return None
     lags, costs = lags[valid], costs[:, valid]
     mean = np.nanmean(costs, axis=0)
-    lowest = int(np.argmin(mean))
-    equivalent = [k for k in range(len(lags)) if not _is_positive(costs[:, k] - costs[:, lowest])]
-    best = min(equivalent, key=lambda k: abs(lags[k]))
-    if not 2 <= best < len(lags) - 2:
-        return None
-    if not all(_is_positive(costs[:, best + k] - costs[:, best]) for k in (-2, 2)):
+    worse = _are_worse(costs, int(np.argmin(mean)))
+    best = int(np.argmin(np.where(worse, np.inf, np.abs(lags))))
+    if not 2 <= best < len(lags) - 2 or not _are_worse(costs, best)[[best - 2, best + 2]].all():
         return None
     window = slice(best - 2, best + 3)
     curvature, slope, _ = np.polyfit(lags[window] - lags[best], mean[window], 2)
     if curvature <= 0:
         return None
-    step = float(
-        np.clip(-0.5 * slope / curvature, lags[best - 1] - lags[best], lags[best + 1] - lags[best])
-    )
-    return float(lags[best] + step)
+    return float(np.clip(lags[best] - 0.5 * slope / curvature, lags[best - 1], lags[best + 1]))
 
 
-def _is_positive(differences: Float64) -> bool:
-    """Whether the mean of differences (M,) is significantly above 0 (Student's t-test)."""
-    d = differences[np.isfinite(differences)]
-    if len(d) < _MIN_INSTANTS:
-        return False
-    standard_error = float(d.std(ddof=1)) / np.sqrt(len(d))
-    return bool(
-        d.mean() > 0 and stdtr(len(d) - 1, -d.mean() / max(standard_error, 1e-12)) < _SIGNIFICANCE
-    )
+def _are_worse(costs: Float64, column: int) -> Bool:
+    """Whether (L,) the costs are significantly above those of a column (Student's t-test)."""
+    d = np.ma.masked_invalid(costs - costs[:, [column]])
+    count = d.count(0)
+    standard_error = np.maximum(d.std(0, ddof=1) / np.sqrt(count), 1e-12)
+    chance = stdtr(count - 1, -(d.mean(0) / standard_error).filled(0.0))
+    return np.asarray((count >= _MIN_INSTANTS) & (chance < _SIGNIFICANCE))
 
 
 def _views_by_instant(
@@ -296,10 +280,9 @@ def _views_at(camera: Camera, offset: float, times: Float64) -> list[PreparedVie
     timestamps = camera.recording.timestamps + offset
     nearest = np.abs(timestamps[None] - times[:, None]).argmin(1)
     differences = np.abs(timestamps[nearest] - times)
-    interval = float(np.median(np.diff(timestamps))) if len(timestamps) > 1 else np.inf
     row: list[PreparedView | None] = []
     for k, difference in zip(nearest, differences, strict=True):
-        frame = camera.image(int(k)) if difference <= _MAX_INTERVALS * interval else None
+        frame = camera.image(int(k)) if difference <= _MAX_INTERVALS * _interval(camera) else None
         row.append(None if frame is None else camera.surface(frame))
     return row
 
@@ -313,9 +296,8 @@ def _is_dynamic(camera: Camera) -> bool:
 
 def _average(camera: Camera) -> RangeFrame:
     frames = camera.images(_MAX_AVERAGED)
-    if len(frames) == 1:
-        return frames[0]
-    return still.average_of(frames, noise_model_for(camera.recording))
+    one = len(frames) == 1
+    return frames[0] if one else still.average_of(frames, noise_model_for(camera.recording))
 
 
 def _common_times(cameras: Sequence[Camera], offsets: Float64) -> Float64:
@@ -323,7 +305,7 @@ def _common_times(cameras: Sequence[Camera], offsets: Float64) -> Float64:
     begin = max(c.recording.timestamps[0] + o for c, o in zip(cameras, offsets, strict=True))
     end = min(c.recording.timestamps[-1] + o for c, o in zip(cameras, offsets, strict=True))
     times = cameras[0].recording.timestamps
-    margin = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    margin = 0.5 * _interval(cameras[0]) if len(times) > 1 else 0.0
     common = times[(times >= begin - margin) & (times <= end + margin)]
     if not len(common):
         common = times[:1]
@@ -370,7 +352,9 @@ def _activity(camera: Camera) -> tuple[Float64, Float64]:
     """Return times (N,) and the fraction of pixels that changed since the previous frame."""
     times, fractions = [], []
     previous: RangeFrame | None = None
-    for frame in camera.every_image():
+    for frame in camera.recording.read_all():
+        if not isinstance(frame, RangeFrame):
+            continue
         if previous is not None:
             valid = previous.valid & frame.valid
             change = np.abs(frame.z - previous.z)[valid]
