@@ -25,7 +25,7 @@ from tofuse.apps.jobs import (
     with_findings,
     write_report_files,
 )
-from tofuse.apps.results import folders, load_result, write_result
+from tofuse.apps.results import folders, integrity, load_result, write_result
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Foreground
 from tofuse.engine.frames import Recording
@@ -343,12 +343,20 @@ def _with_terminal(progress: Progress | bool | None) -> AbstractContextManager[P
     return TerminalProgress(sys.stderr) if progress is True else nullcontext(progress or None)
 
 
-def load(folder: str | Path) -> Result:
+def load(folder: str | Path, *, edited: bool = False) -> Result:
     """Read a result of ``tofuse run`` or `Result.save` from its folder.
+
+    Parameters
+    ----------
+    folder
+        The folder.
+    edited
+        Whether to read it although its files were changed by hand.
 
     Raises
     ------
     InputError
-        If it is not an output folder, or its files are damaged or of different runs.
+        If it is not an output folder, or its files are damaged, edited or of different runs.
     """
-    return Result.of(load_result(folder))
+    with integrity.accepting_edits() if edited else nullcontext():
+        return Result.of(load_result(folder))

@@ -75,6 +75,18 @@ class Json(Command):
     json: bool = False
 
 
+class Edited(Command):
+    """Results that were edited.
+
+    Attributes
+    ----------
+    edited
+        read results although their files were changed by hand
+    """
+
+    edited: bool = False
+
+
 class JsonLines(Command):
     """Machine-readable output while it is made.
 
@@ -348,7 +360,7 @@ class Judge(Json, Threads, Selection):
     tolerance: Length | None = None
 
 
-class Merge(JsonLines, Seed, Threads):
+class Merge(JsonLines, Seed, Threads, Edited):
     """Merge the results of several recordings into one map.
 
     A RESULT is the --out of `tofuse run` or `tofuse merge`; its recording must still be where it
@@ -695,7 +707,7 @@ class Noise(Json, Source):
     name: str | None = None
 
 
-class Evaluate(Json):
+class Evaluate(Json, Edited):
     """Compare a trajectory with a reference.
 
     Attributes
@@ -737,7 +749,7 @@ class Optimize(Command):
     overwrite: bool = False
 
 
-class Export(Command):
+class Export(Edited):
     """Write a result in other formats.
 
     Attributes
@@ -790,7 +802,7 @@ class Experiments(Seed, Threads):
     seeds: Count = 20
 
 
-class View(Page):
+class View(Page, Edited):
     """Show a result in the browser.
 
     Attributes

@@ -211,7 +211,7 @@ def export(
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
     atomic.make_folder(target)
-    with folders.claimed(target), _unchanged(folder):
+    with folders.claimed(target), _unchanged(folder), run_json.opened(folder):
         for path in files.values():
             if path.exists() and not overwrite:
                 raise OutputError(
