@@ -72,32 +72,6 @@ def test_squared_residuals_sum_to_equation_2_10():
         assert other == pytest.approx(value, rel=1e-9)
 
 
-def test_jacobians_agree_with_finite_differences():
-    graph = random_graph(np.random.default_rng(2))
-    problem = Problem.of(graph)
-    q = quaternion.from_matrix(graph.poses[:, :3, :3])
-    t = graph.poses[:, :3, 3]
-    J_i, J_j = problem.jacobian(q, t)
-    h = 1e-6
-    for vertex in range(len(q)):
-        for axis in range(6):
-            sides = []
-            for sign in (1, -1):
-                q2, t2 = q.copy(), t.copy()
-                if axis < 3:
-                    t2[vertex, axis] += sign * h
-                else:
-                    turned = np.append(np.eye(3)[axis - 3] * sign * h / 2, 1.0)
-                    q2[vertex] = quaternion.multiply(turned, q[vertex])
-                sides.append(problem.residuals(q2, t2))
-            numeric = (sides[0] - sides[1]) / (2 * h)
-            analytic = np.zeros_like(numeric)
-            for edge, (i, j) in enumerate(graph.edges):
-                analytic[edge] += J_i[edge, :, axis] * (i == vertex)
-                analytic[edge] += J_j[edge, :, axis] * (j == vertex)
-            np.testing.assert_allclose(analytic, numeric, atol=1e-7)
-
-
 def test_result_minimises_literal_objective():
     graph, _ = circle(12, 0.03)
     optimised = Castellani().optimise(graph).graph

@@ -62,7 +62,6 @@ def result(room_recording) -> tofuse.Result:
     return replace(found, recording={**found.recording, "warnings": []})
 
 
-@pytest.mark.slow
 def test_facts_of_simulated_recording(room_recording) -> None:
     found = inspect_recording(tofuse.open(room_recording))
     facts = found.facts
@@ -238,7 +237,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_good_recording_has_no_findings(turn) -> None:
     assert codes(turn) == set()
     assert codes(colored(turn, 0), quick=False) == set()
@@ -246,7 +245,7 @@ def test_good_recording_has_no_findings(turn) -> None:
     assert codes(ranges) == set()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize("code", FAULTS)
 def test_faults_are_detected(code, few, turn) -> None:
     if code == "color_unregistered":  # needs more edges
@@ -263,7 +262,7 @@ def test_faults_are_detected(code, few, turn) -> None:
     assert str(named) in found.warnings
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("factor", [0.8, 1.25])
 def test_wrong_focal_length_is_estimated_from_range(factor) -> None:
     frames = turning(8, 14.0, BROWN)
@@ -284,7 +283,6 @@ def test_folding_distortion_is_rejected() -> None:
     assert not distortion(0.4, -0.2).folds
 
 
-@pytest.mark.slow
 def test_camera_motion_is_classified() -> None:
     still = turning(6, 0.0)
     assert codes(still) == {"static"}
@@ -310,7 +308,7 @@ def test_bare_wall_is_detected_and_curved_scene_gives_no_lens_findings() -> None
     assert not reported & {"range_taken_for_z", "lens_distortion", "focal_length", "wall_only"}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_real_recordings_have_only_true_findings(shared_data) -> None:
     explained = {
         "sr4000_corridor": {"phase_wrap", "flying_pixels"},  # longer than 5 m; a shiny floor
@@ -328,7 +326,6 @@ def test_real_recordings_have_only_true_findings(shared_data) -> None:
         assert reported <= explained.get(name, set()) | {"static"}, name
 
 
-@pytest.mark.slow
 def test_wraps_behind_rotating_object_do_not_affect_verdict(result: tofuse.Result) -> None:
     wrap = Finding("phase_wrap", "Far surfaces look near.", "Drop them.", {})
     moving = with_findings(result, [wrap])

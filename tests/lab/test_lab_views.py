@@ -82,7 +82,7 @@ def motions(n, seed):
     return poses, pairs
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
 def test_refinement_corrects_drift(method):
     T, clouds = ring()

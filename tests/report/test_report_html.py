@@ -155,7 +155,6 @@ def test_identifiers_are_unique_and_links_resolve(shown):
     assert set(ORDER) - {"recording"} <= anchors
 
 
-@pytest.mark.slow
 def test_same_result_gives_same_file(shown, tmp_path):
     assert page(tmp_path, *room()).text == shown.text
 
@@ -227,7 +226,7 @@ def in_parts(number=20):
     return replace(result, trajectory=poses, diagnostics=diagnostics, components=components)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_components_are_listed_with_their_own_models(tmp_path):
     got = page(tmp_path, in_parts(), ReportExtras("x"))
     assert got.row("0 (main)")[1:] == ["0–9", "this one", "–", "10"]
@@ -353,7 +352,7 @@ def test_model_can_be_coloured_by_attributes_of_points():
     assert wider.high == pytest.approx(0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_external_text_is_escaped(tmp_path):
     bad = "</script><script>alert('1')</script><b>&"
     result, extras = room()
@@ -403,7 +402,7 @@ def many(number):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_page_of_long_recording_stays_readable_and_small(tmp_path):
     got = page(tmp_path, many(10_000), ReportExtras("very long"))
     assert (tmp_path / "report.html").stat().st_size < 4e6
@@ -492,7 +491,7 @@ POOR = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", POOR)
 def test_poor_results_give_complete_report(name, tmp_path):
     result, extras = POOR[name]
@@ -505,7 +504,7 @@ def test_poor_results_give_complete_report(name, tmp_path):
     assert f"{verdict}:" in got.sections["verdict"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("title", [os.fsdecode(b"caf\xe9 'q' \"") + '\u202e\u062e\u0631<b>"x"', ""])
 def test_any_file_name_is_shown(title, tmp_path):
     result, extras = room()
@@ -528,7 +527,7 @@ def test_unwritable_path_leaves_no_file(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_long_recording_of_large_images_stays_below_size_limit(tmp_path):
     result, extras = room()
     rng = np.random.default_rng(0)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tofuse.engine.cameras.depth_conversion import range_from_z
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.sensor.unwrap import (
     Unwrap,
@@ -39,7 +38,7 @@ def periods_of(frame: RangeFrame, radial: np.ndarray) -> tuple[np.ndarray, np.nd
     return lacks, frame.valid & (radial > 0) & (off < 0.5) & confident
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_hall_beyond_period_is_unwrapped() -> None:
     """8 x 8 m before a camera with a period of 5 m: most of it is wrapped."""
     frames = taken("hall", 90)
@@ -59,7 +58,7 @@ def test_hall_beyond_period_is_unwrapped() -> None:
     assert harmed <= 0.001 * good
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_room_within_period_is_unchanged() -> None:
     """Its dark chairs and floor reflect as little as a white wall one period farther."""
     frames = taken("room", 128)
@@ -84,18 +83,6 @@ def test_amplitude_is_adapted_to_unwrapped_range() -> None:
     )
     still = out.depth == frame.depth
     np.testing.assert_array_equal(out.amplitude_image[still], frame.amplitude_image[still])
-
-
-def test_result_is_independent_of_threads() -> None:
-    frame, _ = taken("hall", 180)[0]
-    corrector = Unwrap(white=3000.0).start()
-    with threads(1):
-        one = corrector.apply(frame)
-    with threads(3):
-        three = corrector.apply(frame)
-    assert isinstance(one, RangeFrame)
-    assert isinstance(three, RangeFrame)
-    np.testing.assert_array_equal(one.depth, three.depth)
 
 
 def test_messages_find_minimum_of_a_chain() -> None:
