@@ -193,8 +193,8 @@ def test_color_of_other_camera_is_projected(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"schema": 2}, "schema: is 2; write 1"),
-        ({"schema": None}, "schema: is missing"),
+        ({"schema": 2}, "schema is 2; write 1"),
+        ({"schema": None}, "schema is missing"),
         ({"model": "hexagonal"}, "model: is 'hexagonal'; write one of pinhole"),
         ({"model": ["pinhole"]}, "model: is"),
         ({"model": "rays"}, "no rays.npy"),
@@ -281,10 +281,10 @@ def test_unusable_rays(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"is 41 x 30, camera.json says 40 x 30"):
         NativeSource(folder)
     np.save(folder / "rays.npy", np.zeros((30, 40, 2), np.float32))
-    with pytest.raises(InputError, match="all rays are the same"):
+    with pytest.raises(InputError, match="has only equal rays"):
         NativeSource(folder)
     np.save(folder / "rays.npy", np.full((30, 40, 2), np.nan, np.float32))
-    with pytest.raises(InputError, match="no pixel has a ray"):
+    with pytest.raises(InputError, match="has no pixel with a ray"):
         NativeSource(folder)
     np.save(folder / "rays.npy", np.zeros((30, 40), np.float32))
     with pytest.raises(InputError, match="shape"):

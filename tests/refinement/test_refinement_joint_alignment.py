@@ -10,6 +10,7 @@ import pytest
 from aligned_surfaces import OPTIONS, away, drifted, path, surfaces
 from corner_views import SHARP, corner
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph import external_sensors
 from tofuse.engine.graph.graph import build_graph
 from tofuse.engine.graph.graph_covariances import GraphCovariances
 from tofuse.engine.quality.pose_accuracy import ObservedErrors, accuracy_of
@@ -122,7 +123,8 @@ def refiner(part, views, poses):
     for view, T in zip(views, poses, strict=True):
         store.push(view, T)
         out.push(corner(T), T)
-    return out.finish(list(range(len(poses))), poses)
+    graph = build_graph(range(len(poses)), np.array(poses), [], [])
+    return out.finish(graph, external_sensors.SensorPriors())
 
 
 def test_refinement_is_kept_only_if_views_support_it():

@@ -8,6 +8,7 @@ import pytest
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph import build_graph, external_sensors
 from tofuse.engine.refinement.common_planes import PlaneOptions, refine_clouds
 from tofuse.engine.refinement.plane_refinement import Planes
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
@@ -58,7 +59,8 @@ def refined(part, views, poses):
     out = part.start(ViewStore(Spacing()))
     for view, T in zip(views, poses, strict=True):
         out.push(view, T)
-    return out.finish([v.index for v in views], poses)
+    graph = build_graph([v.index for v in views], np.array(poses), [], [])
+    return out.finish(graph, external_sensors.SensorPriors())
 
 
 @pytest.mark.nightly

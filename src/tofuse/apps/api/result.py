@@ -182,22 +182,6 @@ class Result(Reconstruction):
             webbrowser.open(server.address)
         return server
 
-    def plot(self) -> Plot:
-        """Draw the model and the camera trajectory from above and from the side."""
-        from tofuse.apps.report import plots
-
-        points = self.cloud.points.astype(float)
-        points = points[np.isfinite(points).all(1)]
-        path = self.trajectory[self.has_pose][:, :3, 3]
-        if not len(points):
-            raise InputError("has no points to draw", where="the model")
-        return Plot(
-            tuple(
-                plots.model(points, path, None, view, measured=None, label=f"Model, from {name}")
-                for view, name in (("above", "above"), ("side", "the side"))
-            )
-        )
-
     def _repr_html_(self) -> str:
         from tofuse.apps.report import scene, thumbnails
 
@@ -210,33 +194,6 @@ class Result(Reconstruction):
             source = thumbnails.data_uri(scene.render(drawn, _THUMBNAIL))
             picture = f'<img src="{source}" alt="The model" style="border-radius:8px"><br>'
         return f"<div>{picture}<b>{verdict}</b>: {accuracy}</div>"
-
-
-@dataclass(frozen=True, repr=False)
-class Plot:
-    """Drawings that a notebook shows side by side.
-
-    Attributes
-    ----------
-    drawings
-        SVG elements.
-    """
-
-    drawings: tuple[str, ...]
-
-    def __repr__(self) -> str:
-        return f"Plot of {len(self.drawings)} drawings: save it, or show it in a notebook"
-
-    def _repr_html_(self) -> str:
-        style = "--ink:#1a1d21;--muted:#5c6470;--grid:#dfe3e8;--after:#0b67b8;--bad:#c01f3c"
-        boxes = "".join(f'<div style="width:440px">{svg}</div>' for svg in self.drawings)
-        return f'<div style="display:flex;flex-wrap:wrap;gap:16px;{style}">{boxes}</div>'
-
-    def save(self, path: str | Path) -> None:
-        """Write an HTML page with the drawings to a path."""
-        from tofuse.formats.files import atomic
-
-        atomic.write_text(path, f'<!doctype html><meta charset="utf-8">{self._repr_html_()}\n')
 
 
 def reconstruct(

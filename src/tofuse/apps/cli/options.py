@@ -571,16 +571,13 @@ class Inspect(Json, Source):
     ----------
     inputs : INPUT
         recordings, joined in this order
-    sheet : PNG
-        write a contact sheet of the frames
     object
         an object turns in front of a static camera
     quick
-        only the checks that `tofuse run` makes first
+        check fewer frames, as `tofuse run` does first
     """
 
     inputs: list[str]
-    sheet: Path | None = None
     object: bool = False
     quick: bool = False
 
