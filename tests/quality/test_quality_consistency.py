@@ -29,6 +29,7 @@ from tofuse.engine.quality.map_agreement import (
 )
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.readers.native import NativeSource
+from written_run_json import write_run
 
 # A synthetic room, and poses in it -------------------------------------------------------------
 
@@ -76,19 +77,18 @@ def test_images_use_self_calibrated_camera_of_result(tmp_path: Path) -> None:
     times = np.arange(12) / 10
     write_tum(tmp_path / "trajectory.txt", times, poses)
     write_tum(tmp_path / "true.txt", times, poses)
-    run = {"schema": 1, "version": "0", "verdict": "good"}
-    run["frames"] = [{"index": k, "timestamp": t} for k, t in enumerate(times.tolist())]
+    frames = [{"index": k, "timestamp": t} for k, t in enumerate(times.tolist())]
     found = []
     for focal in (0.0, 0.05):
         config = {"corrections": [{"part": "camera-errors", "focal": focal, "offset_m": 0.0}]}
-        (tmp_path / "run.json").write_text(json.dumps(run | {"config": config}))
+        write_run(tmp_path, frames=frames, config=config)
         for estimate in (tmp_path, tmp_path / "trajectory.txt"):
             score = evaluate(estimate, tmp_path / "true.txt", recording=recording).consistency
             found.append(score.rms_m)
         alone = evaluate(poses, tmp_path / "true.txt", recording=recording, config=config)
         assert alone.consistency.rms_m == pytest.approx(found[-1])
     assert found[0] == found[1] > 3 * found[2] == 3 * found[3]
-    (tmp_path / "run.json").write_text(json.dumps(run | {"config": {"corrections": [7]}}))
+    write_run(tmp_path, frames=frames, config={"corrections": [7]})
     with pytest.raises(InputError, match="is damaged"):
         evaluate(tmp_path, tmp_path / "true.txt", recording=recording)
 

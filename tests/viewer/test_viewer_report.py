@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 from dataclasses import replace
+from threading import Timer
 from urllib.parse import urlsplit
 
 import cv2
@@ -133,8 +134,11 @@ def test_command_serves_until_interrupted_and_without_recording(made, tmp_path) 
     out = shutil.copytree(made[1], tmp_path / "out")
     text = (out / "run.json").read_text()
     (out / "run.json").write_text(text.replace(str(made[1].parent), str(tmp_path / "gone")))
-    command = [sys.executable, "-m", "tofuse", "view", str(out), "--no-open"]
+    command = [sys.executable, "-m", "tofuse", "view", str(out), "--no-open", "--edited"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as p:
+        end = Timer(60, p.kill)  # else a failed assertion would wait for it
+        end.daemon = True
+        end.start()
         assert p.stderr is not None
         lines = [p.stderr.readline() for _ in range(3)]
         assert re.fullmatch(

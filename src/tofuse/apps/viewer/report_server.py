@@ -80,9 +80,11 @@ def report_pages(folder: Path) -> dict[str, tuple[str, bytes]]:
     Raises
     ------
     InputError
-        If the folder is not a result, or has no report.
+        If the folder is not a result, was edited, or has no report.
     """
     folders.check_result(folder)
+    with run_json.opened(folder):
+        pass
     pages = {"": (_HTML, reading.read_bytes(folder / "report.html"))}
     for path in sorted(folder.glob("component-*/report.html")):
         if folders.component_number(path.parent) is not None:
