@@ -32,7 +32,7 @@ FILES = {*SAME, "report.html", "run.json"}
 RUN_KEYS = """
 schema version input seed threads config seconds verdict self_calibration accuracy reasons
 frames loops optimiser priors refinement filters findings warnings components sessions
-session_pairs changes T_up_world rig
+session_pairs changes T_up_world rig shift_m sha256
 """
 FRAME_KEYS = """
 index timestamp status reason valid_share inlier_share rms_m covariance unobservable
