@@ -32,7 +32,7 @@ from tofuse.engine.search.verification import FitStatistics
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
-from tofuse.formats.cameras.correction_file import corrected_depth
+from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model

@@ -54,7 +54,7 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
-from tofuse.formats.cameras.correction_file import corrected_depth
+from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.experiments.surface_error import Surface, compare_surfaces, distances
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import RecordingPlan, plan

@@ -29,7 +29,7 @@ from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, ray_lengths, scaled
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.formats.cameras.correction_file import corrected_depth
+from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import RecordingPlan

@@ -40,7 +40,7 @@ from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.engine.sensor.multipath_correction import Multipath, MultipathCorrector
-from tofuse.formats.cameras.correction_file import corrected_depth
+from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation import record
 from tofuse.lab.simulation.effects import Effects, Flag

@@ -18,7 +18,7 @@ from time import perf_counter
 import numpy as np
 
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.cameras.correction_file import corrected_depth
+from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation import sensor

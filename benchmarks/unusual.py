@@ -16,7 +16,7 @@ from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.formats.cameras.correction_file import corrected_depth
+from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.scenes.composition import Assembly, placed, shell
 from tofuse.lab.scenes.furniture import chair, plant
 from tofuse.lab.simulation import sensor

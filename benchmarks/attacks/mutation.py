@@ -103,7 +103,7 @@ def _with_camera(make: Callable[[Path], Any], inside: str, format_: str) -> Subj
 
 
 def _depth_png(path: Path) -> None:
-    from tofuse.formats.images.writing import png_bytes
+    from tofuse.formats.images.images import png_bytes
 
     path.write_bytes(png_bytes(np.full((24, 32), 2000, np.uint16)))
 
@@ -234,12 +234,11 @@ def _small() -> dict[str, Subject]:
     from tofuse.engine.noise.model import NoiseModel, RangeLaw
     from tofuse.engine.results.types import FrameRecord
     from tofuse.engine.tracking.base import Step
+    from tofuse.formats.cameras.calibration_files import read_noise
     from tofuse.formats.cameras.camera_file import read_camera_file
-    from tofuse.formats.cameras.noise_file import read_noise
     from tofuse.formats.files.tables import read_columns
     from tofuse.formats.poses.g2o import read_g2o
-    from tofuse.formats.poses.given_loops import read_loops
-    from tofuse.formats.poses.pose import read_pose
+    from tofuse.formats.poses.pose import read_loops, read_pose
     from tofuse.formats.poses.trajectory_formats import read_poses
     from tofuse.formats.recordings.open import read_reference
     from tofuse.formats.rigs.rig_file import read_rig
