@@ -2,10 +2,10 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help demo test slow nightly lint docs gallery format lock audit sbom clean
+.PHONY: help demo test nightly nightly-part lint docs gallery format lock audit sbom clean
 
 help:                       ## this list
-	@awk -F ':.*## *' '/^[a-z]+:.*##/ { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## *' '/^[a-z-]+:.*##/ { printf "make %-12s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 .venv/.ready: requirements/dev.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit("tofuse needs Python 3.11 or newer, and $(PYTHON) is %s; try: make PYTHON=python3.12 ..." % sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
@@ -19,14 +19,17 @@ demo: .venv/.ready          ## simulate a recording, reconstruct it, leave a mod
 
 # Compiled modules are kept, even where the environment says otherwise: many tests start processes.
 PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile
-test: .venv/.ready          ## run the tests of up to a second and a half each, some 4 minutes
-	$(PYTEST) -m "not slow and not nightly"
+# Rooms whose tests need no whole run: a first verdict within a minute.
+FIRST = $(addprefix tests/,alignment cameras clouds compute files filters geometry graph icp images loops noise poses search sensor stored_views views)
+test: .venv/.ready          ## run the tests of every change: the quick rooms, and if they pass the others, 6 minutes
+	$(PYTEST) -m "not nightly and not nightly_part" $(FIRST)
+	$(PYTEST) -m "not nightly and not nightly_part" tests $(addprefix --ignore=,$(FIRST))
 
-slow: .venv/.ready          ## run the tests of whole runs, clusters and killed processes, 10 to 15 minutes
-	$(PYTEST) -m "slow and not nightly"
+nightly: .venv/.ready       ## run the other tests: long runs, clusters, killed processes, browsers, fuzzing, notebooks, real data
+	$(PYTEST) -m "nightly or nightly_part"
 
-nightly: .venv/.ready       ## run the remaining tests: browsers, fuzzing, notebooks, documents that reconstruct, all real data
-	$(PYTEST) -m nightly
+nightly-part: .venv/.ready  ## run those of them that .ci/run takes as well, 2 minutes
+	$(PYTEST) -m "nightly_part and not nightly"
 
 lint: .venv/.ready          ## formatting, style, strict types, and who may import whom
 	$(BIN)/ruff format --check .

@@ -104,8 +104,6 @@ def rendered_fault(fault: str) -> Callable[[str, int], Frames]:
         wide, well = CAMERAS[camera]
         if fault == "wall_only":
             return film("wall", camera, k, 3 * n + k)
-        if fault == "moving":
-            return walking(camera, k, rng)
         start = int(rng.integers(0, 384))
         if fault == "saturation":
             for _ in range(6):
@@ -120,30 +118,6 @@ def rendered_fault(fault: str) -> Callable[[str, int], Frames]:
         return film("room", camera, k, start + round(fraction * wide / STEP_DEG) * n)
 
     return make
-
-
-def walking(camera: str, k: int, rng: np.random.Generator) -> Frames:
-    """A person moves sideways at 1 m/s; in half of the recordings the camera moves too."""
-    begin = rng.integers(0, 60) / 30
-    side = 1 if k % 4 < 2 else -1
-
-    def moved(x: float, y: float) -> np.ndarray:
-        T = np.eye(4)
-        T[:2, 3] = x, y
-        return T
-
-    def walk(sequence):
-        thing, stand = sequence.object_path, sequence.camera_path
-        sequence = replace(
-            sequence,
-            object_path=lambda t: moved(0.7, side * (t - begin - 0.35)) @ thing(t),
-        )
-        if k % 2:
-            sequence = replace(sequence, camera_path=lambda t: stand(t) @ moved(0.1 * t, 0))
-        return sequence
-
-    raw = round(begin * 30) + 6 * np.arange(4)
-    return film("torso", camera, k, raw, walk=walk)
 
 
 def with_camera(frames: Frames, camera: Pinhole) -> Frames:
@@ -164,30 +138,11 @@ def z_as_range(frames: Frames, k: int) -> Frames:
 
 
 def wrong_focal(frames: Frames, k: int) -> Frames:
-    if frames[0].depth_kind == "z":
-        frames = rectified(frames)
+    """Of radial range: with z depth planes stay planes."""
     c = frames[0].camera
     factor = 1.25 if k % 2 else 0.8
-    return with_camera(frames, replace(c, fx=c.fx * factor, fy=c.fy * factor))
-
-
-def rectified(frames: Frames) -> Frames:
-    """Undistorted depth, as many drivers output it; by nearest pixels."""
-    c = frames[0].camera
-    plain = Pinhole(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
-    rays = np.concatenate([plain.rays(), np.ones((c.height, c.width, 1))], -1)
-    u, v = np.moveaxis(np.round(c.project(rays)).astype(int), -1, 0)
-    inside = (u >= 0) & (v >= 0) & (u < c.width) & (v < c.height)
-    u, v = np.clip(u, 0, c.width - 1), np.clip(v, 0, c.height - 1)
-    out = []
-    for f in frames:
-        images = {
-            name: None if getattr(f, name) is None else getattr(f, name)[v, u]
-            for name in ("amplitude_image", "confidence_image", "sigma_image")
-        }
-        depth = np.where(inside, f.depth[v, u], 0).astype(np.float32)
-        out.append(replace(f, camera=plain, depth=depth, **images))
-    return out
+    ranges = [replace(f, depth=f.radial_range, depth_kind="range") for f in frames]
+    return with_camera(ranges, replace(c, fx=c.fx * factor, fy=c.fy * factor))
 
 
 def color_intrinsics(frames: Frames, k: int) -> Frames:
@@ -299,7 +254,6 @@ FAULTS: dict[str, tuple[str, Callable[[Frames, int], Frames], str]] = {
     "phase wrap": ("clean", wrapped, "phase_wrap"),
     "saturation": ("saturation", as_it_is, "saturated"),
     "depth smoothed across edges": ("furnished", smoothed, "flying_pixels"),
-    "a person walks": ("moving", as_it_is, "moving_objects"),
     "shift of 0.3 of the view per frame": ("fast", as_it_is, "fast_motion"),
     "shift of 0.75 of the view per frame": ("overlap", as_it_is, "little_overlap"),
     "static camera": ("static", as_it_is, "static"),

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from tofuse.apps.inspection.inspect import inspect_recording as inspect
     from tofuse.apps.jobs.evaluating import Evaluation, evaluate
     from tofuse.apps.jobs.judging import Judgement, judge
-    from tofuse.apps.live.player import Player
     from tofuse.engine.alignment.base import Registration
     from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, Rational, RayTable
     from tofuse.engine.clouds.pair import register

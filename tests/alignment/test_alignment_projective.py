@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
@@ -178,7 +177,6 @@ def test_changed_exposure_is_estimated(room, wall, gain):
         assert_near(found, pair.poses[1], 0.001, 0.03)
 
 
-@pytest.mark.slow
 def test_several_targets_are_combined(room):
     targets = [room.target, Target(room.views[1], se3.inverse(room.poses[1]))]
     both = align(room.views[2], targets, room.poses[1], OPTIONS)
@@ -193,17 +191,6 @@ def test_pose_of_world_is_arbitrary(room):
     T = se3.exp([3, -2, 1, 0.4, -0.8, 1.2])
     found = align(room.views[1], [Target(room.views[0], se3.inverse(T))], T, OPTIONS)
     assert_near(found, T @ room.poses[1])
-
-
-def test_result_is_independent_of_threads(room):
-    results = []
-    for count in (1, 2):
-        with threads(count):
-            results.append(align(room.views[1], [room.target], np.eye(4), OPTIONS))
-    one, two = results
-    np.testing.assert_array_equal(one.T_world_source, two.T_world_source)
-    np.testing.assert_array_equal(one.information, two.information)
-    assert one.rms_m == two.rms_m
 
 
 def test_empty_view_stays_at_prediction(room):

@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.alignment import tile_sum_kernels as tile_sums
 from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.engine.alignment.step_kernels import spurious_information
 from tofuse.engine.alignment.uncertainty import (
@@ -18,7 +17,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.views.prepared_view import prepare_view
-from tofuse.engine.views.residual_kernels import POINT_SIZE, Residuals
+from tofuse.engine.views.residual_kernels import POINT_SIZE
 from tofuse.engine.views.view_planes import SurfaceOptions
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
@@ -172,71 +171,6 @@ def test_uncertainty_is_bounded_by_prediction():
     np.testing.assert_allclose(axes[:, 1] @ cut @ axes[:, 1], 0.09, rtol=1e-4)
     for k in (0, 2, 3, 4, 5):
         np.testing.assert_allclose(axes[:, k] @ cut @ axes[:, k], axes[:, k] @ known @ axes[:, k])
-
-
-@pytest.mark.slow
-def test_tile_sums_match_numpy():
-    """Geometric residuals only, summed pixel by pixel."""
-    T = se3.exp([0.01, -0.01, 0.02, 0.004, 0.01, -0.006])
-    target, source = _view(0, CORNER), _view(1, CORNER, T)
-    inverse_z = source.planes[..., 3]
-    z = np.where(inverse_z > 0, 1 / np.maximum(inverse_z, 1e-6), 0).astype(np.float32)
-    sigma = (np.sqrt(source.plane_variance) * z * z).astype(np.float32)
-
-    residuals = Residuals(0.0, 1.0, 0.0, 0.0, 3.5, np.cos(0.7))
-    found, whole = tile_sums.tile_sums(source.images, target.target_image, T, residuals, 2, 4, 3)
-    found = found.reshape(3, 4, tile_sums.SIZE)
-    expected = np.zeros((3, 4, tile_sums.SIZE))
-    upper = np.triu_indices(7)
-    products, weighed, cross = np.zeros((3, tile_sums.UPPER))
-    for i in range(1, CAMERA.height, 2):
-        for j in range(1, CAMERA.width, 2):
-            if z[i, j] <= 0:
-                continue
-            p = np.append(source.rays[i, j], 1.0) * z[i, j]
-            q = T[:3, :3] @ p + T[:3, 3]
-            u, v = CAMERA.project(q[None])[0]
-            if not (-0.5 < u < CAMERA.width - 0.5 and -0.5 < v < CAMERA.height - 0.5):
-                continue
-            plane = target.planes[int(v + 0.5), int(u + 0.5)].astype(float)
-            if plane[3] <= 0:
-                continue
-            length = np.linalg.norm(plane[:3])
-            r = (plane[:3] @ q - 1) / length
-            m = T[:3, :3].T @ plane[:3] / length
-            s = source.normals[i, j].astype(float)
-            variance = (m @ p / p[2] * sigma[i, j]) ** 2
-            variance += target.plane_variance[int(v + 0.5), int(u + 0.5)] / length**2
-            e2 = r * r / variance / 3.5**2
-            if e2 >= 1 or s @ m < np.cos(0.7):
-                continue
-            J, K = (np.concatenate([x, np.cross(p, x), [0]]) for x in (m, s))
-            w = (1 - e2) ** 2 / variance
-            slope = (1 - e2) * (1 - 5 * e2) / variance
-            mean = (J + K) / 2
-            products += w * np.outer(mean, mean)[upper]
-            both = (np.outer(J, K) + np.outer(K, J))[upper] / 2
-            weighed += w * both
-            cross += slope * both
-            out = expected[i * 3 // CAMERA.height, j * 4 // CAMERA.width]
-            out[tile_sums.RESPONSE : tile_sums.RESPONSE + 7] += w * mean
-            out[tile_sums.WEIGHT] += w
-            out[tile_sums.RESIDUAL] += w * r
-            out[tile_sums.COUNT] += 1
-    for sums, wanted in (
-        (whole[tile_sums.GEOMETRIC], products),
-        (whole[tile_sums.WEIGHTED], weighed),
-        (whole[tile_sums.CROSS], cross),
-    ):
-        np.testing.assert_allclose(sums, wanted, rtol=0.02, atol=0.002 * np.abs(wanted).max())
-    np.testing.assert_array_equal(whole[tile_sums.PHOTOMETRIC], 0)
-    assert expected[..., tile_sums.COUNT].sum() > 500
-    # A pixel that projects onto the border of two may be assigned to either.
-    assert np.abs(found[..., tile_sums.COUNT] - expected[..., tile_sums.COUNT]).sum() <= 4
-    scale = np.abs(expected).max((0, 1))
-    assert np.abs(found - expected).max((0, 1)) == pytest.approx(0 * scale, abs=0.02 * scale.max())
-    same = scale > 0
-    assert (np.abs(found - expected).max((0, 1))[same] < 0.03 * scale[same]).all()
 
 
 def test_spurious_information_matches_random_tilts():

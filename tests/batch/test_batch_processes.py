@@ -86,11 +86,7 @@ def resume(listed: Path, out: Path) -> None:
     assert main(words) in (0, 3)
 
 
-def running(out: Path) -> bool:
-    return (out / "jobs").is_dir() and any(r["state"] == "running" for r in records(out))
-
-
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_bad_recording_does_not_stop_batch(room_recording: Path, tmp_path: Path, capsys) -> None:
     (tmp_path / "list.csv").write_text(
         f"recording,every,method\nnothing,,\n{room_recording},4,thesis\n", encoding="utf-8"
@@ -128,7 +124,7 @@ def test_bad_recording_does_not_stop_batch(room_recording: Path, tmp_path: Path,
     assert (out / room_recording.name / "run.json").stat().st_mtime_ns == before
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_killed_jobs_and_batch_are_resumed(
     batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
 ) -> None:
@@ -148,7 +144,6 @@ def test_killed_jobs_and_batch_are_resumed(
     assert sum(int(r["starts"]) for r in records(out)) >= 4
 
 
-@pytest.mark.slow
 def test_unreachable_scheduler_is_reported(
     listed: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:

@@ -81,7 +81,7 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_known_planes_constrain_curve_constant_and_offsets() -> None:
     fit = calibrate_depth(made_views(known=True, constant=0.03), CAMERA)
     assert rms(curve_error(fit, 0.03)) < 0.001
@@ -96,7 +96,7 @@ def test_known_planes_constrain_curve_constant_and_offsets() -> None:
     assert not any("scale" in warning for warning in fit.warnings)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_unknown_planes_constrain_all_but_constant_and_scale() -> None:
     fit = calibrate_depth(made_views(known=False), CAMERA)
     assert rms(bent(curve_error(fit))) < 0.001
@@ -107,7 +107,7 @@ def test_unknown_planes_constrain_all_but_constant_and_scale() -> None:
     assert "scale" in fit.warnings[0]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_unconstrained_constant_is_not_corrected() -> None:
     far = calibrate_depth(made_views(known=False, constant=0.03), CAMERA)
     error = curve_error(far, 0.03)
@@ -115,7 +115,7 @@ def test_unconstrained_constant_is_not_corrected() -> None:
     assert abs(error.mean()) > 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_fit_is_robust_to_outliers() -> None:
     rng = np.random.default_rng(9)
     views = []
@@ -155,7 +155,7 @@ def simulated_error(fit: DepthFit) -> tuple[float, float]:
     return rms(found - bias), rms(bias)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_board_on_wall_reduces_wiggling_below_2_mm(views: Recording) -> None:
     views = views.select(end=12)  # finding the corners takes most of the time
     fit = calibrate_depth(*board_planes(views, BOARD, "amplitude", wall=True))
@@ -167,13 +167,13 @@ def test_board_on_wall_reduces_wiggling_below_2_mm(views: Recording) -> None:
     assert simulated_error(alone)[0] < 0.0035
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_wall_at_unknown_poses_reduces_wiggling_below_3_mm(views: Recording) -> None:
     fit = calibrate_depth(*scene_planes(views, 1, 0))
     assert simulated_error(fit)[0] < 0.003
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_command_writes_correction_that_is_applied(
     views: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -207,7 +207,7 @@ def test_command_writes_correction_that_is_applied(
     assert "--board" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_real_sr4000_from_two_places_is_rejected(shared_data: Path) -> None:
     """Planes are found, but from two places in a corridor they do not determine the curve."""
     recording = open_recording(shared_data / "sr4000_corridor")

@@ -47,7 +47,7 @@ def fitted() -> LensFit:
     return calibrate_lens(recording_of(frames()), BOARD)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_focal_length_within_0_2_percent_and_principal_point_within_half_a_pixel() -> None:
     camera = fitted().camera
     assert camera.fx == pytest.approx(TRUE.fx, rel=0.002)
@@ -88,7 +88,7 @@ def test_corners_follow_pixel_centre_convention() -> None:
     assert np.abs(offsets).max() < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_inconsistent_view_is_excluded_and_reported() -> None:
     chosen = list(frames()[:10])
     image = chosen[4].amplitude_image
@@ -105,7 +105,7 @@ def _bare(frame: RangeFrame) -> RangeFrame:
     return replace(frame, amplitude_image=None)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("chosen", "board", "message"),
     [
@@ -183,7 +183,7 @@ def _seen(camera: Camera, views: list[BoardView]) -> np.ndarray:
     return mask.astype(bool)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_command_writes_camera_for_readers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -107,7 +107,6 @@ def test_broken_files_are_rejected(tmp_path: Path, name: str, text: str, message
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.slow
 def test_import_command(
     tmp_path: Path, room_recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

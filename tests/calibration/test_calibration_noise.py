@@ -45,7 +45,7 @@ def still_frames(scene: str, camera: str, count: int, first_seed: int = 0) -> li
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("scene", "camera"), [("corner", "sr4000"), ("wall", "pico-flexx")])
 def test_static_recording_recovers_camera_noise(scene: str, camera: str) -> None:
     fit = estimate_noise(recording_of(still_frames(scene, camera, 8)))
@@ -134,14 +134,17 @@ def test_estimate_is_robust_to_flickering_edges() -> None:
     assert estimate_noise(recording_of(flicker)).model.range.b == pytest.approx(0.003, rel=0.15)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("frames", "message"),
     [
         (lambda: still_frames("corner", "sr4000", 8)[:2], "has 2 frames"),
         (lambda: still_frames("corner", "sr4000", 8)[:1] * 6, "repeats the same image"),
         (lambda: [CloudFrame.of(np.eye(3))] * 5, "contains clouds"),
-        (lambda: list(simulate_recording("room", every=3, frames=3)), "consecutive static frames"),
+        pytest.param(
+            lambda: list(simulate_recording("room", every=3, frames=3)),
+            "consecutive static frames",
+            marks=pytest.mark.nightly,
+        ),
         (
             lambda: [replace(f, depth=f.depth * 1000) for f in plain_frames(np.full(80, 0.01))],
             "check depth_unit_m",
@@ -199,7 +202,7 @@ def test_amplitude_gain_mismatch_is_corrected(gain: float) -> None:
     assert np.median(model.sigma(other[0])[seen] / right[seen]) == pytest.approx(1, abs=0.15)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_real_sr4000_noise_agrees_with_data_description(shared_data: Path) -> None:
     fit = estimate_noise(open_recording(shared_data / "sr4000_corridor"))
     assert (fit.law, fit.stretches, fit.frames) == ("amplitude", 2, 8)

@@ -35,7 +35,6 @@ def table(camera: Pinhole) -> RayTable:
 CAMERAS: list[Camera] = [PINHOLE, BROWN, RATIONAL, FISHEYE, table(PINHOLE), table(BROWN)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: f"{type(c).__name__}-{c.width}")
 def test_projected_rays_give_pixels(camera: Camera) -> None:
     rays = camera.rays()

@@ -68,10 +68,10 @@ def together(several: list[Environment]) -> Environment:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize(
     "name",
-    [*CHOSEN, "together", *(pytest.param(name, marks=pytest.mark.nightly) for name in NIGHTLY)],
+    [*CHOSEN, *(pytest.param(name, marks=pytest.mark.nightly) for name in ("together", *NIGHTLY))],
 )
 def test_hostile_environments_give_result_or_one_line_error(
     name: str, clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -96,7 +96,7 @@ def shell(script: str) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_unwritable_stdout_is_reported(clouds: Path) -> None:
     status, stderr = shell(f"tofuse inspect {clouds} > /dev/full")
     assert (status, stderr) == (

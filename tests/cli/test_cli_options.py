@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from cli_calls import call, refuses
+from cli_calls import refuses
 from tofuse.apps.cli.commands import run_options
 from tofuse.apps.cli.parser import make_parser
 from tofuse.apps.cli.values import _size
@@ -93,12 +93,6 @@ def test_invalid_numbers_name_their_option(words: str, capfd) -> None:
     refuses(
         capfd, "run", "rec", "--out", "out", option, value, says=(option,), prefix="tofuse run: "
     )
-
-
-@pytest.mark.parametrize("words", [("--help",), ("run", "--help"), ("rig", "--help")])
-def test_help_is_printed(words: tuple[str, ...], capfd) -> None:
-    assert call(*words) == 0
-    assert capfd.readouterr().out.startswith("usage: tofuse")
 
 
 @pytest.mark.parametrize(

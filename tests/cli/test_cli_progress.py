@@ -62,7 +62,7 @@ print("done")
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX terminal")
 @pytest.mark.parametrize("columns", [50, 100])
 def test_terminal_shows_stages_and_is_cleared_at_end(columns: int) -> None:

@@ -16,7 +16,6 @@ from tofuse.engine.alignment.base import Registration
 from tofuse.engine.clouds import AnyPair
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.formats.geometry.las import write_las
 from tofuse.formats.geometry.ply import read_ply, write_ply
 from tofuse.formats.poses.pose import read_pose
 from tofuse.formats.poses.trajectory import read_tum, tum_text
@@ -71,7 +70,7 @@ def true_motion(recording: Path, source: int, target: int) -> np.ndarray:
     return se3.inverse(poses[target]) @ poses[source]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_two_frames_of_recording_are_registered(room_recording, tmp_path, capfd) -> None:
     out = tmp_path / "out"
     status, output = register_json(
@@ -114,54 +113,13 @@ def test_frame_numbers_select_source_and_target(room_recording, capfd) -> None:
     near(se3.inverse(back["T_target_source"]), np.array(there["T_target_source"]), metres=0.03)
 
 
-def write_cloud(path: Path, points: np.ndarray) -> None:
-    """Write (N, 3) points in double precision, in the format of the suffix."""
-    rows = "".join(" ".join(f"{v:.6f}" for v in row) + "\n" for row in points)
-    if path.suffix == ".ply":
-        write_ply(path, GeometryRecord(points))
-    elif path.suffix == ".xyz":
-        path.write_text(rows)
-    elif path.suffix == ".pcd":
-        path.write_text(
-            "VERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\n"
-            f"WIDTH {len(points)}\nHEIGHT 1\nPOINTS {len(points)}\nDATA ascii\n{rows}"
-        )
-    elif path.suffix == ".las":
-        pytest.importorskip("laspy")
-        write_las(path, GeometryRecord(points))
-    else:
-        laspy = pytest.importorskip("laspy")
-        header = laspy.LasHeader(version="1.2", point_format=0)
-        header.scales, header.offsets = np.full(3, 1e-4), np.floor(points.mean(0))
-        data = laspy.LasData(header)
-        data.x, data.y, data.z = points.T
-        data.write(path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz", ".las", ".laz"])
-def test_clouds_of_each_format_are_registered(suffix, clouds, capfd) -> None:
-    paths = []
-    for path in clouds:
-        points = read_ply(path).points.astype(float)
-        other = path.with_suffix(suffix)
-        paths.append(other)
-        write_cloud(other, points)
-    status, output = register_json(capfd, *paths)
-    assert status == 0
-    assert output["believed"] is True
-    assert output["probability"] > 0.9
-    assert output["source"]["format"] == ("las" if suffix == ".laz" else suffix[1:])
-    near(output["T_target_source"], T_SMALL)
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_georeferenced_and_local_cloud_are_registered(tmp_path, capfd) -> None:
     """Without a guess the centres are aligned first; the result is in the frames of the files."""
     target = bumpy_ball(6000, 1) + MAP
     source = se3.transform(se3.inverse(T_SMALL), bumpy_ball(6000, 2))
-    write_cloud(tmp_path / "map.ply", target)
-    write_cloud(tmp_path / "local.ply", source)
+    write_ply(tmp_path / "map.ply", GeometryRecord(target))
+    write_ply(tmp_path / "local.ply", GeometryRecord(source))
     _, output = register_json(capfd, tmp_path / "local.ply", tmp_path / "map.ply")
     shift = np.eye(4)
     shift[:3, 3] = MAP
@@ -228,18 +186,12 @@ BAD_GUESSES = {
     "missing": (None, ("doesn't exist",)),
     "empty": ("", ("contains 0 numbers", "16 numbers")),
     "words": ("1 0 0 x", ("line 1", "'x'")),
-    "nan": ("nan " * 16, ("nan",)),
-    "nine numbers": ("1 2 3\n" * 3, ("contains 9 numbers",)),
-    "scaled": ("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", ("no rotation", "rigid")),
     "mirrored": ("-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", ("no rotation",)),
     "projective": ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 1", ("last row",)),
     "no quaternion": ("0 0 0 2 0 0 0", ("quaternion", "length 2")),
     "broken json": ('{"T_target_source": ', ("not JSON",)),
     "json without": ('{"pose": 1}', ("T_target_source", "missing")),
     "json of another shape": ('{"T_target_source": [[1, 2]]}', ("T_target_source", "(1, 2)")),
-    "json of words": ('{"T_target_source": [["a"]]}', ("T_target_source", "not a 4x4")),
-    "json ragged": ('{"T_target_source": [[1], [1, 2]]}', ("T_target_source", "not a 4x4")),
-    "binary": ("\0\1", ("'\\x00\\x01'",)),
 }
 
 
@@ -264,13 +216,8 @@ def bad_view(name: str, folder: Path, room: Path) -> tuple[object, tuple[str, ..
     match name:
         case "missing":
             return folder / "none.ply", ("none.ply", "doesn't exist")
-        case "missing recording":
-            return f"{folder / 'none'}#3", ("none", "doesn't exist")
         case "empty cloud":
             write_ply(path, GeometryRecord(np.zeros((0, 3))))
-            return path, ("bad.ply", "0 valid points")
-        case "nan cloud":
-            write_ply(path, GeometryRecord(np.full((50, 3), np.nan)))
             return path, ("bad.ply", "0 valid points")
         case "few points":
             write_ply(path, GeometryRecord(np.eye(3)))
@@ -282,9 +229,6 @@ def bad_view(name: str, folder: Path, room: Path) -> tuple[object, tuple[str, ..
             return room, (str(room), "contains 8 frames", f"{room}#0 to {room}#7")
         case "out of range":
             return f"{room}#8", (str(room), "has no frame 8", "0 to 7")
-        case "out of range of one":
-            write_ply(path, GeometryRecord(np.random.default_rng(0).normal(size=(50, 3))))
-            return f"{path}#1", ("has no frame 1", "its only frame is 0")
         case "negative":
             return f"{room}#-1", ("'-1'", "whole number")
         case "no number":
@@ -296,8 +240,8 @@ def bad_view(name: str, folder: Path, room: Path) -> tuple[object, tuple[str, ..
 @pytest.mark.parametrize("role", ["source", "target"])
 @pytest.mark.parametrize(
     "name",
-    ["missing", "missing recording", "empty cloud", "nan cloud", "few points", "no cloud",
-     "several frames", "out of range", "out of range of one", "negative", "no number"],
+    ["missing", "empty cloud", "few points", "no cloud", "several frames", "out of range",
+     "negative", "no number"],
 )  # fmt: skip
 def test_bad_view_is_rejected(name, role, clouds, room_recording, tmp_path, capfd) -> None:
     bad, says = bad_view(name, tmp_path, room_recording)
@@ -308,29 +252,8 @@ def test_bad_view_is_rejected(name, role, clouds, room_recording, tmp_path, capf
     assert listing(tmp_path) == before
 
 
-def test_degenerate_clouds_are_rejected(tmp_path, capfd) -> None:
-    """Points on a line do not constrain the motion."""
-    for k in range(2):
-        write_ply(tmp_path / f"{k}.ply", GeometryRecord(np.linspace([0, 0, 1], [1, 0, 1 + k], 40)))
-    refuses(capfd, "register", tmp_path / "0.ply", tmp_path / "1.ply", says=("tofuse: ",))
-
-
 def test_overwrite_without_out_is_rejected(clouds, capfd) -> None:
     refuses(capfd, "register", *clouds, "--overwrite", says=("--overwrite", "--out"))
-
-
-def test_foreign_output_folder_is_rejected(clouds, tmp_path, capfd, monkeypatch) -> None:
-    monkeypatch.setattr(
-        AnyPair, "register", lambda *a, **k: pytest.fail("registration was started")
-    )
-    for name, content in (("photo.jpg", "mine"), ("run.json", "{}"), ("registration.json", "{}")):
-        out = tmp_path / f"for {name}"
-        out.mkdir()
-        (out / name).write_text(content)
-        for more in ((), ("--overwrite",)):
-            refuses(capfd, "register", *clouds, "--out", out, *more, says=(str(out), "--out"))
-        assert [p.name for p in out.iterdir()] == [name]
-        assert (out / name).read_text() == content
 
 
 def test_overwrite_replaces_only_earlier_result(clouds, tmp_path, capfd, light_page) -> None:
@@ -349,26 +272,6 @@ def test_overwrite_replaces_only_earlier_result(clouds, tmp_path, capfd, light_p
     assert call(*again) == 0
     assert {p.name for p in out.iterdir()} == set(FILES)
     assert (out / "registration.json").read_text() != first
-
-
-def test_write_failure_keeps_earlier_result(
-    clouds, tmp_path, capfd, monkeypatch, light_page
-) -> None:
-    out = tmp_path / "out"
-    assert call("register", *clouds, "--out", out) == 0
-    before = {p.name: p.read_bytes() for p in out.iterdir()}
-
-    def full(*_: object) -> str:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("tofuse.apps.pairs.page.write_pair_report", full)
-    refuses(
-        capfd, "register", clouds[1], clouds[1], "--out", out, "--overwrite",
-        says=(str(out), "no space left"),
-    )  # fmt: skip
-    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
-    refuses(capfd, "register", *clouds, "--out", tmp_path / "new", says=("no space left",))
-    assert not (tmp_path / "new").exists()
 
 
 def made(T: np.ndarray, **more: object) -> Registration:

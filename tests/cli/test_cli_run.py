@@ -28,7 +28,6 @@ from tofuse.lab.simulation.record import simulate
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
 FILES = {*SAME, "report.html", "run.json"}
-LIGHT = {*SAME, "run.json"}  # with --no-report
 # Fields of run.json, of its frames and of its loops.
 RUN_KEYS = """
 schema version input seed threads config seconds verdict self_calibration accuracy reasons
@@ -127,7 +126,6 @@ def test_run_json_follows_contract(room_result, room_recording) -> None:
         assert 0 <= values["removed"] <= 1
 
 
-@pytest.mark.slow
 def test_result_depends_on_neither_threads_nor_reference(recording, room_result, tmp_path) -> None:
     assert run_json(room_result)["threads"] == 2
     (recording / "groundtruth.txt").write_text("0 5 5 5 0 0 0 1\n0.1 -5 5 5 0 0 0 1\n")
@@ -135,7 +133,7 @@ def test_result_depends_on_neither_threads_nor_reference(recording, room_result,
     assert same(tmp_path / "out") == same(room_result)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_seed_controls_randomness(room_recording, tmp_path) -> None:
     for name, seed in (("a", 5), ("b", 5), ("c", 6)):
         run(room_recording, "--out", tmp_path / name, "--seed", seed, *QUICK)
@@ -144,7 +142,7 @@ def test_seed_controls_randomness(room_recording, tmp_path) -> None:
     assert len(found) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_run_json_as_config_reproduces_result(recording, tmp_path) -> None:
     camera = json.loads((recording / "camera.json").read_text())
     (recording / "camera.json").write_text(json.dumps(camera | {"confidence_max": 2}))
@@ -172,7 +170,7 @@ def test_run_json_as_config_reproduces_result(recording, tmp_path) -> None:
     assert run_json(tmp_path / "c")["seed"] == 4
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_object_is_segmented_from_background(tmp_path, capsys) -> None:
     effects = Effects.none(shot_noise=True, scatter=0.02)
     simulate("box", tmp_path / "rec", every=20, frames=6, effects=effects)
@@ -206,7 +204,6 @@ def test_object_option_rejects_moving_camera(room_recording, tmp_path, capsys) -
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
 def test_unreadable_frame_is_skipped_and_blank_one_lost(recording, tmp_path, capsys) -> None:
     unreadable, blank = (recording / f"depth/00000{k}.png" for k in (1, 3))
     unreadable.write_bytes(unreadable.read_bytes()[:200])
@@ -227,7 +224,6 @@ def test_unreadable_frame_is_skipped_and_blank_one_lost(recording, tmp_path, cap
     assert "Frame 1 could not be read." in (tmp_path / "out/report.html").read_text()
 
 
-@pytest.mark.slow
 def test_loops_are_read_from_file(room_recording, tmp_path) -> None:
     loops = tmp_path / "loops.txt"
     T = read_tum(room_recording / "groundtruth.txt")[1][6]
@@ -239,7 +235,6 @@ def test_loops_are_read_from_file(room_recording, tmp_path) -> None:
     assert len(read_g2o(tmp_path / "out/pose_graph.g2o").edges) == 8
 
 
-@pytest.mark.slow
 def test_json_lines_end_with_result(room_recording, tmp_path, capfd) -> None:
     run(room_recording, "--out", tmp_path / "out", "--json", "--every", 4, "--voxel", "10cm")
     done = capfd.readouterr()
@@ -255,7 +250,6 @@ def test_json_lines_end_with_result(room_recording, tmp_path, capfd) -> None:
     assert json.loads(capfd.readouterr().out)["facts"]["frames"] == "8"
 
 
-@pytest.mark.slow
 def test_log_output_is_concise_and_notes_appear_once(recording, tmp_path, capfd) -> None:
     camera = json.loads((recording / "camera.json").read_text())
     (recording / "camera.json").write_text(json.dumps(camera | {"colour_of_case": "grey"}))
@@ -271,25 +265,13 @@ def test_log_output_is_concise_and_notes_appear_once(recording, tmp_path, capfd)
     assert "\x1b" not in done.out
 
 
-@pytest.mark.slow
-def test_earlier_result_needs_overwrite(room_recording, quick_run, tmp_path, capfd) -> None:
-    out = shutil.copytree(quick_run, tmp_path / "out")
-    before = contents(out)
-    run(room_recording, "--out", out, *QUICK, "--seed", 1, status=2)
-    assert "--overwrite" in capfd.readouterr().err
-    assert contents(tmp_path) == {f"out/{name}": data for name, data in before.items()}
-    run(room_recording, "--out", out, *QUICK, "--seed", 1, "--overwrite")
-    assert contents(out) != before
-
-
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize(
     ("stage", "error"),
     [
         ("tracking", KeyboardInterrupt),
-        ("fusing", RuntimeError),
         ("checking", TofuseError),
-        ("writing", KeyboardInterrupt),
+        ("writing", RuntimeError),
     ],
 )
 def test_interrupted_run_changes_nothing(
@@ -318,54 +300,6 @@ def test_interrupted_run_changes_nothing(
             main(words)
         assert not (tmp_path / "new").exists()
     assert main(words) == 0
-
-
-# Prints a line in the middle of tracking, and waits there.
-_SLOW = """
-import sys, time
-from tofuse.apps.cli.program import main
-from tofuse.apps.cli.progress import QuietProgress
-def advance(self, record=None):
-    if record is not None and record.index == 2:
-        print("middle", flush=True)
-        time.sleep(60)
-QuietProgress.advance = advance
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
-def test_killed_run_changes_nothing(room_recording, quick_run, tmp_path) -> None:
-    """By SIGKILL; test_cli_boundary.py sends signals that the program handles."""
-    out = shutil.copytree(quick_run, tmp_path / "out")
-    before = contents(out)
-    words = [
-        "run",
-        str(room_recording),
-        "--out",
-        str(out),
-        "--overwrite",
-        "--seed",
-        "1",
-        "--no-report",
-    ]
-    job = subprocess.Popen(
-        [sys.executable, "-c", _SLOW, *words, "--end", "4", "--method", "thesis"],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert job.stdout is not None
-    assert job.stdout.readline() == "middle\n"
-    job.kill()
-    job.communicate(timeout=120)
-    # A killed process can't remove what it has written beside the folder; the next run does.
-    assert contents(out) == before
-    left = {p.name for p in tmp_path.iterdir()}
-    assert left == {"out", ".tofuse-new-out", ".tofuse-lock-out"}
-    run(room_recording, "--out", out, *QUICK, status=2)
-    run(room_recording, "--out", out, *QUICK, "--overwrite")
-    assert {p.name for p in out.iterdir()} == LIGHT
 
 
 OPTIONS = {
@@ -414,7 +348,7 @@ def test_module_runs_as_script() -> None:
     assert done.stdout.startswith("usage: tofuse")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_closed_output_pipe_is_silent(room_recording) -> None:
     words = [sys.executable, "-m", "tofuse", "inspect", str(room_recording)]
     reading, writing = os.pipe()
@@ -424,16 +358,7 @@ def test_closed_output_pipe_is_silent(room_recording) -> None:
     assert (done.returncode, done.stderr) == (141, "")
 
 
-@pytest.mark.slow
-def test_simulated_recording_is_readable_by_run(tmp_path, capsys) -> None:
-    words = ["simulate", "box", "--out", str(tmp_path / "rec"), "--frames", "2"]
-    assert main([*words, "--without", "all", "--seed", "3", "--uniform"]) == 0
-    assert "2 frames" in capsys.readouterr().out
-    run(tmp_path / "rec", "--out", tmp_path / "out", "--object", "--max-depth", 1.2)
-    assert len(run_json(tmp_path / "out")["frames"]) == 2
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_peaks_demo(tmp_path, capsys, monkeypatch) -> None:
     out = tmp_path / "demo"
     # A part of the circle.
@@ -442,24 +367,9 @@ def test_peaks_demo(tmp_path, capsys, monkeypatch) -> None:
     made = (FILES | {"recording"}) - {"mesh.ply", "mesh.glb"}
     assert {p.name for p in out.iterdir()} == made
     assert run_json(out)["config"]["filters"] == []
-    before = contents(tmp_path)
     assert main(["demo", "--scene", "peaks", "--out", str(out)]) == 2
     assert "--overwrite" in capsys.readouterr().err
-
-    def interrupt(_self, name, total=None) -> None:
-        if name == "tracking":
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("tofuse.apps.cli.progress.QuietProgress.stage", interrupt)
-        words = ["demo", "--scene", "peaks", "--method", "thesis", "--seed", "1"]
-        assert main([*words, "--out", str(out), "--overwrite"]) == 130
-        after = contents(tmp_path)
-        assert {n: after[n] for n in before if "/recording/" not in n} == {
-            n: data for n, data in before.items() if "/recording/" not in n
-        }
-        assert main([*words, "--out", str(tmp_path / "new")]) == 130
-    assert not (tmp_path / "new").exists()
+    words = ["demo", "--scene", "peaks", "--method", "thesis", "--seed", "1"]
     assert main([*words, "--out", str(out), "--overwrite"]) in (0, 3)
     assert run_json(out)["seed"] == 1
     assert run_json(out)["config"]["odometry"]["registration"]["resolution"] == 1.0

@@ -253,7 +253,7 @@ def test_scans_with_any_heading(scans, registered):
     assert found.contradiction < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_clouds_without_viewpoint_under_any_rotation(frames):
     target, source, true = frames
     moved = se3.transform(ANYWHERE, source.points.astype(float))
@@ -263,7 +263,7 @@ def test_clouds_without_viewpoint_under_any_rotation(frames):
     assert angle < 4
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_clouds_of_different_density(scans):
     source, target, true = scans
     few = source[np.random.default_rng(2).permutation(len(source))[: len(source) // 10]]
@@ -273,7 +273,7 @@ def test_clouds_of_different_density(scans):
         assert off(found.T_target_source, T, pair[0])[1] < 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_views_without_overlap_are_rejected(scans):
     _, elsewhere = scanned([2.5, -2.5, 1.3], 1.0, seed=3)
     for source, target, reason in (
@@ -285,7 +285,6 @@ def test_views_without_overlap_are_rejected(scans):
         assert reason in found.reason
 
 
-@pytest.mark.slow
 def test_views_of_different_extent_raise_error(scans, frames):
     ball = bumpy_ball(5000, 1)
     with pytest.raises(RegistrationError, match="does not fit; check the units"):
@@ -294,7 +293,7 @@ def test_views_of_different_extent_raise_error(scans, frames):
         tofuse.register(frames[0].points, ball * 4)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_ambiguous_corridor_is_rejected():
     """Two parallel walls and a floor: the pose along them is unobservable."""
     found = tofuse.register(box_walls(6000, 1, 0.003, "xy"), box_walls(6000, 0, 0.003, "xy"))
@@ -371,7 +370,7 @@ def test_registration_in_other_frames():
 # Sequences of views
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_views_are_chained_and_rejected_views_start_components(scans):
     source, target, true = scans
     tracker = Pairwise().start(0)
@@ -408,7 +407,7 @@ def test_folder_of_scans_becomes_one_model(tmp_path):
         assert off(result.trajectory[k], true, points)[1] < 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_candidates_of_same_pose_are_not_rivals():
     """With large noise, iterations stop slightly apart; such poses do not contradict each other."""
     views, _ = peaks_views(0.1, 101)

@@ -43,7 +43,7 @@ def nees(seed, bend):
     return xi @ cloud_information(source, target, T, np.zeros((0, 6))) @ xi
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("bend", [0.0, 0.01])
 def test_errors_are_as_large_as_stated(bend):
     found = np.array([nees(seed, bend) for seed in range(4)])
@@ -51,7 +51,6 @@ def test_errors_are_as_large_as_stated(bend):
     assert np.median(found) > 0.1  # nor far smaller
 
 
-@pytest.mark.slow
 def test_correlated_errors_limit_information():
     few, many = (
         cloud_information(*aligned(0, 0.01, points)[0], np.eye(4), np.zeros((0, 6)))

@@ -38,7 +38,7 @@ def test_real_pair_of_lidar_scans_upside_down(shared_data):
     assert angle < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_wrong_start_is_left_without_guess(corners):
     source, target = corners
     turned = turn([0.2, 1, 0.3], 150, centre=np.median(source, 0) + 5)

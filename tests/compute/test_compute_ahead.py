@@ -22,7 +22,6 @@ def test_listed_kernels_exist() -> None:
     assert len(listed) == len(set(listed)) > 50
 
 
-@pytest.mark.slow
 def test_listed_signatures_compile(tmp_path: Path) -> None:
     """From the cache of these tests, or compiled now: unsupported types would fail."""
     words = [sys.executable, "-m", "tofuse.engine.compute.ahead"]
@@ -32,7 +31,7 @@ def test_listed_signatures_compile(tmp_path: Path) -> None:
     assert marker.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_run_uses_listed_signatures(room_recording: Path) -> None:
     program = textwrap.dedent(
         """

@@ -31,7 +31,7 @@ def _run(env: dict[str, str], code: str = _COMPILE) -> tuple[list[str], str]:
     return done.stdout.splitlines(), done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.skipif(sys.platform == "win32", reason="the home folder is used on POSIX systems only")
 @pytest.mark.parametrize("place", ["file", "missing"])
 def test_unwritable_home_is_a_warning(tmp_path, place) -> None:
@@ -50,7 +50,7 @@ def test_unwritable_home_is_a_warning(tmp_path, place) -> None:
     assert [p.name for p in tmp_path.iterdir()] == (["home"] if place == "file" else [])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_writable_cache_is_kept_and_reused(tmp_path) -> None:
     env = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     (text, folder), messages = _run(env)

@@ -62,7 +62,6 @@ def check_same(before: Recording, after: Recording, *, depth: float = 1e-6) -> N
         assert family[0] == family[1]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_every_camera(tmp_path: Path, name: str) -> None:
     make, file, _ = MAKERS[name]

@@ -20,7 +20,6 @@ from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import export
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
 from tofuse.engine.errors import OutputError
-from tofuse.engine.geometry import se3
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.formats.poses.trajectory_formats import read_poses
 
@@ -92,33 +91,6 @@ def test_nerfstudio_depth_and_poses_reproduce_points(tmp_path: Path, camera: Cam
     assert len({path is None for path in masked}) == 1
     # Our own reader of trajectories agrees, too.
     np.testing.assert_allclose(read_poses(folder).poses, POSES[POSED], atol=1e-9)
-
-
-@pytest.mark.parametrize("camera", [PLAIN, BROWN, BENT, RATIO, WIDE, TABLE])
-def test_colmap_read_by_pycolmap(tmp_path: Path, camera: Camera) -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
-    result = made_result(tmp_path, camera)
-    (folder,) = export(result, ["colmap"])
-    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
-    assert len(model.images) == len(POSED)
-    assert len(model.points3D) == 40
-    (lens,) = model.cameras.values()
-    expected = {PLAIN: "PINHOLE", BROWN: "OPENCV", BENT: "FULL_OPENCV", RATIO: "FULL_OPENCV"}
-    expected |= {WIDE: "OPENCV_FISHEYE", TABLE: "PINHOLE"}
-    assert lens.model.name == expected[camera]
-    points = np.random.default_rng(6).normal(size=(50, 3)) * 0.3 + [0, 0, 2]
-    if camera is not TABLE:
-        found = lens.img_from_cam(points)
-        np.testing.assert_allclose(found, camera.project(points) + 0.5, atol=1e-9)
-    for image in model.images.values():
-        k = int(image.name.removeprefix("frame_").removesuffix(".png"))
-        assert (folder / "images" / image.name).is_file()
-        T = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
-        np.testing.assert_allclose(T.matrix(), se3.inverse(POSES[k])[:3], atol=1e-9)
-    cloud = read_ply(result / "cloud.ply").points
-    for number, point in model.points3D.items():
-        np.testing.assert_allclose(point.xyz, cloud[number - 1], atol=1e-6)
-        assert point.color.tolist() == [77, 77, 77]
 
 
 def test_colmap_text_files(tmp_path: Path) -> None:

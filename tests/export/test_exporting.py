@@ -186,30 +186,6 @@ def test_surfaces_read_by_trimesh(name: str, result: Path, upright) -> None:
     check_surface(upright, mesh.vertices, mesh.faces, None if plain else mesh.vertex_normals, color)
 
 
-@pytest.mark.parametrize("name", ["glb", "obj", "stl"])
-def test_surfaces_read_by_open3d(name: str, result: Path, upright) -> None:
-    open3d = pytest.importorskip("open3d", reason="open3d is not installed")
-    (path,) = export(result, [name])
-    mesh = open3d.io.read_triangle_mesh(str(path))
-    points, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
-    color = None
-    if name != "stl":
-        (image,) = (np.asarray(each) for each in mesh.textures if not each.is_empty())
-        # UV coordinates of the corners of triangles, from the lower left; each vertex has one.
-        uv = np.zeros((len(points), 2))
-        uv[faces.ravel()] = np.asarray(mesh.triangle_uvs)
-        color = sampled(image, uv)
-    normals = None if name == "stl" else np.asarray(mesh.vertex_normals)
-    check_surface(upright, points, faces, normals, color)
-
-
-def sampled(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) at UV coordinates (N, 2) from the upper left corner."""
-    size = np.array(image.shape[1::-1])
-    u, v = np.rint(uv * size - 0.5).astype(int).clip(0, size - 1).T
-    return image[v, u, :3]
-
-
 def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) -> None:
     trimesh = pytest.importorskip("trimesh")
     monkeypatch.setattr("tofuse.apps.export.exporting._MAX_TEXTURED_FACES", 10)
@@ -243,15 +219,6 @@ def test_kitti(result: Path) -> None:
     (path,) = export(result, ["kitti"])
     rows = np.loadtxt(path)
     np.testing.assert_allclose(rows.reshape(3, 3, 4), POSES[:, :3], atol=1e-15)
-
-
-def test_log_tum_and_kitti_by_open3d(result: Path) -> None:
-    open3d = pytest.importorskip("open3d", reason="open3d is not installed")
-    (log,) = export(result, ["log"])
-    for path in (log, result / "trajectory.txt"):
-        read = open3d.io.read_pinhole_camera_trajectory(str(path))
-        found = [np.linalg.inv(p.extrinsic) for p in read.parameters]
-        np.testing.assert_allclose(found, POSES, atol=1e-9)
 
 
 def test_export_command(result: Path, tmp_path: Path, capsys) -> None:

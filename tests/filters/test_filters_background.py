@@ -17,7 +17,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.filters.background import Background
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.sensor.scattering import LensScattering
-from tofuse.formats.cameras.correction_file import corrected_depth
+from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 
@@ -73,7 +73,7 @@ def check(case: Shown, least: float) -> None:
         assert (keep & ~outer).sum() < 0.03 * true.sum()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_person_is_segmented() -> None:
     check(shown("torso", off=SLOW), 0.93)
 
@@ -90,7 +90,7 @@ def test_moving_camera_is_rejected() -> None:
         Background().fit(frames)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_lens_scattering_is_estimated_and_corrected() -> None:
     """The estimate matches the simulated scattering, although the shape of its blur differs."""
     case, clean = shown("box"), shown("box", off=("scatter",))

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from tofuse.engine import parts
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.filters.base import Filter, apply_filters
 from tofuse.engine.filters.outliers import (
     NeighbourFraction,
@@ -188,12 +187,3 @@ def test_empty_and_single_pixel_frames_are_filtered(z: np.ndarray) -> None:
     for item in every_filter():
         left, _ = apply_filters([item], f, [f])
         assert len(left) <= len(f) <= 1
-
-
-def test_masks_do_not_depend_on_threads() -> None:
-    f = frame(np.random.default_rng(5).uniform(1, 1.2, (90, 110)))
-    for item in every_filter():
-        with threads(1):
-            one = item.mask(f, [f])
-        with threads(3):
-            assert np.array_equal(one, item.mask(f, [f]))

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.cloud import CloudBuilder, as_cloud, choose_voxel
 from tofuse.engine.fusion.options import Fusion
@@ -81,17 +80,6 @@ def test_cloud_is_independent_of_view_order() -> None:
     np.testing.assert_array_equal(one.views, other.views)
     np.testing.assert_allclose(one.points, other.points, atol=1e-6)
     assert np.abs(one.color.astype(int) - other.color).max() <= 1
-
-
-def test_cloud_is_independent_of_threads() -> None:
-    rng = np.random.default_rng(2)
-    views = [view(plane(rng), k) for k in range(3)]
-    found = []
-    for count in (1, 2, 3):
-        with threads(count):
-            cloud = fuse(views, voxel=0.02)
-            found.append(cloud.points.tobytes() + cloud.normals.tobytes())
-    assert len(set(found)) == 1
 
 
 def test_no_points_give_empty_cloud() -> None:

@@ -76,7 +76,6 @@ POSES = np.stack(
 )
 
 
-@pytest.mark.slow
 def test_triangles_are_rasterized_in_place() -> None:
     rng = np.random.default_rng(0)
     corners = rng.uniform(-3, 33, (12, 3, 2)).astype(np.float32)

@@ -12,13 +12,8 @@ from ball_views import CAMERA, EYE, around_a_ball, frame_of, look, plane_range, 
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.spill import Spill
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.fusion import tsdf_kernels as tsdf
 from tofuse.engine.fusion.block_kernels import (
-    block_key,
     block_of,
-    index_of,
-    mark_octants,
-    parent_of,
     voxel_of,
 )
 from tofuse.engine.fusion.model import ModelBuilder
@@ -131,7 +126,6 @@ def slow_distances(volume, views, poses):
     return np.divide(top, weight, out=np.zeros_like(top), where=weight > 0), weight, seen, margin
 
 
-@pytest.mark.slow
 def test_distances_match_slow_sum_over_views() -> None:
     # A ball in front of a wall, gone after two views: free-space violations, occlusion and jumps.
     rng = np.random.default_rng(2)
@@ -292,7 +286,6 @@ def test_empty_views_make_empty_mesh() -> None:
     assert mesh.cloud().points.shape == (0, 3)
 
 
-@pytest.mark.slow
 def test_builder_keeps_views_within_memory_limit() -> None:
     frames, poses = around_a_ball(60, noise=np.random.default_rng(1))
     posed = dict(enumerate(poses))
@@ -384,78 +377,6 @@ def test_clouds_give_no_mesh_and_sparse_images_give_cloud() -> None:
     assert len(model.cloud) == 1
 
 
-def test_plane_shrinkage_and_jumps_match_slow_twins() -> None:
-    rng = np.random.default_rng(12)
-    shape = (19, 23)
-    z = np.where(rng.random(shape) < 0.1, 0, rng.choice([1.0, 1.04, 1.5], shape))
-    sigma = rng.uniform(0.001, 0.02, shape)
-    planes = np.zeros((*shape, 4))
-    planes[..., 3] = np.where(rng.random(shape) < 0.7, 1 / (z + sigma * rng.normal(size=shape)), 0)
-    planes[z == 0] = 0
-    known = rng.uniform(1e-6, 1e-4, shape)
-    z, sigma, planes, known = (x.astype(np.float32) for x in (z, sigma, planes, known))
-    smooth, variance = np.empty((2, *shape), np.float32)
-    measured, jump = np.empty(shape, bool), np.zeros(shape, np.uint8)
-    tsdf.shrink_to_planes(z, sigma, planes, known, 0.004, 2.0, smooth, variance, measured)
-    tsdf.mark_jumps(z, sigma, 0.03, 4.0, jump)
-    twin = np.zeros(shape, np.uint8)
-    for i, j in np.ndindex(shape):
-        if planes[i, j, 3] > 0:
-            plane, noise, relief = 1 / planes[i, j, 3], sigma[i, j] ** 2, (0.004 * z[i, j]) ** 2
-            gain = relief / (relief + noise)
-            rest = known[i, j] * plane**4 + min(relief, noise)
-            assert smooth[i, j] == pytest.approx(plane + gain * (z[i, j] - plane), rel=1e-6)
-            wanted = gain**2 * noise + (1 - gain) ** 2 * rest
-            assert variance[i, j] == pytest.approx(wanted, rel=1e-4)
-            off = abs(z[i, j] - plane) / plane * z[i, j] / sigma[i, j]
-            assert abs(off - 2) < 1e-3 or measured[i, j] == (off < 2)
-        else:
-            assert smooth[i, j] == z[i, j]
-            assert not measured[i, j]
-            assert variance[i, j] == pytest.approx(sigma[i, j] ** 2, rel=1e-6)
-        for p, q in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
-            if 0 <= p < shape[0] and 0 <= q < shape[1] and z[i, j] > 0 and z[p, q] > 0:
-                step, both = abs(z[i, j] - z[p, q]), np.hypot(sigma[i, j], sigma[p, q])
-                twin[i, j] |= step > 0.03 * min(z[i, j], z[p, q]) and step > 4 * both
-    np.testing.assert_array_equal(jump, twin)
-    assert 0.1 < twin.mean() < 0.9
-    assert 0.1 < measured.mean() < 0.9
-
-
-def test_packed_views_match_slow_twin() -> None:
-    rng = np.random.default_rng(5)
-    shape = (6, 7)
-    rays = rng.uniform(-0.8, 0.8, (*shape, 2)).astype(np.float32)
-    rays[0, 0] = np.nan
-    planes = np.concatenate(
-        [rng.normal(0, 1, (*shape, 2)), rng.uniform(0.2, 1, (*shape, 2))], -1
-    ).astype(np.float32)
-    planes[rng.random(shape) < 0.3] = 0
-    planes[0, 0] = 0
-    variance = rng.uniform(1e-6, 1e-4, shape).astype(np.float32)
-    good = rng.random(shape) < 0.8
-    normals, weights = np.full((*shape, 3), 99, np.int8), np.full(shape, -1, np.float32)
-    lengths2 = (1 + (rays * rays).sum(-1)).astype(np.float32)
-    tsdf.pack_view(planes, rays, lengths2, variance, good, 0.1, normals, weights)
-    assert weights[0, 0] == 0
-    assert not normals[0, 0].any()
-    kept = 0
-    for r, c in np.ndindex(shape):
-        if (r, c) == (0, 0):
-            continue
-        ray = np.array([*rays[r, c], 1.0])
-        fitted = planes[r, c, 3] > 0
-        n = planes[r, c, :3].astype(float) if fitted else ray
-        n = n / np.linalg.norm(n)
-        cosine = n @ ray / np.linalg.norm(ray)
-        expected = 1 / (cosine**2 * variance[r, c])
-        expected *= good[r, c] and cosine > 0.1
-        kept += expected > 0
-        assert weights[r, c] == pytest.approx(expected, rel=1e-4)
-        assert np.abs(normals[r, c] - 127 * n).max() < 0.51
-    assert 10 < kept < good.sum()
-
-
 def half_dark(rng):
     """A wall 2 m away, known to 4 mm on the left and to 60 mm on the right."""
     ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
@@ -501,32 +422,3 @@ def test_round_robin_views_make_accurate_surface() -> None:
     assert np.abs(r - 0.3).max() < 0.03
     area = 4 * np.pi * 0.3**2
     assert len(mesh) == pytest.approx(1.5 * area / 0.012**2, rel=0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stride", [1, 2])
-def test_near_cubes_match_slow_twin(stride) -> None:
-    rng = np.random.default_rng(9)
-    view = RangeView.of(frame_of(rng.uniform(1, 3, (72, 88))))
-    T = look([0.3, -0.2, 0.1], [0.5, 0.4, 2.0])
-    first = (1 % stride, 0)
-    keys = tsdf.near_cubes(view.stored, T, 0.05, 0.04, 0.5, first, stride)
-    expected = set()
-    steps = int(np.ceil(0.08 / 0.025))
-    for r in range(first[0], 72, stride):
-        for c in range(first[1], 88, stride):
-            if view.z[r, c] == 0 or view.strength[r, c] == 0:
-                continue
-            p = view.z[r, c] * view.unit * np.array([*view.projection.rays[r, c], 1.0])
-            for t in np.linspace(-0.04, 0.04, steps + 1):
-                q = se3.transform(T, (p + t * view.normals[r, c] / 127)[None])[0]
-                expected.add(block_key(*(int(n) for n in np.floor(q / 0.05))))
-    assert len(expected) > 200
-    both = expected & set(keys.tolist())
-    assert len(both) > 0.998 * max(len(expected), len(set(keys.tolist())))  # except for rounding
-    marks = np.zeros(2, np.uint8)
-    parents = np.array(sorted({parent_of(k)[0] for k in expected}))[:2]
-    mark_octants(keys, *index_of(parents), marks)
-    for parent, mark in zip(parents, marks, strict=True):
-        octants = {parent_of(k)[1] for k in set(keys.tolist()) if parent_of(k)[0] == parent}
-        assert mark == sum(1 << e for e in octants)

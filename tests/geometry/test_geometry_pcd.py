@@ -12,28 +12,6 @@ from tofuse.formats.geometry.lzf_kernels import lzf_decompress
 from tofuse.formats.geometry.pcd import read_pcd
 
 
-def lzf_twin(source: bytes) -> bytes:
-    """Decompress according to the description of liblzf."""
-    out = bytearray()
-    i = 0
-    while i < len(source):
-        control = source[i]
-        i += 1
-        if control < 32:
-            out += source[i : i + control + 1]
-            i += control + 1
-            continue
-        length = control >> 5
-        if length == 7:
-            length += source[i]
-            i += 1
-        back = ((control & 31) << 8) + source[i] + 1
-        i += 1
-        for _ in range(length + 2):
-            out.append(out[-back])
-    return bytes(out)
-
-
 def lzf_compress(data: bytes) -> bytes:
     """Greedy and slow, but with literals, short and long references, and overlapping ones."""
     out = bytearray()
@@ -68,18 +46,6 @@ def lzf_compress(data: bytes) -> bytes:
         i += best
     flush()
     return bytes(out)
-
-
-def test_lzf_kernel_matches_twin() -> None:
-    rng = np.random.default_rng(5)
-    data = (
-        bytes(rng.integers(0, 256, 500, np.uint8)) + bytes(400) + b"abcab" * 90 + bytes([7, 7, 7])
-    )
-    packed = lzf_compress(data)
-    assert len(packed) < len(data)
-    out = np.zeros(len(data), np.uint8)
-    assert lzf_decompress(np.frombuffer(packed, np.uint8), out) == len(data)
-    assert bytes(out) == data == lzf_twin(packed)
 
 
 def test_lzf_kernel_stays_in_bounds() -> None:

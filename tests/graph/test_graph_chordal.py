@@ -83,7 +83,6 @@ def test_undetermined_poses_give_none():
     assert chordal_poses(poses, edges, graph.measurements, information, first_only(10)) is None
 
 
-@pytest.mark.slow
 def test_optimiser_finds_the_minimum_where_descent_from_odometry_does_not():
     graph, truth = drifting_laps(30, 12, 60.0)
     n = len(truth)

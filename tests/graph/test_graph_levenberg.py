@@ -12,7 +12,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.graph import robust
 from tofuse.engine.graph.graph import Measured, PoseGraph, build_graph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
-from tofuse.engine.graph.solver import Settings, solve
+from tofuse.engine.graph.solver import Settings
 from tofuse.engine.graph.sparse import Blocks, PairSystem
 from tofuse.formats.poses.g2o import read_g2o
 from walked_graph import SIGMA, walk
@@ -86,64 +86,6 @@ def test_gradient_and_curvature_match_objective():
     np.testing.assert_allclose(dense(system, matrix), numeric.T @ numeric, atol=1e-7 * scale)
     expected = numeric.T @ whitened(np.zeros(42))
     np.testing.assert_allclose(gradient.ravel(), expected, atol=1e-7 * np.abs(expected).max())
-
-
-def test_one_step_solves_damped_system():
-    graph, _, _ = walk(12, 8)
-    rng = np.random.default_rng(2)
-    m = len(graph.edges)
-    root = rng.normal(size=(m, 6, 6))
-    H, g = root @ np.swapaxes(root, 1, 2), rng.normal(size=(m, 6))
-    system = PairSystem(12, graph.edges)
-    matrix, gradient = system.relative(H, g, graph.measurements)
-    whole = dense(system, matrix)
-    for damping in (0.0, 0.5):
-        step = system.solve(H, g, graph.measurements, damping)
-        damped = whole + damping * np.diag(np.diag(whole))
-        expected = np.linalg.solve(damped, -gradient.ravel())
-        np.testing.assert_allclose(step[system.free].ravel(), expected, rtol=1e-8, atol=1e-12)
-        assert (step[0] == 0).all()
-    # Terms of single poses, here enough to constrain a pose that no pair reaches.
-    lonely = PairSystem(13, graph.edges, np.zeros(13, bool))
-    single = np.tile(np.eye(6), (13, 1, 1)), np.tile(np.arange(6.0), (13, 1))
-    np.testing.assert_allclose(
-        lonely.solve(H, g, graph.measurements, unary=single)[12], -np.arange(6.0)
-    )
-    assert lonely.solve(H, g, graph.measurements) is None
-
-
-@pytest.mark.slow
-def test_covariances_match_repeated_measurements():
-    """Marginals of the dense inverse, and the spread over many graphs, agree."""
-    graph, truth, _ = walk(16, 8)
-    solution = solve(graph.poses, graph.edges, graph.measurements, graph.information)
-    factor = solution.factor()
-    assert factor is not None
-    C = factor.covariances()
-    np.testing.assert_array_equal(C[0], 0)
-    joint = factor.joint_covariance(np.array([3, 0, 9]))
-    np.testing.assert_allclose(joint[:6, :6], C[3], rtol=1e-9)
-    np.testing.assert_allclose(joint[12:, 12:], C[9], rtol=1e-9)
-    np.testing.assert_array_equal(joint[6:12], 0)
-    # Relative ones, from the joint covariance of the two ends.
-    i, j = graph.edges.T
-    T_i_j = se3.inverse(solution.poses[i]) @ solution.poses[j]
-    relative = factor.relative_covariances(T_i_j)
-    for m in (0, 4, len(i) - 1):
-        both = factor.joint_covariance(graph.edges[m])
-        J = np.concatenate([-se3.adjoint(se3.inverse(T_i_j[m])), np.eye(6)], axis=1)
-        np.testing.assert_allclose(relative[m], J @ both @ J.T, rtol=1e-7, atol=1e-14)
-    rng = np.random.default_rng(5)
-    exact = se3.inverse(truth[graph.edges[:, 0]]) @ truth[graph.edges[:, 1]]
-    errors = []
-    for _ in range(150):
-        noisy = exact @ se3.exp(rng.normal(size=(len(exact), 6)) * SIGMA)
-        found = solve(truth, graph.edges, noisy, graph.information).poses
-        errors.append(se3.log(se3.inverse(truth) @ found)[15])
-    x = np.array(errors)
-    mahalanobis = np.einsum("ki,ij,kj->k", x, np.linalg.inv(C[15]), x)
-    # 150 chi-square variables with six degrees of freedom: 6 with a deviation of 0.28.
-    assert mahalanobis.mean() == pytest.approx(6, abs=1)
 
 
 def test_information_weights_edges():
@@ -236,7 +178,6 @@ def test_robust_kernels(kernel):
     assert ate(done.graph.poses, truth) < 0.8 * ate(plain.graph.poses, truth)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least"), [("sphere", 63789.07892761), ("parking-garage", 0.63419240)]
 )

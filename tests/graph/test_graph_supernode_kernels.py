@@ -55,7 +55,6 @@ def test_pattern_is_that_of_the_factor(n: int, links: int) -> None:
     assert all((np.diff(rows[start[k] : start[k + 1]]) > 0).all() for k in range(n))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("n", "links", "k"), SIZES)
 def test_solution_and_inverse_are_those_of_the_dense_matrix(n: int, links: int, k: int) -> None:
     A = Sparse(n, links, k)

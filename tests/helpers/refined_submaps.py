@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from tofuse.engine.compute.spill import Scratch
+from tofuse.engine.graph import build_graph, external_sensors
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 
 
@@ -11,4 +14,5 @@ def refined(part, views, poses, scratch=Scratch()):  # noqa: B008 - immutable
     out = part.start(store)
     for view, T in zip(views, poses, strict=True):
         store.push(view, T)
-    return out.finish(list(range(len(poses))), poses)
+    graph = build_graph(range(len(poses)), np.array(poses), [], [])
+    return out.finish(graph, external_sensors.SensorPriors())

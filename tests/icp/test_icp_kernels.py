@@ -69,13 +69,6 @@ def test_curvature_of_sphere_is_inverse_radius():
     np.testing.assert_allclose(np.median(inside), -2.0, rtol=0.02)
 
 
-def test_curvature_of_cylinder_is_half_inverse_radius():
-    r = np.random.default_rng(2)
-    a, h = r.uniform(0, 2 * np.pi, 6000), r.uniform(-1, 1, 6000)
-    _, (_, curvature, _, _) = shapes(np.column_stack([np.cos(a), h, np.sin(a)]), 20)
-    np.testing.assert_allclose(np.median(curvature), -0.5, rtol=0.05)
-
-
 def test_sheet_border_has_wide_angular_gap():
     x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
     sheet = np.column_stack([x.ravel(), y.ravel(), np.full(400, 9.0)])

@@ -18,13 +18,11 @@ from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.apps.inspection.planar import Distortion
 from tofuse.apps.jobs.running import with_findings
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
-from tofuse.engine.errors import OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pose_accuracy import Accuracy, WorstFrame
 from tofuse.engine.results.types import Reason, SelfCalibration
-from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.native import RecordingWriter
 from wrapped_depth import wrapping
 
@@ -64,7 +62,6 @@ def result(room_recording) -> tofuse.Result:
     return replace(found, recording={**found.recording, "warnings": []})
 
 
-@pytest.mark.slow
 def test_facts_of_simulated_recording(room_recording) -> None:
     found = inspect_recording(tofuse.open(room_recording))
     facts = found.facts
@@ -189,7 +186,6 @@ def few():
 
 
 def codes(frames, quick=True, **options) -> set[str]:
-    """Findings; the focal length from z depth, which takes longest, has tests of its own."""
     return {f.code for f in tofuse.inspect(of(frames, **options), quick=quick).findings}
 
 
@@ -220,16 +216,6 @@ def saturating(frames):
     return out
 
 
-def walking(frames):
-    """An object 1.2 m away moves from left to right."""
-    out = []
-    for k, f in enumerate(frames):
-        depth = f.depth.copy()
-        depth[20:66, 8 + 9 * k : 30 + 9 * k] = 1.2
-        out.append(replace(f, depth=depth))
-    return out
-
-
 BROWN = Pinhole(96, 72, 70.0, 70.0, 47.0, 36.0)
 TIMES = np.arange(8) / 10
 FAULTS = {
@@ -251,7 +237,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_good_recording_has_no_findings(turn) -> None:
     assert codes(turn) == set()
     assert codes(colored(turn, 0), quick=False) == set()
@@ -259,7 +245,7 @@ def test_good_recording_has_no_findings(turn) -> None:
     assert codes(ranges) == set()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize("code", FAULTS)
 def test_faults_are_detected(code, few, turn) -> None:
     if code == "color_unregistered":  # needs more edges
@@ -267,7 +253,7 @@ def test_faults_are_detected(code, few, turn) -> None:
     else:
         found = tofuse.inspect(of(FAULTS[code](few)), quick=True)
     (named,) = [f for f in found.findings if f.code == code]
-    assert named.severity == CODES[code][0]
+    assert named.severity == CODES[code]
     assert named.text.endswith((".", "?"))
     assert named.remedy.endswith(".")
     assert named.evidence
@@ -276,15 +262,13 @@ def test_faults_are_detected(code, few, turn) -> None:
     assert str(named) in found.warnings
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "factor"), [("range", 0.8), ("range", 1.25), ("z", 1.25)])
-def test_wrong_focal_length_is_estimated(kind, factor) -> None:
-    """From z only rotations constrain it, and they constrain a larger focal length better."""
-    frames = turning(8, 14.0, BROWN) if kind == "range" else turning(camera=BROWN)
-    if kind == "range":
-        frames = [replace(f, depth=f.radial_range, depth_kind="range") for f in frames]
+@pytest.mark.nightly
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_wrong_focal_length_is_estimated_from_range(factor) -> None:
+    frames = turning(8, 14.0, BROWN)
+    frames = [replace(f, depth=f.radial_range, depth_kind="range") for f in frames]
     wrong = replace(BROWN, fx=70 * factor, fy=70 * factor)
-    reported = tofuse.inspect(of(seen_by(frames, wrong)), quick=kind == "range").findings
+    reported = tofuse.inspect(of(seen_by(frames, wrong)), quick=True).findings
     (found,) = [f for f in reported if f.code == "focal_length"]
     assert found.evidence["factor"] == pytest.approx(1 / factor, abs=0.09)
 
@@ -299,7 +283,6 @@ def test_folding_distortion_is_rejected() -> None:
     assert not distortion(0.4, -0.2).folds
 
 
-@pytest.mark.slow
 def test_camera_motion_is_classified() -> None:
     still = turning(6, 0.0)
     assert codes(still) == {"static"}
@@ -307,9 +290,8 @@ def test_camera_motion_is_classified() -> None:
     fast = tofuse.inspect(of(turning(6, 40.0)), quick=True)
     # Consequences of little overlap are reported by the run.
     assert ("little_overlap", "warning") in {(f.code, f.severity) for f in fast.findings}
-    assert "moving_objects" in codes(walking(still))
-    found = tofuse.inspect(of(walking(still)), turning=True, quick=True)
-    assert not {"static", "moving_objects"} & {f.code for f in found.findings}
+    found = tofuse.inspect(of(still), turning=True, quick=True)
+    assert "static" not in {f.code for f in found.findings}
 
 
 def test_bare_wall_is_detected_and_curved_scene_gives_no_lens_findings() -> None:
@@ -326,18 +308,7 @@ def test_bare_wall_is_detected_and_curved_scene_gives_no_lens_findings() -> None
     assert not reported & {"range_taken_for_z", "lens_distortion", "focal_length", "wall_only"}
 
 
-@pytest.mark.slow
-def test_contact_sheet_is_saved(few, tmp_path, capsys) -> None:
-    wrong = of(FAULTS["range_taken_for_z"](few))
-    path = tofuse.inspect(wrong, quick=True).save_sheet(tmp_path / "a/sheet.png")
-    picture = read_image(path)
-    assert picture.shape[1] > 800
-    assert picture[..., :3].std() > 20
-    with pytest.raises(OutputError, match="can't be written"):
-        tofuse.inspect(of(few[:2]), quick=True).save_sheet(path / "below.png")
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_real_recordings_have_only_true_findings(shared_data) -> None:
     explained = {
         "sr4000_corridor": {"phase_wrap", "flying_pixels"},  # longer than 5 m; a shiny floor
@@ -351,13 +322,10 @@ def test_real_recordings_have_only_true_findings(shared_data) -> None:
         "sevenscenes_kitchen", "iphone_stray", "ifm_o3r/O3RBuffer.data", "pico_zense_static",
         "slam6d_scans", *explained,
     ):  # fmt: skip
-        # The focal length is checked where a camera that rotates measures z.
-        quick = name != "kinectv2_loop/recording"
-        reported = {f.code for f in tofuse.inspect(shared_data / name, quick=quick).findings}
+        reported = {f.code for f in tofuse.inspect(shared_data / name, quick=True).findings}
         assert reported <= explained.get(name, set()) | {"static"}, name
 
 
-@pytest.mark.slow
 def test_wraps_behind_rotating_object_do_not_affect_verdict(result: tofuse.Result) -> None:
     wrap = Finding("phase_wrap", "Far surfaces look near.", "Drop them.", {})
     moving = with_findings(result, [wrap])

@@ -20,7 +20,6 @@ from tofuse.apps.jobs.sessions import read_sessions
 from tofuse.apps.report.session_words import session_sentences
 from tofuse.apps.results.folders import OutputFolder
 from tofuse.apps.results.output import write_result
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion import texture
@@ -104,7 +103,7 @@ def test_run_json_states_session_of_each_frame(both, session_results) -> None:
     assert data["session_pairs"][0]["joined"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_flat_of_same_plan_is_not_joined(session_results) -> None:
     found = merged(session_results["here"], session_results["elsewhere"], searches=4)
     assert found.has_pose.tolist() == [True] * N + [False] * N
@@ -121,7 +120,7 @@ def test_flat_of_same_plan_is_not_joined(session_results) -> None:
     assert exit_status(found) == 3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_loops_of_earlier_merge_are_registered_again(both, session_results, pair) -> None:
     sessions = read_sessions([session_results["elsewhere"], pair], 2, Silent())
     across = [(p.i, p.j) for p in both.diagnostics.loops if p.accepted and p.i < N <= p.j]
@@ -139,16 +138,7 @@ def test_loops_of_earlier_merge_are_registered_again(both, session_results, pair
     assert "loop_rejected" not in codes
 
 
-@pytest.mark.slow
-def test_result_is_independent_of_threads(both, session_results) -> None:
-    sessions = read_sessions([session_results["here"], session_results["there"]], 1, Silent())
-    with threads(1):
-        again = merge_sessions(sessions, quick_merge(sessions), threads=1)
-    assert again.trajectory.tobytes() == both.trajectory.tobytes()
-    assert again.cloud.points.tobytes() == both.cloud.points.tobytes()
-
-
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_command_writes_result(session_results, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(merging, "merged_config", quick_merge)
     out = tmp_path / "all"

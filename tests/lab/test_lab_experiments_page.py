@@ -51,7 +51,7 @@ def test_sweep_is_judged_by_its_errors():
     assert outcome("peaks-threshold", replace(sweep, position=position + 1)) == "partly"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_peaks_case_gives_page_and_results(peaks_page):
     data = read(peaks_page)
     assert (data["kind"], data["parameters"]["seeds"]) == ("experiments", 1)
@@ -68,7 +68,7 @@ def test_peaks_case_gives_page_and_results(peaks_page):
     assert "“The yaw-angle is most improved.”" in text
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_scene_is_run_with_all_variants(rail_page):
     data = read(rail_page)
     runs = data["cases"]["rail"]["runs"]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.lab.experiments.recording_bound import phase_noise, trajectory_bounds, visible_pixels
+from tofuse.lab.experiments.recording_bound import phase_noise, trajectory_bounds
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
@@ -36,16 +36,6 @@ def test_phase_noise_matches_simulated_camera():
     levels = np.std([np.log(m.amplitude) for m in many], axis=0, ddof=1)
     assert np.mean(ranges / expected) == pytest.approx(1, abs=0.02)
     assert np.mean(levels / expected) == pytest.approx(1, abs=0.02)
-
-
-def test_normals_face_camera_and_slopes_follow_albedo():
-    made = plan("empty-room", effects=NOISE, frames=1)
-    view = visible_pixels(made, int(made.raw[0]))
-    np.testing.assert_allclose(np.linalg.norm(view.normals, axis=1), 1, atol=1e-5)
-    assert ((view.points * view.normals).sum(1) < 0).all()
-    plain = plan("empty-room", effects=NOISE, frames=1, texture=False)
-    # With uniform albedo its slope is zero everywhere.
-    assert np.abs(visible_pixels(plain, int(plain.raw[0])).slopes).max() < 1e-6
 
 
 def test_albedo_and_light_lower_the_bound():

@@ -107,13 +107,6 @@ def test_inliers_are_separated_from_outliers(method, right, wrong):
         assert all(rival.count < 0.5 * right for rival in found[1:])
 
 
-def test_compatible_pairs_are_found_among_many_outliers():
-    pairs, T = made_pairs(20, 780, sigma=0.005, spread=1.5)
-    found = consensus(pairs, SampleOptions(method="compatible"), np.random.default_rng(0))[0]
-    assert off(found.T_target_source, T)[0] < 0.02
-    assert np.count_nonzero(found.inliers[:20]) >= 18
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_pairs_are_weighted_by_their_noise(method):
     """Half of the points are much noisier: they are inliers too, but have little weight."""

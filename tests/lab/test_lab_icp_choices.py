@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -49,7 +47,7 @@ from tofuse.lab.methods.correspondence import (
     Projection,
     ProjectionSearch,
 )
-from tofuse.lab.methods.sampling import IntensityGradient, NormalSpace, RandomEachIteration, Voxel
+from tofuse.lab.methods.sampling import IntensityGradient, NormalSpace, Voxel
 
 
 def everything(a_view):
@@ -87,41 +85,6 @@ def test_voxel_selects_point_nearest_to_centre_of_each_cube():
     np.testing.assert_array_equal(chosen, sorted(i for _, i in cells.values()))
 
 
-def test_random_selection_is_redrawn_at_each_iteration():
-    target, source = view(relief(2000, 0)), view(relief(2000, 1))
-    seen = []
-
-    class Spy(ClosestPoint):
-        def prepare(self, target):
-            search = ClosestPoint().prepare(target)
-
-            class Search:
-                def match(self, alignment, reach):
-                    seen.append((alignment.source.index, alignment.target.index))
-                    return search.match(alignment, reach)
-
-            return Search()
-
-    method = Icp(
-        0.05,
-        source=RandomEachIteration(300),
-        target=RandomEachIteration(1500),
-        matcher=Spy(),
-        metric=PointToPlane(),
-        stopping=SmallStep(1e-12, 4),
-    )
-    found = method.register(source, target, np.eye(4), rng())
-    assert found.iterations == len(seen) == 4
-    assert len({tuple(i) for i, _ in seen}) == 4
-    assert len({tuple(j) for _, j in seen}) == 4
-    assert all(len(i) == 300 and (np.diff(i) > 0).all() for i, _ in seen)
-    seen.clear()
-    replace(method, source=Random(300), target=Random(1500)).register(
-        source, target, np.eye(4), rng()
-    )
-    assert len({tuple(i) for i, _ in seen}) == len({tuple(j) for _, j in seen}) == 1
-
-
 def grooved_wall(n, seed):
     """A wall with two grooves, 12 mm deep, and 1.5 mm of noise."""
     r = rng(seed)
@@ -133,7 +96,7 @@ def grooved_wall(n, seed):
     return p
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_normal_space_registers_grooves_that_random_points_miss():
     """Figures 7 and 8 of Rusinkiewicz and Levoy: an incised plane."""
     T = se3.exp([0.008, -0.006, 0.003, 0.004, -0.003, 0.01])
@@ -237,25 +200,6 @@ def test_projection_search_finds_closest_points_for_small_motions():
     both, i, j = np.intersect1d(found.source, exact.source, return_indices=True)
     assert len(both) > 0.97 * len(exact)
     assert (found.target[i] == exact.target[j]).mean() > 0.97
-
-
-def test_projection_converges_to_same_pose_as_closest_points():
-    source = relief_image(SMALL, 1, noise=0.001)
-    target = relief_image(np.eye(4), noise=0.001)
-    for matcher in (ClosestPoint(), ProjectionSearch(), Projection()):
-        method = Icp(
-            0.02,
-            source=All(),
-            target=All(),
-            matcher=matcher,
-            rejectors=(MaxDistance(3),),
-            metric=PointToPlane(),
-            stopping=SmallStep(1e-3, 40),
-        )
-        found = method.register(source, target, np.eye(4), rng())
-        assert found.inlier_ratio > 0.9
-        assert error(found, SMALL)[0] < 5e-4
-        assert error(found, SMALL)[1] < 0.05
 
 
 def test_closest_compatible_skips_incompatible_points():

@@ -66,24 +66,6 @@ def test_hits_match_brute_force():
     np.testing.assert_allclose((w[..., None] * corners).sum(1), points, atol=1e-9)
 
 
-def test_each_triangle_is_in_one_leaf_inside_its_ancestors():
-    triangles = soup(500, seed=2)
-    box, first, count, order = bvh.build_tree(triangles)
-    assert sorted(order) == list(range(500))
-    covered = np.zeros(500, int)
-    for node in range(len(count)):
-        if count[node]:
-            covered[first[node] : first[node] + count[node]] += 1
-            inside = triangles[order[first[node] : first[node] + count[node]]].reshape(-1, 3)
-        else:
-            children = box[first[node] : first[node] + 2].reshape(-1, 3)
-            inside = children * (1 - 1e-6)
-        assert (inside >= box[node, :3] - 1e-5).all()
-        assert (inside <= box[node, 3:] + 1e-5).all()
-    assert (covered == 1).all()
-    assert count.max() <= bvh.MAX_LEAF_SIZE
-
-
 @pytest.mark.parametrize("count", [1, 2, 5, 400])
 def test_coincident_triangles_make_a_tree(count):
     triangles = np.tile([0.0, -1, -1, 0, 1, -1, 0, 0, 1], (count, 1))

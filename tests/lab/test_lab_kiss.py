@@ -39,7 +39,7 @@ def path(n):
     return np.array(out)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_path_is_tracked_with_default_parameters():
     poses = path(12)
     tracker = Kiss().start(0)

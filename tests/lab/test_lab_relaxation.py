@@ -36,33 +36,6 @@ def ring(n: int, noise: float, seed: int = 0, loops: int = 1) -> tuple[PoseGraph
     return build_graph(range(n), np.array(poses), edges, closing), truth
 
 
-def test_linear_problem_is_solved_in_one_step():
-    """Without rotation one step is the weighted mean, by dense least squares."""
-    rng = np.random.default_rng(0)
-    n = 7
-    pairs = [(k, k + 1) for k in range(n - 1)] + [(0, 6), (1, 5), (2, 6)]
-    root = rng.normal(size=(len(pairs), 3, 3))
-    edges, rows, values = [], [], []
-    for (i, j), A in zip(pairs, root, strict=True):
-        T = np.eye(4)
-        T[:3, 3] = rng.normal(size=3)
-        information = np.eye(6) * 1e13  # rotations are fixed
-        information[:3, :3] = A.T @ A
-        edges.append(Measured(i, j, T, information))
-        row = np.zeros((3, 3 * n))
-        row[:, 3 * j : 3 * j + 3], row[:, 3 * i : 3 * i + 3] = A, -A
-        rows.append(row)
-        values.append(A @ T[:3, 3])
-    graph = build_graph(range(n), np.tile(np.eye(4), (n, 1, 1)), edges[:6], edges[6:])
-    expected = np.linalg.lstsq(np.concatenate(rows)[:, 3:], np.concatenate(values), rcond=None)[0]
-    done = LuMilios(max_iterations=1).optimise(graph)
-    np.testing.assert_allclose(done.graph.poses[1:, :3, 3].ravel(), expected, atol=1e-9)
-    # The second step finds nothing to improve.
-    again = LuMilios().optimise(graph)
-    assert again.converged
-    np.testing.assert_allclose(again.graph.poses, done.graph.poses, atol=1e-7)
-
-
 def test_linear_system_matches_paper():
     """G X = B, block by block."""
     graph, _ = ring(8, 0.01, loops=2)

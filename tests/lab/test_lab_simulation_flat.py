@@ -50,17 +50,3 @@ def test_rooms_are_closed_except_for_doorways(flat) -> None:
         x, y = low[:, 0], low[:, 1]
         through = (x > np.abs(y) * HALF / (DOOR / 2)) | (y > np.abs(x) * HALF / (DOOR / 2))
         assert through.all()
-
-
-@pytest.mark.slow
-def test_flat_is_recorded_from_given_frame() -> None:
-    from tofuse.lab.simulation.effects import Effects
-    from tofuse.lab.simulation.record import plan, simulate_recording
-
-    effects = Effects.none()
-    late = simulate_recording("flat", first=300, frames=2, effects=effects)
-    np.testing.assert_array_equal(late.reference[0], np.eye(4))
-    assert late.timestamps[0] == pytest.approx(10.0)
-    whole = plan("flat")
-    expected = se3.inverse(whole.poses[100]) @ whole.poses[101]
-    np.testing.assert_allclose(late.reference[1], expected, atol=1e-9)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.lab.experiments.peaks import PoseErrors, run_peaks, sweep_peaks
+from tofuse.lab.experiments.peaks import run_peaks, sweep_peaks
 from tofuse.lab.simulation.peaks import peaks, peaks_cameras, peaks_points, peaks_views
 
 
@@ -74,31 +74,13 @@ def test_noise_is_independent_per_view_with_given_sigma():
     assert not np.array_equal(other[7].points, noisy[7].points)
 
 
-def test_pose_errors_are_position_and_rotation_about_camera_axes():
-    truth = se3.exp(np.random.default_rng(0).normal(size=(4, 6)))
-    wrong = truth.copy()
-    wrong[1, :3, 3] += [0.3, 0, -0.4]
-    for k, axis in ((2, 4), (3, 5)):
-        turn = np.zeros(6)
-        turn[axis] = 0.1
-        wrong[k] = wrong[k] @ se3.exp(turn)
-    errors = PoseErrors.of(wrong, truth)
-    np.testing.assert_allclose(errors.position, [0, 0.5, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(errors.rotation, [0, 0, 0.1, 0.1], atol=1e-7)
-    expected = np.zeros((4, 6))
-    expected[1, [0, 2]] = 0.3, -0.4
-    expected[2, 3] = 0.1  # yaw, about y
-    expected[3, 5] = 0.1  # roll, about z
-    np.testing.assert_allclose(errors.axes, expected, atol=1e-12)
-
-
 def test_method_is_nearly_exact_without_noise():
     run = run_peaks(0.0, 0)
     assert run.sequential.position.max() < 1e-3
     assert run.optimised.position.max() < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_noise_sweep_reproduces_thesis():
     """Figure 5.12, and the level that an independent implementation of the method reaches."""
     sweep = sweep_peaks(range(3), (0.02, 0.06, 0.10))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.lab.world.scene import SCENES, Scene, build
 
@@ -106,19 +105,6 @@ def test_turn_closes_after_last_frame(built, name):
     np.testing.assert_allclose(quarter[:3, 3], 0, atol=1e-12)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [n for n in SCENES if n != "flat-alike"])  # moves as flat does
-def test_motion_is_smooth_and_slow(built, name):
-    _, sequence = built[name]
-    t = np.arange(0, sequence.frames / 30, 1 / 60)
-    poses = np.array([sequence.T_world_camera(s) for s in t])
-    steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) * 60
-    turning = np.linalg.norm(steps[:, 3:], axis=1)
-    assert turning.max() < np.deg2rad(60)
-    assert np.abs(np.diff(steps, axis=0)).max() < 0.1  # no jumps in velocity
-    assert max(turning.max(), np.linalg.norm(steps[:, :3], axis=1).max()) > 0.01
-
-
 @pytest.mark.parametrize("name", SCENES)
 def test_visible_points_lie_on_truth_mesh(built, name):
     """Hits, mapped by the true pose into the world and back onto the truth mesh."""
@@ -188,14 +174,3 @@ def test_camera_orbits_moving_object_in_its_frame(built, name):
     assert radius.min() > 1.0
     np.testing.assert_allclose(radius, radius[0], atol=1e-9)
     np.testing.assert_allclose(centres[0], centres[-1], atol=1e-9)
-
-
-def test_hits_are_independent_of_threads(built):
-    scene, sequence = built["torso"]
-    rays = sr4000_rays(1)
-    with threads(1):
-        a = look(scene, sequence, 1.0, rays)
-    with threads(3):
-        b = look(scene, sequence, 1.0, rays)
-    for name in ("distance", "normal", "albedo", "gloss", "surface"):
-        assert getattr(a, name).tobytes() == getattr(b, name).tobytes()

@@ -202,27 +202,6 @@ def test_wiggling_has_four_periods_per_phase_period() -> None:
     assert amplitude == pytest.approx((h3 - h5) * model.period_m / (2 * np.pi), rel=0.05)
 
 
-def test_pixel_offsets_grow_along_readout() -> None:
-    offset = ranges(wall(2.0), Effects.none(pixel_offsets=1.0)) - ranges(wall(2.0), Effects.none())
-    np.testing.assert_allclose(offset, sensor.pixel_offsets(MODEL), atol=2e-4)
-    slope = np.polyfit(np.arange(44), offset.mean(0), 1)[0]
-    assert slope * 43 == pytest.approx(MODEL.readout_delay_m, rel=0.2)
-    assert (offset - offset.mean(0)).std() > 0.5 * MODEL.pixel_delay_m
-
-
-def test_thermal_drift_grows_monotonically_to_limit() -> None:
-    times = [0, 300, 1500, 6000, 300000]
-    seen = [
-        float(ranges(wall(2.0), Effects.none(thermal_drift=1.0), index=k).mean()) for k in times
-    ]
-    base = float(ranges(wall(2.0), Effects.none()).mean())
-    drift = np.array(seen) - base
-    assert (np.diff(drift) > 0).all()
-    seconds = np.array(times) / 30.0
-    expected = MODEL.drift_m * (1 - np.exp(-seconds / MODEL.drift_time_s))
-    np.testing.assert_allclose(drift, expected, atol=1e-4)
-
-
 def test_scattering_biases_background_towards_bright_foreground() -> None:
     near = Board((-0.25, 0, 0.5), a=(0.2, 0, 0), b=(0, 0.5, 0), albedo=0.9)
     scene = Boards([near, Board((0, 0, 2.0), albedo=0.3)])
@@ -250,21 +229,6 @@ def corner(albedo: float = 0.6) -> Boards:
     )
 
 
-def test_multipath_rounds_corners() -> None:
-    bias = ranges(corner(), Effects.none(multipath=True)) - ranges(corner(), Effects.none())
-    assert (bias > -0.002).all()
-    middle, side = bias[:, 20:24].mean(), bias[:, [4, 5, 38, 39]].mean()
-    assert middle > 0.01
-    assert abs(bias[:, 4:8].mean() - bias[:, 36:40].mean()) < 0.4 * bias.mean()
-    # The corner looks flatter: the range error is larger beside the edge than at it,
-    # where the detour vanishes.
-    assert bias[:, 12:18].mean() > side * 0.5
-    # Half the albedo, half the fraction of light by way of the other wall.
-    dark = ranges(corner(0.3), Effects.none(multipath=True)) - ranges(corner(), Effects.none())
-    assert dark.mean() / bias.mean() == pytest.approx(0.5, abs=0.1)
-
-
-@pytest.mark.slow
 def test_corner_multipath_matches_integral_over_walls() -> None:
     """Falloff: half lamp, half lens; bounced light has that of the lamp at its source."""
     model = replace(MODEL, camera=Pinhole(176, 144, 152.0, 152.0, 87.5, 71.5))

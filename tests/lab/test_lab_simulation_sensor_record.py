@@ -29,7 +29,7 @@ def folder(tmp_path_factory):
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_written_folder_matches_recording_in_memory(folder) -> None:
     source = NativeSource(folder)
     memory = simulate_recording("corner", every=10, frames=3)
@@ -85,16 +85,6 @@ def test_moving_object_defines_world() -> None:
         ]
         expected = se3.inverse(T_object_camera[0]) @ T_object_camera[1]
         np.testing.assert_allclose(pose, expected, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_raw_frame_is_independent_of_stride() -> None:
-    effects = Effects()
-    two = simulate_recording("wall", every=2, frames=3, effects=effects)
-    four = simulate_recording("wall", every=4, frames=2, effects=effects)
-    np.testing.assert_array_equal(two[2].depth, four[1].depth)
-    assert two[2].timestamp == four[1].timestamp
-    assert not np.array_equal(two[1].depth, four[1].depth)
 
 
 def test_bias_remains_without_correction(tmp_path) -> None:

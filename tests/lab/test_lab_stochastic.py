@@ -44,7 +44,7 @@ def grid(side: int, noise: float, seed: int) -> PoseGraph:
     return build_graph(range(n), np.array(poses), steps, loops)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sgd_approaches_least_squares_from_odometry():
     graph = grid(6, 0.03, 0)
     least = LevenbergMarquardt().optimise(graph).graph.chi2()
@@ -54,7 +54,6 @@ def test_sgd_approaches_least_squares_from_odometry():
     np.testing.assert_array_equal(found.graph.poses[0], graph.poses[0])
 
 
-@pytest.mark.slow
 def test_sgd_converges_from_random_poses():
     """A few rounds remove most of the error, and least squares converges from there."""
     for seed in range(3):

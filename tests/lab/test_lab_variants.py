@@ -35,7 +35,7 @@ def small(seed):
     return T
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("overlap", [0.5, 0.65])
 def test_tricp_estimates_overlap_and_motion_with_outliers(overlap):
     low = 0.5 - overlap  # of the source, where the target ends at 0.5

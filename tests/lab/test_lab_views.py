@@ -11,6 +11,7 @@ import pytest
 from registration_scenes import MIDDLE, directions, rng, turn, view
 from tofuse.engine import parts
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph import build_graph, external_sensors
 from tofuse.engine.icp.icp_kernels import transform_points
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.engine.views.prepared_view import PreparedView
@@ -81,7 +82,7 @@ def motions(n, seed):
     return poses, pairs
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
 def test_refinement_corrects_drift(method):
     T, clouds = ring()
@@ -89,7 +90,8 @@ def test_refinement_corrects_drift(method):
     refiner = replace(method, points=2000).start(ViewStore[PreparedView](Spacing()))
     for cloud, pose in zip(clouds, start, strict=True):
         refiner.push(cloud, pose)
-    found = refiner.finish([c.index for c in clouds], start)
+    graph = build_graph([c.index for c in clouds], start, [], [])
+    found = refiner.finish(graph, external_sensors.SensorPriors())
     assert found.kept
     assert found.views == VIEWS
     assert found.support[1] > found.support[0]

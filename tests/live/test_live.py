@@ -26,12 +26,10 @@ from fake_cameras import (
 )
 from tofuse.apps.cli.program import main
 from tofuse.apps.live.device import DeviceError, Stream, device_named, is_installed, known_devices
-from tofuse.apps.live.player import Player
 from tofuse.apps.live.recorder import QUEUE_FRAMES, record
 from tofuse.engine.cameras.cameras import Pinhole, Rational
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import ArraySource, Recording
 
 Install = Callable[..., None]
 
@@ -230,44 +228,3 @@ def test_record_command(
     )
     assert main(["record", "azure-kinect"]) == 2
     assert "--out: is missing" in capsys.readouterr().err
-
-
-class Clock:
-    """Simulated time, advanced by sleeping and by the test."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.slept: list[float] = []
-
-    def sleep(self, seconds: float) -> None:
-        self.slept.append(seconds)
-        self.now += seconds
-
-
-def ten_frames(times: Any = None) -> Recording:
-    camera = Pinhole(4, 3, 4.0, 4.0, 1.5, 1.0)
-    times = np.arange(10) / 10 if times is None else times
-    frames = [
-        RangeFrame(k, float(t), camera, np.ones((3, 4), np.float32)) for k, t in enumerate(times)
-    ]
-    return Recording.of(ArraySource(frames), "made", "made")
-
-
-def test_player_keeps_timing() -> None:
-    clock = Clock()
-    player = Player(ten_frames(), clock=lambda: clock.now, sleep=clock.sleep)
-    seen = [(frame.index, round(clock.now - 100, 6)) for frame in player]
-    assert seen == [(k, k / 10) for k in range(10)]
-    assert player.dropped == []
-
-
-def test_player_drops_late_frames_and_returns_newest() -> None:
-    clock = Clock()
-    player = Player(ten_frames(), clock=lambda: clock.now, sleep=clock.sleep)
-    seen = []
-    for frame in player:
-        seen.append(frame.index)
-        clock.now += 0.25  # work
-    # Asked at 0, 0.25, 0.5, ...: the newest by then; at the end the last one.
-    assert seen == [0, 2, 5, 7, 9]
-    assert player.dropped == [1, 3, 4, 6, 8]

@@ -209,7 +209,7 @@ def test_candidates_require_leaving_and_returning(full_turn):
     assert refused == [(0, 18)]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_candidates_of_many_views_are_found_by_index() -> None:
     """Past 300 places and back: too many views to compare all pairs."""
     rng = np.random.default_rng(4)

@@ -10,7 +10,6 @@ import pytest
 
 from made_rooms import OTHER, at, seen, surface
 from tofuse.engine.alignment.base import Link, Registration
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.join_checks import JoinChecks
 from tofuse.engine.loops.joining import Joining
@@ -122,15 +121,6 @@ def test_order_of_links_does_not_matter(three, seed) -> None:
     assert_joined(group, three)
 
 
-def test_result_is_independent_of_threads(three) -> None:
-    found = []
-    for count in (1, 2):
-        with threads(count):
-            (group,) = SPARSELY.join(three, [])
-        found.append([T.tobytes() for T in group.T_group_component.values()])
-    assert found[0] == found[1]
-
-
 def test_views_of_two_scenes_stay_separate(three, elsewhere) -> None:
     both = [three[0], elsewhere]
     groups = SPARSELY.join(both, [])
@@ -138,7 +128,7 @@ def test_views_of_two_scenes_stay_separate(three, elsewhere) -> None:
     assert all(not group.joins for group in groups)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_component_of_another_scene_does_not_separate_others(three, elsewhere) -> None:
     path = [*PATH[:22], *PATH[4:14]]
     parts = [three[0], elsewhere, stretch(2, range(22, 32), path)]
@@ -147,7 +137,6 @@ def test_component_of_another_scene_does_not_separate_others(three, elsewhere) -
     assert_joined(groups[0], parts, path)
 
 
-@pytest.mark.slow
 def test_largest_group_comes_first(elsewhere, three) -> None:
     strange = stretch(0, range(4), **STRANGE)
     groups = SPARSELY.join([strange, three[1], three[2]], [])
@@ -230,7 +219,7 @@ def similar_rooms():
     return path, parts
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_single_link_waits_for_links_elsewhere() -> None:
     """The views at the gap are similar, and a link between them would be certain."""
     path, parts = similar_rooms()
@@ -306,7 +295,7 @@ def test_gap_in_steady_motion_is_bridged_and_reported() -> None:
     assert np.linalg.eigvalsh(join.link.information).min() > 0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_gap_in_irregular_motion_is_not_bridged() -> None:
     _, parts = along_a_wall()
     assert members(replace(SPARSELY, searches=0).join(parts, [])) == [[1], [0]]
@@ -337,7 +326,7 @@ def test_gap_in_irregular_motion_is_bridged_by_odometry() -> None:
     assert np.linalg.norm(off) < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_odometry_inconsistent_with_tracking_bridges_nothing() -> None:
     path, parts = along_a_wall(shake=0.03)
     for odometry in (with_odometry(parts, path, 0.2), [replace(p, odometry=None) for p in parts]):
@@ -403,7 +392,6 @@ def test_independent_links_raise_probability(three, min_probability) -> None:
     assert other > same
 
 
-@pytest.mark.slow
 def test_first_group_is_main_on_request(elsewhere, three) -> None:
     strange = stretch(0, range(4), **STRANGE)
     groups = replace(SPARSELY, main="first").join([strange, three[1], three[2]], [])

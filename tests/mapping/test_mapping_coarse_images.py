@@ -39,7 +39,7 @@ def recording() -> Recording:
     return Recording.of(ArraySource(tuple(frames), poses), "made", "arrays")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_few_pixels_are_tracked(recording):
     result = reconstruct(recording, "default", threads=1)
     assert all(frame.status == "tracked" for frame in result.diagnostics.frames)

@@ -107,24 +107,7 @@ def test_live_poses_of_connected_components_are_correct(there_and_back, joined) 
     assert_right([np.eye(4) if T is None else T for T in live], places, rows)
 
 
-@pytest.mark.slow
-def test_result_is_independent_of_threads(there_and_back, joined) -> None:
-    result, live = joined
-    other, also = run(there_and_back[1], threads=2)
-    assert other.trajectory.tobytes() == result.trajectory.tobytes()
-    assert [c.frames for c in other.components] == [c.frames for c in result.components]
-    for one, two in zip(result.components, other.components, strict=True):
-        assert one.joined == two.joined
-        for a, b in ((one.T_main_component, two.T_main_component),):
-            assert (a is None) == (b is None)
-            if a is not None:
-                assert a.tobytes() == b.tobytes()
-    for one, two in zip(live, also, strict=True):
-        assert (one is None) == (two is None)
-        assert one is None or one.tobytes() == two.tobytes()
-
-
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_two_scenes_give_two_components_with_models() -> None:
     places = [*range(10), *range(8)]
     result, _ = run(in_order([*frames_of(range(10)), *frames_of(range(8), **STRANGE)]))
@@ -146,14 +129,14 @@ def test_two_scenes_give_two_components_with_models() -> None:
     assert result.diagnostics.verdict == "degraded"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_few_frames_of_another_scene_get_no_model() -> None:
     result, _ = run(in_order([*frames_of(range(6)), *frames_of(range(3), **STRANGE)]))
     assert [c.connected for c in result.components] == [True, False]
     assert result.components[1].result is None
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_unordered_views_are_joined() -> None:
     places = np.random.default_rng(2).permutation(range(0, 24, 2)).tolist()
     result, _ = run(in_order(frames_of(places)))

@@ -72,7 +72,6 @@ def test_falloff_is_estimated(frames, exponent):
     assert found == pytest.approx(exponent, abs=0.6)
 
 
-@pytest.mark.slow
 def test_estimated_falloff_enters_configuration_once(frames):
     config = adapted(from_method("default"), recording(frames, 5.0), threads=1)
     assert config.odometry.views.falloff == pytest.approx(5.0, abs=0.6)

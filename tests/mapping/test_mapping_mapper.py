@@ -123,7 +123,7 @@ def test_filter_for_images_refuses_clouds_early(frames) -> None:
     mapper.push(frames[0])  # the refused view does not set the kind
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize(
     ("method", "amplitude", "filters", "corrected", "ready"),
     [
@@ -180,7 +180,6 @@ def test_given_loops_are_used_or_rejected(frames, whole) -> None:
     assert len(result.diagnostics.objective) > 0
 
 
-@pytest.mark.slow
 def test_clouds_alone_give_a_model(frames) -> None:
     clouds = [CloudFrame.of(f.points[::6], index=f.index, timestamp=f.index) for f in frames[:3]]
     result = reconstruct(in_memory(clouds))

@@ -46,7 +46,7 @@ def made(folder: Path, *priors: object, frames: int | None = None) -> Reconstruc
     return reconstruct(open_recording(folder).select(end=frames), config, threads=1)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_priors_are_used_on_request_and_reported(beside, room_recording):
     alone, both = made(beside), made(beside, *BOTH)
     records = {record.sensor: record for record in both.diagnostics.priors}
@@ -76,7 +76,6 @@ def test_priors_are_used_on_request_and_reported(beside, room_recording):
     assert np.trace(last[0][3:, 3:]) < np.trace(last[1][3:, 3:])
 
 
-@pytest.mark.slow
 def test_missing_sensor_files_change_nothing(room_recording):
     asked, not_asked = (made(room_recording, *p, frames=3) for p in (BOTH, ()))
     assert asked.diagnostics.priors == ()

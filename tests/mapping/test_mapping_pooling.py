@@ -8,7 +8,6 @@ import pytest
 from tofuse.engine.mapping.trial import pooled
 
 
-@pytest.mark.slow
 def test_variance_of_equal_estimates_follows_their_spread() -> None:
     rng = np.random.default_rng(0)
     off, stated = [], []

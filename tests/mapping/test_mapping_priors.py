@@ -103,7 +103,7 @@ def test_odometry_file_takes_precedence_over_device_poses(recording) -> None:
     assert with_prior(phone, with_odometry, "device")[1] is with_odometry
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_inconsistent_device_poses_are_ignored(recording) -> None:
     """A phone that lost tracking: its poses contradict the images."""
     rng = np.random.default_rng(0)

@@ -41,7 +41,7 @@ def multipath_of(config: Config) -> Multipath:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_compensation_is_disabled_without_multipath(straight: Recording) -> None:
     listener = Listener()
     config = adapted(from_method("default"), straight, 1, listener)
@@ -59,7 +59,7 @@ def test_compensation_is_disabled_without_multipath(straight: Recording) -> None
     assert adapted(config, straight, 1) == config
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_compensation_is_kept_with_multipath() -> None:
     effects = Effects.none(shot_noise=True, multipath=True)
     recording = simulate_recording("empty-room", every=6, frames=20, effects=effects)
@@ -112,7 +112,7 @@ def plain(frame: Frame) -> Frame:
     return frame
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("there", [0.0, 0.5])
 def test_strength_is_fraction_of_error_in_data(straight: Recording, there: float) -> None:
     """The correction removes a bump of 2 %, of which the data contain this fraction."""
@@ -122,7 +122,7 @@ def test_strength_is_fraction_of_error_in_data(straight: Recording, there: float
     assert found.is_significant == (there > 0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_correction_of_another_error_does_not_help(straight: Recording) -> None:
     spoil, correct = bent(0.02, 8.0), bent(-0.02, 21.0)
     assert not trial(straight, spoil, lambda frame: correct(spoil(frame))).is_significant

@@ -12,7 +12,6 @@ import pytest
 
 from paths import DOCS
 from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.noise.model import (
@@ -139,39 +138,6 @@ def test_tilted_wall_is_noisier_by_change_within_pixel() -> None:
     assert (model.sigma(seen, np.ones((30, 40), np.float32)) < 1e-5).all()
     unknown = np.full((30, 40), np.nan, np.float32)
     assert (model.sigma(seen, unknown) < 1e-5).all()
-
-
-def twin(seen: RangeFrame, model: NoiseModel, cosine: np.ndarray) -> np.ndarray:
-    r = seen.radial_range.astype(float)
-    length = ray_lengths(CAMERA).astype(float)
-    light = model.amplitude
-    assert light is not None
-    with np.errstate(all="ignore"):
-        counts = seen.amplitude_image / r**2 / length**light.falloff
-        variance = light.floor**2 + light.shot**2 / counts + (light.dark / counts) ** 2
-        bad = (seen.amplitude_image <= 0) | (seen.amplitude_image >= 65535)
-        variance = np.minimum(np.where(bad, np.inf, variance), model.ceiling_m**2)
-        change = model.footprint / 30.0 * r / length * np.sqrt(1 / np.maximum(cosine, 0.1) ** 2 - 1)
-    variance += np.where(np.isfinite(cosine), change, 0) ** 2
-    return np.where(r > 0, np.sqrt(variance), 0)
-
-
-def test_kernel_matches_numpy_for_any_number_of_threads() -> None:
-    rng = np.random.default_rng(3)
-    depth = rng.uniform(0.5, 5, (30, 40)) * (rng.random((30, 40)) < 0.9)
-    amplitude = rng.uniform(0, 1000, (30, 40)).astype(np.float32)
-    amplitude[rng.random((30, 40)) < 0.05] = 65535
-    amplitude[rng.random((30, 40)) < 0.05] = 0
-    cosine = rng.uniform(0, 1, (30, 40)).astype(np.float32)
-    cosine[rng.random((30, 40)) < 0.1] = np.nan
-    seen = frame(depth, amplitude_image=amplitude, amplitude_kind="range_compensated")
-    model = NOISE["sr4000"]
-    with threads(1):
-        one = model.sigma(seen, cosine)
-    with threads(3):
-        three = model.sigma(seen, cosine)
-    np.testing.assert_array_equal(one, three)
-    np.testing.assert_allclose(one, twin(seen, model, cosine), rtol=2e-5)
 
 
 def test_json_round_trip(tmp_path: Path) -> None:

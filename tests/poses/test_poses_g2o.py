@@ -123,7 +123,6 @@ def test_invalid_graphs_are_not_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "vertices", "edges"), [("sphere", 2500, 9799), ("parking-garage", 1661, 6275)]
 )

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.geometry.quaternion import from_matrix
@@ -172,26 +171,6 @@ def test_damaged_files_never_crash(tmp_path: Path) -> None:
                 continue
             assert isinstance(found, TimedPoses)
             assert np.isfinite(found.poses).all()
-
-
-def test_evaluate_accepts_poses_by_frame(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    moved = se3.exp(np.array([1.0, 2, 3, 0.1, 0.2, 0.3])) @ POSES
-    np.save(tmp_path / "a.npy", POSES)
-    write_kitti(tmp_path / "b.txt", moved)
-    given = ["evaluate", str(tmp_path / "a.npy"), str(tmp_path / "b.txt")]
-    assert main([*given, "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
-    assert data["associated"] == 5
-    assert data["ate_rms_m"] < 1e-6
-    assert "ate_interval_m" not in data
-    assert main([*given, "--reference-error", "20mm", "--json"]) == 0
-    low, high = json.loads(capsys.readouterr().out)["ate_interval_m"]
-    assert low == 0
-    assert high == pytest.approx(0.02, abs=1e-6)
-    assert main([*given, "--reference-error", "20mm"]) == 0
-    assert "true ATE within" in capsys.readouterr().out
 
 
 def test_true_error_is_within_interval() -> None:

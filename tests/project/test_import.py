@@ -6,15 +6,11 @@ import json
 import re
 import subprocess
 import sys
-import tomllib
 
 import pytest
-from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name
-from packaging.version import Version
 
 import tofuse
-from paths import DOCS, ROOT
+from paths import DOCS
 
 HEAVY = {"numba", "scipy", "cv2", "matplotlib", "jinja2", "rich"}
 
@@ -62,22 +58,6 @@ def test_errors_state_place_problem_and_remedy_on_one_line() -> None:
     assert str(tofuse.OutputError("can't be written")) == "can't be written"
     for kind in (tofuse.InputError, tofuse.OutputError, tofuse.RegistrationError):
         assert issubclass(kind, tofuse.TofuseError)
-
-
-def test_extras_are_compatible() -> None:
-    """`make lock` resolves the package with all extras: one version of each serves all."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = project["optional-dependencies"].values()
-    wanted = [*project["dependencies"], *(line for extra in extras for line in extra)]
-    pins: dict[str, set[Version]] = {}
-    for line in (ROOT / "requirements" / "extras.txt").read_text().splitlines():
-        found = re.match(r"([\w.-]+)==([^\s;]+)", line)
-        if found:
-            pins.setdefault(canonicalize_name(found[1]), set()).add(Version(found[2]))
-    for line in wanted:
-        requirement = Requirement(line)
-        versions = pins[canonicalize_name(requirement.name)]
-        assert all(version in requirement.specifier for version in versions), line
 
 
 def test_reference_shows_every_public_name() -> None:

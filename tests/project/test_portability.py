@@ -99,7 +99,6 @@ def unguarded(tree: ast.AST) -> Iterator[tuple[int, str]]:
     yield from walk(tree, False)
 
 
-@pytest.mark.slow
 def test_uses_of_missing_features_are_guarded() -> None:
     found = [
         f"{path.relative_to(SOURCE)}:{line}: {name}"

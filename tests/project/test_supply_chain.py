@@ -26,18 +26,6 @@ def check(monkeypatch):
     return check
 
 
-def test_every_pin_has_hashes(check) -> None:
-    assert {path.stem for path in FOLDER.glob("*.txt")} == set(check.ALL)
-    for name in check.ALL:
-        path = FOLDER / f"{name}.txt"
-        found = check.pins(path)
-        assert len(found) > 20
-        assert list(check.unhashed(path)) == []
-        assert len(re.findall(r"--hash=", path.read_text())) == sum(
-            len(pin.hashes) for pin in found
-        )
-
-
 def test_pins_of_runtime_and_development_agree(check) -> None:
     """One version of each package, which satisfies the requirements of tofuse and its extras."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

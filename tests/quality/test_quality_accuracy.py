@@ -46,7 +46,7 @@ def bounded(graph, unobservable, unmeasured=()) -> PoseGraph:
     return without_degenerate(graph, directions, unmeasured)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize("loops", [(), ((0, N - 1), (2, 9))])
 def test_coverage_of_error_bounds(loops) -> None:
     """With noise alone, which the covariance models completely."""
@@ -242,7 +242,7 @@ def test_disconnected_parts_are_unbounded() -> None:
     assert len(a.unbounded) in (5, 9)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize("scene", ["wall", pytest.param("corridor", marks=pytest.mark.nightly)])
 def test_slide_along_bare_walls_is_unbounded(scene) -> None:
     """Whatever the error happens to be: it was not measured."""

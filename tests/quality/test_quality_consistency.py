@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording, evenly_spaced
-from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.geometry import se3
 from tofuse.engine.quality.map_agreement import (
     Consistency,
     SurfaceImage,
@@ -28,7 +26,6 @@ from tofuse.engine.quality.map_agreement import (
     poses_of_frames,
 )
 from tofuse.formats.poses.trajectory import write_tum
-from tofuse.formats.readers.native import NativeSource
 
 # A synthetic room, and poses in it -------------------------------------------------------------
 
@@ -284,36 +281,3 @@ def test_depths_are_requantized_to_recording_unit() -> None:
 
 
 # The reference tool ----------------------------------------------------------------------------
-
-
-def by_tool(shared_data: Path, recording: Path, trajectory: Path, frames: int) -> str:
-    tool = shared_data.parent / "tools" / "map_consistency.py"
-    if not tool.is_file():
-        pytest.skip("the tool that defines map consistency is not on this machine")
-    done = subprocess.run(
-        [sys.executable, str(tool), str(recording), str(trajectory), "--frames", str(frames)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return done.stdout.strip()
-
-
-def tool_format(found: Consistency) -> str:
-    return f"rms {found.rms_m:.5f} m, inliers {found.inlier_ratio:.4f}, pairs {found.pairs}"
-
-
-def ours(recording: Path, trajectory: Path, frames: int) -> Consistency:
-    opened = Recording.of(NativeSource(recording), recording, "native")
-    rows = np.loadtxt(trajectory)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = quaternion.to_matrix(rows[:, 4:8])
-    poses[:, :3, 3] = rows[:, 1:4]
-    return map_consistency(opened, poses_of_frames(opened.timestamps, rows[:, 0], poses), frames)
-
-
-def test_output_matches_reference_tool_on_real_loop(shared_data: Path) -> None:
-    recording = shared_data / "kinectv2_loop" / "recording"
-    trajectory = recording / "reference_poses.txt"
-    expected = by_tool(shared_data, recording, trajectory, 9)
-    assert tool_format(ours(recording, trajectory, 9)) == expected

@@ -15,7 +15,6 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory_errors import (
     align,
-    associate,
     evaluate_trajectory,
     relative_error,
 )
@@ -156,20 +155,6 @@ def test_coverage_counts_frames_if_known() -> None:
     assert plain.coverage == pytest.approx(27 / 300)
     known = evaluate_trajectory(times, estimate, reference_times, fast, frames)
     assert known.coverage == pytest.approx(27 / 30)
-
-
-@settings(max_examples=40)
-@given(seed=st.integers(0, 10**6))
-def test_association_matches_brute_force(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    a, b = rng.uniform(0, 0.3, 12), rng.uniform(0, 0.3, 15)
-    left = sorted((abs(x - y), i, j) for i, x in enumerate(a) for j, y in enumerate(b))
-    expected = []
-    while left and left[0][0] < 0.02:
-        _, i, j = left[0]
-        expected.append([i, j])
-        left = [c for c in left if c[1] != i and c[2] != j]
-    assert associate(a, b).tolist() == sorted(expected, key=lambda pair: a[pair[0]])
 
 
 @settings(max_examples=30)

@@ -193,34 +193,23 @@ def test_color_of_other_camera_is_projected(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"schema": 2}, "schema: is 2; write 1"),
-        ({"schema": None}, "schema: is missing"),
+        ({"schema": 2}, "schema is 2; write 1"),
+        ({"schema": None}, "schema is missing"),
         ({"model": "hexagonal"}, "model: is 'hexagonal'; write one of pinhole"),
         ({"model": ["pinhole"]}, "model: is"),
         ({"model": "rays"}, "no rays.npy"),
         ({"width": 41}, "40 x 30 pixels, camera.json states 41 x 30"),
         ({"width": 40.5}, "width: is 40.5"),
-        ({"height": "30"}, "height: is '30'"),
-        ({"height": -1}, "height: is -1"),
         ({"width": 10**9}, "width"),
         ({"fx": None}, "fx: is missing; use a positive number"),
         ({"fx": float("nan")}, "fx: is nan; use a finite"),
-        ({"cy": float("inf")}, "cy: is inf; use a finite"),
         ({"fx": 10**400}, "fx: is too large"),
-        ({"fy": 0}, "fy: is 0"),
-        ({"fy": True}, "fy: is True"),
-        ({"fy": -5.0}, "fy: is -5"),
-        ({"distortion": 0.1}, "distortion: is 0.1"),
         ({"distortion": [0.1]}, "distortion: has 1 numbers, the model 'pinhole' takes 0"),
         ({"model": "brown", "distortion": [0.1, "x"]}, r"distortion\[1\]: is 'x'"),
         ({"model": "brown", "distortion": [0.1, float("nan")]}, r"distortion\[1\]: is nan"),
         ({"depth_unit_m": None}, "depth_unit_m: is missing"),
-        ({"depth_unit_m": 0}, "depth_unit_m: is 0"),
         ({"depth_kind": "slant"}, "depth_kind: is 'slant'; write one of z, range"),
-        ({"depth_kind": None}, "depth_kind: is missing"),
-        ({"frame_rate_hz": 0}, "frame_rate_hz"),
         ({"ambiguity_m": "five"}, "ambiguity_m: is 'five'"),
-        ({"confidence_max": float("-inf")}, "confidence_max"),
         ({"amplitude_kind": "loud"}, "amplitude_kind: is 'loud'"),
         ({"color": 5}, "color: has no intrinsics"),
         (
@@ -292,10 +281,10 @@ def test_unusable_rays(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"is 41 x 30, camera.json says 40 x 30"):
         NativeSource(folder)
     np.save(folder / "rays.npy", np.zeros((30, 40, 2), np.float32))
-    with pytest.raises(InputError, match="all rays are the same"):
+    with pytest.raises(InputError, match="has only equal rays"):
         NativeSource(folder)
     np.save(folder / "rays.npy", np.full((30, 40, 2), np.nan, np.float32))
-    with pytest.raises(InputError, match="no pixel has a ray"):
+    with pytest.raises(InputError, match="has no pixel with a ray"):
         NativeSource(folder)
     np.save(folder / "rays.npy", np.zeros((30, 40), np.float32))
     with pytest.raises(InputError, match="shape"):
@@ -303,14 +292,6 @@ def test_unusable_rays(tmp_path: Path) -> None:
     np.save(folder / "rays.npy", np.array([{}], object), allow_pickle=True)
     with pytest.raises(InputError, match=r"rays\.npy"):
         NativeSource(folder)
-
-
-def test_rays_that_mirror_image(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a")
-    np.save(folder / "rays.npy", PINHOLE.rays() * np.array([1, -1], np.float32))
-    with pytest.raises(InputError, match=r"mirror the image.*negate one") as caught:
-        NativeSource(folder)
-    assert "rays.npy" in str(caught.value)
 
 
 def test_rays_override_the_lens(tmp_path: Path) -> None:

@@ -58,7 +58,6 @@ def test_depth_images(tmp_path: Path, kind: str) -> None:
         assert frame.timestamp == recording.timestamps[k]
 
 
-@pytest.mark.slow
 def test_compressed_depth(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros2")
     bag.info("/a/depth/camera_info")

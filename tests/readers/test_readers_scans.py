@@ -58,9 +58,6 @@ def test_sens_color_is_projected_from_its_own_camera(tmp_path: Path) -> None:
 
 def test_invalid_sens_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "scene.sens"
-    make_sens(path, depth="occi")
-    with pytest.raises(InputError, match="compressed by method 2"):
-        tofuse.open(path)
     make_sens(path)
     data = bytearray(path.read_bytes())
     at = data.index(b"StructureSensor") + 15 + 256 + 16
@@ -110,26 +107,22 @@ def test_las_written_by_laspy(tmp_path: Path, suffix: str) -> None:
     assert np.array_equal(frame.color, RGB)
 
 
-def test_exported_las_is_read_back(tmp_path: Path) -> None:
-    pytest.importorskip("laspy")
-    write_las(tmp_path / "a.las", GeometryRecord(POINTS, color=RGB))
-    frame = tofuse.open(tmp_path / "a.las")[0]
-    assert isinstance(frame, CloudFrame)
-    assert np.allclose(frame.points, POINTS, atol=1e-4)
-    assert np.array_equal(frame.color, RGB)
-    assert frame.amplitude is None
+def written(path: Path, points: np.ndarray = POINTS, **header: object) -> Path:
+    """A file of points as laspy writes it."""
+    laspy = pytest.importorskip("laspy")
+    data = laspy.LasData(laspy.LasHeader(version="1.2", point_format=2))
+    for name, value in header.items():
+        setattr(data.header, name, value)
+    data.x, data.y, data.z = points.T
+    data.write(path)
+    return path
 
 
 def test_map_coordinates_keep_millimetre_precision(tmp_path: Path) -> None:
     """Easting and northing exceed float32 precision: the frame has the shift to them."""
-    laspy = pytest.importorskip("laspy")
     where = np.array([453_210.0, 5_411_870.0, 300.0])
-    header = laspy.LasHeader(version="1.2", point_format=0)
-    header.scales, header.offsets = np.full(3, 1e-3), where
-    data = laspy.LasData(header)
-    data.x, data.y, data.z = (POINTS + where).T
-    data.write(tmp_path / "a.las")
-    frame = tofuse.open(tmp_path / "a.las")[0]
+    path = written(tmp_path / "a.las", POINTS + where, scales=np.full(3, 1e-3), offsets=where)
+    frame = tofuse.open(path)[0]
     assert isinstance(frame, CloudFrame)
     np.testing.assert_array_equal(frame.shift, [453_000, 5_412_000, 0])
     assert np.allclose(frame.points + frame.shift, POINTS + where, atol=2e-3)
@@ -147,15 +140,11 @@ def test_las_with_excessive_point_count(tmp_path: Path) -> None:
 
 def test_las_with_wrong_bounds(tmp_path: Path) -> None:
     """The shift of its points is derived from the bounds in the header, which are wrong here."""
-    laspy = pytest.importorskip("laspy")
-    header = laspy.LasHeader(version="1.2", point_format=0)
-    data = laspy.LasData(header)
-    data.x, data.y, data.z = POINTS.T
-    data.write(tmp_path / "a.las")
-    content = bytearray((tmp_path / "a.las").read_bytes())
+    path = written(tmp_path / "a.las")
+    content = bytearray(path.read_bytes())
     content[179:227] = struct.pack("<6d", *[1e300] * 6)
-    (tmp_path / "a.las").write_bytes(content)
-    for item in tofuse.open(tmp_path / "a.las").read_all():
+    path.write_bytes(content)
+    for item in tofuse.open(path).read_all():
         assert isinstance(item, InputError) or np.isfinite(item.points).all()
 
 
@@ -167,11 +156,7 @@ def test_las_with_wrong_bounds(tmp_path: Path) -> None:
 def test_forged_chunk_tables_of_laz_are_rejected(tmp_path: Path, where: str, number: int) -> None:
     """lazrs would allocate 64 GB for them, and abort the process if that fails."""
     laspy = pytest.importorskip("laspy")
-    header = laspy.LasHeader(version="1.2", point_format=2)
-    data = laspy.LasData(header)
-    data.x, data.y, data.z = POINTS.T
-    path = tmp_path / "a.laz"
-    data.write(path)
+    path = written(tmp_path / "a.laz")
     with laspy.open(path) as file:
         start = int(file.header.offset_to_point_data)
     content = bytearray(path.read_bytes())
@@ -186,12 +171,7 @@ def test_forged_chunk_tables_of_laz_are_rejected(tmp_path: Path, where: str, num
 
 
 def test_laz_with_more_points_than_its_chunks(tmp_path: Path) -> None:
-    laspy = pytest.importorskip("laspy")
-    header = laspy.LasHeader(version="1.2", point_format=2)
-    data = laspy.LasData(header)
-    data.x, data.y, data.z = POINTS.T
-    path = tmp_path / "a.laz"
-    data.write(path)
+    path = written(tmp_path / "a.laz")
     content = bytearray(path.read_bytes())
     for count, message in (
         (60_000, "chunk table: 50000 points"),

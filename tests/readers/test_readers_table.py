@@ -153,11 +153,8 @@ def longer_points(path: Path) -> None:
 
 
 SMALL = made_tof.Rational(32, 24, 23.0, 23.0, 15.5, 11.5)
-STREAM = "Depth Long Throw"
-LUT = f"{STREAM}_lut.bin"
 TRANSFORMS = "transforms.json"
 ONE_IMAGE = "only 2 of 3 frames have colour"
-KEYFRAMES = "keyframes/corrected_cameras"
 
 DAMAGED: list[tuple[str, Change, str | tuple[int, ...], str]] = [
     ("sr4000", put("frm_0002.dat", "% Calibrated Distance\n1 2\n"), (1,), "interpolated"),

@@ -41,7 +41,7 @@ def cloud_of(frame: RangeFrame, order: Intp | None = None) -> CloudFrame:
     return CloudFrame(frame.index, 0.0, frame.points[order], amplitude=amplitude[order])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize("lens", LENSES)
 def test_image_is_recovered_from_shuffled_points(lens: str) -> None:
     frames = [seen(LENSES[lens], k) for k in range(3)]
@@ -90,7 +90,7 @@ def test_other_clouds_stay_clouds(change: str) -> None:
     assert find_deprojection([CloudFrame.of(other)]) is None
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_folder_of_exported_clouds_is_read_as_images(tmp_path: Path) -> None:
     frames = [seen(LENSES["brown"], k) for k in range(4)]
     for k, frame in enumerate(frames[:3]):
@@ -106,14 +106,6 @@ def test_folder_of_exported_clouds_is_read_as_images(tmp_path: Path) -> None:
         np.testing.assert_array_equal(image.depth, frame.depth)
         assert image.amplitude_image is not None
     assert len(recording[3]) == 0
-
-
-def test_folder_with_other_clouds_stays_clouds(tmp_path: Path) -> None:
-    frames = [seen(PINHOLE, k) for k in range(3)]
-    for k, frame in enumerate(frames):
-        points = np.concatenate([frame.points, moved(frame.points)]) if k else frame.points
-        write_ply(tmp_path / f"{k}.ply", GeometryRecord(points))
-    assert isinstance(open_recording(tmp_path)[0], CloudFrame)
 
 
 def test_cloud_off_the_rays_is_unreadable(tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ from tofuse.formats.recordings.still import (
     change_between,
     stationary_intervals,
 )
-from tofuse.lab.simulation.record import simulate_recording
 
 CAMERA = Pinhole(120, 96, 100.0, 100.0, 59.5, 47.5)
 SIGMA = 0.02
@@ -220,13 +219,7 @@ def test_memory_of_long_intervals_is_bounded() -> None:
     assert np.median(frame.sigma_image) == pytest.approx(SIGMA / np.sqrt(48), rel=0.02)
 
 
-@pytest.mark.slow
-def test_simulated_rotation_is_not_stationary() -> None:
-    frames = simulate_recording("wall", every=10, frames=2)
-    assert len(stationary_intervals(frames)) == 2
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sr4000_corridor(shared_data: Path) -> None:
     recording = open_recording(shared_data / "sr4000_corridor")
     assert stationary_intervals(recording) == [(0, 4), (4, 8)]

@@ -56,7 +56,7 @@ def test_invalid_entry_in_place_of_frame_is_unreadable(name, recording) -> None:
     assert found.timestamps[4] == pytest.approx(tofuse.open(recording).timestamps[4])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ODD)
 def test_unrelated_entries_are_ignored(name, recording, tmp_path, capfd) -> None:
     for path in (recording / "lock", recording / "depth" / ".#000001.png", recording / "truth/x"):

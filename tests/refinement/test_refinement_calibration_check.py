@@ -31,7 +31,7 @@ def kept(offset: float, views: int = 12) -> tuple[list[SampledView], Refined]:
     return views, refine(views, truth, OPTIONS)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_range_offset_raises_alarm():
     views, refined = kept(0.06)
     found = check_calibration(views, refined, OPTIONS, Priors.none())
@@ -96,7 +96,7 @@ def test_focal_length_error_scales_sideways_motion() -> None:
     assert 0.01 * found.motion["focal"][0] == pytest.approx(expected, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_estimate_converges_in_errors_too() -> None:
     """Poses may rest while the error still changes."""
     views, refined = kept(0.06)

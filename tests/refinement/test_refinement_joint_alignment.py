@@ -9,8 +9,8 @@ import pytest
 
 from aligned_surfaces import OPTIONS, away, drifted, path, surfaces
 from corner_views import SHARP, corner
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph import external_sensors
 from tofuse.engine.graph.graph import build_graph
 from tofuse.engine.graph.graph_covariances import GraphCovariances
 from tofuse.engine.quality.pose_accuracy import ObservedErrors, accuracy_of
@@ -56,17 +56,7 @@ def test_only_given_pairs_are_compared(swing):
     np.testing.assert_allclose(alone.poses[-1], start[-1], atol=1e-12)
 
 
-def test_result_is_independent_of_threads(swing):
-    views, truth = swing
-    results = []
-    for count in (1, 2, 3):
-        with threads(count):
-            results.append(refine(views, drifted(truth), OPTIONS).poses)
-    np.testing.assert_array_equal(results[0], results[1])
-    np.testing.assert_array_equal(results[0], results[2])
-
-
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_camera_errors_are_estimated_where_observable():
     truth = path(12)
     views = [SampledView.of(s, 1500) for s in surfaces(truth, offset=0.05)]
@@ -133,7 +123,8 @@ def refiner(part, views, poses):
     for view, T in zip(views, poses, strict=True):
         store.push(view, T)
         out.push(corner(T), T)
-    return out.finish(list(range(len(poses))), poses)
+    graph = build_graph(range(len(poses)), np.array(poses), [], [])
+    return out.finish(graph, external_sensors.SensorPriors())
 
 
 def test_refinement_is_kept_only_if_views_support_it():

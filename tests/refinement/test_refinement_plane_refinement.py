@@ -8,7 +8,7 @@ import pytest
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.refinement import plane_kernels as kernels
+from tofuse.engine.graph import build_graph, external_sensors
 from tofuse.engine.refinement.common_planes import PlaneOptions, refine_clouds
 from tofuse.engine.refinement.plane_refinement import Planes
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
@@ -24,7 +24,7 @@ def nudged(poses, size, seed=0):
     return poses @ se3.exp(steps)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_peaks_error_is_near_bound():
     """From the drift of the thesis's method; `benchmarks/peaks.py` has more noise levels."""
     sigma = 0.04
@@ -42,7 +42,7 @@ def test_peaks_error_is_near_bound():
     assert 0.7 < rms / peaks_bound(sigma) < 2
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_result_is_independent_of_threads():
     views, truth = peaks_views(0.05, 0)
     clouds, start = [v.points[::2] for v in views[:5]], nudged(truth[:5], 0.05)
@@ -55,96 +55,15 @@ def test_result_is_independent_of_threads():
         np.testing.assert_array_equal(other.covariance, found[0].covariance)
 
 
-def cells_of(rng, poses, cells=6, points=60):
-    """Points of every view on tilted planes, sorted by cell and view."""
-    n = len(poses)
-    x, view, start = [], [], [0]
-    for _ in range(cells):
-        normal = rng.normal(size=3)
-        normal /= np.linalg.norm(normal)
-        who = np.sort(rng.integers(0, n, points))
-        spots = rng.normal(size=(points, 3)) * 0.3
-        spots -= np.outer(spots @ normal, normal)
-        spots += 0.02 * rng.normal(size=(points, 1)) * normal
-        x.append(spots + rng.normal(size=3))
-        view.append(who)
-        start.append(start[-1] + points)
-    x, view = np.concatenate(x), np.concatenate(view)
-    p = se3.transform(se3.inverse(poses)[view], x[:, None])[:, 0]
-    return p, x, view, np.array(start)
-
-
-def test_planes_are_eliminated_exactly():
-    """Reference: one dense system of all poses and planes, with the planes eliminated."""
-    rng = np.random.default_rng(4)
-    poses = nudged(np.tile(np.eye(4), (3, 1, 1)), 1.0)
-    p, x, view, start = cells_of(rng, poses)
-    cells, n = len(start) - 1, len(poses)
-    mean, axes = np.empty((cells, 3)), np.empty((cells, 3, 3))
-    spread, views = np.empty((cells, 3)), np.empty(cells, np.int64)
-    kernels.fit_cells(x, view, start, mean, axes, spread, views)
-    number = np.full((n, n), -1)
-    pairs = np.array([(0, 1), (0, 2), (1, 2)])
-    number[pairs[:, 0], pairs[:, 1]] = np.arange(3)
-    own, gradient, mixed = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((3, 6, 6))
-    variance, robust = spread[:, 0].copy(), 2.0
-    variance[-1] = 0  # is excluded
-    kernels.plane_equations(
-        p,
-        x,
-        view,
-        start,
-        mean,
-        axes,
-        variance,
-        poses[:, :3, :3].copy(),
-        number,
-        robust,
-        own,
-        gradient,
-        mixed,
-    )
-    J = np.zeros((len(p), 6 * n + 3 * cells))
-    w, r = np.zeros(len(p)), np.zeros(len(p))
-    for s in range(cells):
-        rows = slice(start[s], start[s + 1])
-        _, vectors = np.linalg.eigh(np.cov(x[rows].T))
-        normal = vectors[:, 0] * np.sign(vectors[:, 0] @ axes[s, 0])
-        np.testing.assert_allclose(normal, axes[s, 0], atol=1e-9)
-        np.testing.assert_allclose(mean[s], x[rows].mean(0))
-        assert views[s] == len(np.unique(view[rows]))
-        apart = x[rows] - mean[s]
-        r[rows] = apart @ normal
-        if variance[s] > 0:
-            e2 = r[rows] ** 2 / variance[s] / robust**2
-            w[rows] = np.where(e2 < 1, (1 - e2) ** 2, 0) / variance[s]
-        along = np.column_stack([np.ones(len(apart)), apart @ vectors[:, 1:]])
-        J[rows, 6 * n + 3 * s : 6 * n + 3 * s + 3] = along
-        for k in range(start[s], start[s + 1]):
-            m = poses[view[k], :3, :3].T @ normal
-            J[k, 6 * view[k] : 6 * view[k] + 6] = np.r_[m, np.cross(p[k], m)]
-    H, g = (J * w[:, None]).T @ J, J.T @ (w * r)
-    a, b = slice(0, 6 * n), slice(6 * n, None)
-    rest = H[a, b] @ np.linalg.pinv(H[b, b])
-    schur, right = H[a, a] - rest @ H[b, a], g[a] - rest @ g[b]
-    tall = np.abs(schur).max()
-    for i in range(n):
-        block = schur[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
-        np.testing.assert_allclose(own[i], block, atol=1e-9 * tall)
-    for k, (i, j) in enumerate(pairs):
-        block = schur[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
-        np.testing.assert_allclose(mixed[k], block, atol=1e-9 * tall)
-    np.testing.assert_allclose(gradient.ravel(), right, atol=1e-9 * np.abs(g).max())
-
-
 def refined(part, views, poses):
     out = part.start(ViewStore(Spacing()))
     for view, T in zip(views, poses, strict=True):
         out.push(view, T)
-    return out.finish([v.index for v in views], poses)
+    graph = build_graph([v.index for v in views], np.array(poses), [], [])
+    return out.finish(graph, external_sensors.SensorPriors())
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_refinement_is_kept_only_if_views_support_it():
     views, truth = peaks_views(0.05, 2)
     start = nudged(truth[:10], 0.1)
@@ -180,7 +99,7 @@ def test_view_of_another_place_does_not_drag_others():
     assert error.mean() < 2 * peaks_bound(0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_two_sides_of_wall_stay_separate():
     """Two rooms with a thin wall between them, each seen from inside; the rest is seen by both."""
     rng = np.random.default_rng(0)
@@ -201,15 +120,3 @@ def test_two_sides_of_wall_stay_separate():
     ]
     found = refined(Planes(), views, truth)
     assert np.abs(found.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01
-
-
-@pytest.mark.nightly
-def test_frames_that_are_not_kept_follow_the_others():
-    views, truth = peaks_views(0.03, 0)
-    part = Planes(max_views=12)
-    drift = np.cumsum(np.tile([0.01, 0.01, 0.0, 0.001, -0.001, 0.0], (20, 1)), axis=0)
-    start = truth @ se3.exp(drift - drift[0])
-    found = refined(part, views, start)
-    assert 6 <= found.views <= 12
-    error = PoseErrors.of(found.poses, truth).position
-    assert error.mean() < PoseErrors.of(start, truth).position.mean() / 2

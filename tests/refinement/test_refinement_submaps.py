@@ -31,7 +31,7 @@ def swing() -> tuple[list, np.ndarray]:
     return surfaces(truth, noise=0.005), truth
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_submaps_match_refinement_of_all_views(swing) -> None:
     views, truth = swing
     start = drifted(truth)
@@ -49,7 +49,7 @@ def test_submaps_match_refinement_of_all_views(swing) -> None:
     assert {i for e in parts.edges for i in (e.i, e.j)} == set(range(COUNT))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_memory_limit_does_not_change_result(swing, tmp_path: Path) -> None:
     views, truth = swing
     start = drifted(truth)
@@ -108,7 +108,7 @@ def test_views_of_nearby_places_are_compared() -> None:
     assert len(candidate_pairs(middles[:50])[0]) == 50 * 49 // 2  # few are all compared
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_descriptor_index_finds_most_similar_views() -> None:
     rng = np.random.default_rng(4)
     places = rng.normal(0, 0.3, (200, 2, 15, 24)).astype(np.float32)

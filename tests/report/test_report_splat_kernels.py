@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.apps.report.thumbnails import nearest_points
+from tofuse.apps.report.thumbnails import splat
 
 
 @pytest.mark.parametrize(("distance", "radius"), [(0.0, 1), (0.0, 3), (2.0, 1), (2.0, 2)])
@@ -16,9 +16,11 @@ def test_nearest_point_of_each_pixel_is_found(distance: float, radius: int) -> N
     T = np.eye(4)
     T[:3, 3] = 0.1, -0.2, 0.3
     scale, (height, width) = 12.0, (23, 31)
-    found = nearest_points(
-        points, T, (width, height), scale=scale, distance=distance or None, side=radius
-    )
+    colors = np.stack([np.zeros(400), *np.divmod(np.arange(400), 256)], 1).astype(np.uint8)
+    image = splat(
+        points, colors, T, (width, height), scale=scale, distance=distance or None, radius=radius
+    ).astype(int)
+    found = np.where(image[..., 3] > 0, 256 * image[..., 1] + image[..., 2], -1)
 
     wanted = np.full((height, width), -1)
     nearest = np.full((height, width), np.inf)

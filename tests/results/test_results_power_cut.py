@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
-import os
 import shutil
 import tempfile
 from pathlib import Path
@@ -12,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from made_results import contents, result, torn
+from made_results import contents, torn
 from paths import BENCHMARKS
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.table import write_table
-from tofuse.apps.results.folders import OutputFolder, finish_interrupted, is_result
+from tofuse.apps.results.folders import OutputFolder, finish_interrupted
 from tofuse.apps.results.output import write_result
 from tofuse.formats.files.atomic import write_text
 from tofuse.formats.files.staging import finish_replacing, is_interrupted, new_folder
@@ -46,11 +44,7 @@ def shown(folder: Path) -> dict[str, bytes]:
     return {name: data for name, data in found.items() if not name.startswith(".tofuse-")}
 
 
-def finish_by_run(folder: Path) -> None:
-    OutputFolder(folder, overwrite=True).discard()
-
-
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize("old", [True, False], ids=["over an old one", "a first one"])
 def test_result_is_old_or_new_after_power_cut(memory, power, old) -> None:
     numbers = itertools.count()
@@ -91,46 +85,6 @@ def test_result_is_old_or_new_after_power_cut(memory, power, old) -> None:
     assert power.cut_everywhere(prepare, write, check) > 40
     # It is also interrupted when it tries at first whether the folder can be renamed.
     assert seen == {(False, False), (True, False), (True, True), (False, True)}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("recovery", [finish_interrupted, finish_by_run], ids=["reader", "run"])
-def test_recovery_survives_another_power_cut(memory, power, monkeypatch, recovery) -> None:
-    numbers = itertools.count()
-    move = os.replace
-
-    def prepare() -> Path:
-        """A replacement that was interrupted between the two moves."""
-        folder = memory / f"{next(numbers):06}" / "out"
-        write_result(torn(seed=1), OutputFolder(folder))
-        (folder / "recording").mkdir()
-
-        def fails(source, target) -> None:
-            if Path(target) == folder and Path(source).name.startswith(".tofuse-new"):
-                raise power.PowerCut
-            move(source, target)
-
-        staged = OutputFolder(folder, overwrite=True)
-        with monkeypatch.context() as patch:
-            patch.setattr(os, "replace", fails)
-            with pytest.raises(power.PowerCut):
-                write_result(torn(seed=2), staged)
-        assert is_interrupted(folder)
-        return folder
-
-    whole = prepare()
-    recovery(whole)
-    wanted = shown(whole)
-    assert is_result(whole)
-    assert json.loads((whole / "run.json").read_text())["seed"] == 2
-
-    def check(folder: Path, calls: int) -> None:
-        finish_interrupted(folder)
-        assert shown(folder) == wanted, calls
-        OutputFolder(folder, overwrite=True).discard()
-        assert contents(folder.parent).keys() == {f"out/{name}" for name in wanted}, calls
-
-    assert power.cut_everywhere(prepare, recovery, check) > 10
 
 
 def _record(folder: Path, state: str, job: Job) -> None:
@@ -201,18 +155,3 @@ def test_other_files_are_old_or_new_after_power_cut(memory, power, write) -> Non
         assert set(known(folder)) == set(after)
 
     assert power.cut_everywhere(prepare, lambda folder: write(folder, 1), check) >= 4
-
-
-def test_power_cut_loses_unsynced_data(tmp_path, power) -> None:
-    """Checks the simulation: without fsync a file that was moved into place is truncated."""
-    cut = power.Power(2)
-    (tmp_path / "a").mkdir()
-    with cut.connected():
-        (tmp_path / "a" / "part").write_text("0123456789")
-        os.replace(tmp_path / "a" / "part", tmp_path / "a" / "whole")
-        with pytest.raises(power.PowerCut):
-            os.unlink(tmp_path / "a" / "whole")
-    cut.lose(tmp_path)
-    assert (tmp_path / "a" / "whole").read_text() == "01234"
-    write_result(result(), OutputFolder(tmp_path / "b"))
-    assert json.loads((tmp_path / "b" / "run.json").read_text())["seed"] == 0

@@ -66,7 +66,7 @@ def test_static_cameras_are_calibrated_from_one_instant(calibrated: Calibration)
     assert {(d.a, d.b) for d in found.rig.disagreement} >= {("cam0", "cam1"), ("cam1", "cam2")}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_camera_without_overlap_is_named() -> None:
     wall = RangeFrame(0, 0.0, CAMERA, np.full((72, 96), 1.7, np.float32), "z", None)
     cameras = [camera(0, images(0)), camera(1, images(1)), camera(2, [wall])]
@@ -86,7 +86,7 @@ def test_static_camera_beside_moving_camera_is_refused() -> None:
         moves([camera(0, images(0, 8)), camera(1, frames)], "auto")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # Two cameras: from three on, each could be the wrong one, which takes much longer.
     folder = written(tmp_path / "rig", cameras=2)
@@ -137,7 +137,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_displaced_camera_is_found(
     calibrated: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -152,7 +152,7 @@ def test_displaced_camera_is_found(
     assert [line.split()[0] for line in output if "moved by" in line] == ["cam2"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rig_that_contradicts_images_is_reported(tmp_path: Path) -> None:
     folder = written(tmp_path / "rig", 1)
     cameras = [str(folder / f"cam{k}") for k in range(3)]

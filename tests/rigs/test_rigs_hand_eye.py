@@ -72,7 +72,7 @@ def test_hand_eye_is_exact_without_errors() -> None:
     assert found.time_offset_s == pytest.approx(OFFSET, abs=0.0003)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_covariance_covers_errors() -> None:
     squares, clocks = [], []
     for seed in range(15):

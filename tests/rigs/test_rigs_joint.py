@@ -76,7 +76,7 @@ def test_covariance_matches_size_of_errors() -> None:
     assert 1.5 < np.median(squares) < 12.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_covariance_includes_systematic_range_errors() -> None:
     """Each camera's ranges are distorted smoothly, as by multipath: the poses absorb it."""
     rng = np.random.default_rng(8)

@@ -67,7 +67,7 @@ def calibrated() -> Calibration:
     return calibrate_cameras(cameras())
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_moving_rig_is_calibrated_from_its_trajectories() -> None:
     found = calibrated()
     assert found.how == "a walk"
@@ -81,7 +81,7 @@ def test_moving_rig_is_calibrated_from_its_trajectories() -> None:
     assert e @ np.linalg.solve(camera.covariance, e) < 22.5  # 99.9 % of chi-square, 6 degrees
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_each_instant_of_moving_rig_has_one_pose() -> None:
     rig = calibrated().rig
     source = RigSource(rig, [camera.recording for camera in cameras()])

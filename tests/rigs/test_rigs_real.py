@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-import pytest
 
 from tofuse.apps.rigs.calibrating import calibrate_cameras
 from tofuse.apps.rigs.inputs import open_cameras
@@ -12,7 +11,6 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views.view_store import SampledView
 
 
-@pytest.mark.slow
 def test_surfaces_agree_better_than_under_reference_poses(shared_data) -> None:
     folder = shared_data / "azure_kinect_rig"
     # Three of the five, to save time.

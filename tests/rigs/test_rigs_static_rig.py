@@ -61,7 +61,7 @@ def calibrated(clock_s: float, moving: Callable[[float], Board]) -> Calibration:
     return calibrate_cameras([filmed(0, 0.0, moving), filmed(1, clock_s, moving)])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_clocks_are_aligned_by_motion_and_all_instants_are_used() -> None:
     found = calibrated(100.0, towards)
     assert found.how == "60 instants"

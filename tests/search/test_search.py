@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from searched_pair import CAMERA, TRUE, A, B, camera, error, seen
+from searched_pair import TRUE, A, B, camera, error, seen
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
-from tofuse.engine.search.pair_agreement import AgreementOptions, agreement
+from tofuse.engine.search.pair_agreement import agreement
 from tofuse.engine.search.plane_detection import find_floor, find_floors
 from tofuse.engine.search.search import (
     Search,
@@ -191,58 +191,6 @@ def test_icp_step_solves_equations_of_both_directions():
     np.testing.assert_array_equal(poses[0], np.eye(4))  # outside the given range
 
 
-def agreed(source, target, T, o):
-    """One direction of `agree`, without the kernel: (compared, support, violation)."""
-    stride = 2
-    rows, columns = source.z.shape
-    counts = np.zeros(3)
-    for i in range(stride // 2, rows, stride):
-        for j in range(stride // 2, columns, stride):
-            plane = source.planes[i, j].astype(float)
-            if plane[3] <= 0:
-                continue
-            p = np.append(source.rays[i, j], 1.0) / plane[3]
-            q = T[:3, :3] @ p + T[:3, 3]
-            if q[2] <= 0.05:
-                continue
-            u, v = np.floor(CAMERA.project(q) + 0.5).astype(int)
-            if not (0 <= u < columns and 0 <= v < rows):
-                continue
-            other = target.planes[v, u].astype(float)
-            s = np.sqrt(source.plane_variance[i, j]) * p[2] ** 2
-            slack = o.floor_m + o.floor_fraction * q[2]
-            if other[3] <= 0:
-                patch = target.z[max(v - 2, 0) : v + 3, max(u - 2, 0) : u + 3]
-                here = target.z[v, u] > 0
-                nearest = patch[patch > 0].min() if here else 0
-                counts[2] += here and q[2] < nearest - 2 * (o.sigmas * s + slack)
-                continue
-            counts[0] += 1
-            length = np.linalg.norm(other[:3])
-            n = other[:3] / length
-            r = n @ q - 1 / length
-            along = (T[:3, :3].T @ n) @ p / p[2]
-            spread = np.sqrt((along * s) ** 2 + target.plane_variance[v, u] / length**2)
-            limit = o.sigmas * spread + slack
-            own = plane[:3] / np.linalg.norm(plane[:3])
-            counts[2] += r < -2 * limit
-            facing = own @ T[:3, :3].T @ n >= np.cos(o.max_angle)
-            counts[1] += abs(r) < limit and facing
-    return counts
-
-
-def test_agreement_matches_loop_over_pixels(pair):
-    o = AgreementOptions(points=int(0.25 * pair[0].planar_fraction * pair[0].z.size))
-    T = TRUE @ se3.exp([0.02, 0, 0.05, 0, 0.03, 0])
-    found = agreement(*pair, T, o)
-    counts = agreed(*pair, T, o) + agreed(pair[1], pair[0], se3.inverse(T), o)
-    # A pixel more or less: the kernel projects with a lookup table.
-    shares = np.array([found.overlap, found.support, found.violation]) * found.points
-    np.testing.assert_allclose(shares, counts, atol=0.004 * found.points)
-    assert counts.min() > 50
-    assert found.score == pytest.approx(found.support - 2 * found.violation)
-
-
 # Agreement of two images
 
 
@@ -342,7 +290,7 @@ def test_large_step_is_found_without_guess(pair, mode):
     assert found.agreement.violation < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_albedo_resolves_geometric_ambiguity():
     """Bare textured walls, 27 degrees apart."""
     effects = Effects.none(shot_noise=True)

@@ -12,7 +12,6 @@ from made_rooms import BOXES, CAMERA, OTHER, at, seen, surface
 from tofuse.engine.alignment.base import PROBABLE
 from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.cameras.cameras import RayTable
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.pair_agreement import Agreement, agreement
@@ -88,7 +87,7 @@ def test_covariance_covers_error(far):
     assert gap @ far.information @ gap < 22.5  # 99.9 % of a chi square of six dimensions
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("quarters", [1, 2])
 def test_camera_on_its_side_is_found(quarters):
     # Outside the exhaustive search, whose poses are upright.
@@ -112,7 +111,7 @@ def test_camera_on_its_side_is_found(quarters):
     assert found.believed
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_views_of_different_rooms_are_rejected(pair):
     for k, boxes in enumerate((OTHER, BOXES)):
         half = (3.4, 1.6, 2.9)
@@ -182,15 +181,6 @@ def test_small_scene_is_registered_like_large_one(pair, far):
         found.T_target_source[:3, 3], 0.25 * far.T_target_source[:3, 3], atol=0.01
     )
     assert np.degrees(se3.angle(gap)) < 1
-
-
-def test_result_is_independent_of_threads(pair, far):
-    for count in (1, 5):
-        with threads(count):
-            found = tofuse.register(*pair)
-        assert found.T_target_source.tobytes() == far.T_target_source.tobytes()
-        assert found.information.tobytes() == far.information.tobytes()
-        assert found.probability == far.probability
 
 
 def test_views_of_different_scale_are_refused(pair):

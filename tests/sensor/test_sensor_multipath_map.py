@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from multipath_corner import CAMERA, FLOOR, GAIN, LEFT, PERIOD_M, RIGHT, Plane, Seen
-from tofuse.engine.frames.frames import Frame, RangeFrame
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.mapper import Mapper
-from tofuse.engine.mapping.methods import from_method
-from tofuse.engine.sensor.base import Correction, Corrector
 from tofuse.engine.sensor.multipath import MultipathModel, ToFImage
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.sensor.multipath_kernels import PATCH
@@ -73,7 +69,7 @@ def test_cells_tile_surroundings_of_image_up_to_lamp_cone() -> None:
     assert around.fraction.sum() * around.pitch.prod() == pytest.approx(lit, rel=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_map_recalls_planes_and_albedo_after_rotation() -> None:
     known = ReflectorMap()
     # Back and forth, so that the newest view is the one in the middle.
@@ -148,7 +144,7 @@ def test_views_are_stored_by_motion_up_to_a_limit() -> None:
     assert known.patches[:, 0].min() > 20
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_correction_uses_map_only_with_poses() -> None:
     world = (LEFT, RIGHT, FLOOR)
     T = turned(0.45)
@@ -176,46 +172,3 @@ def test_correction_uses_map_only_with_poses() -> None:
     fixed = corrector.apply(second, np.eye(4))
     assert isinstance(fixed, RangeFrame)
     np.testing.assert_array_equal(fixed.depth, guessed)
-
-
-@dataclass(frozen=True)
-class Recorder(Correction, Corrector):
-    """Changes nothing, and records its calls."""
-
-    expected: list[np.ndarray | None] = field(default_factory=list)
-    received: list[tuple[int, np.ndarray]] = field(default_factory=list)
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def start(self) -> Recorder:
-        return self
-
-    def apply(self, frame: Frame, T_world_camera: np.ndarray | None = None) -> Frame:
-        self.expected.append(T_world_camera)
-        return frame
-
-    def add_pose(self, frame: Frame, T_world_camera: np.ndarray) -> None:
-        self.received.append((frame.index, T_world_camera))
-
-
-@pytest.mark.slow
-def test_mapper_passes_poses_and_predictions_to_corrections() -> None:
-    listener = Recorder()
-    mapper = Mapper(replace(from_method("default"), corrections=(listener,)))
-    world = (LEFT, RIGHT, FLOOR)
-    frames = [replace(seen_from(turned(0.03 * k), *world).frame(), index=k) for k in range(5)]
-    frames[3] = frames[3].keep(np.zeros(frames[3].depth.shape, bool))
-    poses = [mapper.push(frame) for frame in frames]
-    assert poses[3] is None
-    tracked = {k: T for k, T in enumerate(poses) if T is not None}
-    assert {0, 1, 2} <= set(tracked)
-    assert [index for index, _ in listener.received] == list(tracked)
-    for index, T in listener.received:
-        np.testing.assert_array_equal(T, tracked[index])
-    assert listener.expected[0] is None
-    assert listener.expected[1] is None
-    assert listener.expected[2] is not None
-    motion = se3.inverse(tracked[0]) @ tracked[1]
-    np.testing.assert_allclose(listener.expected[2], tracked[1] @ motion, atol=1e-9)
-    # After a lost frame the pose is unknown.
-    assert listener.expected[4] is None

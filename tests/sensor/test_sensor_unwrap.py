@@ -1,26 +1,18 @@
-"""Phase unwrapping: by amplitude and neighbourhood, and by several frequencies."""
+"""Phase unwrapping by amplitude and neighbourhood."""
 
 from __future__ import annotations
-
-import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import tofuse
 from tofuse.engine.cameras.depth_conversion import range_from_z
-from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.sensor.frequencies import SPEED_OF_LIGHT, combined
 from tofuse.engine.sensor.unwrap import (
     Unwrap,
     count_periods,
     on_surface,
 )
 from tofuse.engine.sensor.unwrap_kernels import NEIGHBOURS, pass_messages
-from tofuse.formats.images.writing import write_png
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 
@@ -46,7 +38,7 @@ def periods_of(frame: RangeFrame, radial: np.ndarray) -> tuple[np.ndarray, np.nd
     return lacks, frame.valid & (radial > 0) & (off < 0.5) & confident
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_hall_beyond_period_is_unwrapped() -> None:
     """8 x 8 m before a camera with a period of 5 m: most of it is wrapped."""
     frames = taken("hall", 90)
@@ -66,7 +58,7 @@ def test_hall_beyond_period_is_unwrapped() -> None:
     assert harmed <= 0.001 * good
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_room_within_period_is_unchanged() -> None:
     """Its dark chairs and floor reflect as little as a white wall one period farther."""
     frames = taken("room", 128)
@@ -91,18 +83,6 @@ def test_amplitude_is_adapted_to_unwrapped_range() -> None:
     )
     still = out.depth == frame.depth
     np.testing.assert_array_equal(out.amplitude_image[still], frame.amplitude_image[still])
-
-
-def test_result_is_independent_of_threads() -> None:
-    frame, _ = taken("hall", 180)[0]
-    corrector = Unwrap(white=3000.0).start()
-    with threads(1):
-        one = corrector.apply(frame)
-    with threads(3):
-        three = corrector.apply(frame)
-    assert isinstance(one, RangeFrame)
-    assert isinstance(three, RangeFrame)
-    np.testing.assert_array_equal(one.depth, three.depth)
 
 
 def test_messages_find_minimum_of_a_chain() -> None:
@@ -178,67 +158,3 @@ def test_surface_that_crosses_period_is_connected() -> None:
     lonely = np.zeros((9, 9), np.float32)
     lonely[4, 4] = 2.0
     assert not on_surface(lonely, PERIOD).any()
-
-
-def test_two_frequencies_are_combined() -> None:
-    rng = np.random.default_rng(8)
-    periods = [SPEED_OF_LIGHT / 2 / f for f in (80e6, 60e6)]  # 1.87 and 2.50 m meet at 7.5 m
-    true = rng.uniform(0.3, 7.0, (40, 50))
-    ranges = [np.mod(true + rng.normal(0, 0.01, true.shape), p).astype(np.float32) for p in periods]
-    ranges[0][3, 4] = 0
-    found, apart = combined(ranges, periods)
-    assert found[3, 4] == 0
-    known = found > 0
-    assert known.sum() >= known.size - 20  # phases of nearly zero count as invalid
-    assert np.abs(found - true)[known].max() < 0.05
-    assert apart[known].max() < 0.05
-    # The finer frequency has more weight: more accurate than the coarse one alone.
-    assert np.std((found - true)[known]) < 0.01
-
-
-@pytest.fixture
-def two_frequencies(room_recording: Path, tmp_path: Path) -> Path:
-    """A recording whose depth is stored in two frequencies only."""
-    folder = tmp_path / "two"
-    shutil.copytree(room_recording, folder)
-    recording = tofuse.open(room_recording)
-    for k in range(len(recording)):
-        frame = recording[k]
-        assert isinstance(frame, RangeFrame)
-        unit = recording.metadata["depth_unit_m"]
-        for hertz in (80_000_000, 60_000_000):
-            period = SPEED_OF_LIGHT / 2 / hertz
-            radial = np.mod(frame.radial_range, period)
-            depth = radial if frame.depth_kind == "range" else radial * frame.z / np.where(
-                frame.valid, frame.radial_range, 1
-            )  # fmt: skip
-            (folder / "frequencies" / str(hertz)).mkdir(parents=True, exist_ok=True)
-            path = folder / "frequencies" / str(hertz) / f"{k:06d}.png"
-            write_png(path, np.rint(depth / unit).astype(np.uint16))
-    (folder / "correction.npz").unlink(missing_ok=True)
-    return folder
-
-
-def test_native_recordings_with_several_frequencies(
-    room_recording: Path, two_frequencies: Path
-) -> None:
-    plain, combined_ = tofuse.open(room_recording), tofuse.open(two_frequencies)
-    a, b = plain[1], combined_[1]
-    assert isinstance(a, RangeFrame)
-    assert isinstance(b, RangeFrame)
-    both = a.valid & b.valid
-    assert both.sum() > 0.98 * a.valid.sum()
-    assert np.quantile(np.abs(a.depth - b.depth)[both], 0.999) < 0.003
-
-
-def test_invalid_frequencies_are_refused(two_frequencies: Path) -> None:
-    folder = two_frequencies / "frequencies"
-    (folder / "80000000" / "000000.png").unlink()
-    with pytest.raises(InputError, match="frequencies/80000000"):
-        tofuse.open(two_frequencies)
-    shutil.rmtree(folder / "80000000")
-    with pytest.raises(InputError, match="has only one frequency"):
-        tofuse.open(two_frequencies)
-    (folder / "fast").mkdir()
-    with pytest.raises(InputError, match="isn't a frequency"):
-        tofuse.open(two_frequencies)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pytest
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
@@ -43,7 +42,6 @@ def test_views_are_spaced_more_sparsely_as_their_number_grows() -> None:
     assert set(np.diff(found)[-20:]) == {2}
 
 
-@pytest.mark.slow
 def test_views_of_a_path_that_repeats_itself_are_thinned() -> None:
     spacing = Spacing(angle=0.03, max_views=30, max_stretch=4, views_per_place=8)
     few, many = len(stored(20, spacing)), len(stored(160, spacing))

@@ -121,7 +121,6 @@ def counted(monkeypatch):
     return asked
 
 
-@pytest.mark.slow
 def test_search_budget_grows_with_frames(around, monkeypatch) -> None:
     keyframes, _ = around
     asked = counted(monkeypatch)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.formats.recordings.open import open_recording
@@ -128,7 +127,6 @@ def test_motion_thresholds_decide_keyframes(room):
     assert [step.reference for step in always[1:]] == list(range(7))
 
 
-@pytest.mark.slow
 def test_odometry_fills_degenerate_directions():
     sequence = Sequence("wall", range(0, 15, 3))
     # In a frame of reference of its own, as in odometry files.
@@ -204,7 +202,7 @@ def test_unusable_image_is_lost(request, scene, damage, amplitude):
     assert_right(steps, poses)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @BOTH_KINDS
 @pytest.mark.parametrize("damage", NONSENSE.values(), ids=NONSENSE.keys())
 def test_corrupted_image_stays_unconnected(request, scene, damage, amplitude):
@@ -231,19 +229,6 @@ def test_plausible_wrong_image_does_not_affect_other_poses(request, damage):
     assert_right(after, poses[BAD + 1 :], 0.03, 1.0)
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("damage", ["mirrored", "upside down", "turned round"])
-def test_run_of_wrong_images_forms_its_own_component(corner, damage):
-    frames = list(corner.frames)
-    frames[3:6] = [PLAUSIBLE[damage](frame) for frame in frames[3:6]]
-    steps = run(frames)
-    assert components(steps) == [0, 0, 0, 1, 1, 1, 2, 2]
-    assert certain_links(steps)
-    assert not any(i in (3, 4, 5) or j in (3, 4, 5) for i, j in certain_links(steps))
-    right = [*corner.poses[:3], None, None, None, *corner.poses[6:]]
-    assert_right(steps, right)
-
-
 @pytest.mark.parametrize("damage", [UNUSABLE["blank"], UNUSABLE["sparse"]], ids=["blank", "sparse"])
 def test_recording_may_start_with_corrupted_frames(room, damage):
     steps = run([damage(room.frames[0]), damage(room.frames[1]), *room.frames[2:]])
@@ -259,7 +244,7 @@ def test_static_camera_stays_static(room):
     assert_right(steps, [*room.poses[:4], *[room.poses[3]] * 4])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.parametrize("searches", [True, False])
 def test_jump_away_and_back_gives_three_components(corner, elsewhere, searches):
     frames = in_order([*corner.frames[:4], *elsewhere, *corner.frames[2:5]])
@@ -277,7 +262,6 @@ def test_jump_away_and_back_gives_three_components(corner, elsewhere, searches):
     assert any(i < 4 and j >= 7 for i, j in links) == searches
 
 
-@pytest.mark.slow
 def test_degenerate_directions_are_reported():
     """A flat wall without albedo does not constrain motion within its plane."""
     wall = Sequence("wall", range(0, 12, 3), False)
@@ -293,23 +277,7 @@ def test_degenerate_directions_are_reported():
         assert len(tracked[-1].unobservable) == 3
 
 
-@pytest.mark.slow
-def test_result_is_independent_of_threads(room, elsewhere):
-    frames = in_order([*room.frames[:3], *elsewhere, *room.frames[2:5]])
-    results = []
-    for count in (1, 2):
-        with threads(count):
-            results.append(run(frames))
-    for one, two in zip(*results, strict=True):
-        assert one.T_component_camera.tobytes() == two.T_component_camera.tobytes()
-        assert one.component == two.component
-        assert one.reason == two.reason
-        assert [link.T_i_j.tobytes() for link in one.links] == [
-            link.T_i_j.tobytes() for link in two.links
-        ]
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_interruption_starts_component_without_motion_prior(room):
     frames, poses = [*room.frames[:6], *room.frames[:6]], [*room.poses[:6], *room.poses[:6]]
     tracker = Keyframes().start(0)
@@ -326,7 +294,7 @@ def test_interruption_starts_component_without_motion_prior(room):
     assert_right(run(in_order(frames)), poses)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_real_camera_after_large_move_is_correct_or_doubtful(shared_data):
     """Two positions 305 mm apart along a corridor, with nothing recorded in between."""
     recording = open_recording(shared_data / "sr4000_corridor")

@@ -10,12 +10,10 @@ import pytest
 
 from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
-from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.geometry.rigid_motion_kernels import distance_and_angle
 from tofuse.engine.search.pair_agreement import agreement
-from tofuse.engine.tracking import moving_object_kernels as kernels
 from tofuse.engine.tracking.moving_objects import (
     Moving,
     MovingObjects,
@@ -293,21 +291,6 @@ def test_masks_of_keyframes_are_kept_up_to_limit(room):
     assert not objects.predicted_mask(poses[9], views[9]).any()
 
 
-def test_result_is_independent_of_threads(room):
-    frames, poses, noise = room
-    centres, half = trajectory("away", 0.25, frames[0])
-    made = [with_box(frames[n], centres[n], half, noise, n)[0] for n in range(8)]
-    results = []
-    for count in (1, 2):
-        with threads(count):
-            results.append(segment(made, poses[:8])[1])
-    for (_, a, one), (_, b, two) in zip(*results, strict=True):
-        np.testing.assert_array_equal(a, b)
-        np.testing.assert_array_equal(one.view, two.view)
-        np.testing.assert_array_equal(one.reference, two.reference)
-        assert (one.fraction, one.agreement, one.scale) == (two.fraction, two.agreement, two.scale)
-
-
 def wall(depth, index=0):
     camera = Pinhole(64, 48, 60.0, 60.0, 31.5, 23.5)
     z = np.full((camera.height, camera.width), depth, np.float32)
@@ -354,49 +337,6 @@ def pair(seed=3):
     return camera, views[1], views[0], T
 
 
-def depth_and_variance(view, stride=1):
-    w, z, sigma = (
-        a[::stride, ::stride].astype(float) for a in (view.planes[..., 3], view.z, view.sigma)
-    )
-    pv = view.plane_variance[::stride, ::stride].astype(float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.where(w > 0, 1 / w, np.where((z > 0) & (sigma > 0), z, 0))
-        return depth, np.where(w > 0, pv / w**4, np.where(depth > 0, sigma**2, 0))
-
-
-def projected(camera, view, depth, T, stride):
-    """Ray, depth and pixel of each cell in the other view; pixel (-1, -1) outside."""
-    rays = view.rays[::stride, ::stride].astype(float)
-    p = np.concatenate([rays * depth[..., None], depth[..., None]], -1)
-    q = se3.transform(T, p.reshape(-1, 3)).reshape(p.shape)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        xy = q[..., :2] / q[..., 2:]
-    u, v = 45.0 * xy[..., 0] + 23.5, 45.0 * xy[..., 1] + 17.5
-    ok = (depth > 0) & (q[..., 2] > 0.02) & (u > -0.5) & (v > -0.5)
-    ok &= (u < camera.width - 0.5) & (v < camera.height - 0.5)
-    i, j = (np.where(ok, a + 0.5, -1).astype(int) for a in (v, u))
-    return xy, q[..., 2], i, j, ok
-
-
-def along(view, xy, i, j):
-    """Depth and variance of pixels (i, j) on rays xy."""
-    plane = view.planes[i, j].astype(float)
-    depth, variance = (a[i, j] for a in depth_and_variance(view))
-    w = plane[..., 3]
-    on = (plane[..., :2] * xy).sum(-1) + plane[..., 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        there = np.where(w > 0, 1 / np.clip(on, 0.9 * w, 1.1 * w), depth)
-    pv = view.plane_variance[i, j].astype(float)
-    return there, np.where(w > 0, pv * there**4, variance)
-
-
-def window(z, i, j, radius):
-    """Minimum and maximum valid depth, and number of invalid pixels, around a pixel."""
-    part = z[max(i - radius, 0) : i + radius + 1, max(j - radius, 0) : j + radius + 1]
-    valid = part[part > 0]
-    return valid.min(initial=np.inf), valid.max(initial=0), part.size - valid.size
-
-
 SCALE, MODEL_ERROR, JUMP, RADIUS, MOST, LEAST, WEIGHT, STRIDE = (
     1.3,
     0.004,
@@ -409,119 +349,6 @@ SCALE, MODEL_ERROR, JUMP, RADIUS, MOST, LEAST, WEIGHT, STRIDE = (
 )
 
 
-def sampled(view):
-    """The view and its cells in the form that the kernels take."""
-    images = view.rays, view.z, view.sigma, view.planes, view.plane_variance
-    return kernels.View(*images, view.projection.lookup, view.projection.frame, STRIDE)
-
-
-def test_compare_matches_reference():
-    camera, view, other, T = pair()
-    flagged = np.zeros((18, 24), bool)
-    flagged[:, 12:] = True
-    depth, variance = depth_and_variance(view, STRIDE)
-    xy, here, i, j, ok = projected(camera, view, depth, T, STRIDE)
-    there, own = along(other, xy, i, j)
-    outcome = np.zeros(depth.shape, int)
-    llr = np.zeros(depth.shape)
-    for a, b in zip(*np.nonzero(ok & (there > 0)), strict=True):
-        noise = SCALE**2 * variance[a, b]
-        v = noise + SCALE**2 * (own[a, b] + (MODEL_ERROR * there[a, b]) ** 2)
-        gap = max(np.log(there[a, b] ** 2 / (2 * np.pi * v)), 0)
-        d = here[a, b] - there[a, b]
-        if d * d <= gap * v:
-            outcome[a, b] = kernels.AGREES
-            llr[a, b] = max((d * d / v - gap) / 2, -LEAST)
-            if flagged[i[a, b] // STRIDE, j[a, b] // STRIDE]:
-                llr[a, b] *= WEIGHT
-            continue
-        outcome[a, b] = kernels.AMBIGUOUS
-        low, high, missing = window(other.z, i[a, b], j[a, b], RADIUS)
-        outside = min(here[a, b] - low, 0) if d < 0 else max(here[a, b] - high, 0)
-        if not outside**2 > gap * v or 2 * missing > (2 * RADIUS + 1) ** 2:
-            continue
-        low, high, _ = window(view.z, a * STRIDE, b * STRIDE, 1)
-        if max(high, depth[a, b]) - min(low, depth[a, b]) > max(
-            JUMP * depth[a, b], 4 * np.sqrt(noise)
-        ):
-            continue
-        outcome[a, b] = kernels.IN_FRONT if d < 0 else kernels.BEHIND
-        llr[a, b] = min((outside**2 / v - gap) / 2, MOST)
-    got, evidence = np.empty(depth.shape, np.uint8), np.empty(depth.shape, np.float32)
-    limits = kernels.Limits(MODEL_ERROR, JUMP, RADIUS, MOST, LEAST, WEIGHT)
-    views = sampled(view), sampled(other)
-    for start, stop in ((0, 7), (7, 18)):
-        kernels.compare(*views, flagged, T, SCALE, limits, got, evidence, start, stop)
-    assert set(np.unique(outcome)) == {0, 1, 2, 3, 4}
-    np.testing.assert_array_equal(got, outcome)
-    np.testing.assert_allclose(evidence, llr, atol=1e-3)
-
-
-def test_residual_ratios_match_reference():
-    camera, view, other, T = pair()
-    moving = np.zeros((18, 24), bool)
-    moving[:5] = True
-    depth, variance = depth_and_variance(view, 2)
-    xy, here, i, j, ok = projected(camera, view, depth, T, 2)
-    there, own = along(other, xy, i, j)
-    ok &= (there > 0) & ~moving
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = np.abs(here - there) / np.sqrt(variance + own + (MODEL_ERROR * there) ** 2)
-    got = kernels.residual_ratios(sampled(view), moving, 3, sampled(other), T, MODEL_ERROR)
-    np.testing.assert_allclose(got, ratios[::3, ::3][ok[::3, ::3]], rtol=1e-3, atol=1e-4)
-
-
-def test_propagate_and_predict_match_reference():
-    camera, view, other, T = pair()
-    rng = np.random.default_rng(5)
-    before = depth_and_variance(other, STRIDE)[0].astype(np.float32)
-    odds_before = rng.normal(0, 2, before.shape).astype(np.float32)
-    tracked_before = (rng.random(before.shape) < 0.5).astype(np.uint8)
-    prior, tolerance = -3.0, 0.05
-    depth, variance = depth_and_variance(view, STRIDE)
-    _, here, i, j, ok = projected(camera, view, depth, T, STRIDE)
-    i, j = i // STRIDE, j // STRIDE
-    there = np.where(ok, before[i, j], 0)
-    apart = np.maximum(tolerance * here, 4 * np.sqrt(variance))
-    same = (there > 0) & (np.abs(here - there) <= apart)
-    # Objects that move with the camera keep their pixel.
-    moved = odds_before > 2
-    _, _, own_i, own_j, on_ray = projected(camera, view, depth, np.eye(4), STRIDE)
-    own_i, own_j = own_i // STRIDE, own_j // STRIDE
-    along_ray = np.abs(before[own_i, own_j] - depth) <= tolerance * depth
-    with_camera = ok & ~same & on_ray & moved[own_i, own_j] & along_ray
-    odds = np.where(same, odds_before[i, j], np.float32(prior))
-    odds = np.where(with_camera, odds_before[own_i, own_j], odds)
-    out = [np.empty(before.shape, t) for t in (np.float32, np.float32, np.uint8, np.bool_)]
-    views = sampled(view), sampled(other)
-    cells = kernels.Cells(before, odds_before, moved, tracked_before)
-    for start, stop in ((0, 5), (5, 18)):
-        kernels.propagate(*views, cells, T, tolerance, prior, *out, start, stop)
-    np.testing.assert_allclose(out[0], depth, rtol=1e-6)
-    assert with_camera.any()
-    np.testing.assert_array_equal(out[1], odds)
-    np.testing.assert_array_equal(out[2], np.where(same, tracked_before[i, j], 0))
-    np.testing.assert_array_equal(out[3], there > here + apart)
-    assert out[3].any()
-
-    raw = view.z[::STRIDE, ::STRIDE].astype(float)
-    _, here, i, j, ok = projected(camera, view, raw, T, STRIDE)
-    expected = np.zeros(before.shape, bool)
-    for pose, distance in ((T, here), (np.eye(4), raw)):
-        _, _, i, j, seen = projected(camera, view, raw, pose, STRIDE)
-        for a, b in zip(*np.nonzero(ok & seen), strict=True):
-            k, m = i[a, b] // STRIDE, j[a, b] // STRIDE
-            near = np.s_[max(k - 1, 0) : k + 2, max(m - 1, 0) : m + 2]
-            expected[a, b] |= np.any(
-                moved[near] & (np.abs(before[near] - distance[a, b]) <= 0.1 * distance[a, b])
-            )
-    got = np.empty(before.shape, np.bool_)
-    kernels.predict(*views, cells, T, 0.1, 1, got)
-    assert 0 < np.count_nonzero(expected) < expected.size
-    np.testing.assert_array_equal(got, expected)
-
-
-@pytest.mark.slow
 def test_person_before_static_camera_is_segmented(shared_data):
     frames = list(open_recording(shared_data / "person_turning"))[:40:4]
     views = [prepare_view(frame, SurfaceOptions()) for frame in frames]

@@ -11,6 +11,10 @@ import pytest
 from coarse_steps import without_multipath
 from made_rooms import CAMERA, at, seen
 from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.config import changed
+from tofuse.engine.mapping.methods import from_method
+from tofuse.engine.mapping.reconstructing import reconstruct
+from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.search import pair_agreement
 from tofuse.engine.search.verification import FitQuality, FitStatistics
 from tofuse.engine.tracking.keyframes import Keyframes
@@ -114,7 +118,7 @@ def test_conflict_is_explained_by_objects_or_rivals(monkeypatch) -> None:
     assert Selection(alignments).best() is static[1]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 def test_passing_object_does_not_drag_poses() -> None:
     """A plate moves with the camera at 3 cm per frame: nearly half a metre in total."""
     frames = []
@@ -134,7 +138,7 @@ def test_passing_object_does_not_drag_poses() -> None:
     assert all(step.moving is None for step in steps[:FIRST])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("there", "component"),
     [(at(0.35, 0.3, 0.25), 1), (at(-0.4, 0.0, 0.25), 0), (at(0.45, 0.0, 0.25), 1)],
@@ -153,7 +157,6 @@ def test_camera_jump_is_not_explained_by_moving_objects(there, component) -> Non
         assert not link.certain or np.linalg.norm(error[:3, 3]) < 0.03
 
 
-@pytest.mark.slow
 def test_fast_turn_keeps_component_if_search_is_certain() -> None:
     path = [*WALK[:12], *(at(-0.07 + 0.03 * k, 0.0, 0.165 + 0.45 + 0.015 * k) for k in range(6))]
     steps = run([seen(T, k) for k, T in enumerate(path)])
@@ -163,7 +166,6 @@ def test_fast_turn_keeps_component_if_search_is_certain() -> None:
         assert off(step, pose)[0] < 0.03
 
 
-@pytest.mark.slow
 def test_fast_turn_measured_by_odometry_needs_no_search() -> None:
     rng = np.random.default_rng(5)
     path = [T @ se3.exp([0, 0, 0, *rng.normal(0, 0.01, 3)]) for T in WALK[:12]]
@@ -177,7 +179,7 @@ def test_fast_turn_measured_by_odometry_needs_no_search() -> None:
         assert off(step, pose, path[0])[0] < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_new_component_continues_motion() -> None:
     """Another room from one frame to the next, with the same camera motion."""
     frames = [seen(T, k) for k, T in enumerate(WALK[:12])]
@@ -193,35 +195,20 @@ def test_new_component_continues_motion() -> None:
 
 
 @pytest.mark.nightly
-def test_view_that_slides_along_wall_is_searched(tmp_path) -> None:
-    """Steps of 26 cm: a wall fits anywhere, and the objects before it are out of reach."""
-    from tofuse.engine.mapping.config import changed
-    from tofuse.engine.mapping.methods import from_method
-    from tofuse.engine.mapping.reconstructing import reconstruct
-    from tofuse.engine.quality.trajectory_errors import displacement
-
-    recording = without_multipath(tmp_path, "rail", "ifm-o3r", every=20, frames=16)
-    changes = {"refinement": {"part": "none"}, "fusion": {"voxel_m": 0.1}}
-    config = changed(from_method("default"), changes, where="test")
+@pytest.mark.parametrize(
+    ("scene", "camera", "taken", "bound"),
+    [
+        # Steps of 26 cm: a wall fits anywhere, and the objects before it are out of reach.
+        ("rail", "ifm-o3r", {"every": 20, "frames": 16}, 0.04),
+        # Steps of 14, 37 and 46 cm: the prediction is too short; 0.27 m if started only near it.
+        ("corridor", "sr4000", {"every": 12}, 0.02),
+    ],
+)
+def test_large_steps_along_walls_are_searched(tmp_path, scene, camera, taken, bound) -> None:
+    recording = without_multipath(tmp_path, scene, camera, **taken)
+    changes = {"refinement": {"part": "none"}} if scene == "rail" else {}
+    config = changed(from_method("default"), changes | {"fusion": {"voxel_m": 0.1}}, where="test")
     result = reconstruct(recording, config)
-    assert recording.reference is not None
     assert result.has_pose.all()
-    assert displacement(recording.reference, result.trajectory)[0] < 0.04
-    assert not any(len(f.unobservable) for f in result.diagnostics.frames)
-
-
-@pytest.mark.nightly
-def test_starts_along_corridor_correct_short_prediction(tmp_path) -> None:
-    """Steps of 14, 37 and 46 cm: the walls fit anywhere, and the prediction is too short."""
-    from tofuse.engine.mapping.config import changed
-    from tofuse.engine.mapping.methods import from_method
-    from tofuse.engine.mapping.reconstructing import reconstruct
-    from tofuse.engine.quality.trajectory_errors import displacement
-
-    recording = without_multipath(tmp_path, "corridor", "sr4000", every=12)
-    config = changed(from_method("default"), {"fusion": {"voxel_m": 0.1}}, where="test")
-    result = reconstruct(recording, config)
-    assert recording.reference is not None
-    assert result.has_pose.all()
-    # 0.27 m if started only near the prediction.
-    assert displacement(recording.reference, result.trajectory)[0] < 0.02
+    assert displacement(recording.reference, result.trajectory)[0] < bound
+    assert scene == "corridor" or not any(len(f.unobservable) for f in result.diagnostics.frames)

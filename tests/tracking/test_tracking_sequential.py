@@ -170,7 +170,7 @@ def test_camera_is_tracked(guess):
         assert np.linalg.norm(xi[3:]) < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_peaks_is_tracked_at_low_noise_and_drifts_at_high_noise():
     """Section 5.6: "ICP does well on its own" below 0.05 m of noise, and not above."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import time
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ import pytest
 from browser import changed, chromium, watched
 from tofuse.apps.jobs.run_options import Options
 from tofuse.apps.jobs.running import run
-from tofuse.apps.viewer.coverage import Coverage
 from tofuse.apps.viewer.server import serve, stop
 from tofuse.engine.progress import Silent
 
@@ -64,11 +62,9 @@ def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, br
     server = serve()
     try:
         live = LiveView(server)
-        began = time.perf_counter()
         watched_run = run(
             [room_recording], Options(out=tmp_path / "a", **quick), CombinedProgress(recorder, live)
         )
-        assert live.first_seconds <= time.perf_counter() - began
         # The first frame is shown before any stage begins, and then each one with its pose.
         assert recorder.frames[0][0::2] == (0, 0)
         assert [k for k, *_ in recorder.frames[1:]] == [0, 1, 2, 3]
@@ -78,10 +74,6 @@ def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, br
             seen.page.get_by_text("writing").wait_for(timeout=30_000)
             growing = drawn(seen)
             assert len(np.unique(growing.reshape(-1, 3), axis=0)) > 100
-            seen.page.get_by_label("Colour by").click()
-            seen.page.get_by_role("option", name="accuracy").click()
-            seen.page.get_by_text("Go to bright places next").wait_for(timeout=15_000)
-            assert changed(growing, drawn(seen)) > 0.01
             live.finish("http://127.0.0.1:1")
             seen.page.get_by_role("link", name="The report").wait_for(timeout=30_000)
             seen.check()
@@ -91,18 +83,3 @@ def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, br
     for name in same:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert json.loads((tmp_path / "a/run.json").read_text())["schema"] == 1
-
-
-def test_accuracy_improves_with_proximity_and_number_of_views():
-    rng = np.random.default_rng(1)
-    wall = np.float32(rng.uniform([-1, -1, 2], [1, 1, 2.001], (4000, 3)))
-    left = wall[:, 0] < 0
-    coverage = Coverage(0.05)
-    assert np.isinf(coverage.sigma(wall)).all()
-    coverage.add(wall, np.full(len(wall), 0.008))
-    for _ in range(3):
-        coverage.add(wall[left], np.full(left.sum(), 0.008))
-    inside = np.abs(wall[:, 0]) > 0.1
-    np.testing.assert_allclose(coverage.sigma(wall)[left & inside], 0.004, rtol=1e-6)
-    np.testing.assert_allclose(coverage.sigma(wall)[~left & inside], 0.008, rtol=1e-6)
-    assert np.isinf(coverage.sigma(wall + np.float32([0, 0, 1]))).all()

@@ -114,7 +114,7 @@ def test_pages_of_other_sites_are_refused(server) -> None:
             assert ask(server, path, **headers)[0] == 403
 
 
-@pytest.mark.slow
+@pytest.mark.nightly_part
 @pytest.mark.skipif(sys.platform == "win32", reason="sends a signal of POSIX")
 def test_command_serves_until_interrupted_and_without_recording(made, tmp_path) -> None:
     out = shutil.copytree(made[1], tmp_path / "out")

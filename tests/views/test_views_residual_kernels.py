@@ -142,36 +142,6 @@ def test_sums_match_numpy(exposure):
         np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=2e-4 * np.abs(wanted).max())
 
 
-def test_gradient_matches_finite_differences():
-    """With equal normals and slopes on both sides, and almost no robust weighting."""
-    view, of = packed(*source(noise=0.004)), target()
-    wide = {"robust": 1e3, "slack": 0.02}
-    # The target's exact normal and slopes at the projections, so that both Jacobians agree.
-    view[:, 3:6] = MOTION[:3, :3].T @ NORMAL / np.linalg.norm(NORMAL)
-    there = se3.transform(MOTION, view[:, :3])
-    third = -(there[:, :2] @ SLOPES) / there[:, 2]
-    slopes = np.column_stack([np.tile(SLOPES, (len(there), 1)), third]) / there[:, 2:]
-    view[:, 8:] = slopes @ MOTION[:3, :3]
-    together = kernels.normal_equations(accumulate(view, of, **wide))[1]
-    alone = kernels.normal_equations(accumulate(view, of, scale_p=0.0, **wide))[1]
-
-    def cost(xi, exposure=0.0):
-        T = MOTION @ se3.exp(xi)
-        sums = accumulate(view, of, T, exposure=exposure, **wide)
-        return np.array([sums[kernels.SQUARES_G], sums[kernels.SQUARES_P] / SCALE_P**2])
-
-    step = 1e-4
-    for k in range(6):
-        xi = np.zeros(6)
-        xi[k] = step
-        slopes = (cost(xi) - cost(-xi)) / (2 * step) / 2
-        albedo = together - alone
-        assert slopes[0] == pytest.approx(alone[k], abs=0.03 * np.abs(alone[:6]).max())
-        assert slopes[1] == pytest.approx(albedo[k], abs=0.03 * np.abs(albedo[:6]).max())
-    up, down = (cost(np.zeros(6), e)[1] for e in (step, -step))
-    assert (up - down) / (2 * step) / 2 == pytest.approx(together[6], rel=1e-3)
-
-
 @pytest.mark.parametrize("step", [1, 2])
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 def test_points_project_onto_their_pixels(camera, step):

@@ -73,17 +73,10 @@ def test_halving_matches_slow_twin(shape):
         np.testing.assert_allclose(found, wanted, rtol=1e-6)
 
 
-def test_halving_preserves_planes():
-    rays = CAMERA.rays()
-    found, _, _ = halved(1 / plane_w(rays), plane_w(rays), jump=0.5)
-    blocks = rays.reshape(15, 2, 20, 2, 2).mean((1, 3))
-    np.testing.assert_allclose(1 / found, plane_w(blocks), rtol=1e-6)
-
-
 # --- planes --------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_pixels_without_weight_are_ignored_even_with_unknown_rays():
     rays = CAMERA.rays().copy()
     w, weight = plane_w(rays), np.ones(rays.shape[:2], np.float32)
@@ -93,24 +86,6 @@ def test_pixels_without_weight_are_ignored_even_with_unknown_rays():
     holed, _ = fit(w, rays, weight)
     np.testing.assert_array_equal(holed, whole)
     assert (holed[4, 5:8, 3] > 0).all()
-
-
-def test_fits_are_independent_of_row_chunks():
-    rng = np.random.default_rng(2)
-    rays = LENS.rays()
-    weight = rng.uniform(0.5e6, 2e6, rays.shape[:2]).astype(np.float32)
-    w = plane_w(rays) + (rng.normal(size=weight.shape) / np.sqrt(weight)).astype(np.float32)
-    found = []
-    for bounds in ((0, 30), (0, 1, 2, 17, 30)):
-        planes = np.empty((30, 40, 4), np.float32)
-        quality = np.empty((30, 40, 2), np.float32)
-        for a, b in itertools.pairwise(bounds):
-            fit_planes(
-                w, rays, weight, weight > 0, np.array([2, 5]), 2.0, 0.7, 0.2, planes, quality, a, b
-            )
-        found.append(planes)
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-5, atol=1e-6)
-    assert (found[0][5:-5, 5:-5, 3] > 0).mean() > 0.9
 
 
 def twin_of_one_fit(w, rays, weight, i, j, r):
@@ -139,31 +114,6 @@ def test_depth_is_fitted_in_smallest_and_slope_in_widest_window():
         assert planes[i, j, :2] @ rays[i, j] + planes[i, j, 2] == pytest.approx(small[1], rel=1e-5)
         assert quality[i, j, 1] == pytest.approx(small[2], rel=1e-4)
         assert quality[i, j, 0] == pytest.approx(small[3], rel=1e-3)
-
-
-def test_slope_noise_falls_with_window_and_depth_variance_is_calibrated():
-    rng = np.random.default_rng(4)
-    rays = CAMERA.rays()
-    sigma = 0.002
-    weight = np.full(rays.shape[:2], 1 / sigma**2, np.float32)
-    spread, errors = {2: [], 4: [], 8: []}, []
-    for _ in range(6):
-        w = plane_w(rays) + rng.normal(0, sigma, weight.shape).astype(np.float32)
-        for r in spread:
-            planes, quality = fit(w, rays, weight, radii=(r,), limit=2.0)
-            good = planes[9:-9, 9:-9]
-            good = good[good[..., 3] > 0]
-            spread[r].append(good[:, 0] - A)
-            if r == 2:
-                inside = planes[..., 3] > 0
-                off = (planes[..., 3] - plane_w(rays))[inside]
-                errors.append(off / np.sqrt(quality[..., 1][inside]))
-    variance = {r: np.concatenate(v).var() for r, v in spread.items()}
-    # The variance of a slope falls with the fourth power of the width.
-    for a, b in ((2, 4), (4, 8)):
-        wanted = ((2 * a + 1) / (2 * b + 1)) ** 4
-        assert wanted / 2 < variance[b] / variance[a] < wanted * 2
-    assert np.concatenate(errors).std() == pytest.approx(1, abs=0.1)
 
 
 def test_depth_edges_are_not_bridged():

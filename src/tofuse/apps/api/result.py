@@ -25,7 +25,7 @@ from tofuse.apps.jobs import (
     with_findings,
     write_report_files,
 )
-from tofuse.apps.results import folders, load_result, write_result
+from tofuse.apps.results import folders, integrity, load_result, write_result
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Foreground
 from tofuse.engine.frames import Recording
@@ -182,22 +182,6 @@ class Result(Reconstruction):
             webbrowser.open(server.address)
         return server
 
-    def plot(self) -> Plot:
-        """Draw the model and the camera trajectory from above and from the side."""
-        from tofuse.apps.report import plots
-
-        points = self.cloud.points.astype(float)
-        points = points[np.isfinite(points).all(1)]
-        path = self.trajectory[self.has_pose][:, :3, 3]
-        if not len(points):
-            raise InputError("has no points to draw", where="the model")
-        return Plot(
-            tuple(
-                plots.model(points, path, None, view, measured=None, label=f"Model, from {name}")
-                for view, name in (("above", "above"), ("side", "the side"))
-            )
-        )
-
     def _repr_html_(self) -> str:
         from tofuse.apps.report import scene, thumbnails
 
@@ -210,33 +194,6 @@ class Result(Reconstruction):
             source = thumbnails.data_uri(scene.render(drawn, _THUMBNAIL))
             picture = f'<img src="{source}" alt="The model" style="border-radius:8px"><br>'
         return f"<div>{picture}<b>{verdict}</b>: {accuracy}</div>"
-
-
-@dataclass(frozen=True, repr=False)
-class Plot:
-    """Drawings that a notebook shows side by side.
-
-    Attributes
-    ----------
-    drawings
-        SVG elements.
-    """
-
-    drawings: tuple[str, ...]
-
-    def __repr__(self) -> str:
-        return f"Plot of {len(self.drawings)} drawings: save it, or show it in a notebook"
-
-    def _repr_html_(self) -> str:
-        style = "--ink:#1a1d21;--muted:#5c6470;--grid:#dfe3e8;--after:#0b67b8;--bad:#c01f3c"
-        boxes = "".join(f'<div style="width:440px">{svg}</div>' for svg in self.drawings)
-        return f'<div style="display:flex;flex-wrap:wrap;gap:16px;{style}">{boxes}</div>'
-
-    def save(self, path: str | Path) -> None:
-        """Write an HTML page with the drawings to a path."""
-        from tofuse.formats.files import atomic
-
-        atomic.write_text(path, f'<!doctype html><meta charset="utf-8">{self._repr_html_()}\n')
 
 
 def reconstruct(
@@ -343,12 +300,20 @@ def _with_terminal(progress: Progress | bool | None) -> AbstractContextManager[P
     return TerminalProgress(sys.stderr) if progress is True else nullcontext(progress or None)
 
 
-def load(folder: str | Path) -> Result:
+def load(folder: str | Path, *, edited: bool = False) -> Result:
     """Read a result of ``tofuse run`` or `Result.save` from its folder.
+
+    Parameters
+    ----------
+    folder
+        The folder.
+    edited
+        Whether to read it although its files were changed by hand.
 
     Raises
     ------
     InputError
-        If it is not an output folder, or its files are damaged or of different runs.
+        If it is not an output folder, or its files are damaged, edited or of different runs.
     """
-    return Result.of(load_result(folder))
+    with integrity.accepting_edits() if edited else nullcontext():
+        return Result.of(load_result(folder))

@@ -362,8 +362,6 @@ def inspect(arguments: cli.Inspect) -> int:
 
     recording = Opening.of(arguments.inputs, arguments).open()
     inspection = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
-    if arguments.sheet is not None:
-        inspection.save_sheet(arguments.sheet)
     width = max(map(len, inspection.facts))
     lines = [f"[bold]{n:<{width}}[/]  {escaped(value)}" for n, value in inspection.facts.items()]
     lines += warning_lines(inspection.notes)
@@ -373,8 +371,6 @@ def inspect(arguments: cli.Inspect) -> int:
         lines.append(f"  {escaped(finding.remedy)}")
     if not inspection.findings:
         lines.append(f"[green]No{' other' if inspection.notes else ''} problems found.[/]")
-    if arguments.sheet is not None:
-        lines.append(f"see {escaped(str(arguments.sheet))}")
     return show(arguments, inspection.to_dict(), *lines)
 
 

@@ -58,9 +58,7 @@ def _job(picture: str, run_arguments: Sequence[str]) -> int:
     rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
     atomic.write_bytes(
         picture,
-        thumbnails.encode(
-            scene.render_thumbnail(scene.make_scene(result, rows), _PICTURE_SIZE), jpeg=True
-        ),
+        thumbnails.encode(scene.render(scene.make_scene(result, rows), _PICTURE_SIZE), jpeg=True),
     )
     print_result(result, arguments.out, as_json=True)
     emit({"posed": int(result.has_pose.sum()), "peak_bytes": _peak_bytes()})

@@ -75,6 +75,18 @@ class Json(Command):
     json: bool = False
 
 
+class Edited(Command):
+    """Results that were edited.
+
+    Attributes
+    ----------
+    edited
+        read results although their files were changed by hand
+    """
+
+    edited: bool = False
+
+
 class JsonLines(Command):
     """Machine-readable output while it is made.
 
@@ -348,7 +360,7 @@ class Judge(Json, Threads, Selection):
     tolerance: Length | None = None
 
 
-class Merge(JsonLines, Seed, Threads):
+class Merge(JsonLines, Seed, Threads, Edited):
     """Merge the results of several recordings into one map.
 
     A RESULT is the --out of `tofuse run` or `tofuse merge`; its recording must still be where it
@@ -559,16 +571,13 @@ class Inspect(Json, Source):
     ----------
     inputs : INPUT
         recordings, joined in this order
-    sheet : PNG
-        write a contact sheet of the frames
     object
         an object turns in front of a static camera
     quick
-        only the checks that `tofuse run` makes first
+        check fewer frames, as `tofuse run` does first
     """
 
     inputs: list[str]
-    sheet: Path | None = None
     object: bool = False
     quick: bool = False
 
@@ -695,7 +704,7 @@ class Noise(Json, Source):
     name: str | None = None
 
 
-class Evaluate(Json):
+class Evaluate(Json, Edited):
     """Compare a trajectory with a reference.
 
     Attributes
@@ -737,7 +746,7 @@ class Optimize(Command):
     overwrite: bool = False
 
 
-class Export(Command):
+class Export(Edited):
     """Write a result in other formats.
 
     Attributes
@@ -790,7 +799,7 @@ class Experiments(Seed, Threads):
     seeds: Count = 20
 
 
-class View(Page):
+class View(Page, Edited):
     """Show a result in the browser.
 
     Attributes

@@ -16,7 +16,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from time import sleep
 from typing import TYPE_CHECKING
 
@@ -142,10 +142,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         except SystemExit as stop:  # help or an error has been printed
             raise SystemExit(_status_after_output(int(stop.code or 0), None)) from None
         check_machine(getattr(arguments, "threads", None))
-        status: int = arguments.command(arguments)
+        with _edits_accepted(getattr(arguments, "edited", False)):
+            status: int = arguments.command(arguments)
         return _status_after_output(status, getattr(arguments, "out", None))
 
     return run_command(command)
+
+
+def _edits_accepted(accepted: bool) -> AbstractContextManager[None]:
+    if not accepted:
+        return nullcontext()
+    from tofuse.apps.results import integrity
+
+    return integrity.accepting_edits()
 
 
 def _status_after_output(status: int, out: object) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tofuse.apps.export.image_folder import ImageFolder, subsampled_points
+from tofuse.apps.export.image_folder import subsampled_points, write_images
 from tofuse.engine.arrays import Float32, UInt8
 from tofuse.engine.cameras import BrownConrady, Fisheye, Pinhole, Rational
 from tofuse.engine.geometry import quaternion, se3
@@ -38,13 +38,12 @@ def write_colmap(result: Path, folder: Path, every: int, pinhole: bool = False) 
     Raises
     ------
     InputError
-        See `ImageFolder.write_all`.
+        See `write_images`.
     """
-    images = ImageFolder(folder)
     supported = {Pinhole} if pinhole else set(_MODELS)
     cameras: dict[str, int] = {}
     lines: list[str] = []
-    written = images.write_all(result, every, lambda camera: type(camera) in supported)
+    written = write_images(result, folder, every, lambda camera: type(camera) in supported)
     for number, posed in enumerate(written, 1):
         camera = cameras.setdefault(lens(posed.camera), len(cameras) + 1)
         T = se3.inverse(posed.T_world_camera)

@@ -11,7 +11,7 @@ from pathlib import Path
 from tofuse.apps.export.colmap import write_colmap
 from tofuse.apps.export.nerfstudio import write_nerfstudio
 from tofuse.apps.results import folders, read_cloud, read_mesh, run_json
-from tofuse.engine.arrays import Float64, Intp, UInt8
+from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion import GeometryRecord, Mesh, texture
 from tofuse.formats.export import exchange
@@ -42,7 +42,7 @@ class _Result:
     def cloud(self) -> GeometryRecord:
         """The cloud, with the number of views and sigma of each point."""
         cloud = read_cloud(self.folder)
-        scalars = {name: cloud.scalars[name] for name in _SCALARS if name in cloud.scalars}
+        scalars = {k: v for k, v in cloud.scalars.items() if k in ("views", "sigma")}
         return replace(cloud, faces=None, scalars=scalars)
 
     @cached_property
@@ -74,35 +74,24 @@ class _Result:
         n_faces = min(max_faces, len(self.mesh.faces))
         if self.mesh.color is None or not 0 < n_faces <= _MAX_TEXTURED_FACES:
             return self.mesh.decimated(max_faces).record()
-        baked_mesh = texture.baked(self.mesh, max_faces, _TEXTURE_SIZE)
-        vertex_rows = baked_mesh.atlas.vertices
+        baked = texture.baked(self.mesh, max_faces, _TEXTURE_SIZE)
+        rows, faces = baked.atlas.vertices, baked.atlas.faces
+        other_bytes = _VERTEX_BYTES * len(rows) + _FACE_BYTES * len(faces) + _OTHER_BYTES
         return GeometryRecord(
-            baked_mesh.mesh.vertices[vertex_rows],
-            baked_mesh.atlas.faces,
-            baked_mesh.mesh.normals[vertex_rows],
-            uv=baked_mesh.atlas.uv,
-            texture=_jpeg(baked_mesh.image, len(vertex_rows), len(baked_mesh.atlas.faces)),
+            baked.mesh.vertices[rows],
+            faces,
+            baked.mesh.normals[rows],
+            uv=baked.atlas.uv,
+            texture=_jpeg(baked.image, other_bytes),
         )
 
-    @cached_property
-    def frame_numbers(self) -> Intp:
-        """(N,) frame index of each pose."""
-        clock = run_json.frame_clock(self.folder)
-        assert clock is not None
-        times, index = clock
-        return index[associate(self.trajectory[0], times, limit=1e-6)]
 
-
-_SCALARS = ("views", "sigma")
-
-
-def _jpeg(image: UInt8, vertices: int, faces: int) -> bytes:
+def _jpeg(image: UInt8, other_bytes: int) -> bytes:
     """The best JPEG that keeps a mesh of this size below `_MAX_BYTES`, or the smallest one."""
-    max_bytes = _MAX_BYTES - _VERTEX_BYTES * vertices - _FACE_BYTES * faces - _OTHER_BYTES
     data = b""
     for quality in _QUALITIES:
         data = jpeg_bytes(image, quality)
-        if len(data) <= max_bytes:
+        if len(data) + other_bytes <= _MAX_BYTES:
             break
     return data
 
@@ -141,7 +130,11 @@ def _kitti(result: _Result, path: Path) -> None:
 
 
 def _log(result: _Result, path: Path) -> None:
-    write_log(path, result.trajectory[1], result.frame_numbers)
+    clock = run_json.frame_clock(result.folder)
+    assert clock is not None
+    times, index = clock
+    stamps_of_poses, poses = result.trajectory
+    write_log(path, poses, index[associate(stamps_of_poses, times, limit=1e-6)])
 
 
 # The file of each format, and the function that writes it.
@@ -211,7 +204,7 @@ def export(
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
     atomic.make_folder(target)
-    with folders.claimed(target), _unchanged(folder):
+    with folders.claimed(target), _unchanged(folder), run_json.opened(folder):
         for path in files.values():
             if path.exists() and not overwrite:
                 raise OutputError(

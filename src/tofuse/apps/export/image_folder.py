@@ -32,52 +32,46 @@ _MAX_POINTS = 200_000
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """One frame of a result with its pose.
+    """One frame of a result with its pose, as its files were written.
 
     Attributes
     ----------
-    index
-        Frame index, as in `run.json`.
-    frame
-        z depth, with the camera as the result calibrated it; rectified if requested.
+    name
+        File name of the frame's images; its number is the index in `run.json`.
+    timestamp
+        Of the frame, s.
     camera
-        Camera of the image: the same camera at the resolution of the image.
-    image
-        (H, W, 3) uint8 RGB: the colour, or the albedo as grey.
-    sigma
-        (H, W) standard deviation of the z depth in m, 0 where invalid.
+        Camera of the image, at its resolution, as the result calibrated it; rectified if requested.
+    masked
+        Whether the image has unknown pixels.
     T_world_camera
         (4, 4).
     covariance
         (6, 6) of the pose (docs/conventions.md); None where not known.
     """
 
-    index: int
-    frame: RangeFrame
+    name: str
+    timestamp: float
     camera: Pinhole
-    image: UInt8
-    sigma: Float32
+    masked: bool
     T_world_camera: Float64
     covariance: Float64 | None
 
-    @property
-    def name(self) -> str:
-        """File name of the frame's images."""
-        return f"frame_{self.index:06d}.png"
 
-
-def posed_images(
-    folder: Path, every: int, is_supported: Callable[[Camera], bool]
-) -> Iterator[PosedImage]:
-    """Yield the images of the main model of a result, in order.
+def write_images(
+    result: Path, folder: Path, every: int, is_supported: Callable[[Camera], bool]
+) -> list[PosedImage]:
+    """Write images, depth, sigma and masks of the main model of a result, in order.
 
     Frames that can't be read, or have neither colour nor amplitude, are left out. Colour that is
     registered to depth keeps its recorded resolution, which may be larger than that of depth.
 
     Parameters
     ----------
-    folder
+    result
         The result.
+    folder
+        Where to write.
     every
         Every n-th of the frames with a pose.
     is_supported
@@ -86,65 +80,64 @@ def posed_images(
     Raises
     ------
     InputError
-        If the recording is missing or has changed, contains clouds, or no image has colour or
-        amplitude.
+        If the recording is missing or has changed, contains clouds, no image can be read, or none
+        has colour or amplitude.
     """
-    with run_json.opened(folder) as run:
-        indices, poses = run_json.main_poses(folder, run)
+    with run_json.opened(result) as run:
+        indices, poses = run_json.main_poses(result, run)
         selected = dict(zip(indices[::every], poses[::every], strict=True))
-        covariances = {
-            f["index"]: run_json.frame_covariance(f)
-            for f in run["frames"]
-            if f["index"] in selected
-        }
-        parts = list(reopening.stored_recordings(folder, run))
+        covariances = {f["index"]: run_json.frame_covariance(f) for f in run["frames"]}
+        parts = list(reopening.stored_recordings(result, run))
         correctors = [CameraErrors.made_with(part.config) for part in parts]
+    written: list[PosedImage] = []
+    unmasked: list[tuple[str, tuple[int, ...]]] = []
     skipped: list[str] = []
-    n_images = 0
     for part, frame_correctors in zip(parts, correctors, strict=True):
-        recording = reopening.reopen(part, folder)
-        renderer = _ImageRenderer(recording)
+        recording = reopening.reopen(part, result)
+        noise, render = noise_model_for(recording), _Renderer()
         camera: Camera | None = None
         rectifier: Rectifier | None = None
         for frame in _frames(part, recording, selected, frame_correctors):
-            image = renderer.image(frame)
+            image = render(frame)
             if image is None:
                 skipped.append(f"{recording.path}: frame {frame.index}")
                 continue
-            frame = replace(frame, sigma_image=renderer.noise.sigma(frame), color_image=image)
+            frame = replace(frame, sigma_image=noise.sigma(frame), color_image=image)
             if rectifier is None or frame.camera != camera:
                 camera = frame.camera
-                rectifier = Rectifier(_image_camera(camera, is_supported))
-            rectified = rectifier(frame)
-            image_camera = rectifier.pinhole
+                is_kept = isinstance(camera, Pinhole) and is_supported(camera)
+                rectifier = Rectifier(camera if is_kept else pinhole_of(camera))
+            rectified, image_camera = rectifier(frame), rectifier.pinhole
+            image, sigma = rectified.color_image, rectified.sigma_image
+            assert image is not None
+            assert sigma is not None
             if image_camera == camera and (full_color := _full_color(recording, frame)) is not None:
                 image_camera = scaled(image_camera, full_color.shape[1], full_color.shape[0])
                 image = full_color
-            else:
-                assert rectified.color_image is not None
-                image = rectified.color_image
             index = part.first + frame.index
-            assert rectified.sigma_image is not None
-            yield PosedImage(
-                index,
-                rectified,
-                image_camera,
-                image,
-                np.where(
-                    rectified.valid,
-                    rectified.sigma_image / ray_lengths(rectified.camera),
-                    np.float32(0),
-                ),
-                selected[index],
-                covariances.get(index),
-            )
-            n_images += 1
-    if skipped and not n_images:
+            name = f"frame_{index:06d}.png"
+            z_sigma = np.where(rectified.valid, sigma / ray_lengths(rectified.camera), 0)
+            is_known = image.any(-1)
+            masked = not is_known.all()
+            _write(folder / IMAGES, name, image)
+            _write(folder / DEPTH, name, _counts(rectified.depth, DEPTH_UNIT_M))
+            _write(folder / SIGMA, name, _counts(z_sigma, SIGMA_UNIT_M))
+            if masked:
+                _write(folder / MASKS, name, np.where(is_known, 255, 0).astype(np.uint8))
+            else:
+                unmasked.append((name, is_known.shape))
+            pose = selected[index], covariances.get(index)
+            written.append(PosedImage(name, frame.timestamp, image_camera, masked, *pose))
+    if not written:
         raise InputError(
-            "has neither colour nor amplitude",
-            where=skipped[0],
-            remedy="record one of them: the target programs need images",
+            "has neither colour nor amplitude" if skipped else "has no readable frame with a pose",
+            where=skipped[0] if skipped else result,
+            remedy="record one of them: the target programs need images" if skipped else None,
         )
+    # If any frame has a mask, all get one.
+    for name, shape in unmasked if len(unmasked) < len(written) else ():
+        _write(folder / MASKS, name, np.full(shape, 255, np.uint8))
+    return written
 
 
 def _frames(
@@ -169,11 +162,6 @@ def _frames(
         yield frame
 
 
-def _image_camera(camera: Camera, is_supported: Callable[[Camera], bool]) -> Pinhole:
-    """The camera itself if it is supported, else an equivalent pinhole camera."""
-    return camera if isinstance(camera, Pinhole) and is_supported(camera) else pinhole_of(camera)
-
-
 def _full_color(recording: Recording, frame: RangeFrame) -> UInt8 | None:
     """The colour of a frame at its recorded resolution; None if that is not above that of depth."""
     source = recording.source
@@ -186,14 +174,13 @@ def _full_color(recording: Recording, frame: RangeFrame) -> UInt8 | None:
     return None if color is None or len(color) <= len(frame.color_image) else color
 
 
-class _ImageRenderer:
-    """Renders the frames of one recording with a common white level, and has its noise model."""
+class _Renderer:
+    """Renders the frames of one recording with a common white level."""
 
-    def __init__(self, recording: Recording) -> None:
-        self.noise = noise_model_for(recording)
+    def __init__(self) -> None:
         self._white: float | None = None
 
-    def image(self, frame: RangeFrame) -> UInt8 | None:
+    def __call__(self, frame: RangeFrame) -> UInt8 | None:
         """(H, W, 3) RGB of a frame, black where unknown; None without colour and amplitude."""
         if frame.color_image is not None and frame.color_registered:
             return frame.color_image
@@ -210,56 +197,8 @@ class _ImageRenderer:
         return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
 
 
-class ImageFolder:
-    """Writes images, depth, sigma and masks of posed images into a folder.
-
-    Attributes
-    ----------
-    folder
-        The folder.
-    masked
-        Whether any image so far has unknown pixels.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._unmasked: list[tuple[str, tuple[int, int]]] = []
-        self.masked = False
-
-    def write(self, posed: PosedImage) -> None:
-        """Write the files of one frame."""
-        self._png(IMAGES, posed.name, posed.image)
-        self._png(DEPTH, posed.name, _counts(posed.frame.depth, DEPTH_UNIT_M))
-        self._png(SIGMA, posed.name, _counts(posed.sigma, SIGMA_UNIT_M))
-        valid = posed.image.any(-1)
-        if valid.all():
-            self._unmasked.append((posed.name, valid.shape))
-        else:
-            self.masked = True
-            self._png(MASKS, posed.name, np.where(valid, 255, 0).astype(np.uint8))
-
-    def write_all(
-        self, result: Path, every: int, is_supported: Callable[[Camera], bool]
-    ) -> Iterator[PosedImage]:
-        """Yield the images of a result, see `posed_images`, after writing each.
-
-        Raises
-        ------
-        InputError
-            See `posed_images`; or if no image can be read.
-        """
-        posed = None
-        for posed in posed_images(result, every, is_supported):
-            self.write(posed)
-            yield posed
-        if posed is None:
-            raise InputError("has no readable frame with a pose", where=result)
-        # If any frame has a mask, all get one.
-        for name, shape in self._unmasked if self.masked else ():
-            self._png(MASKS, name, np.full(shape, 255, np.uint8))
-
-    def _png(self, kind: str, name: str, image: NDArray[Any]) -> None:
-        write_png(atomic.make_folder(self.folder / kind) / name, image)
+def _write(folder: Path, name: str, image: NDArray[Any]) -> None:
+    write_png(atomic.make_folder(folder) / name, image)
 
 
 def _counts(metres: Float32, unit_m: float) -> UInt16:

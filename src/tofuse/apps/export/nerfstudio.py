@@ -15,8 +15,8 @@ from tofuse.apps.export.image_folder import (
     MASKS,
     SIGMA,
     SIGMA_UNIT_M,
-    ImageFolder,
     subsampled_points,
+    write_images,
 )
 from tofuse.engine.cameras import DISTORTION_ORDER, BrownConrady, Camera, Fisheye, Pinhole
 from tofuse.engine.errors import InputError
@@ -45,23 +45,19 @@ def write_nerfstudio(result: Path, folder: Path, every: int, pinhole: bool = Fal
     Raises
     ------
     InputError
-        See `ImageFolder.write_all`; or if only some have a fisheye lens.
+        See `write_images`; or if only some have a fisheye lens.
     """
-    images = ImageFolder(folder)
     supported = {Pinhole} if pinhole else set(_MODELS)
+    images = write_images(result, folder, every, lambda camera: type(camera) in supported)
+    lenses = [lens(posed.camera) for posed in images]
     frames: list[dict[str, Any]] = []
-    lenses: list[dict[str, Any]] = []
-    for posed in images.write_all(result, every, lambda camera: type(camera) in supported):
-        lenses.append(lens(posed.camera))
-        frames.append(
-            {key: f"{kind}/{posed.name}" for key, kind in _FILES.items()}
-            | {
-                "transform_matrix": (posed.T_world_camera @ OPENGL).tolist(),
-                "timestamp": posed.frame.timestamp,
-            }
-        )
+    for posed in images:
+        frame = {key: f"{kind}/{posed.name}" for key, kind in _FILES.items()}
+        frame["transform_matrix"] = (posed.T_world_camera @ OPENGL).tolist()
+        frame["timestamp"] = posed.timestamp
         if posed.covariance is not None:
-            frames[-1]["pose_covariance"] = posed.covariance.ravel().tolist()
+            frame["pose_covariance"] = posed.covariance.ravel().tolist()
+        frames.append(frame)
     header: dict[str, Any] = {"camera_model": lenses[0]["camera_model"]}
     if any(camera["camera_model"] != header["camera_model"] for camera in lenses):
         raise InputError(
@@ -74,7 +70,7 @@ def write_nerfstudio(result: Path, folder: Path, every: int, pinhole: bool = Fal
     else:
         for frame, camera in zip(frames, lenses, strict=True):
             frame |= {key: value for key, value in camera.items() if key != "camera_model"}
-    if images.masked:
+    if any(posed.masked for posed in images):
         for frame in frames:
             frame["mask_path"] = f"{MASKS}/{Path(frame['file_path']).name}"
     header |= {

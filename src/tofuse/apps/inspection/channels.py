@@ -32,69 +32,61 @@ _MIN_FRAMES = 3
 # direction correlate at many shifts.
 _MIN_COLOR_CORRELATION, _MIN_COLOR_LEAD, _MAX_COLOR_UNSHIFTED = 0.42, 0.16, 0.68
 _MAX_ELSEWHERE, _PEAK_RADIUS_PX = 0.95, 4
-# Gain in correlation by a shift of up to some pixels that shows camera motion.
-_MIN_MOTION_GAIN, _MAX_MOTION_PX = 0.03, 6
 
 
 def check_mirrored(sample: Sample) -> Iterator[Finding]:
     """Check that edges of depth and amplitude (else colour) do not match better if mirrored."""
     for name, channel_of in (("amplitude", _amplitude), ("colour", _grey)):
-        pairs = [(f, image) for f in sample.images if (image := channel_of(f)) is not None]
-        if len(pairs) < _MIN_FRAMES:
+        edges = _edge_pairs(sample.images, channel_of)
+        if len(edges) < _MIN_FRAMES:
             continue
-        edges = [(_edges(_log_depth(f)), _edges(image)) for f, image in pairs]
         scores = {
-            label: np.array([_correlation(d, transform(a)) for d, a in edges])
+            label: _correlations([(d, transform(a)) for d, a in edges], 0)[:, 0, 0]
             for label, transform in _ORIENTATIONS.items()
         }
         identity = scores.pop("as it is")
         orientation, best = max(scores.items(), key=lambda item: float(item[1].mean()))
-        reoriented = [(d, np.ascontiguousarray(_ORIENTATIONS[orientation](a))) for d, a in edges]
-        if (
-            best.mean() > _MIN_CORRELATION
-            and is_significant(best - identity, _MIN_LEAD, _MIN_LEAD_SIGMAS)
-            and _peaks_at_zero_shift(reoriented)
+        if best.mean() <= _MIN_CORRELATION or not is_significant(
+            best - identity, _MIN_LEAD, _MIN_LEAD_SIGMAS
         ):
-            yield Finding(
-                "mirrored",
-                f"Depth and {name} do not match: their edges correlate by {best.mean():.2f} with "
-                f"one of them {orientation}, and by {identity.mean():.2f} as they are.",
-                "Mirror or rotate one of them, and check that the rays (x right, y down) are those "
-                "of the images.",
-                {
-                    "correlation": float(identity.mean()),
-                    "correlation_if_turned": float(best.mean()),
-                },
-            )
-            return
+            continue
+        # Unrelated edges in the same part of the images correlate too, but then a shift fits too.
+        turned = [(d, _ORIENTATIONS[orientation](a)) for d, a in edges]
+        max_shift = round(_MAX_SHIFT * edges[0][0].shape[1])
+        from_peak = _from_peak(_correlations(turned, max_shift).mean(0))
+        if from_peak[max_shift, max_shift] > _PEAK_RADIUS_PX:
+            continue
+        yield Finding(
+            "mirrored",
+            f"Depth and {name} do not match: their edges correlate by {best.mean():.2f} with one "
+            f"of them {orientation}, and by {identity.mean():.2f} as they are.",
+            "Mirror or rotate one of them, and check that the rays (x right, y down) are those of "
+            "the images.",
+            {"correlation": float(identity.mean()), "correlation_if_turned": float(best.mean())},
+        )
+        return
 
 
 def check_color(sample: Sample) -> Iterator[Finding]:
     """Check that the edges of colour coincide with those of depth."""
-    pairs = [
-        (f, grey) for f in sample.images if f.color_registered and (grey := _grey(f)) is not None
-    ]
-    if len(pairs) < _MIN_FRAMES:
+    edges = _edge_pairs([f for f in sample.images if f.color_registered], _grey)
+    if len(edges) < _MIN_FRAMES:
         return
-    columns = min(_COLUMNS, pairs[0][0].camera.width)
+    columns = edges[0][0].shape[1]
     max_shift = round(_MAX_SHIFT * columns)
-    correlations = np.stack(
-        [_shift_correlations(_edges(_log_depth(f)), _edges(grey), max_shift) for f, grey in pairs]
+    correlations = _correlations(edges, max_shift)
+    mean, unshifted = correlations.mean(0), correlations[:, max_shift, max_shift]
+    from_peak = _from_peak(mean)
+    best = correlations[:, from_peak == 0][:, 0]
+    shift = float(from_peak[max_shift, max_shift]) / columns
+    is_clear = (
+        mean.max() >= _MIN_COLOR_CORRELATION
+        and unshifted.mean() <= _MAX_COLOR_UNSHIFTED * mean.max()
+        and mean[from_peak > _PEAK_RADIUS_PX].max() <= _MAX_ELSEWHERE * mean.max()
     )
-    mean = correlations.mean(0)
-    i, j = np.unravel_index(int(mean.argmax()), mean.shape)
-    lead = correlations[:, i, j] - correlations[:, max_shift, max_shift]
-    shift = float(np.hypot(i - max_shift, j - max_shift)) / columns
-    down, right = np.mgrid[: mean.shape[0], : mean.shape[1]]
-    elsewhere = mean[np.hypot(down - i, right - j) > _PEAK_RADIUS_PX].max()
-    if (
-        mean[i, j] < _MIN_COLOR_CORRELATION
-        or mean[max_shift, max_shift] > _MAX_COLOR_UNSHIFTED * mean[i, j]
-        or elsewhere > _MAX_ELSEWHERE * mean[i, j]
-    ):
-        return
-    if shift > _MIN_SHIFT and is_significant(lead, _MIN_COLOR_LEAD, _MIN_LEAD_SIGMAS):
-        pixels = shift * pairs[0][0].camera.width
+    lead = best - unshifted
+    if is_clear and shift > _MIN_SHIFT and is_significant(lead, _MIN_COLOR_LEAD, _MIN_LEAD_SIGMAS):
+        pixels = shift * sample.images[0].camera.width
         yield Finding(
             "color_unregistered",
             f"Colour is not registered to depth: its edges lie {pixels:.0f} pixels away from "
@@ -102,18 +94,6 @@ def check_color(sample: Sample) -> Iterator[Finding]:
             "Add the colour camera's intrinsics and T_color_depth, or remove the colour.",
             {"shift_px": pixels, "lead": float(lead.mean())},
         )
-
-
-def shifted(first: RangeFrame, second: RangeFrame) -> bool:
-    """Whether the edges of one image are shifted relative to those of the other."""
-    for channel_of in (_amplitude, _log_depth):
-        a, b = channel_of(first), channel_of(second)
-        if a is None or b is None:
-            continue
-        scores = _shift_correlations(_edges(a), _edges(b), _MAX_MOTION_PX)
-        if scores.max() - scores[_MAX_MOTION_PX, _MAX_MOTION_PX] > _MIN_MOTION_GAIN:
-            return True
-    return False
 
 
 def _amplitude(frame: RangeFrame) -> Float32 | None:
@@ -152,24 +132,34 @@ def _edges(image: Float32) -> Float32:
     return np.minimum(strength / max(saturation, 1e-6), 1.0).astype(np.float32)
 
 
-def _correlation(a: Float32, b: Float32) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    size = float(np.sqrt((a * a).sum() * (b * b).sum()))
-    return float((a * b).sum()) / size if size > 0 else 0.0
+def _edge_pairs(
+    frames: Sequence[RangeFrame], channel_of: Callable[[RangeFrame], Float32 | None]
+) -> list[tuple[Float32, Float32]]:
+    """The edges of depth and of another channel, of the frames that have it."""
+    return [
+        (_edges(_log_depth(f)), _edges(image))
+        for f in frames
+        if (image := channel_of(f)) is not None
+    ]
 
 
-def _peaks_at_zero_shift(edges: Sequence[tuple[Float32, Float32]]) -> bool:
-    """Whether edges of two channels coincide best without a shift.
+def _correlations(edges: Sequence[tuple[Float32, Float32]], max_shift: int) -> Float64:
+    """Correlations of the centre of one image with the other, for shifts of up to some pixels.
 
-    Unrelated edges in the same part of the images correlate too, but then a shift fits as well.
+    (N, 2 * max_shift + 1, 2 * max_shift + 1) of N pairs.
     """
-    max_shift = round(_MAX_SHIFT * edges[0][0].shape[1])
-    scores = np.mean([_shift_correlations(a, b, max_shift) for a, b in edges], axis=0)
+    inner = slice(max_shift, -max_shift or None)
+    maps = [
+        cv2.matchTemplate(
+            np.ascontiguousarray(b), np.ascontiguousarray(a[inner, inner]), cv2.TM_CCOEFF_NORMED
+        )
+        for a, b in edges
+    ]
+    return np.stack(maps).astype(float)
+
+
+def _from_peak(scores: Float64) -> Float64:
+    """Distance of each element of (H, W) scores from the largest one, pixels."""
     i, j = np.unravel_index(int(scores.argmax()), scores.shape)
-    return bool(np.hypot(i - max_shift, j - max_shift) <= _PEAK_RADIUS_PX)
-
-
-def _shift_correlations(a: Float32, b: Float32, max_shift: int) -> Float64:
-    """Correlations of the centre of `a` with `b`, for shifts of up to `max_shift` pixels."""
-    template = a[max_shift:-max_shift, max_shift:-max_shift]
-    return cv2.matchTemplate(b, np.ascontiguousarray(template), cv2.TM_CCOEFF_NORMED).astype(float)
+    down, right = np.indices(scores.shape)
+    return np.hypot(down - i, right - j)

@@ -13,35 +13,19 @@ Severity = Literal["severe", "warning", "note"]
 
 SEVERITIES: tuple[Severity, ...] = ("severe", "warning", "note")
 
-# The closed list of codes, with severity and meaning.
-CODES: dict[str, tuple[Severity, str]] = {
-    "depth_unit": ("severe", "Depths are implausible for a ToF camera, or in another unit."),
-    "range_taken_for_z": ("severe", "Radial ranges are declared as z: walls bulge."),
-    "z_taken_for_range": ("severe", "z depths are declared as radial ranges: walls are concave."),
-    "focal_length": ("severe", "The focal length does not match these images."),
-    "other_intrinsics": ("severe", "The intrinsics are of another resolution or another camera."),
-    "lens_distortion": ("severe", "Planes are distorted as by an uncorrected lens."),
-    "mirrored": (
-        "severe",
-        "Depth and amplitude or colour are mirrored or rotated relative to each other.",
-    ),
-    "color_unregistered": ("severe", "Colour is declared as registered to depth, and is not."),
-    "time_unsorted": ("severe", "Timestamps decrease."),
-    "phase_wrap": ("severe", "Surfaces beyond the ambiguity range appear too close."),
-    "time_unit": ("warning", "Intervals of frames are implausible, or in another unit."),
-    "time_repeated": ("warning", "Timestamps are repeated."),
-    "frames_missing": ("warning", "The timestamps have gaps."),
-    "frames_repeated": ("warning", "Images are identical to the previous one."),
-    "saturated": ("warning", "Many pixels are saturated."),
-    "few_valid": ("warning", "Few pixels are valid."),
-    "flying_pixels": ("warning", "Many pixels are between surfaces, at depth edges."),
-    # The effect of these is measured by tracking, and decides the verdict.
-    "little_overlap": ("warning", "Consecutive frames overlap too little."),
-    "moving_objects": ("warning", "Something moves in front of the camera."),
-    "fast_motion": ("warning", "The camera moves fast for the frame rate."),
-    "static": ("note", "The camera does not move."),
-    "wall_only": ("note", "Most frames show a single plane, which does not constrain the camera."),
-}
+# The closed list of codes; docs/inspect.md has their meanings.
+CODES: dict[str, Severity] = {
+    **dict.fromkeys(
+        ("depth_unit", "range_taken_for_z", "z_taken_for_range", "focal_length", "mirrored",
+         "other_intrinsics", "lens_distortion", "color_unregistered", "time_unsorted",
+         "phase_wrap"), "severe"),
+    # The effect of the last two is measured by tracking, and decides the verdict.
+    **dict.fromkeys(
+        ("time_unit", "time_repeated", "frames_missing", "frames_repeated", "saturated",
+         "few_valid", "flying_pixels", "little_overlap", "fast_motion"),
+        "warning"),
+    **dict.fromkeys(("static", "wall_only"), "note"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -68,7 +52,7 @@ class Finding:
     @property
     def severity(self) -> Severity:
         """ "severe" makes a model wrong; "note" states what to expect."""
-        return CODES[self.code][0]
+        return CODES[self.code]
 
     def __str__(self) -> str:
         return f"{self.text} {self.remedy}"

@@ -14,9 +14,8 @@ from threadpoolctl import threadpool_limits
 from tofuse.apps.inspection import channels, geometry, motion_checks, times, values
 from tofuse.apps.inspection.finding import SEVERITIES, Finding
 from tofuse.apps.inspection.sample import Sample
-from tofuse.apps.inspection.sheet import write_sheet
-from tofuse.apps.inspection.values import depths_of
-from tofuse.engine.arrays import Float32, Float64
+from tofuse.apps.inspection.values import depths_of, valid_fraction
+from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import Pinhole, RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, RangeFrame, Recording
@@ -30,7 +29,7 @@ _MAX_DURATION_S = 1e6  # longer ones are implausible, and perhaps astronomical
 Check = Callable[[Sample], Iterable[Finding]]
 
 # In the order in which findings of equal severity are reported.
-QUICK: tuple[Check, ...] = (
+CHECKS: tuple[Check, ...] = (
     values.check_unit,
     values.check_valid,
     geometry.check_intrinsics,
@@ -44,11 +43,9 @@ QUICK: tuple[Check, ...] = (
     values.check_saturation,
     values.check_flying,
     motion_checks.check_motion,
-    motion_checks.check_moving_objects,
     motion_checks.check_still,
     motion_checks.check_walls,
 )
-CHECKS: tuple[Check, ...] = (*QUICK, geometry.check_focal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,16 +92,6 @@ class Inspection:
             "warnings": list(self.warnings),
         }
 
-    def save_sheet(self, path: str | Path) -> Path:
-        """Write a contact sheet of some of the frames as a PNG.
-
-        Raises
-        ------
-        OutputError
-            If it can't be written.
-        """
-        return write_sheet(Path(path), self.frames, self.facts, self.findings)
-
 
 def inspect_recording(
     recording: Recording | str | Path, *, turning: bool = False, quick: bool = False
@@ -118,7 +105,7 @@ def inspect_recording(
     turning
         Whether an object turns in front of a stationary camera: then motion is not checked.
     quick
-        Whether to read fewer frames and skip slow checks, as at the start of a run.
+        Whether to read fewer frames, as at the start of a run.
 
     Raises
     ------
@@ -133,7 +120,7 @@ def inspect_recording(
         raise InputError("no frame can be read", where=recording.path, remedy=notes[-1])
     # BLAS results depend on its number of threads.
     with threadpool_limits(1):
-        findings = [f for check in (QUICK if quick else CHECKS) for f in check(sample)]
+        findings = [f for check in CHECKS for f in check(sample)]
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))
     return Inspection(recording, tuple(findings), tuple(notes), sample.frames)
 
@@ -147,15 +134,16 @@ def _facts(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
         "duration": _time(recording),
         **_view_facts(recording, frames[0]),
         **_depth_facts(frames),
-        "reference poses": _coverage(recording.reference),
-        "odometry": _coverage(recording.odometry),
     }
-    facts |= {
+    stored = {"reference poses": recording.reference, "odometry": recording.odometry}
+    for name, poses in stored.items():
+        known = 0 if poses is None else int(np.isfinite(poses[:, 0, 0]).sum())
+        facts[name] = "none" if poses is None else f"for {known} frames"
+    return facts | {
         name: str(value)
         for name, value in recording.metadata.items()
         if isinstance(value, str | int | float) and name != "depth_kind"
     }
-    return facts
 
 
 def _time(recording: Recording) -> str:
@@ -164,43 +152,38 @@ def _time(recording: Recording) -> str:
         return "a single frame"
     if not recording.has_timestamps:
         return "unknown, as there are no timestamps"
-    step = float(np.median(np.diff(times)))
+    step, duration = float(np.median(np.diff(times))), float(times[-1] - times[0])
     rate = f", {1 / step:.1f} frames per second" if step > 0 else ""
-    duration = float(times[-1] - times[0])
-    is_plausible = abs(duration) < _MAX_DURATION_S
-    return f"{duration:.2f} s{rate}" if is_plausible else f"{duration:.3g} s"
+    return f"{duration:.2f} s{rate}" if abs(duration) < _MAX_DURATION_S else f"{duration:.3g} s"
 
 
 def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:
     if not isinstance(frame, RangeFrame):
         return {"views": f"clouds of about {len(frame)} points"}
-    rays = frame.camera.rays()
+    camera = frame.camera
+    lens = camera.fit if isinstance(camera, RayTable) else camera
+    rays = camera.rays()
     width = _angle(rays[rays.shape[0] // 2, :, 0])
     height = _angle(rays[:, rays.shape[1] // 2, 1])
-    model = getattr(frame.camera, "model", type(frame.camera).__name__)
-    channels = [
-        name + ("" if name != "colour" or frame.color_registered else " (not registered)")
-        for name, image in (
-            ("amplitude", frame.amplitude_image),
-            ("confidence", frame.confidence_image),
-            ("colour", frame.color_image),
-            ("noise", frame.sigma_image),
-        )
-        if image is not None
-    ]
     family = family_of(recording, frame)
-    lens = frame.camera.fit if isinstance(frame.camera, RayTable) else frame.camera
+    channels = {
+        "amplitude": frame.amplitude_image,
+        "confidence": frame.confidence_image,
+        "colour" if frame.color_registered else "colour (not registered)": frame.color_image,
+        "noise": frame.sigma_image,
+    }
     facts = {
-        "images": f"{frame.camera.width} x {frame.camera.height}, "
-        f"{width:.0f} x {height:.0f} degrees, {model} camera",
+        "images": f"{camera.width} x {camera.height}, {width:.0f} x {height:.0f} degrees, "
+        f"{getattr(camera, 'model', type(camera).__name__)} camera",
         "noise model": family if family != "unknown" else "unknown camera",
     }
     if isinstance(lens, Pinhole):
         focal, centre = f"{lens.fx:.1f}, {lens.fy:.1f}", f"{lens.cx:.1f}, {lens.cy:.1f}"
         facts["intrinsics"] = f"f {focal} pixels, centre {centre}"
+    present = [name for name, image in channels.items() if image is not None]
     return facts | {
         "kind of depth": "z" if frame.depth_kind == "z" else "radial range",
-        "other images": ", ".join(channels) or "none",
+        "other images": ", ".join(present) or "none",
     }
 
 
@@ -215,25 +198,13 @@ def _angle(tangents: Float32) -> float:
 
 def _depth_facts(frames: Sequence[Frame]) -> dict[str, str]:
     depths = np.concatenate([depths_of(f) for f in frames])
-    valid = np.mean([len(f) / max(f.valid.size, 1) for f in frames])
     if len(depths) == 0:
         return {"depth": "no valid point in the sampled frames"}
     low, median, high = np.percentile(depths, [1, 50, 99])
-    extent = np.median([_extent(f) for f in frames if len(f)], axis=0)
+    boxes = [np.percentile(f.points, [1, 99], axis=0) for f in frames if len(f)]
+    extent = np.median(np.ptp(boxes, axis=1), axis=0)
     return {
         "depth": f"{low:.2f} to {high:.2f} m, median {median:.2f} m",
         "extent of a view": " x ".join(f"{size:.2f}" for size in extent) + " m",
-        "valid points": f"{valid:.0%}",
+        "valid points": f"{valid_fraction(frames):.0%}",
     }
-
-
-def _extent(frame: Frame) -> Float64:
-    """Size (3,) in m of the box around 98 % of the points of a view, per axis."""
-    low, high = np.percentile(frame.points, [1, 99], axis=0)
-    return high - low
-
-
-def _coverage(poses: Float64 | None) -> str:
-    if poses is None:
-        return "none"
-    return f"for {int(np.isfinite(poses[:, 0, 0]).sum())} frames"

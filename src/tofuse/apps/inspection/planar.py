@@ -124,19 +124,17 @@ def _labels(view: PreparedView, is_valid: Bool) -> Int64:
     tolerance = np.hypot(
         _MAX_PLANE_FRACTION, _MAX_PLANE_SIGMAS * view.sigma / np.maximum(view.z, 1e-3)
     )
-    starts, ends = [], []
+    links = []
     for a, b in (
-        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
-        ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
+        (np.s_[:, 1:], np.s_[:, :-1]),
+        (np.s_[1:], np.s_[:-1]),
     ):
         is_same = is_valid[a] & is_valid[b]
         is_same &= (normals[a] * normals[b]).sum(-1) > _MIN_NORMAL_COSINE
-        terms = planes[b][..., :2] * rays[a]
-        predicted_w = terms[..., 0] + terms[..., 1] + planes[b][..., 2]
+        predicted_w = (planes[b][..., :2] * rays[a]).sum(-1) + planes[b][..., 2]
         is_same &= np.abs(predicted_w - planes[a][..., 3]) < tolerance[a] * planes[a][..., 3]
-        starts.append(number[a][is_same])
-        ends.append(number[b][is_same])
-    i, j = np.concatenate(starts), np.concatenate(ends)
+        links.append((number[a][is_same], number[b][is_same]))
+    i, j = np.concatenate(links, axis=1)
     graph = sparse.coo_matrix((np.ones(len(i), bool), (i, j)), shape=(number.size,) * 2)
     return connected_components(graph, directed=False)[1].reshape(is_valid.shape).astype(np.int64)
 

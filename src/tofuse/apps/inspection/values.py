@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +39,11 @@ def depths_of(frame: Frame) -> Float32:
     return np.linalg.norm(frame.points - frame.origin.astype(np.float32), axis=1)
 
 
+def valid_fraction(frames: Sequence[Frame]) -> float:
+    """Return the mean fraction of valid pixels of views."""
+    return float(np.mean([len(f) / max(f.valid.size, 1) for f in frames]))
+
+
 def check_unit(sample: Sample) -> Iterator[Finding]:
     """Check that the typical distance is plausible for a ToF camera."""
     depths = np.concatenate([depths_of(f) for f in sample.frames])
@@ -60,22 +66,19 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
         problem = "nearer than ToF cameras measure"
     else:
         return
+    # The power of ten by which the distance is nearest to 2 m.
+    factor = float(10.0 ** np.round(np.log10(median / 2.0)))
     yield Finding(
         "depth_unit",
         f"The median depth is {median:.3g} m, {problem}.",
-        f"Check depth_unit_m: it may be wrong by a factor of {_factor(median):g}.",
-        evidence | {"factor": _factor(median)},
+        f"Check depth_unit_m: it may be wrong by a factor of {factor:g}.",
+        evidence | {"factor": factor},
     )
-
-
-def _factor(median: float) -> float:
-    """The power of ten by which a distance is nearest to 2 m."""
-    return float(10.0 ** np.round(np.log10(median / 2.0)))
 
 
 def check_valid(sample: Sample) -> Iterator[Finding]:
     """Check that enough pixels are valid."""
-    valid = float(np.mean([len(f) / max(f.valid.size, 1) for f in sample.frames]))
+    valid = valid_fraction(sample.frames)
     if 0 < valid < _MIN_VALID:
         yield Finding(
             "few_valid",
@@ -105,7 +108,9 @@ def check_flying(sample: Sample) -> Iterator[Finding]:
     """Check the number of flying pixels and the width of depth edges."""
     flying = edges = valid = 0
     for frame in sample.images:
-        is_flying, is_edge = _flying(frame.radial_range, frame.valid)
+        along_rows = _flying(frame.radial_range, frame.valid)
+        along_columns = _flying(frame.radial_range.T, frame.valid.T)
+        is_flying, is_edge = (a | b.T for a, b in zip(along_rows, along_columns, strict=True))
         flying += int(np.count_nonzero(is_flying))
         edges += int(np.count_nonzero(is_edge))
         valid += len(frame)
@@ -122,40 +127,31 @@ def check_flying(sample: Sample) -> Iterator[Finding]:
         )
 
 
-def flying_pixels(frame: RangeFrame) -> Bool:
-    """Return the (H, W) mask of flying pixels."""
-    return _flying(frame.radial_range, frame.valid)[0]
-
-
 def _flying(r: Float32, valid: Bool) -> tuple[Bool, Bool]:
-    """Masks (H, W) of flying pixels, and of all pixels at depth edges between smooth surfaces."""
+    """Masks (H, W), along rows, of flying pixels and of all at edges between smooth surfaces."""
     is_flying, is_edge = np.zeros(r.shape, bool), np.zeros(r.shape, bool)
     margin = _REACH + 2
-    for axis in (0, 1):
-        n = r.shape[axis]
-        if n <= 2 * margin:
-            continue
+    inner = slice(margin, r.shape[1] - margin)
+    if r.shape[1] <= 2 * margin:
+        return is_flying, is_edge
 
-        def shifted(shift: int, axis: int = axis, n: int = n) -> tuple[slice, ...]:
-            part = slice(margin + shift, n - margin + shift)
-            return (part, slice(None)) if axis == 0 else (slice(None), part)
+    def shifted(image: Any, shift: int) -> Any:
+        return image[:, margin + shift : image.shape[1] - margin + shift]
 
-        center, a, b = r[shifted(0)], r[shifted(-_REACH)], r[shifted(_REACH)]
-        gap = np.abs(b - a)
-        measured = valid[shifted(0)] & valid[shifted(-_REACH)] & valid[shifted(_REACH)]
-        measured &= valid[shifted(-margin)] & valid[shifted(margin)]
-        edge = measured & (gap > _MIN_STEP * np.minimum(a, b))
-        edge &= (np.abs(a - r[shifted(-margin)]) < _MAX_CHANGE * gap) & (
-            np.abs(b - r[shifted(margin)]) < _MAX_CHANGE * gap
-        )
+    center, a, b = (shifted(r, shift) for shift in (0, -_REACH, _REACH))
+    gap = np.abs(b - a)
+    edge = gap > _MIN_STEP * np.minimum(a, b)
+    for shift in (0, -_REACH, _REACH, -margin, margin):
+        edge &= shifted(valid, shift)
+    for side, surface in ((-1, a), (1, b)):
+        edge &= np.abs(surface - shifted(r, side * margin)) < _MAX_CHANGE * gap
         # Also smooth in the other direction, unlike noise.
-        for side in (-_REACH, _REACH):
-            for offset in (-1, 1):
-                neighbour = np.roll(r, offset, 1 - axis)[shifted(side)]
-                edge &= np.abs(r[shifted(side)] - neighbour) < _MAX_CHANGE * gap
-        is_edge[shifted(0)] |= edge
-        inner = np.minimum(np.abs(center - a), np.abs(b - center)) > _MIN_INSIDE * gap
-        is_flying[shifted(0)] |= edge & inner & ((center - a) * (b - center) > 0)
+        for offset in (-1, 1):
+            neighbour = shifted(np.roll(r, offset, 0), side * _REACH)
+            edge &= np.abs(surface - neighbour) < _MAX_CHANGE * gap
+    between = (center - a) * (b - center) > 0
+    between &= np.minimum(np.abs(center - a), np.abs(b - center)) > _MIN_INSIDE * gap
+    is_edge[:, inner], is_flying[:, inner] = edge, edge & between
     return is_flying, is_edge
 
 
@@ -178,16 +174,16 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
         for a, b in ((np.s_[:, :-2], np.s_[:, 2:]), (np.s_[:-2], np.s_[2:])):
             seams += int(np.count_nonzero((late[a] & early[b]) | (early[a] & late[b])))
         valid += len(frame)
-        albedo = _apparent_albedo(frame, r)
-        if albedo is None:
+        amplitude = frame.amplitude_image
+        if amplitude is None:
             continue
-        usable = frame.valid & (albedo > 0)
+        usable = frame.valid & (amplitude > 0) & (amplitude < SATURATED_AMPLITUDE)
+        albedo = amplitude if frame.amplitude_kind == "range_compensated" else amplitude * r * r
         with_albedo += int(np.count_nonzero(usable))
-        if not usable.any():
-            continue
-        typical = float(np.median(albedo[usable]))
-        near = usable & surface & (r < _NEAR * period)
-        dark += int(np.count_nonzero(near & (albedo < _DARK * typical)))
+        if usable.any():
+            near = usable & surface & (r < _NEAR * period)
+            is_dark = albedo < _DARK * float(np.median(albedo[usable]))
+            dark += int(np.count_nonzero(near & is_dark))
     seam_fraction, dark_fraction = seams / max(valid, 1), dark / max(with_albedo, 1)
     if seam_fraction > _MAX_SEAM_FRACTION or dark_fraction > _MAX_DARK_FRACTION:
         yield Finding(
@@ -199,11 +195,3 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
             "drop weak pixels by an amplitude filter.",
             {"seam_fraction": seam_fraction, "dark_fraction": dark_fraction, "period_m": period},
         )
-
-
-def _apparent_albedo(frame: RangeFrame, r: Float32) -> Float32 | None:
-    amplitude = frame.amplitude_image
-    if amplitude is None:
-        return None
-    amplitude = np.where(amplitude < SATURATED_AMPLITUDE, amplitude, np.float32(0))
-    return amplitude if frame.amplitude_kind == "range_compensated" else amplitude * r * r

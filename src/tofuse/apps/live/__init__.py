@@ -11,6 +11,7 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.apps.live.device import (
         TIMEOUT_S,
+        Device,
         DeviceError,
         Settings,
         Stream,
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
         is_installed,
         known_devices,
         no_frame,
-        not_started,
-        vendor,
     )
     from tofuse.apps.live.recorder import record
 

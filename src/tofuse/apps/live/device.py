@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import importlib.util
+import json
+import re
+import typing
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from types import ModuleType, TracebackType
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,10 @@ from tofuse.engine.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.parts import discover, from_dict, registered
 
 TIMEOUT_S = 2.0  # without a frame until a camera counts as stopped
+
+
+# How options that are not text are written.
+_WORDS: dict[Any, str] = {bool: "true|false", int: "-?[1-9][0-9]*|0"}
 
 
 class DeviceError(InputError):
@@ -55,7 +60,7 @@ class Settings:
     amplitude_kind: AmplitudeKind | None = None
 
 
-class Stream(ABC):
+class Stream(AbstractContextManager["Stream"], ABC):
     """A running camera; closed at the end of its ``with`` block.
 
     Attributes
@@ -65,6 +70,45 @@ class Stream(ABC):
     """
 
     settings: Settings
+
+    def __init__(self, options: Device) -> None:
+        pip, module = options.package
+        try:
+            package = importlib.import_module(module)
+        except ImportError as error:
+            raise DeviceError(
+                f"needs the package {pip}, which can't be imported ({error})",
+                where="camera",
+                remedy=f"run `pip install {pip}`",
+            ) from error
+        try:
+            self.start(package, options)
+        except DeviceError:
+            raise
+        except Exception as error:  # the maker's package may raise anything
+            raise DeviceError(
+                f"does not start ({type(error).__name__}: {error})",
+                where=options.maker,
+                remedy="check that it is connected, and not used by another program",
+            ) from error
+        try:
+            self.settings = self.read_settings()
+        except BaseException:
+            self.close()
+            raise
+
+    def start(self, package: Any, options: Any) -> None:
+        """Start the camera with the maker's package and the options of its device.
+
+        Raises
+        ------
+        DeviceError
+            If no camera is connected, or it doesn't start.
+        """
+
+    def read_settings(self) -> Settings:
+        """Return the properties of the running camera, after `start`."""
+        raise NotImplementedError
 
     @abstractmethod
     def read(self, index: int) -> RangeFrame:
@@ -101,28 +145,29 @@ class Stream(ABC):
             yield self.read(index)
             index += 1
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
-class Device(Protocol):
+class Device(ABC):
     """A kind of camera, registered by ``@part("device", name)`` in a module of `devices`.
 
     Attributes
     ----------
+    maker
+        Its name in messages.
     package
         Name of the required package for pip, and for import.
+    stream
+        Its frames.
     """
 
     part_kind: ClassVar[str] = "device"
+    maker: ClassVar[str]
     package: ClassVar[tuple[str, str]]
+    stream: ClassVar[type[Stream]]
 
-    def open(self) -> AbstractContextManager[Stream]:
+    def open(self) -> Stream:
         """Start the camera.
 
         Raises
@@ -130,7 +175,7 @@ class Device(Protocol):
         DeviceError
             If the package is missing, no camera is connected, or it doesn't start.
         """
-        ...
+        return self.stream(self)
 
 
 def device_named(name: str, options: Mapping[str, str]) -> Device:
@@ -146,25 +191,16 @@ def device_named(name: str, options: Mapping[str, str]) -> Device:
         raise InputError(
             f"there is no camera {name!r}", where="record", remedy=f"use one of {list(kinds)}"
         )
-    types = {f.name: f.type for f in dataclasses.fields(kinds[name])}
+    types = typing.get_type_hints(kinds[name])
     values: dict[str, Any] = {"part": name}
     for key, text in options.items():
-        values[key] = _read(text, str(types.get(key)), f"--set {key}")
+        words = _WORDS.get(types.get(key), "")
+        if words and (not re.fullmatch(words, text)):
+            remedy = "use true or false" if types[key] is bool else "use a whole number"
+            raise InputError(f"is {text!r}", where=f"--set {key}", remedy=remedy)
+        values[key] = json.loads(text) if words else text
     kind: Device = from_dict(Device, values, where="--set")
     return kind
-
-
-def _read(text: str, kind: str, where: str) -> object:
-    if kind == "bool":
-        if text not in ("true", "false"):
-            raise InputError(f"is {text!r}", where=where, remedy="use true or false")
-        return text == "true"
-    if kind == "int":
-        try:
-            return int(text)
-        except ValueError as error:
-            raise InputError(f"is {text!r}", where=where, remedy="use a whole number") from error
-    return text
 
 
 def known_devices() -> dict[str, type[Any]]:
@@ -178,38 +214,10 @@ def is_installed(device: type[Any]) -> bool:
     return importlib.util.find_spec(device.package[1]) is not None
 
 
-def vendor(package: tuple[str, str]) -> ModuleType:
-    """Import the maker's package, see `Device.package`.
-
-    Raises
-    ------
-    DeviceError
-        Stating what to install.
-    """
-    pip, module = package
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise DeviceError(
-            f"needs the package {pip}, which can't be imported ({error})",
-            where="camera",
-            remedy=f"run `pip install {pip}`",
-        ) from error
-
-
 def no_frame(sensor: str) -> DeviceError:
     """Return the error of a camera that sends no frames."""
     return DeviceError(
         f"sent no frame for {TIMEOUT_S:g} s",
         where=sensor,
         remedy="check its cable and power supply",
-    )
-
-
-def not_started(name: str, error: Exception) -> DeviceError:
-    """Return the error of a camera that does not start."""
-    return DeviceError(
-        f"does not start ({type(error).__name__}: {error})",
-        where=name,
-        remedy="check that it is connected, and not used by another program",
     )

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import queue
 import threading
-import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
@@ -102,38 +100,35 @@ def record(
     return Recorded(Path(folder), len(writer), reader.dropped, ended_by)
 
 
-class _Reader:
+class _Reader(AbstractContextManager["_Reader"]):
     """Reads a camera on its own thread into a queue, and drops new frames while it is full."""
 
     def __init__(self, stream: Stream) -> None:
         self.dropped = 0
         self.error: DeviceError | None = None
         self._stream = stream
-        self._queue: queue.Queue[RangeFrame | None] = queue.Queue(QUEUE_FRAMES)
+        self._queue: queue.Queue[RangeFrame] = queue.Queue(QUEUE_FRAMES)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="tofuse-camera", daemon=True)
         self._thread.start()
 
     def next(self) -> RangeFrame | None:
         """Wait for the next frame; None if the camera has failed."""
-        return self._queue.get()
+        while self._thread.is_alive() or not self._queue.empty():
+            with suppress(queue.Empty):
+                return self._queue.get(timeout=0.1)
+        return None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         # A camera that has gone silent may never return from `read`; the thread is a daemon.
         self._thread.join(_JOIN_TIMEOUT_S)
 
     def _work(self) -> None:
-        index = 0
         try:
-            while not self._stop.is_set():
-                frame = self._stream.read(index)
-                index += 1
+            for frame in self._stream:
+                if self._stop.is_set():
+                    return
                 try:
                     self._queue.put_nowait(frame)
                 except queue.Full:
@@ -141,15 +136,8 @@ class _Reader:
         except DeviceError as error:
             self.error = error
         except Exception as error:  # the maker's package may raise anything
-            self.error = DeviceError(
-                f"failed ({type(error).__name__}: {error})", where=self._stream.settings.sensor
-            )
-        while not self._stop.is_set():
-            try:
-                self._queue.put(None, timeout=0.1)
-                return
-            except queue.Full:
-                time.sleep(0)
+            problem = f"failed ({type(error).__name__}: {error})"
+            self.error = DeviceError(problem, where=self._stream.settings.sensor)
 
 
 def _writer(stream: Stream, first: RangeFrame, folder: Path) -> RecordingWriter:
@@ -159,13 +147,4 @@ def _writer(stream: Stream, first: RangeFrame, folder: Path) -> RecordingWriter:
         max_sigma = float(np.nanmax(first.sigma_image, initial=0.0))
         # Later frames may be noisier than the first.
         sigma_unit = max(MIN_SIGMA_UNIT_M, 4 * max_sigma / 65535)
-    return RecordingWriter(
-        folder,
-        settings.camera,
-        depth_unit_m=settings.depth_unit_m,
-        depth_kind=settings.depth_kind,
-        frame_rate_hz=settings.frame_rate_hz,
-        amplitude_kind=settings.amplitude_kind,
-        sensor=settings.sensor,
-        sigma_unit_m=sigma_unit,
-    )
+    return RecordingWriter(folder, **vars(settings), sigma_unit_m=sigma_unit)

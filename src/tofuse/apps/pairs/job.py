@@ -103,8 +103,7 @@ def _registered(
     name = None if options.guess is None else str(options.guess)
     near_source = replace(views[0], frame=near.source)
     near_target = replace(views[1], frame=near.target)
-    T_start = np.eye(4) if near.guess is None else near.guess
-    return PairResult(near_source, near_target, registration, T_start, name, seconds)
+    return PairResult(near_source, near_target, registration, name, seconds)
 
 
 def _open_both(source: str, target: str, options: PairOptions) -> tuple[SingleView, SingleView]:

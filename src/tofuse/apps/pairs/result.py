@@ -34,8 +34,6 @@ class PairResult:
         The views, near the origin: a cloud in map coordinates has the `shift` to them.
     registration
         The registration of these views.
-    T_start
-        (4, 4) initial guess T_target_source of these views.
     guess
         The file of the initial guess, or None.
     seconds
@@ -45,7 +43,6 @@ class PairResult:
     source: SingleView
     target: SingleView
     registration: Registration
-    T_start: Float64
     guess: str | None = None
     seconds: float = 0.0
 
@@ -105,14 +102,13 @@ class PairResult:
         covariance = self._observed_covariance
         if covariance is None:
             return None, None
-        variances = [
-            float(np.linalg.eigvalsh(covariance[k, k])[-1]) for k in (_TRANSLATION, _ROTATION)
-        ]
+        sigma_m, sigma_rad = se3.largest_sigmas(covariance).tolist()
         # In metres both are of similar size; a negligible one is rounding error.
-        limit = 1e-12 * max(variances[0], variances[1] * self.lever_m**2)
-        significant = variances[0] > limit, variances[1] * self.lever_m**2 > limit
-        sigma_m, sigma_rad = (float(np.sqrt(max(value, 0.0))) for value in variances)
-        return sigma_m if significant[0] else None, sigma_rad if significant[1] else None
+        limit = 1e-6 * max(sigma_m, sigma_rad * self.lever_m)
+        return (
+            sigma_m if sigma_m > limit else None,
+            sigma_rad if sigma_rad * self.lever_m > limit else None,
+        )
 
     @property
     def _observed_covariance(self) -> Float64 | None:
@@ -158,7 +154,6 @@ class PairResult:
         return points + self.target.frame.shift
 
 
-_TRANSLATION, _ROTATION = slice(0, 3), slice(3, 6)
 # A free direction with a smaller fraction of rotation counts as a translation.
 _MAX_ROTATION = 0.4
 # Attributes of a registration in `registration.json`.

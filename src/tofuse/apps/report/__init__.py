@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.apps.report import html, packing, plots, scene, session_words, thumbnails, words
+    from tofuse.apps.report import fields, html, plots, scene, session_words, thumbnails, words
     from tofuse.apps.report.extras import ReportExtras
-    from tofuse.apps.report.policy import script_hashes
     from tofuse.apps.report.sections import write_report
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

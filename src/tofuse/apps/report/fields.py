@@ -82,29 +82,15 @@ def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
     sigma = scene.sigma if mesh is None else mesh.sigma
     views = scene.views if mesh is None else mesh.views
     available = [] if sigma is None else [accuracy(OF_95_PERCENT * sigma.astype(float), errors)]
-    available.append(height(-points[:, 1]))
+    low, high = percentile_range(-points[:, 1])
+    ticks = words.length(0.0), words.length((high - low) / 2), words.length(high - low)
+    available.append(Field("height", "Height", -points[:, 1], low, high, ticks, (low, high)))
     if views is not None:
-        available.append(view_count(views.astype(float)))
+        low, high = percentile_range(views)
+        ticks = f"{low:.0f}", "", f"{high:.0f}"
+        counts = views.astype(float)
+        available.append(Field("views", "Number of views", counts, low, high, ticks, (low, high)))
     return available
-
-
-def normalized_accuracy(metres: Float64) -> Float64:
-    """Return 95 % bounds in m as fractions of the span of a field of accuracies."""
-    return accuracy(metres).normalized(metres)
-
-
-def view_count(counts: Float64) -> Field:
-    """Return the field of numbers of views (K,)."""
-    low, high = percentile_range(counts)
-    labels = (f"{low:.0f}", "", f"{high:.0f}")
-    return Field("views", "Number of views", counts, low, high, labels, (low, high))
-
-
-def height(heights: Float64) -> Field:
-    """Return the field of heights (K,) in m."""
-    low, high = percentile_range(heights)
-    labels = (words.length(0.0), words.length((high - low) / 2), words.length(high - low))
-    return Field("height", "Height", heights, low, high, labels, (low, high))
 
 
 def accuracy(values: Float64, errors: Float64 | None = None) -> Field:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import json
+import math
 import re
 from functools import cache
 from importlib import resources
@@ -9,24 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from tofuse._version import __version__
-from tofuse.apps.report.policy import secured
+from tofuse.apps.report import session_words, words
+from tofuse.engine.frames import frame_ranges
 from tofuse.formats.files import atomic
 
 # Files of the pages' script; each uses functions of the previous ones.
 SCRIPTS = (
-    "bytes.js",
-    "eye.js",
-    "gestures.js",
-    "painter.js",
-    "section.js",
-    "measure.js",
-    "overlay.js",
-    "cameras.js",
-    "timeline.js",
-    "viewer.js",
-    "frames.js",
-    "main.js",
-)
+    "bytes", "eye", "gestures", "painter", "section", "measure",
+    "overlay", "cameras", "timeline", "viewer", "frames", "main",
+)  # fmt: skip
 
 
 def write_page(path: Path, template: str, **values: Any) -> None:
@@ -47,9 +42,26 @@ def page(template: str, **values: Any) -> str:
     return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text)
 
 
+def secured(html: str) -> str:
+    """Return a page with its content security policy in the head.
+
+    The page runs only its inline scripts, and loads nothing else. Everything filled into its
+    template must be escaped: any script in the page is allowed.
+    """
+    scripts = re.findall("<script>(.*?)</script>", html, re.DOTALL)
+    hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts]
+    allowed = " ".join(f"'sha256-{digest}'" for digest in hashes) or "'none'"
+    policy = (
+        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "
+        "img-src 'self' data: blob:; font-src data:; base-uri 'none'; form-action 'none'"
+    )
+    meta = f'\n<meta http-equiv="Content-Security-Policy" content="{policy}">'
+    return re.sub("<meta charset=[^>]*>", lambda head: head[0] + meta, html, count=1)
+
+
 def script() -> str:
     """Return the script of a page with a 3D view."""
-    parts = "\n".join(asset(f"js/{name}") for name in SCRIPTS)
+    parts = "\n".join(asset(f"js/{name}.js") for name in SCRIPTS)
     return f'"use strict";\n(() => {{\n{parts}}})();'
 
 
@@ -71,5 +83,21 @@ def _environment() -> Any:
         lstrip_blocks=True,
         loader=loader,
     )
+    environment.filters |= {
+        "metres": words.length,
+        "signed": words.signed_length,
+        "degrees": math.degrees,
+        "percent": words.percent,
+        "duration": words.seconds,
+        "things": words.count,
+        "more": words.more,
+        "coordinates": words.coordinates,
+        "frames": lambda ends: words.frame_range(*ends),
+        "probability": session_words.probability_text,
+        "ranges": lambda ranges: frame_ranges.numbers(ranges).replace("-", "–"),
+        "number": "{:,}".format,
+        "css": lambda color: f"rgb{tuple(color)}",
+        "pretty": lambda data: json.dumps(data, indent=2, ensure_ascii=False, default=str),
+    }
     environment.policies["json.dumps_kwargs"] = {}  # keys in their order
     return environment

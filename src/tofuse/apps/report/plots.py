@@ -5,8 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -20,18 +19,14 @@ if TYPE_CHECKING:
 
 
 # Placeholders that `svg` replaces by the page's variables of the same names.
-INK, MUTED, GRID, PAGE = "#010101", "#020202", "#030303", "#090909"
+INK, MUTED, GRID = "#010101", "#020202", "#030303"
 BEFORE, AFTER, REFERENCE, BAD = "#040404", "#050505", "#060606", "#080808"
-_VARIABLES = dict(
-    zip(
-        (INK, MUTED, GRID, PAGE, BEFORE, AFTER, REFERENCE, BAD),
-        ("ink", "muted", "grid", "page", "before", "after", "reference", "bad"),
-        strict=True,
-    )
-)
+_VARIABLES = {INK: "ink", MUTED: "muted", GRID: "grid"}
+_VARIABLES |= {BEFORE: "before", AFTER: "after", REFERENCE: "reference", BAD: "bad"}
 _MODEL_COLOR = (112, 138, 176)  # of the model's points: visible on white and on near-black
 _MAX_QUANTILE = 50_000  # maximum number of points of which quantiles are computed
 _MAX_MM_EXTENT_M = 0.6  # plans of smaller extent have ticks in mm
+_MARGIN, _MIN_MARGIN_M = 0.06, 0.02  # around a plan
 _WIDTH = 440  # of a plan, in pixels
 _LABEL: Any = {"color": MUTED, "fontsize": 10.5, "labelpad": 2}  # style of an axis label
 _STYLE: Any = {
@@ -55,8 +50,9 @@ def make_figure(
     margins
         Left, bottom, right and top, pixels.
     """
-    with _quiet("matplotlib"):  # about the font cache
-        from matplotlib.figure import Figure
+    logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # about the font cache
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width / 72, height / 72), dpi=72)
     left, bottom, right, top = margins
     size = (width - left - right, height - bottom - top)
@@ -69,18 +65,6 @@ def make_figure(
     axes.grid(color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     return figure, axes
-
-
-@contextmanager
-def _quiet(name: str) -> Iterator[None]:
-    """Suppress a logger's messages below errors."""
-    log = logging.getLogger(name)
-    level = log.level
-    log.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        log.setLevel(level)
 
 
 def svg(figure: Figure, label: str) -> str:
@@ -182,13 +166,11 @@ def project(points: Float64, view: str) -> Float64:
     return np.stack([sa * points[:, a], sb * points[:, b]], axis=1)
 
 
-def limits(
-    *groups: Float64, outer: float = 0.0, margin: float = 0.06, min_margin_m: float = 0.02
-) -> Float64:
+def limits(*groups: Float64, outer: float = 0.0) -> Float64:
     """Return (2, 2) low and high corners around groups of (N, 2) points.
 
-    `outer` percent of the points are left out at each end. The border is `margin` of the size,
-    and at least `min_margin_m` m.
+    `outer` percent of the points are left out at each end. The border is `_MARGIN` of the size,
+    and at least `_MIN_MARGIN_M`.
     """
     sampled = [g[:: -(-len(g) // _MAX_QUANTILE)] if outer else g for g in groups if len(g)]
     boxes = [np.percentile(g, [outer, 100 - outer], axis=0) for g in sampled]
@@ -196,7 +178,7 @@ def limits(
         return np.array([[-0.5, -0.5], [0.5, 0.5]])
     low = np.min([b[0] for b in boxes], axis=0)
     high = np.max([b[1] for b in boxes], axis=0)
-    border = np.maximum(margin * (high - low).max(), min_margin_m)
+    border = np.maximum(_MARGIN * (high - low).max(), _MIN_MARGIN_M)
     return np.stack([low - border, high + border])
 
 
@@ -300,60 +282,3 @@ def _outline(axes: Axes, flat: Float64) -> None:
     x, y = x[:-1] + cell / 2, y[:-1] + cell / 2
     style: Any = {"colors": BAD, "linewidths": 1.6, "linestyles": "dashed"}
     axes.contour(x, y, mask.T.astype(float), levels=[0.5], **style)
-
-
-def rig(
-    poses: Float64,
-    names: Sequence[str],
-    view: str,
-    *,
-    label: str,
-    pairs: Sequence[tuple[int, int, str]] = (),
-) -> str:
-    """Draw the cameras of a rig as labelled frusta.
-
-    Parameters
-    ----------
-    poses
-        (n, 4, 4) T_rig_camera; the first camera is emphasised.
-    names
-        Names of the cameras.
-    view
-        Key of `VIEWS`.
-    label
-        Text for screen readers.
-    pairs
-        Cameras a and b that are joined by a line, and its label.
-    """
-    centres = poses[:, :3, 3]
-    radius = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
-    size = 0.35 * radius if radius > 0.01 else 0.1
-    corners = np.array([[-0.5, -0.4, 1], [0.5, -0.4, 1], [0.5, 0.4, 1], [-0.5, 0.4, 1]])
-    frusta = np.einsum("nij,kj->nki", poses[:, :3, :3], size * corners) + centres[:, None]
-    box = limits(project(centres, view), project(frusta.reshape(-1, 3), view), margin=0.16)
-    figure, axes = plan(box, view)
-    low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
-    per_pixel = float(high[0] - low[0]) / (_WIDTH - 58)
-    for a, b, text in pairs:
-        ends = project(centres[[a, b]], view)
-        axes.plot(*ends.T, color=MUTED, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
-        style: Any = {"ha": "center", "va": "center", "fontsize": 10, "color": MUTED}
-        background = {"facecolor": PAGE, "edgecolor": "none", "pad": 1.5}
-        axes.annotate(text, ends.mean(0), bbox=background, **style)
-    for k, name in enumerate(names):
-        eye, flat = project(centres[k : k + 1], view)[0], project(frusta[k], view)
-        color, linewidth = (AFTER, 1.8) if k == 0 else (INK, 1.1)
-        axes.fill(*flat.T, color=color, alpha=0.12, linewidth=0)
-        axes.plot(*np.concatenate([flat, flat[:1]]).T, color=color, linewidth=linewidth)
-        for corner in flat:
-            axes.plot(*np.stack([eye, corner]).T, color=color, linewidth=linewidth)
-        axes.plot(*eye, "o", color=color, markersize=4)
-        # The name is behind the camera, where nothing is drawn.
-        behind = eye - flat.mean(0)
-        length = float(np.linalg.norm(behind))
-        behind = behind / length if length > 0.2 * size else np.array([0.0, -1.0])
-        position = eye + 10 * per_pixel * behind
-        ha = "left" if behind[0] > 0.4 else "right" if behind[0] < -0.4 else "center"
-        va = "bottom" if behind[1] > 0.4 else "top" if behind[1] < -0.4 else "center"
-        axes.text(*position, name, color=color, fontsize=11, ha=ha, va=va)
-    return svg(figure, label)

@@ -12,11 +12,9 @@ from tofuse.apps.report import thumbnails
 from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
 from tofuse.engine.fusion import Cloud, Mesh, display_colors
-from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
 
 MAX_POINTS = 150_000
-MAX_CAMERAS = 72
 _MAX_SEGMENTS = 1000  # segments of a trajectory
 _MAX_EXTENT_RATIO = 1.8  # of model and cameras to the model; beyond, cameras are not framed
 _MAX_NORMALS, _MIN_AREA_RATIO = 5000, 1.05  # sampled normals; area to the default view's
@@ -138,34 +136,6 @@ class Scene:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class RigCameras:
-    """The camera of each frame of a rig's recording.
-
-    Attributes
-    ----------
-    names
-        Names of the cameras.
-    colors
-        RGB colour of each.
-    of_frames
-        (N,) number of the camera of each frame.
-    """
-
-    names: tuple[str, ...]
-    colors: tuple[tuple[int, int, int], ...]
-    of_frames: Intp
-
-    @classmethod
-    def of(cls, rig: Any, frames: int) -> RigCameras | None:
-        """Read the entry `rig` of `run.json`; None if it does not match the number of frames."""
-        if not rig or len(rig["of_frames"]) != frames:
-            return None
-        names, of_frames = tuple(rig["cameras"]), np.array(rig["of_frames"], np.intp)
-        colors = tuple(CAMERA_COLORS[k % len(CAMERA_COLORS)] for k in range(len(names)))
-        return cls(names, colors, of_frames)
-
-
 def finite_poses(poses: Float64 | None) -> Float64:
     """Return the finite poses, (n, 4, 4)."""
     if poses is None or len(poses) == 0:
@@ -279,30 +249,6 @@ def opening_yaw(scene: Scene) -> float:
     return float(yaws[best]) if visible_area[best] > _MIN_AREA_RATIO * visible_area[0] else YAW
 
 
-def camera_lines(poses: Float64, edge: float, step: int = 1) -> Float64:
-    """Return end points of lines (2 n, 3): cameras as pyramids, and the trajectory.
-
-    Parameters
-    ----------
-    poses
-        (N, 4, 4) T_world_camera; the first camera is drawn larger, as in the thesis.
-    edge
-        Width of a pyramid, m.
-    step
-        Every n-th camera is drawn.
-    """
-    if len(poses) == 0:
-        return np.zeros((0, 3))
-    w, h, d = 0.5, 0.4, 0.8
-    apex = np.zeros(3)
-    a, b, c, e = ([x * w, y * h, d] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
-    shape = np.array([apex, a, apex, b, apex, c, apex, e, a, b, b, c, c, e, e, a], float) * edge
-    drawn = poses[::step]
-    out = [se3.transform(drawn, shape[None]).reshape(-1, 3), path_lines(poses)]
-    out.append(se3.transform(poses[0], 1.8 * shape))
-    return np.concatenate(out)
-
-
 def path_lines(poses: Float64) -> Float64:
     """Return end points of the lines (2 n, 3) that join the camera centres in order.
 
@@ -314,86 +260,33 @@ def path_lines(poses: Float64) -> Float64:
     return np.stack([centers[:-1], centers[1:]], axis=1).reshape(-1, 3)
 
 
-def render(
-    scene: Scene,
-    size: tuple[int, int] = (960, 600),
-    *,
-    yaw: float = YAW,
-    pitch: float = PITCH,
-    eye_at: tuple[Float64, float] | None = None,
-    peel: bool = True,
-    min_radius: int = 1,
-) -> UInt8:
-    """Render the initial 3D view as an image (H, W, 3), for browsers without WebGL.
+def render(scene: Scene, size: tuple[int, int] = (960, 600), *, yaw: float = YAW) -> UInt8:
+    """Render the initial 3D view, so that it fills an image (H, W, 3), for use without WebGL."""
+    import cv2
 
-    Parameters
-    ----------
-    scene
-        The scene.
-    size
-        Width and height, pixels.
-    yaw, pitch
-        Viewing direction, rad.
-    eye_at
-        Point (3,) to look at, and the distance from it, m; by default the full scene.
-    peel
-        Whether to leave out back faces.
-    min_radius
-        Minimum size of a point, pixels.
-    """
-    center, distance = (scene.center, 1.2 * scene.size) if eye_at is None else eye_at
-    R = thumbnails.view_rotation(yaw, pitch)
-    T = np.eye(4)
-    T[:3, :3] = R
-    T[:3, 3] = -R @ center
-    scale = size[1] / (2 * np.tan(0.35) * distance)
     points, colors = scene.points, (36 + 0.86 * scene.colors).astype(np.uint8)
+    framed = points if len(points) else scene.after[:, :3, 3]
+    T, scale = thumbnails.framing(framed, size, yaw=yaw, pitch=PITCH)
+    R, t = T[:3, :3], T[:3, 3]
+    # Smaller, so that the nearest points, which appear largest, fit.
+    depth = float(np.ptp(np.percentile(framed @ R[2], [0.2, 99.8]))) if len(framed) else 0.0
+    distance = 1.5 * (scene.size + depth)
+    lens: Any = {"scale": scale * (1 - 0.5 * depth / distance), "distance": distance}
     if scene.normals is not None and len(points):
         # Surfaces that face away are walls in front of the interior.
-        eye = center - R.T @ np.array([0, 0, distance])
-        to_eye = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
+        to_eye = -R.T @ (t + np.array([0.0, 0.0, distance])) - points
+        to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
         facing = (to_eye * np.nan_to_num(scene.normals)).sum(1)
         colors = (colors * (0.6 + 0.4 * np.abs(facing[:, None]))).astype(np.uint8)
-        if peel:
-            points, colors = points[facing >= 0], colors[facing >= 0]
-    radius = int(np.clip(np.ceil(scene.spacing * scale), min_radius, 6))
-    rgba = thumbnails.splat(points, colors, T, size, scale=scale, distance=distance, radius=radius)
-    image = np.empty((*rgba.shape[:2], 3), np.uint8)
-    image[:] = thumbnails.BACKGROUND
-    covered = rgba[..., 3] > 0
-    image[covered] = rgba[covered, :3]
-    edge, step = 0.018 * scene.size, -(-max(len(scene.after), 1) // MAX_CAMERAS)
+        points, colors = points[facing >= 0], colors[facing >= 0]
+    radius = int(np.clip(np.ceil(1.5 * scene.spacing * lens["scale"]), 2, 6))
+    rgba = thumbnails.splat(points, colors, T, size, radius=radius, **lens)
+    image = np.where(rgba[..., 3:] > 0, rgba[..., :3], np.uint8(thumbnails.BACKGROUND))
     for poses, color in ((scene.before, (240, 160, 60)), (scene.after, (90, 176, 245))):
-        line_points = _sample_lines(camera_lines(poses, edge, step))
-        lines_rgba = thumbnails.splat(
-            line_points,
-            np.broadcast_to(np.array(color, np.uint8), line_points.shape),
-            T,
-            size,
-            scale=scale,
-            distance=distance,
-        )
-        covered = lines_rgba[..., 3] > 0
-        image[covered] = lines_rgba[covered, :3]
+        pixels, depths = thumbnails.project(poses[:, :3, 3], T, size, **lens)
+        path = np.rint(pixels[np.isfinite(depths)]).astype(np.int32)
+        image = cv2.polylines(image, [path], False, color, 2, cv2.LINE_AA)
     return image
-
-
-def render_thumbnail(scene: Scene, size: tuple[int, int]) -> UInt8:
-    """Render the model so that it fills a small image (H, W, 3)."""
-    if len(scene.points) == 0:
-        return render(scene, size)
-    framing = thumbnails.Framing.around(scene.points, size, yaw=YAW, pitch=PITCH)
-    R, t = framing.T_view_world[:3, :3], framing.T_view_world[:3, 3]
-    # So distant that the nearest points, which appear largest, fit.
-    depth = np.ptp(np.percentile(scene.points @ R[2], [0.2, 99.8]))
-    distance = size[1] / (2 * np.tan(0.35) * framing.scale) + 0.5 * float(depth)
-    return render(scene, size, eye_at=(-R.T @ t, distance), min_radius=2)
-
-
-def _sample_lines(lines: Float64, number: int = 24) -> Float64:
-    ends = lines.reshape(-1, 2, 3)
-    t = np.linspace(0, 1, number)[None, :, None]
-    return (ends[:, :1] * (1 - t) + ends[:, 1:] * t).reshape(-1, 3)
 
 
 def extreme_points(points: Float64, outer: float = 2.0) -> Float64:

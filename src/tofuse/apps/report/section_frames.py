@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import base64
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from tofuse.apps.report import plots, thumbnails, words
-from tofuse.apps.report.section_parts import component_color
 from tofuse.apps.report.subject import ROWS, Subject, Values
+from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.compute import run_all, trim_memory
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.quality import frame_samples
@@ -38,63 +37,39 @@ def frames(s: Subject) -> Values:
     statuses: list[str] = [r.status for r in records]
     runs = words.runs((r.index, r.status, r.reason) for r in records)
     runs = [run for run in runs if run[3] != "tracked"]
-    hint, found = "", words.frame_range(records[0].index, records[-1].index) if records else ""
-    if found:
-        has_bounds = any(r.covariance is not None for r in records)
-        hint = ": status above, accuracy below (dark = accurate)." if has_bounds else ": status."
     counts = [(name, statuses.count(name)) for name in words.STATUSES]
+    path = s.scene.after[:, :3, 3]
+    travelled = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     return {
-        "facts": _facts(s, counts),
+        "counts": [(f"frames {name}", f"{number:,}") for name, number in counts],
+        "triangles": s.scene.surface and len(s.scene.surface.faces),
+        "points": s.scene.total,
+        "travelled": travelled if len(path) > 1 else None,
         "lanes": [*words.STATUSES, *(["component"] if len(components) > 1 else [])],
         "strip": _strip(records, components),
-        "label": "Status of each frame: " + ", ".join(f"{n} {name}" for name, n in counts),
-        "short_hint": found.capitalize() + hint,
-        "hint": f"From left to right: {found}. Point at a frame to see its status.",
+        "label": ", ".join(f"{n} {name}" for name, n in counts),
+        "found": words.frame_range(records[0].index, records[-1].index) if records else "",
+        "bounded": any(r.covariance is not None for r in records),
         "figures": _health(records),
         "has_bad": "lost" in statuses or "skipped" in statuses,
         "player": _player(s),
-        "problems": [
-            (words.frame_range(a, b), f"{n:,}", status, reason or "–", [[a, b]])
-            for a, b, n, status, reason in runs[:ROWS]
-        ],
+        "problems": runs[:ROWS],
         "more": words.more(len(runs) - ROWS),
         "apart": any(not c.connected for c in components),
     }
 
 
-def _facts(s: Subject, counts: Sequence[tuple[str, int]]) -> list[tuple[str, str]]:
-    facts = [(f"frames {name}", f"{number:,}") for name, number in counts]
-    if s.scene.surface is not None:
-        facts.append(("surface", words.count(len(s.scene.surface.faces), "triangle")))
-    facts.append(("point cloud", words.count(s.scene.total, "point")))
-    path = s.scene.after[:, :3, 3]
-    if len(path) > 1:
-        travelled = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-        facts.append(("trajectory length", words.length(travelled)))
-    closures = sum(p.accepted for p in s.result.diagnostics.loops)
-    return [*facts, ("loop closures", f"{closures:,}")]
-
-
-def _strip(records: Sequence[FrameRecord], components: Sequence[Component]) -> list[Values]:
+def _strip(
+    records: Sequence[FrameRecord], components: Sequence[Component]
+) -> list[tuple[FrameRecord, str]]:
     """The cells of the strip; with more frames than cells, a cell shows the worst of several."""
-    strip = []
-    cell_frames = -(-len(records) // _STRIP)
-    for start in range(0, len(records), max(cell_frames, 1)):
-        worst = max(records[start : start + cell_frames], key=lambda r: _SEVERITY[r.status])
-        is_colored = worst.component is not None and len(components) > 1
-        strip.append(
-            {
-                "status": worst.status,
-                "lane": words.STATUSES.index(worst.status),
-                "title": frame_text(worst, components),
-                "index": worst.index,
-                "color": component_color(worst.component or 0) if is_colored else None,
-            }
-        )
-    return strip
+    size = max(-(-len(records) // _STRIP), 1)
+    cells = (records[start : start + size] for start in range(0, len(records), size))
+    worst = [max(cell, key=lambda r: _SEVERITY[r.status]) for cell in cells]
+    return [(record, frame_text(record, components)) for record in worst]
 
 
-def _health(records: Sequence[FrameRecord]) -> list[tuple[str, str]]:
+def _health(records: Sequence[FrameRecord]) -> list[str]:
     """The plots of inliers and residuals over frames."""
     index = np.array([r.index for r in records], float)
     bad = index[[r.status in ("lost", "skipped") for r in records]]
@@ -106,8 +81,9 @@ def _health(records: Sequence[FrameRecord]) -> list[tuple[str, str]]:
         y = scale * np.array(values, float)  # NaN where there is none
         if np.isfinite(y).any():
             series = [(y, plots.AFTER, "-")]
-            svg = plots.lines(index, series, label=label, ylabel=ylabel, bad=bad, floor=True)
-            figures.append((svg, ""))
+            figures.append(
+                plots.lines(index, series, label=label, ylabel=ylabel, bad=bad, floor=True)
+            )
     return figures
 
 
@@ -130,41 +106,30 @@ def frame_text(record: FrameRecord, components: Sequence[Component] = ()) -> str
 
 def _player(s: Subject) -> Values | None:
     """The images of frames, with the status of each."""
-    shown = _draw(s.result.diagnostics.samples)
-    trim_memory()
-    if not shown:
+    samples = s.result.diagnostics.samples
+    if not samples:
         return None
+    low, high = _depth_range(samples)
+    fate_colors = np.array([_FATES[fate][0] for fate in sorted(_FATES)], np.uint8)
+    images = run_all([partial(_images, p, (low, high), fate_colors) for p in samples])
+    trim_memory()
     records = {r.index: r for r in s.result.diagnostics.frames}
-    listed = [records.get(p.index) for p in shown]
-    kinds = {kind: title for kind, title in _KINDS.items() if kind in shown[0].images}
-    low, high = _depth_range(s.result.diagnostics.samples)
+    listed = [records.get(p.index) for p in samples]
+    kinds = {kind: title for kind, title in _KINDS.items() if kind in images[0]}
     note = f"Range from dark ({words.length(low)}) to bright ({words.length(high)})."
-    if len(shown) < len(records):
-        note = f"{len(shown):,} of {len(records):,} frames have images here. " + note
+    if len(samples) < len(records):
+        note = f"{len(samples):,} of {len(records):,} frames have images here. " + note
     return {
         "data": {
-            "index": [p.index for p in shown],
+            "index": [p.index for p in samples],
             "descriptions": [frame_text(r, s.result.components) if r else "" for r in listed],
             "status": [r.status if r else "" for r in listed],
-            "images": {kind: [p.uri(kind) for p in shown] for kind in kinds},
+            "images": {kind: [each.get(kind, "data:,") for each in images] for kind in kinds},
         },
         "kinds": kinds,
         "note": note,
         "fates": [(thumbnails.css(color), text) for color, text in _FATES.values()],
     }
-
-
-@dataclass(frozen=True, eq=False)
-class _Pictures:
-    """Images of one frame by kind (`_KINDS`): JPEG, and PNG for the use of pixels."""
-
-    index: int
-    images: dict[str, bytes]
-
-    def uri(self, kind: str) -> str:
-        """Return an image as a data URI, which is empty if there is none of this kind."""
-        data, name = self.images.get(kind), "png" if kind == "fate" else "jpeg"
-        return f"data:image/{name};base64,{base64.b64encode(data).decode()}" if data else "data:,"
 
 
 def _depth_range(frames: Sequence[frame_samples.FrameSample]) -> tuple[float, float]:
@@ -176,104 +141,64 @@ def _depth_range(frames: Sequence[frame_samples.FrameSample]) -> tuple[float, fl
     return thumbnails.percentile_range(values, min_width=1e-3)
 
 
-def _draw(frames: Sequence[frame_samples.FrameSample]) -> tuple[_Pictures, ...]:
-    """Render the samples of frames."""
-    low, high = _depth_range(frames)
-    fate_colors = np.zeros((4, 3), np.uint8)
-    for fate, (color, _) in _FATES.items():
-        fate_colors[fate] = color
-
-    def render(frame: frame_samples.FrameSample) -> _Pictures:
-        depth = frame.depth.astype(float)
-        picture = thumbnails.viridis((depth - low) / (high - low))
-        picture[depth == 0] = thumbnails.NO_MEASUREMENT
-        images = {} if frame.color is None else {"color": thumbnails.encode(frame.color, jpeg=True)}
-        images["range"] = thumbnails.encode(picture, jpeg=True)
-        if frame.amplitude is not None:
-            images["amplitude"] = thumbnails.encode(thumbnails.grey(frame.amplitude), jpeg=True)
-        images["fate"] = thumbnails.encode(fate_colors[frame.fate])
-        return _Pictures(frame.index, images)
-
-    return tuple(run_all([partial(render, frame) for frame in frames]))
+def _images(
+    sample: frame_samples.FrameSample, limits: tuple[float, float], fate_colors: UInt8
+) -> dict[str, str]:
+    """The images of a frame by kind (`_KINDS`): JPEG, and PNG for the use of pixels."""
+    images = {"range": thumbnails.depth_colors(sample.depth, sample.depth > 0, limits)}
+    if sample.color is not None:
+        images["color"] = sample.color
+    if sample.amplitude is not None:
+        images["amplitude"] = thumbnails.grey(sample.amplitude)
+    uris = {kind: thumbnails.data_uri(image, jpeg=True) for kind, image in images.items()}
+    return uris | {"fate": thumbnails.data_uri(fate_colors[sample.fate])}
 
 
 def loops(s: Subject) -> Values:
     """Return the table of candidates for loop closures."""
     loops = sorted(s.result.diagnostics.loops, key=lambda p: (not p.accepted, p.i, p.j))
     accepted = sum(p.accepted for p in loops)
-    rows = [
-        (
-            f"{p.i} and {p.j}",
-            "✓ accepted" if p.accepted else "✗ rejected",
-            p.reason or "–",
-            words.percent(p.overlap),
-            words.length(p.rms_m),
-            words.percent(p.free_space_violation),
-            words.percent(p.margin),
-            [[p.i, p.i], [p.j, p.j]],
-        )
-        for p in loops[:ROWS]
-    ]
-    text = f"{words.count(len(loops), 'candidate')}: {accepted:,} accepted, "
-    text += f"{len(loops) - accepted:,} rejected."
-    return {"rows": rows, "text": text, "more": words.more(len(loops) - ROWS)}
+    return {"rows": loops[:ROWS], "accepted": accepted, "rejected": len(loops) - accepted}
 
 
 def filters(s: Subject) -> Values:
     """Return one frame after each filter (figure 3.2), and the fractions removed."""
     removed, steps = s.result.diagnostics.removed, s.extras.filter_steps
-    counts: dict[str, tuple[int, int]] = {}  # points removed, of all; a filter may be used twice
-    shown: list[tuple[str, str, list[str]]] = []
-    note = ""
+    gone: Counter[str] = Counter()  # a filter may be used twice
+    reached: Counter[str] = Counter()
+    values: Values = {"steps": []}
     if steps:
-        (first, raw), *later = steps
+        raw = previous = steps[0][1]
         limits = thumbnails.depth_limits(raw)
-        low, high = (words.length(limit) for limit in limits)
-        note = (
-            f"Frame {raw.index} after each filter; colours from dark (near, {low}) to bright (far, "
-            f"{high})."
-        )
-        if isinstance(raw, RangeFrame):
-            note += (
-                " Grey pixels have no measurement, pink ones were removed by this filter. Below: "
-                "the points from above and to the side."
-            )
-        framing = thumbnails.Framing.around(raw.points.astype(float), _FILTER)
-        images = _step_images(raw, None, limits, framing)
-        shown.append((first, words.count(len(raw), "point"), images))
-        previous = raw
-        for name, frame in later:
+        values |= {"frame": raw.index, "limits": limits, "is_image": isinstance(raw, RangeFrame)}
+        view = thumbnails.framing(raw.points.astype(float), _FILTER)
+        for k, (name, frame) in enumerate(steps):
+            images = _step_images(frame, previous if k else None, limits, view)
             num_removed = len(previous) - len(frame)
-            fraction = words.percent(num_removed / len(previous) if len(previous) else None)
-            text = f"removed {fraction} ({num_removed:,} points), {len(frame):,} are left"
-            if not num_removed and name not in removed:
-                text = f"corrects; {words.count(len(frame), 'point')}"
-            before = counts.get(name, (0, 0))
-            counts[name] = (before[0] + num_removed, before[1] + len(previous))
-            shown.append((name, text, _step_images(frame, previous, limits, framing)))
+            values["steps"].append((name, len(frame), num_removed, images))
+            if k:
+                gone[name] += num_removed
+                reached[name] += len(previous)
             previous = frame
     # Corrections remove nothing.
-    names = [*removed, *(n for n in counts if n not in removed and counts[n][0])]
-    rows = []
-    for name in names:
-        num_removed, num_points = counts.get(name, (0, 0))
-        fraction = words.percent(num_removed / num_points if num_points else None)
-        rows.append((name, words.percent(removed.get(name)), fraction))
-    return {"rows": rows, "steps": shown, "note": note}
+    names = [*removed, *(n for n in gone if n not in removed and gone[n])]
+    fractions = [gone[n] / reached[n] if reached[n] else None for n in names]
+    whole = [removed.get(n) for n in names]
+    return values | {"rows": list(zip(names, whole, fractions, strict=True))}
 
 
 def _step_images(
     frame: Frame,
     previous: Frame | None,
     limits: tuple[float, float],
-    framing: thumbnails.Framing,
+    view: tuple[Float64, float],
 ) -> list[str]:
     """The depth image of a frame, with the pixels removed since the previous one; its points."""
     images = []
     if isinstance(frame, RangeFrame):
         removed = previous.valid & ~frame.valid if isinstance(previous, RangeFrame) else None
         images.append(thumbnails.depth_image(frame, limits, removed, _FILTER[0]))
-    images.append(thumbnails.cloud_image(frame, limits, framing))
+    images.append(thumbnails.cloud_image(frame, limits, _FILTER, view))
     return [thumbnails.data_uri(image) for image in images]
 
 
@@ -283,13 +208,8 @@ def recording(s: Subject) -> Values | None:
     if not frames:
         return None
     ranges = [thumbnails.depth_limits(f) for f in frames if len(f)]
-    low, high = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else (0.0, 1.0)
-    samples = []
-    for frame in frames:
-        framing = thumbnails.Framing.around(frame.points.astype(float), _THUMBNAIL)
-        image = thumbnails.cloud_image(frame, (low, high), framing)
-        samples.append((frame.index, thumbnails.data_uri(image)))
-    note = "Sample views before filtering, from above and to the side."
-    if ranges:
-        note += f" Depth from dark ({words.length(low)}) to bright ({words.length(high)})."
-    return {"samples": samples, "note": note}
+    lows, highs = zip(*ranges, strict=True) if ranges else ((0.0,), (1.0,))
+    limits = min(lows), max(highs)
+    images = [thumbnails.cloud_image(frame, limits, _THUMBNAIL) for frame in frames]
+    samples = [(f.index, thumbnails.data_uri(i)) for f, i in zip(frames, images, strict=True)]
+    return {"samples": samples, "limits": limits if ranges else None}

@@ -7,16 +7,18 @@ from typing import Any
 import numpy as np
 
 from tofuse.apps.report import plots, thumbnails, words
-from tofuse.apps.report.fields import fields, normalized_accuracy
+from tofuse.apps.report.fields import accuracy, fields
 from tofuse.apps.report.packing import pack
-from tofuse.apps.report.scene import RigCameras, Scene, opening_yaw, packed, render
+from tofuse.apps.report.scene import CAMERA_COLORS, opening_yaw, packed, render
 from tofuse.apps.report.subject import OUTER, Subject, Values
-from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole, RayTable
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.fusion import UNKNOWN_M
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import OF_95_PERCENT
+
+_SWITCHED = ("after", "before", "reference", "loops")  # parts of the scene
 
 
 def model(s: Subject) -> Values:
@@ -27,7 +29,11 @@ def model(s: Subject) -> Values:
     displayed = scene.view_rotation(s.R_display_world)
     errors = position_errors(s)
     shown = fields(displayed, errors) if len(scene.points) else []
-    rig = RigCameras.of(s.result.recording.get("rig"), len(s.index))
+    rig = s.result.recording.get("rig")
+    if rig and len(rig["of_frames"]) != len(s.index):
+        rig = None
+    names = rig["cameras"] if rig else ()
+    colors = [CAMERA_COLORS[k % len(CAMERA_COLORS)] for k in range(len(names))]
     color_source = _color_source(s)
     if scene.mesh is not None and scene.surface is not None:
         thinned = words.thinned(len(scene.mesh.faces), len(scene.surface.faces), "triangles")
@@ -37,39 +43,26 @@ def model(s: Subject) -> Values:
         "scene": packed(displayed)
         | {
             "fields": {field.name: field.packed() for field in shown},
-            "frames": _packed_cameras(s, errors, rig),
-            "lens": None if rig is not None else _lens(s),
+            "frames": {
+                "rig": rig and {"colors": colors, "of": pack(np.array(rig["of_frames"], "u1"))},
+                **_packed_cameras(s, errors),
+            },
+            "lens": None if rig else _lens(s),
             "axes": s.R_display_world.tolist(),
         },
         "still": thumbnails.data_uri(render(displayed, yaw=opening_yaw(displayed))),
-        "toggles": _toggles(scene),
+        "has": {
+            "mesh": scene.mesh is not None,
+            "normals": scene.mesh is not None or scene.normals is not None,
+            **{name: len(getattr(scene, name)) for name in _SWITCHED},
+        },
         "colorings": [
             *([("", color_source)] if color_source else []),
             *((field.name, field.label) for field in shown),
         ],
-        "cameras": []
-        if rig is None
-        else [
-            (name, thumbnails.css(color)) for name, color in zip(rig.names, rig.colors, strict=True)
-        ],
+        "cameras": list(zip(names, colors, strict=True)),
         "thinned": thinned,
     }
-
-
-def _toggles(scene: Scene) -> list[tuple[str, str, str, bool]]:
-    """Name, label, colour and initial state of the switches below the view."""
-    has_mesh = scene.mesh is not None
-    has_normals = has_mesh or scene.normals is not None
-    switches = (
-        (has_mesh, ("mesh", "Surface", "", True)),
-        (True, ("points", "Points", "", not has_mesh)),
-        (has_normals, ("peel", "Hide walls seen from behind", "", True)),
-        (len(scene.after), ("after", "Cameras", "#5ab0f5", True)),
-        (len(scene.before), ("before", "Cameras before optimisation", "#f0a03c", False)),
-        (len(scene.reference), ("reference", "Reference trajectory", "#d8dade", False)),
-        (len(scene.loops), ("loops", "Loop closures", "#5fd08a", True)),
-    )
-    return [switch for is_available, switch in switches if is_available]
 
 
 def _color_source(s: Subject) -> str:
@@ -82,7 +75,7 @@ def _color_source(s: Subject) -> str:
     return "Amplitude" if grey else "Colour"
 
 
-def _packed_cameras(s: Subject, errors: Float64, rig: RigCameras | None) -> dict[str, Any]:
+def _packed_cameras(s: Subject, errors: Float64) -> dict[str, Any]:
     """Every frame for the viewer: its index, status, error and poses.
 
     Poses (3, 4) are in the axes of the displayed model, row by row, zeros where there is none;
@@ -91,14 +84,13 @@ def _packed_cameras(s: Subject, errors: Float64, rig: RigCameras | None) -> dict
     records = {r.index: r for r in s.result.diagnostics.frames}
     index = s.index.astype(int)
     statuses = [records[k].status if k in records else "tracked" for k in index.tolist()]
-    error_bytes = np.round(255 * normalized_accuracy(errors)).astype(np.uint8)
+    error_bytes = np.round(255 * accuracy(errors).normalized(errors)).astype(np.uint8)
 
     def displayed(poses: Float64) -> str:
         rows = np.nan_to_num(s.R_display_world @ poses[:, :3]).reshape(len(poses), 12)
         return pack(rows.astype("<f4"))
 
     return {
-        "rig": rig and {"colors": rig.colors, "of": pack(rig.of_frames.astype("u1"))},
         "index": pack(index.astype("<u4")),
         "status": "".join(str(words.STATUSES.index(status)) for status in statuses),
         "errors": pack(error_bytes) if np.isfinite(errors).any() else None,
@@ -142,51 +134,35 @@ def views(s: Subject) -> Values:
     R = s.R_display_world
     truth = None if s.truth is None else s.truth @ R.T
 
-    def drawing(points: Float64, poses: Float64, view: str, name: str) -> tuple[str, str]:
+    def drawing(points: Float64, poses: Float64, view: str, name: str) -> str:
         measured = np.percentile(points, [OUTER, 100 - OUTER], axis=0)
         path, label = poses[:, :3, 3] @ R.T, f"Model, {name}"
-        return plots.model(points, path, truth, view, measured=measured, label=label), name
+        return plots.model(points, path, truth, view, measured=measured, label=label)
 
     points = s.scene.points @ R.T
-    figures = [
-        drawing(points, s.scene.after, "above", "From above"),
-        drawing(points, s.scene.after, "side", "From the side"),
+    shown = [
+        (points, s.scene.after, "above", "From above"),
+        (points, s.scene.after, "side", "From the side"),
     ]
     before = s.result.diagnostics.cloud_before
     if before is not None and len(before):
         earlier = before.points[np.isfinite(before.points).all(1)].astype(float) @ R.T
         name = "From above, before optimisation"
-        figures.insert(0, drawing(earlier, s.scene.before, "above", name))
-    legend = [("after", "", "measured extents")]
-    if len(s.scene.after):
-        legend.append(("ink", "", "camera trajectory (dot: start)"))
-    if truth is not None:
-        legend.insert(0, ("bad", "6 3", "true outline"))
-    angle = float(np.degrees(se3.angle(R)))
-    note = "Axes: right, down and forward of the first camera"
-    if angle >= 0.5:
-        note += f", rotated by {angle:.0f}° so that the model is upright and axis-aligned"
-    sizes = _sizes(s.result.cloud.points @ R.T.astype(np.float32), points, truth)
-    return {
-        "figures": figures,
-        "sizes": sizes,
-        "true_sizes": truth is not None,
-        "dimensions": [(row[0], row[1 if truth is None else 2]) for row in sizes],
-        "legend": legend,
-        "note": f"{note}.",
-    }
-
-
-def _sizes(every: Float32, points: Float64, truth: Float64 | None) -> list[list[str]]:
-    """Extents of the points without outliers, and of every point of the model."""
+        shown.insert(0, (earlier, s.scene.before, "above", name))
+    every = s.result.cloud.points @ R.T.astype(np.float32)
     every = every[np.isfinite(every).all(1)]
-    extents = np.ptp(np.percentile(points, [OUTER, 100 - OUTER], axis=0), axis=0).tolist()
-    rows = []
-    for axis, name in enumerate(("width", "height", "depth")):
-        row = [words.length(extents[axis]), words.length(float(np.ptp(every[:, axis])))]
-        if truth is not None:
-            true_extent = float(np.ptp(truth[:, axis]))
-            row.insert(0, words.length(true_extent))
-            row.insert(2, words.signed_length(extents[axis] - true_extent))
-        rows.append([name, *row])
-    return rows
+    sizes = [
+        np.ptp(np.percentile(points, [OUTER, 100 - OUTER], axis=0), axis=0),
+        np.ptp(every, axis=0),
+        np.zeros(3) if truth is None else np.ptp(truth, axis=0),
+    ]
+    return {
+        "figures": {drawn[-1]: drawing(*drawn) for drawn in shown},
+        "sizes": [
+            (name, *map(float, row))
+            for name, row in zip(("width", "height", "depth"), np.stack(sizes, 1), strict=True)
+        ],
+        "exact": truth is not None,
+        "path": len(s.scene.after),
+        "angle": float(np.degrees(se3.angle(R))),
+    }

@@ -8,7 +8,7 @@ from tofuse.apps.report import plots, words
 from tofuse.apps.report.subject import Subject, Values
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.refinement import Refinement, calibration_check
+from tofuse.engine.refinement import calibration_check
 
 _AXES = ("x (right)", "y (down)", "z (forward)", "rotation")
 
@@ -16,20 +16,9 @@ _AXES = ("x (right)", "y (down)", "z (forward)", "rotation")
 def error(s: Subject) -> Values:
     """Return the error or displacement per axis over frames (figures 5.2, 5.6)."""
     compared = s.reference is not None
-    if compared:
-        title, quantity = "Trajectory error against the reference poses", "error"
-        text = (
-            "Estimated minus reference position along each axis of the first camera, "
-            "both starting at the identity, without further alignment."
-        )
-    else:
-        title, quantity = "Displacement from the first camera", "displacement"
-        text = (
-            "There is no reference for this recording, so this is the displacement relative to the "
-            "first camera: where the camera returned to its start, it is the error."
-        )
+    quantity = "error" if compared else "displacement"
     if int(s.result.has_pose.sum()) < 2:
-        return {"figures": [], "title": title}
+        return {"figures": [], "compared": compared}
     before, after = (_offsets(p, s.reference) for p in (s.sequential, s.result.trajectory))
     bad = s.index[~s.result.has_pose]
     figures = []
@@ -43,34 +32,24 @@ def error(s: Subject) -> Values:
         ]
         label = f"{quantity.capitalize()} in {axis} over frames, before and after optimisation"
         ylabel = f"{axis}, {unit}"
-        figures.append(
-            (plots.lines(s.index, series, label=label, ylabel=ylabel, zero=True, bad=bad), "")
-        )
-    legend = [("before", "6 3", "before optimisation"), ("after", "", "after optimisation")]
-    if len(bad):
-        legend.append(("bad", "x", f"{words.count(len(bad), 'frame')} without a pose"))
+        figures.append(plots.lines(s.index, series, label=label, ylabel=ylabel, zero=True, bad=bad))
     return {
-        "title": title,
-        "text": text,
+        "compared": compared,
         "moved": _moved(s),
         "figures": figures,
-        "legend": legend,
+        "missing": len(bad),
         "rows": [*_rows("Before", before, compared), *_rows("After", after, compared)],
         "uncertainty": _uncertainty(s),
     }
 
 
-def _moved(s: Subject) -> str:
+def _moved(s: Subject) -> tuple[float, int] | None:
+    """The largest displacement by optimisation in m, and its frame; None if not known."""
     displacement = np.linalg.norm(s.result.trajectory[:, :3, 3] - s.sequential[:, :3, 3], axis=1)
     if not np.isfinite(displacement).any():
-        return ""
+        return None
     k = int(np.nanargmax(displacement))
-    if displacement[k] < 1e-6:
-        return "Optimisation changed no pose: the trajectory is that of odometry."
-    return (
-        f"Optimisation moved poses by up to {words.length(float(displacement[k]))}, "
-        f"most at frame {int(s.index[k])}. The 3D view can show the cameras before it."
-    )
+    return float(displacement[k]), int(s.index[k])
 
 
 def _offsets(poses: Float64, reference: Float64 | None) -> Float64:
@@ -94,7 +73,7 @@ def _offsets(poses: Float64, reference: Float64 | None) -> Float64:
     return offsets
 
 
-def _rows(name: str, offsets: Float64, compared: bool) -> list[list[str]]:
+def _rows(name: str, offsets: Float64, compared: bool) -> list[tuple[str, Float64]]:
     """The errors of the last frame, rms and largest: per axis, of the position, of the rotation."""
     valid = np.abs(offsets[np.isfinite(offsets).all(1)])
     if len(valid) == 0:
@@ -107,17 +86,10 @@ def _rows(name: str, offsets: Float64, compared: bool) -> list[list[str]]:
     }
     if not compared:
         del kinds["rms"]
-    return [
-        [
-            f"{name}, {kind}",
-            *(words.length(float(v)) for v in row[:4]),
-            f"{np.degrees(row[4]):.2f}°",
-        ]
-        for kind, row in kinds.items()
-    ]
+    return [(f"{name}, {kind}", row) for kind, row in kinds.items()]
 
 
-def _uncertainty(s: Subject) -> list[tuple[str, str]]:
+def _uncertainty(s: Subject) -> list[str]:
     """Plots of the pose uncertainty over frames: one sigma in the worst direction."""
     C = np.full((len(s.index), 6, 6), np.nan)
     for k, record in enumerate(s.result.diagnostics.frames[: len(C)]):
@@ -130,36 +102,24 @@ def _uncertainty(s: Subject) -> list[tuple[str, str]]:
     sigma[bounded] = se3.largest_sigmas(C[bounded]) * [1000.0, 180 / np.pi]
     sigma[:, 1] = np.minimum(sigma[:, 1], 180.0)
     return [
-        (
-            plots.lines(
-                s.index,
-                [(sigma[:, k], plots.AFTER, "-")],
-                label=f"Standard deviation of the {quantity} over frames",
-                ylabel=f"{quantity}, {unit}",
-                floor=True,
-            ),
-            "",
+        plots.lines(
+            s.index,
+            [(sigma[:, k], plots.AFTER, "-")],
+            label=f"Standard deviation of the {quantity} over frames",
+            ylabel=f"{quantity}, {unit}",
+            floor=True,
         )
         for k, (quantity, unit) in enumerate((("position", "mm"), ("rotation", "degrees")))
     ]
 
 
 def optimisation(s: Subject) -> Values:
-    """Return the plot of the objective (figure 5.3), and the outcome of the optimiser as text."""
+    """Return the plot of the objective (figure 5.3), and the outcome of the optimiser."""
     d = s.result.diagnostics
-    sentences = []
-    if len(d.parts) > 1:
-        sentences.append(f"The pose graph has {len(d.parts)} disconnected parts.")
-    if any(p.before > 0 and not p.improved for p in d.parts):
-        sentences.append("The optimiser did not improve on the initial poses.")
-    sentences += [f"{prior.text[0].upper()}{prior.text[1:]}." for prior in d.priors]
-    texts = [" ".join(sentences)]
-    if d.refinement is not None and d.refinement.views:
-        texts += [_refined(d.refinement), _camera_check(d.refinement)]
+    check = d.refinement and d.refinement.calibration_check
     values = np.array(d.objective, float)
     finite = values[np.isfinite(values)]
-    figures: list[tuple[str, str]] = []
-    text = ""
+    figures, text = [], ""
     if len(finite):
         text = f"From {finite[0]:.4g} to {finite[-1]:.4g}"
         text += f" in {words.count(len(values) - 1, 'iteration')}."
@@ -172,56 +132,10 @@ def optimisation(s: Subject) -> Values:
             log=True,
             size=(480, 240),
         )
-        figures.append((svg, ""))
-    return {"figures": figures, "text": text, "texts": [text for text in texts if text]}
-
-
-def _refined(refinement: Refinement) -> str:
-    """The outcome of the global refinement as text."""
-    refined = (
-        f"Global refinement over {words.count(refinement.views, 'view')} in "
-        f"{words.count(refinement.pairs, 'overlapping pair')}. "
-    )
-    support = " to ".join(words.percent(value) for value in refinement.support[:2])
-    if refinement.kept:
-        return (
-            f"{refined}Poses moved by up to {words.length(refinement.moved_m)} and "
-            f"{np.degrees(refinement.moved_rad):.2f}°, and consistency rose from {support}."
-        )
-    if refinement.pairs:
-        return f"{refined}Consistency fell from {support}: it was discarded."
-    return "No two views overlap enough for a global refinement."
-
-
-def _camera_check(refinement: Refinement) -> str:
-    """The check of the camera's calibration as text."""
-    sentences = []
-    if refinement.errors:
-        errors_text = [
-            f"{name} {words.signed_length(value)}"
-            if name == "offset"
-            else f"{name} {100 * value:+.1f} %".replace("-", "−")
-            for name, value in refinement.errors.items()
-        ]
-        sentences.append(f"Calibration errors were estimated jointly: {', '.join(errors_text)}.")
-    check = refinement.calibration_check
-    if check is None:
-        return " ".join(sentences)
-    if check.errors:
-        verdict = "This is not significant."
-        if check.alarm:
-            verdict = "Check the calibration."
-        elif check.unconfirmed:
-            verdict = "The stated accuracy includes its effect."
-        correction = calibration_check.proposal(check.errors, check.best)
-        sentences += [f"Overlapping views would be more consistent with {correction}.", verdict]
-    elif not refinement.errors:
-        sentences.append("No evidence of errors of the intrinsics or of the range.")
-    if check.gap is not None:
-        gap, (m, rad), (m_after, rad_after) = check.gap, check.gap.before, check.gap.after
-        sentences.append(
-            f"Odometry drift over loop {gap.i}–{gap.j} is {words.length(m)}, "
-            f"{np.degrees(rad):.1f}°; with this correction {words.length(m_after)}, "
-            f"{np.degrees(rad_after):.1f}°."
-        )
-    return " ".join(sentences)
+        figures.append(svg)
+    return {
+        "figures": figures,
+        "text": text,
+        "not_improved": any(p.before > 0 and not p.improved for p in d.parts),
+        "proposal": check and check.errors and calibration_check.proposal(check.errors, check.best),
+    }

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from tofuse._version import __version__
 from tofuse.apps.report import (
@@ -55,7 +53,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         ("filters", "Filters", section_frames.filters),
         ("loops", "Loop closures", section_frames.loops),
         ("recording", "Recording", section_frames.recording),
-        ("timings", "Time", _timings),
+        ("timings", "Time", lambda _: {}),
         ("settings", "Settings", _settings),
     )
     # Simplifying the surface takes as long as all plots, and releases the interpreter lock.
@@ -65,77 +63,34 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         shown = [(name, title) for name, title, _ in listed if contents[name] is not None]
         return {
             "title": extras.title,
-            "subtitle": _subtitle(result),
+            "result": result,
             "contents": [("model", "Model"), *shown, ("reading", "How to read this")],
             **model.result(),
             **contents,
         }
 
 
-def _subtitle(result: Reconstruction) -> str:
-    parts = [words.count(len(result.diagnostics.frames), "frame")]
-    if name := result.recording.get("format"):
-        parts.append(f"format {name}")
-    if method := result.config.get("method"):
-        parts.append(f"method {method}")
-    return ", ".join([*parts, f"tofuse {__version__}"])
-
-
 def _verdict(s: Subject) -> Values:
-    d = s.result.diagnostics
+    d, a = s.result.diagnostics, s.result.diagnostics.accuracy
+    frames = [a.unbounded[0], a.unbounded[-1]] if a.unbounded else []
+    if a.worst is not None and not frames:
+        frames = [a.worst.frame, a.worst.frame]
     findings = words.findings(d.reasons, len(d.frames))
-    head, _, tail = words.verdict_sentence(s.result, findings).partition(":")
     return {
         "headline": s.extras.headline,
-        "card": _card(s.result),
+        "bound": accuracy_card.bound(a, s.result.cloud.diagonal_m).removeprefix("accuracy "),
+        "weakest": accuracy_card.weakest_frame(a),
+        "frames": frames,
         "card_tone": d.verdict if d.accuracy.assessed else "",
         "tone": d.verdict,
-        "head": head + ":",
-        "tail": tail,
+        "posed": int(s.result.has_pose.sum()),
+        "readable": sum(f.status != "skipped" for f in d.frames),
+        "decisive": any(f["level"] == d.verdict for f in findings),
         "findings": findings,
     }
 
 
-def _card(result: Reconstruction) -> list[tuple[str, str, str]]:
-    """Name, value and frame ranges of each line of the accuracy card."""
-    d, a = result.diagnostics, result.diagnostics.accuracy
-    readable = sum(f.status != "skipped" for f in d.frames)
-    closures = sum(p.accepted for p in d.loops)
-    covered = f"{int(result.has_pose.sum()):,} of {words.count(readable, 'frame')}"
-    lines = [
-        ("Accuracy", accuracy_card.bound(a, result.cloud.diagonal_m).removeprefix("accuracy "), ""),
-        ("Coverage", f"{covered}, {words.count(closures, 'loop closure')}", ""),
-    ]
-    if weakest := accuracy_card.weakest_frame(a):
-        frames = [a.unbounded[0], a.unbounded[-1]] if a.unbounded else []
-        if a.worst is not None and not frames:
-            frames = [a.worst.frame, a.worst.frame]
-        lines.append(("Weakest", weakest, json.dumps([frames])))
-    return lines
-
-
-def _timings(s: Subject) -> Values:
-    durations = s.result.diagnostics.seconds
-    total = sum(durations.values())
-    frames = len(s.result.diagnostics.frames)
-    rows = [
-        (name, words.seconds(value), f"{100 * value / total if total else 0:.1f}")
-        for name, value in durations.items()
-    ]
-    per_frame = f"{words.seconds(total / frames)} per frame" if frames else ""
-    return {"rows": rows, "total": words.seconds(total), "per_frame": per_frame}
-
-
 def _settings(s: Subject) -> Values:
-    result = s.result
-    recording = {k: v for k, v in result.recording.items() if k not in ("warnings", "findings")}
-    source = {"version": __version__, **recording, "seed": result.seed, "threads": result.threads}
-    return {
-        "warnings": [str(w) for w in result.recording.get("warnings", ())],
-        "input": _pretty(source),
-        "config": _pretty(result.config),
-    }
-
-
-def _pretty(data: Any) -> str:
-    return json.dumps(data, indent=2, ensure_ascii=False, default=str)
+    recording = {k: v for k, v in s.result.recording.items() if k not in ("warnings", "findings")}
+    run = {"seed": s.result.seed, "threads": s.result.threads}
+    return {"version": __version__, **recording, **run}

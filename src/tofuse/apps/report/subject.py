@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import permutations, product
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.scene import Scene, finite_poses, make_scene
@@ -17,7 +17,7 @@ Values = dict[str, Any]
 
 OUTER = 0.25  # percent of the points at each end that the measured size excludes
 ROWS = 150  # maximum in a table
-_ANGLES = np.radians(np.arange(0, 90, 0.5))
+_ANGLES = np.arange(-44.5, 45.5, 0.5)[:, None]  # degrees
 _MIN_BOX_FILL = 0.9  # minimum fraction of a box in the hull of points that have its shape
 _MAX_SAMPLES = 5000  # maximum number of sampled points
 
@@ -71,10 +71,10 @@ class Subject:
         truth_points = truth.astype(float) if truth is not None and len(truth) else None
         R_up_world = np.diag([1.0, -1.0, -1.0]) @ result.T_up_world[:3, :3]
         if truth_points is None:
-            R_display_up = _upright_axes(scene.points @ R_up_world.T, OUTER)
+            R = _upright_axes(scene.points @ R_up_world.T, OUTER) @ R_up_world
         else:
-            R_display_up = _box_axes(truth_points @ R_up_world.T)
-        R = R_display_up @ R_up_world
+            R_up_world = _levelled(truth_points @ R_up_world.T) @ R_up_world
+            R = _upright_axes(truth_points @ R_up_world.T, 0.0) @ R_up_world
         return cls(result, extras, index, sequential, reference, scene, truth_points, R)
 
 
@@ -86,6 +86,22 @@ def _row_indices(result: Reconstruction) -> Float64:
         if len(candidates) == rows:
             return np.array([r.index for r in candidates], float)
     return np.arange(rows, dtype=float)
+
+
+def _levelled(points: Float64) -> Float64:
+    """Return the rotation (3, 3) that makes the floor of an exact box level, with y vertical."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(points)
+    except QhullError:  # coplanar points
+        return np.eye(3)
+    normals = hull.equations[:, :3]
+    floor = normals[normals[:, 1].argmax()]
+    R = Rotation.align_vectors([[0.0, 1.0, 0.0]], [floor])[0].as_matrix()
+    extents = np.ptp(points @ (_upright_axes(points @ R.T, 0.0) @ R).T, axis=0)
+    is_box = hull.volume > _MIN_BOX_FILL * extents.prod()
+    return np.asarray(R if is_box else np.eye(3), np.float64)
 
 
 def _upright_axes(points: Float64, outer: float) -> Float64:
@@ -100,63 +116,12 @@ def _upright_axes(points: Float64, outer: float) -> Float64:
 
     Returns
     -------
-    (3, 3) rotation; its rows are the model's axes, as close to x, y, z as possible.
+    (3, 3) rotation, by less than 45 degrees; its rows are the model's axes.
     """
     if len(points) < 3:
         return np.eye(3)
     sampled = points[:: -(-len(points) // _MAX_SAMPLES)]
-    axes = _rotated_axes(np.array([0.0, 1.0, 0.0]))
-    coordinates = np.einsum("aki,ni->akn", axes[:, ::2], sampled)
+    rotations = Rotation.from_euler("y", _ANGLES, degrees=True).as_matrix()
+    coordinates = np.einsum("aki,ni->akn", rotations[:, ::2], sampled)
     extents = np.ptp(np.percentile(coordinates, [outer, 100 - outer], axis=2), axis=0)
-    return _nearest_axes(axes[int(extents.prod(1).argmin())])
-
-
-def _box_axes(points: Float64) -> Float64:
-    """Return the axes of the smallest box around exact points, with one side on a hull face.
-
-    Like `_upright_axes`, but any direction may be vertical if the points have the shape of a box;
-    otherwise, and for coplanar points, only rotations about y are tried.
-    """
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        hull = ConvexHull(points)
-    except (QhullError, ValueError):
-        return _upright_axes(points, 0.0)
-    corners = points[hull.vertices]
-    faces = np.unique(np.round(np.abs(hull.equations[:, :3]), 2), axis=0, return_index=True)[1]
-    best, min_volume = np.eye(3), np.inf
-    for face in faces[:400]:
-        axes = _rotated_axes(hull.equations[face, :3])
-        volumes = np.ptp(axes @ corners.T, axis=2).prod(1)
-        k = int(volumes.argmin())
-        # Earlier boxes are preferred to ones that are hardly smaller.
-        if volumes[k] < (1 - 1e-6) * min_volume:
-            best, min_volume = axes[k], float(volumes[k])
-    if hull.volume < _MIN_BOX_FILL * min_volume:
-        return _upright_axes(points, 0.0)
-    return _nearest_axes(best)
-
-
-def _rotated_axes(vertical: Float64) -> Float64:
-    """Return (A, 3, 3) axes with the second along `vertical`, rotated about it."""
-    vertical = vertical / np.linalg.norm(vertical)
-    helper = np.eye(3)[int(np.abs(vertical).argmin())]
-    first = np.cross(helper, vertical)
-    first /= np.linalg.norm(first)
-    third = np.cross(first, vertical)
-    c, s = np.cos(_ANGLES)[:, None], np.sin(_ANGLES)[:, None]
-    a = c * first + s * third
-    b = -s * first + c * third
-    return np.stack([a, np.broadcast_to(vertical, a.shape), b], axis=1)
-
-
-def _nearest_axes(axes: Float64) -> Float64:
-    """Reorder and flip rows so that they are right-handed and closest to x, y and z."""
-    best, max_trace = np.eye(3), -np.inf
-    for order in permutations(range(3)):
-        for signs in product((1, -1), repeat=3):
-            R = axes[list(order)] * np.array(signs)[:, None]
-            if np.linalg.det(R) > 0 and np.trace(R) > max_trace:
-                best, max_trace = R, float(np.trace(R))
-    return best
+    return np.asarray(rotations[int(extents.prod(1).argmin())], np.float64)

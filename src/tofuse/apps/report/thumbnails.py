@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
+from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.engine.geometry import se3
 
@@ -110,12 +109,18 @@ def depth_image(
     width
         Maximum width; wider images are subsampled.
     """
-    low, high = limits
     step = 1 if width is None else -(-frame.z.shape[1] // width)
-    image = viridis((frame.z[::step, ::step].astype(float) - low) / (high - low))
-    image[~frame.valid[::step, ::step]] = NO_MEASUREMENT
+    image = depth_colors(frame.z[::step, ::step], frame.valid[::step, ::step], limits)
     if removed is not None:
         image[removed[::step, ::step]] = REMOVED
+    return image
+
+
+def depth_colors(z: NDArray[np.floating], valid: Bool, limits: tuple[float, float]) -> UInt8:
+    """Return the colours (H, W, 3) of depths (H, W) in m, grey where they are not valid."""
+    low, high = limits
+    image = viridis((z.astype(float) - low) / (high - low))
+    image[~valid] = NO_MEASUREMENT
     return image
 
 
@@ -152,52 +157,49 @@ def splat(
     distance
         Of the eye from the view's origin in m; None for a parallel projection.
     radius
-        Pixels along the side of a square.
+        Pixels along the side of a square, whose upper left one contains the point.
 
     Returns
     -------
-    (H, W, 4) RGBA, transparent where there is no point.
+    (H, W, 4) RGBA, transparent where there is no point. Of equally near points the last is seen.
     """
-    row = nearest_points(points, T_view_world, size, scale=scale, distance=distance, side=radius)
-    covered = row >= 0
-    image = np.zeros((*row.shape, 4), np.uint8)
-    image[covered, :3] = colors[row[covered]]
-    image[covered, 3] = 255
+    width, height = size
+    pixels, z = project(points, T_view_world, size, scale=scale, distance=distance)
+    u, v = np.rint(pixels).T
+    shown = (u >= 0) & (v >= 0) & (u < width) & (v < height) & (z > -np.inf)
+    rows = np.flatnonzero(shown)
+    rows = rows[np.argsort(-z[rows], kind="stable")]
+    # Squares may reach beyond the image, to the right and below.
+    order = np.full((height + radius, width + radius), -1)
+    down, right = np.divmod(np.arange(radius**2), radius)
+    squares = v[rows, None].astype(int) + down, u[rows, None].astype(int) + right
+    np.maximum.at(order, squares, np.arange(len(rows))[:, None])
+    order = order[:height, :width]
+    image = np.zeros((height, width, 4), np.uint8)
+    image[order >= 0, :3] = colors[rows[order[order >= 0]]]
+    image[order >= 0, 3] = 255
     return image
 
 
-def nearest_points(
+def project(
     points: Float64,
     T_view_world: Float64,
     size: tuple[int, int],
     *,
     scale: float,
     distance: float | None,
-    side: int,
-) -> Intp:
-    """Return the row (H, W) of the nearest point at each pixel, the last of equally near ones.
+) -> tuple[Float64, Float64]:
+    """Return pixels (N, 2) of points (N, 3) and their depths (N,), which are -inf behind the eye.
 
-    -1 where there is none. Parameters as for `splat`; each point covers a square of `side` pixels,
-    and is in its upper left one.
+    Parameters as for `splat`.
     """
-    width, height = size
     x, y, z = se3.transform(T_view_world, points).T
     if distance is not None:
         z = z + distance
-        scale = scale * distance / np.maximum(z, _MIN_DEPTH * distance)
-    u, v = np.rint(0.5 * width + scale * x), np.rint(0.5 * height + scale * y)
-    shown = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    if distance is not None:
-        shown &= z > _MIN_DEPTH * distance
-    rows = np.flatnonzero(shown)
-    rows = rows[np.argsort(-z[rows], kind="stable")]
-    # Squares may reach beyond the image, to the right and below.
-    order = np.full((height + side, width + side), -1)
-    down, right = np.divmod(np.arange(side * side), side)
-    squares = v[rows, None].astype(int) + down, u[rows, None].astype(int) + right
-    np.maximum.at(order, squares, np.arange(len(rows))[:, None])
-    order = order[:height, :width]
-    return np.where(order >= 0, np.append(rows, 0)[order], -1)
+        nearest = _MIN_DEPTH * distance
+        scale = scale * distance / np.maximum(z, nearest)
+        z = np.where(z > nearest, z, -np.inf)
+    return np.stack([0.5 * size[0] + scale * x, 0.5 * size[1] + scale * y], 1), z
 
 
 def view_rotation(yaw: float, pitch: float) -> Float64:
@@ -208,52 +210,49 @@ def view_rotation(yaw: float, pitch: float) -> Float64:
     return about_x @ about_y
 
 
-@dataclass(frozen=True, eq=False)
-class Framing:
-    """A parallel projection that shows all but the outermost points.
+def framing(
+    points: Float64, size: tuple[int, int], *, yaw: float = 0.7, pitch: float = 0.45
+) -> tuple[Float64, float]:
+    """Return a parallel projection that shows all but the outermost points.
 
-    Attributes
+    Parameters
     ----------
-    T_view_world
-        (4, 4).
-    scale
-        Pixels per metre.
+    points
+        (N, 3) m.
     size
-        Width and height in pixels.
+        Width and height of the picture in pixels.
+    yaw, pitch
+        Direction of the view, from above and to the side, rad.
+
+    Returns
+    -------
+    T_view_world (4, 4), and pixels per metre.
     """
-
-    T_view_world: Float64
-    scale: float
-    size: tuple[int, int]
-
-    @classmethod
-    def around(
-        cls, points: Float64, size: tuple[int, int], *, yaw: float = 0.7, pitch: float = 0.45
-    ) -> Framing:
-        """Frame (N, 3) points, seen from above and to the side."""
-        R = view_rotation(yaw, pitch)
-        T = np.eye(4)
-        T[:3, :3] = R
-        if len(points) == 0:
-            return cls(T, 1.0, size)
-        view = points @ R.T
-        low, high = np.percentile(view, [0.2, 99.8], axis=0)
-        T[:3, 3] = -(low + high) / 2
-        extent = np.maximum(high - low, 1e-6)
-        return cls(T, float(0.9 * min(size[0] / extent[0], size[1] / extent[1])), size)
+    T = np.eye(4)
+    T[:3, :3] = view_rotation(yaw, pitch)
+    if len(points) == 0:
+        return T, 1.0
+    low, high = np.percentile(points @ T[:3, :3].T, [0.2, 99.8], axis=0)
+    T[:3, 3] = -(low + high) / 2
+    extent = np.maximum(high - low, 1e-6)
+    return T, float(0.9 * min(size[0] / extent[0], size[1] / extent[1]))
 
 
-def cloud_image(frame: Frame, limits: tuple[float, float], framing: Framing) -> UInt8:
-    """Render a view's points in the colours of `depth_image`, (H, W, 4) RGBA."""
+def cloud_image(
+    frame: Frame,
+    limits: tuple[float, float],
+    size: tuple[int, int],
+    view: tuple[Float64, float] | None = None,
+) -> UInt8:
+    """Render a view's points in the colours of `depth_image`, (H, W, 4) RGBA.
+
+    `view` is the `framing`; None: its own.
+    """
     points = frame.points.astype(float)
     is_range = isinstance(frame, RangeFrame)
     depth = points[:, 2] if is_range else np.linalg.norm(points - frame.origin, axis=1)
     low, high = limits
-    return splat(
-        points,
-        viridis((depth - low) / (high - low)),
-        framing.T_view_world,
-        framing.size,
-        scale=framing.scale,
-        radius=1 if len(points) > 60_000 else 2,
-    )
+    T, scale = view or framing(points, size)
+    radius = 1 if len(points) > 60_000 else 2
+    colors = viridis((depth - low) / (high - low))
+    return splat(points, colors, T, size, scale=scale, radius=radius)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 
 from tofuse.engine.frames import frame_ranges
-from tofuse.engine.results import Reason, Reconstruction, verdicts
+from tofuse.engine.results import Reason, verdicts
 
 STATUSES = ("tracked", "predicted", "lost", "skipped")
 
@@ -74,44 +76,15 @@ def runs(items: Iterable[tuple[int, str, str]]) -> list[tuple[int, int, int, str
     Returns (first index, last index, count, status, reason). Items that follow each other count as
     consecutive even if their indices have gaps, as in a recording read with a stride.
     """
-    merged: list[tuple[int, int, int, str, str]] = []
-    for index, status, reason in items:
-        if merged and merged[-1][3:] == (status, reason):
-            first, _, number, _, _ = merged[-1]
-            merged[-1] = (first, index, number + 1, status, reason)
-        else:
-            merged.append((index, index, 1, status, reason))
-    return merged
+    groups = (list(group) for _, group in groupby(items, itemgetter(1, 2)))
+    return [(group[0][0], group[-1][0], len(group), *group[0][1:]) for group in groups]
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A reason for the verdict in the report.
+def findings(reasons: Sequence[Reason], total: int) -> list[dict[str, Any]]:
+    """Return the reasons as findings of the report, the most severe first.
 
-    Attributes
-    ----------
-    level
-        "failed", "degraded" or "note".
-    text
-        The finding, with its frames where that adds information.
-    ranges
-        The frames.
-    advice
-        What the user can do; may be empty.
-    where
-        The frames as text; empty if they are all frames.
-    """
-
-    level: str
-    text: str
-    ranges: tuple[frame_ranges.Range, ...]
-    advice: str
-
-    where: str = ""
-
-
-def findings(reasons: Sequence[Reason], total: int) -> list[Finding]:
-    """Return the reasons as findings, the most severe first.
+    Each has its level ("failed", "degraded" or "note"), text, frame ranges, advice, and the frames
+    as text; empty if they are all frames.
 
     Parameters
     ----------
@@ -123,11 +96,15 @@ def findings(reasons: Sequence[Reason], total: int) -> list[Finding]:
     listed = []
     for reason in verdicts.ranked(reasons):
         level, meaning = verdicts.REASONS[reason.code]
-        text = _with_frames(reason, total) if reason.text.strip() else meaning
         is_subset = 0 < frame_ranges.size(reason.ranges) < total
-        where = frame_ranges.in_words(reason.ranges).replace("-", "–") if is_subset else ""
         listed.append(
-            Finding(level, text, reason.ranges, verdicts.ADVICE.get(reason.code, ""), where)
+            {
+                "level": level,
+                "text": _with_frames(reason, total) if reason.text.strip() else meaning,
+                "ranges": reason.ranges,
+                "advice": verdicts.ADVICE.get(reason.code, ""),
+                "where": frame_ranges.in_words(reason.ranges).replace("-", "–") * is_subset,
+            }
         )
     return listed
 
@@ -153,19 +130,3 @@ def sentence(text: str) -> str:
     if first and first[0].isalpha():  # a path or a number stays as it is
         text = text[0].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) or not text else text + "."
-
-
-def verdict_sentence(result: Reconstruction, findings: Sequence[Finding]) -> str:
-    """Return the verdict in a sentence or two."""
-    d = result.diagnostics
-    readable = sum(f.status != "skipped" for f in d.frames)
-    posed = int(result.has_pose.sum())
-    poses_text = f"{posed} of {readable} readable frames have a pose"
-    if posed == readable:
-        poses_text = f"all {posed} frames have a pose" if posed > 1 else "the only frame has a pose"
-    decisive = [f for f in findings if f.level == d.verdict]
-    if d.verdict == "good":
-        return f"Good: {poses_text}. No problems found."
-    if d.verdict == "degraded":
-        return "Degraded: use this model with care."
-    return f"Failed: do not rely on this model.{'' if decisive else f' {poses_text}.'}"

@@ -1,8 +1,8 @@
 """The output folder of a run, the same for everything that writes or reads a result.
 
 `folders` knows which files belong to it and replaces an earlier result only as a whole; `run_json`
-is the format of `run.json`; `reopening` opens the recordings again that a result refers to. What
-`write_result` writes, `load_result` reads back.
+is the format of `run.json`; `integrity` says whether a result was edited; `reopening` opens the
+recordings again that a result refers to. What `write_result` writes, `load_result` reads back.
 """
 
 from typing import TYPE_CHECKING
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.apps.results import folders, reopening, run_json
+    from tofuse.apps.results import folders, integrity, reopening, run_json
     from tofuse.apps.results.loading import load_result, read_cloud, read_mesh
     from tofuse.apps.results.output import CHANGE_COLORS, write_result
 

@@ -20,29 +20,10 @@ TRACKED = f"{atomic.UNFINISHED}tracked.npz"  # tracked frames of an interrupted 
 RECORDING = "recording"  # written by `tofuse demo` next to its result, and kept with it
 
 # Files of a result, by `tofuse run` and `tofuse export`; all of them are removed with it.
-FILES = (
-    "trajectory.txt",
-    "pose_graph.g2o",
-    "cloud.ply",
-    "mesh.ply",
-    "mesh.glb",
-    "changes.ply",
-    "mesh.obj",
-    "mesh.mtl",
-    "mesh.png",
-    "mesh.jpg",
-    "mesh.stl",
-    "report.html",
-    "run.json",
-    "judge.json",
-    "rig_trajectory.txt",
-    "cloud.pcd",
-    "cloud.las",
-    "cloud.laz",
-    "cloud.e57",
-    "mesh.gltf",
-    "trajectory.kitti.txt",
-    "trajectory.log",
+_FILE = (
+    r"trajectory\.(txt|kitti\.txt|log)|rig_trajectory\.txt|pose_graph\.g2o|changes\.ply|"
+    r"cloud\.(ply|pcd|las|laz|e57)|mesh\.(ply|glb|gltf|obj|mtl|png|jpg|stl)|"
+    r"report\.html|(run|judge)\.json"
 )
 # The model of a separate component is in its own folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
@@ -268,7 +249,6 @@ def component_number(folder: Path) -> int | None:
     return int(folder.name.split("-")[1]) if _COMPONENT.fullmatch(folder.name) else None
 
 
-_FILE = "|".join(map(re.escape, FILES))
 _EXPORTED = rf"nerfstudio/(transforms\.json|points\.ply|{_IMAGES})|colmap/{_IMAGES}"
 RESULT = Contract(
     re.compile(rf"({_COMPONENT.pattern}/)?({_FILE})|{_EXPORTED}", re.ASCII),

@@ -34,9 +34,9 @@ _edits_accepted: ContextVar[bool] = ContextVar("edits_accepted", default=False)
 
 
 @contextmanager
-def accepting_edits(accepted: bool = True) -> Iterator[None]:
-    """Read results inside the block although their files were edited, if `accepted`."""
-    token = _edits_accepted.set(accepted or _edits_accepted.get())
+def accepting_edits() -> Iterator[None]:
+    """Read results inside the block although their files were edited."""
+    token = _edits_accepted.set(True)
     try:
         yield
     finally:

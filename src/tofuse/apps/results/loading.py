@@ -117,20 +117,21 @@ def _part(data: dict[str, Any]) -> GraphPart:
     return GraphPart(**{name: data[name] for name in names})
 
 
-def _accuracy(data: dict[str, Any]) -> pose_accuracy.Accuracy:
-    def bound(value: float | None) -> float:
-        return np.inf if value is None else float(value)
+def _bound(value: float | None) -> float:
+    return np.inf if value is None else float(value)
 
+
+def _accuracy(data: dict[str, Any]) -> pose_accuracy.Accuracy:
     worst = data["worst"]
+    if worst:
+        bounds = _bound(worst["position_m"]), _bound(worst["rotation_rad"])
+        worst = pose_accuracy.WorstFrame(worst["frame"], *bounds)
     return pose_accuracy.Accuracy(
-        bound(data["position_m"]),
-        bound(data["rotation_rad"]),
-        bound(data["relative"]),
+        _bound(data["position_m"]),
+        _bound(data["rotation_rad"]),
+        _bound(data["relative"]),
         data["assessed"],
-        worst
-        and pose_accuracy.WorstFrame(
-            worst["frame"], bound(worst["position_m"]), bound(worst["rotation_rad"])
-        ),
+        worst,
         tuple(data["unbounded"]),
         tuple(data["by_odometry"]),
     )
@@ -139,16 +140,14 @@ def _accuracy(data: dict[str, Any]) -> pose_accuracy.Accuracy:
 def _calibration(data: dict[str, Any] | None) -> SelfCalibration | None:
     if data is None:
         return None
-    bounds = (data["stated_bound_m"], data["corrected_bound_m"])
-    before, after = (np.inf if b is None else float(b) for b in bounds)
     return SelfCalibration(
         data["focal"],
         data["offset_m"],
-        data.get("center_x", 0.0),
-        data.get("center_y", 0.0),
-        data.get("distortion", 0.0),
+        data["center_x"],
+        data["center_y"],
+        data["distortion"],
         data["sigma"],
-        (before, after),
+        (_bound(data["stated_bound_m"]), _bound(data["corrected_bound_m"])),
     )
 
 

@@ -122,12 +122,8 @@ def _fields(record: Any, *names: str) -> dict[str, Any]:
 
 def _frame(f: FrameRecord, result: Reconstruction) -> dict[str, Any]:
     covariance = None if f.covariance is None else f.covariance.ravel()
-    return {**vars(f), "covariance": covariance, "session": _session_of(f.index, result)}
-
-
-def _session_of(index: int, result: Reconstruction) -> int | None:
-    """Number of the session that a frame belongs to; None where there is only one recording."""
-    return next((k for k, session in enumerate(result.sessions) if session.has(index)), None)
+    session = next((k for k, session in enumerate(result.sessions) if session.has(f.index)), None)
+    return {**vars(f), "covariance": covariance, "session": session}
 
 
 def frame_clock(folder: Path) -> tuple[Float64, Intp] | None:
@@ -178,7 +174,14 @@ def _suspicion(check: calibration_check.CalibrationCheck | None) -> dict[str, An
     """The check of the camera's calibration; None where it was not made."""
     if check is None:
         return None
-    gap = check.gap
+    gap = check.gap and {
+        "i": check.gap.i,
+        "j": check.gap.j,
+        "gap_m": check.gap.before[0],
+        "gap_rad": check.gap.before[1],
+        "calibrated_gap_m": check.gap.after[0],
+        "calibrated_gap_rad": check.gap.after[1],
+    }
     return {
         "alarm": check.alarm,
         "camera": check.errors,
@@ -186,16 +189,7 @@ def _suspicion(check: calibration_check.CalibrationCheck | None) -> dict[str, An
         "focal_sigma": check.focal_sigma,
         "focal_motion_m": 0.01 * check.motion["focal"][0] if check.motion else None,
         "support": check.support,
-        "loop": None
-        if gap is None
-        else {
-            "i": gap.i,
-            "j": gap.j,
-            "gap_m": gap.before[0],
-            "gap_rad": gap.before[1],
-            "calibrated_gap_m": gap.after[0],
-            "calibrated_gap_rad": gap.after[1],
-        },
+        "loop": gap,
     }
 
 
@@ -206,15 +200,11 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
     if isinstance(value, np.ndarray):
-        is_finite = value.dtype.kind in "iub" or (
-            value.dtype.kind == "f" and np.isfinite(value).all()
-        )
-        return value.tolist() if is_finite else plain(value.tolist())
+        has_gaps = value.dtype.kind == "f" and not np.isfinite(value).all()
+        return plain(value.tolist()) if has_gaps else value.tolist()
     if isinstance(value, np.generic):
         return plain(value.item())
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def read_run_json(path: str | Path) -> dict[str, Any]:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tofuse.apps.report import thumbnails, words
-from tofuse.apps.viewer.coverage import Coverage
-from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.apps.report import scene, thumbnails
+from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.results import FrameRecord
 
 if TYPE_CHECKING:
@@ -28,9 +25,6 @@ _CLOUDS = 120  # views shown; beyond, every second one is removed
 _MIN_DISTANCE, _MIN_ANGLE = 0.15, np.radians(8.0)  # m and rad between views that are shown
 _UPDATE_PERIOD = 0.3  # s between updates of the current frame
 _IMAGE_WIDTH = 240  # px
-_RECOLOR_PERIOD = 2.0  # s between updates of all colours
-_CELL_FRACTION = 0.015  # edge of a coverage cell, as a fraction of the first view's distance
-_COLOR_RATIO = 10.0  # ratio of the colour bar's ends to its middle, the median
 
 
 class LiveView:
@@ -38,35 +32,21 @@ class LiveView:
 
     It copies a small part of each view, so that the job is hardly slowed down and not influenced.
     It is called from one thread at a time, and raises no error because of a browser.
-
-    Attributes
-    ----------
-    first_seconds
-        Time until the first view was shown, s; None before.
     """
 
     def __init__(self, server: ViserServer) -> None:
         self._server = server
         self._shown: list[tuple[Float64, Any]] = []
-        # Points and colours of the shown views.
-        self._cloud_data: dict[str, tuple[Float32, UInt8]] = {}
-        self._coverage: Coverage | None = None
-        self._recolored = 0.0
         self._path: list[Float64] = []
         self._lock = threading.Lock()
         self._stage, self._done, self._total = "opening", 0, 0
         self._last_update = -1.0
-        self.first_seconds: float | None = None
-        self._start = perf_counter()
         self._spacing = (_MIN_DISTANCE, _MIN_ANGLE)
         server.gui.main_panel.dock_right()
         server.scene.set_up_direction("-y")
         server.initial_camera.position = (0.6, -1.2, -2.2)
         server.initial_camera.look_at = (0.0, 0.0, 1.5)
         self._status = server.gui.add_markdown("Opening the recording.")
-        self._coloring = server.gui.add_dropdown("Colour by", ("colour", "accuracy"))
-        self._coloring.on_update(lambda _: self._recolor_now())
-        self._legend = server.gui.add_html("")
         self._image = server.gui.add_html("")
 
     def stage(self, name: str, total: int | None = None) -> None:
@@ -94,8 +74,6 @@ class LiveView:
             if f"/live/{frame.index}" in shown_names or self._is_new_view(T):
                 self._add(frame, T)
             now = perf_counter()
-            if self._coloring.value == "accuracy" and now - self._recolored > _RECOLOR_PERIOD:
-                self._recolor()
             if now - self._last_update > _UPDATE_PERIOD:
                 self._last_update = now
                 self._show_current(frame, T)
@@ -125,20 +103,11 @@ class LiveView:
             return
         sampled = slice(None, None, -(-len(points) // _POINTS))
         world = se3.transform(T, points[sampled].astype(float)).astype(np.float32)
-        frame_colors = frame.color
-        if frame_colors is not None:
-            colors = frame_colors[sampled]
+        colors = scene.height_colors(world.astype(float))
+        if frame.color is not None:
+            colors = frame.color[sampled]
         elif frame.amplitude is not None:
-            amplitude = frame.amplitude[sampled].astype(float)
-            white_level = max(float(np.percentile(amplitude, 98)), 1e-9)
-            grey = 255 * (amplitude / white_level).clip(0.02, 1) ** (1 / 2.2)
-            colors = np.repeat(grey.astype(np.uint8)[:, None], 3, axis=1)
-        else:
-            low, high = np.percentile(world[:, 1], [2, 98])
-            colors = thumbnails.viridis(
-                (high - world[:, 1].astype(float)) / max(float(high - low), 1e-6)
-            )
-        self._add_coverage(frame, world, sampled)
+            colors = thumbnails.grey(frame.amplitude[None, sampled])[0]
         handle = self._server.scene.add_point_cloud(
             f"/live/{frame.index}",
             world,
@@ -147,56 +116,15 @@ class LiveView:
             point_shading="flat",
             precision="float16",
         )
-        if self.first_seconds is None:
-            self.first_seconds = perf_counter() - self._start
-        self._cloud_data[handle.name] = (world, colors)
         self._shown = [item for item in self._shown if item[1].name != handle.name]
         self._shown.append((T, handle))
         if len(self._shown) > _CLOUDS:
             for _, removed in self._shown[1::2]:
-                del self._cloud_data[removed.name]
                 removed.remove()
             del self._shown[1::2]
             self._spacing = (1.5 * self._spacing[0], 1.5 * self._spacing[1])
 
-    def _add_coverage(self, frame: Frame, world: Float32, sampled: slice) -> None:
-        """Add a view to the coverage."""
-        distance = np.linalg.norm(frame.points[sampled], axis=1)
-        if self._coverage is None:
-            self._coverage = Coverage(max(_CELL_FRACTION * float(np.median(distance)), 1e-4))
-        frame_sigma = frame.sigma
-        # Without a noise model, noise is assumed to grow with the squared distance.
-        sigma = 0.001 * distance**2 if frame_sigma is None else frame_sigma[sampled].astype(float)
-        self._coverage.add(world, sigma)
-
-    def _recolor_now(self) -> None:
-        with self._lock:
-            self._recolor()
-
-    def _recolor(self) -> None:
-        """Update the colours of all views."""
-        self._recolored = perf_counter()
-        coverage = self._coverage
-        if self._coloring.value == "colour" or coverage is None:
-            self._legend.content = ""
-            for _, handle in self._shown:
-                handle.colors = self._cloud_data[handle.name][1]
-            return
-        median = OF_95_PERCENT * float(np.median(coverage.sigmas))
-        for _, handle in self._shown:
-            ratio = OF_95_PERCENT * coverage.sigma(self._cloud_data[handle.name][0]) / median
-            level = 0.5 + 0.5 * np.log(np.minimum(ratio, _COLOR_RATIO)) / np.log(_COLOR_RATIO)
-            handle.colors = thumbnails.viridis(level)
-        labels = [
-            f"±{words.length(median * ratio)}" for ratio in (1 / _COLOR_RATIO, 1.0, _COLOR_RATIO)
-        ]
-        self._legend.content = _color_bar("Accuracy so far (95 %), noise only", labels) + (
-            '<div style="padding:0 0.8em 0.6em;font-size:0.85em">Go to bright places next: they '
-            "were seen from too far away or too rarely.</div>"
-        )
-
     def _show_current(self, frame: Frame, T: Float64) -> None:
-        scene = self._server.scene
         image = None
         if isinstance(frame, RangeFrame):
             frame_image = frame.color_image
@@ -207,7 +135,7 @@ class LiveView:
             self._image.content = (
                 f'<img alt="The frame" src="{source}" style="width:100%;padding:0 0.6em">'
             )
-        scene.add_camera_frustum(
+        self._server.scene.add_camera_frustum(
             "/live_camera",
             _FOV,
             1.25 if image is None else image.shape[1] / image.shape[0],
@@ -221,17 +149,6 @@ class LiveView:
         path = np.stack(self._path[:: -(-len(self._path) // 2000)])
         if len(path) > 1:
             ends = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)
-            scene.add_line_segments(
+            self._server.scene.add_line_segments(
                 "/live_path", ends, _PATH, thickness=2.0, thickness_units="screen"
             )
-
-
-def _color_bar(label: str, labels: Sequence[str]) -> str:
-    """A colour bar with a title, and labels at its ends and in its middle, as HTML."""
-    stops = ", ".join(f"rgb{tuple(c)}" for c in thumbnails.viridis(np.linspace(0, 1, 9)).tolist())
-    ticks = "".join(f"<span>{text}</span>" for text in labels)
-    return (
-        f'<div style="padding:0 0.8em 0.5em;font-size:0.85em">{label}'
-        f'<div style="height:12px;border-radius:3px;background:linear-gradient(90deg,{stops})">'
-        f'</div><div style="display:flex;justify-content:space-between">{ticks}</div></div>'
-    )

@@ -6,15 +6,13 @@ other sites whose name resolves to this machine (DNS rebinding).
 
 from __future__ import annotations
 
-import gzip
 import io
 import logging
 import socket
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
 from typing import TYPE_CHECKING, Any
 
-from tofuse.apps.report import script_hashes
 from tofuse.engine.errors import InputError
 from tofuse.formats.files import reading
 
@@ -22,12 +20,6 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 HOST, PORT = "127.0.0.1", 8080
-# The script in the page of viser 1.1.1 unpacks another script.
-_UNPACKED = {
-    "'sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw='": (
-        "'sha256-o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE='"
-    )
-}
 _NAMES = ("127.0.0.1", "localhost")  # of this machine, in a browser on it
 _MAX_PORTS = 100  # that are tried if none is given
 
@@ -89,9 +81,6 @@ def _guarded() -> Iterator[list[int]]:
             response: Response | None = None
             if process_request is not None:
                 response = process_request(connection, request)
-            if response is not None:
-                for name, value in page_headers(response.headers, bytes(response.body)).items():
-                    response.headers[name] = value
             return response
 
         guards.append(1)
@@ -120,27 +109,6 @@ def is_same_origin(hosts: Sequence[str], origins: Sequence[str]) -> bool:
     return all(o.lower() in (f"http://{hosts[0].lower()}",) for o in origins)
 
 
-def page_headers(headers: Mapping[str, str], body: bytes) -> dict[str, str]:
-    """Return the headers of a response that keep its page from running foreign scripts."""
-    secure_headers = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
-    if not headers.get("Content-Type", "").startswith("text/html"):
-        return secure_headers
-    if headers.get("Content-Encoding") == "gzip":
-        body = gzip.decompress(body)
-    hashes = script_hashes(body.decode("utf-8", "replace"))
-    unpacked = [_UNPACKED[outer] for outer in hashes if outer in _UNPACKED]
-    # The hash of the script that other versions unpack is not known.
-    scripts = " ".join([*hashes, *unpacked]) if unpacked else "'unsafe-inline'"
-    policy = (
-        f"default-src 'self'; script-src 'self' blob: 'unsafe-eval' {scripts}; "
-        "worker-src 'self' blob:; style-src 'self' 'unsafe-inline'; "
-        "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob:; "
-        "object-src 'none'; base-uri 'none'; form-action 'none'; "
-        "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # notebooks
-    )
-    return {**secure_headers, "Content-Security-Policy": policy}
-
-
 def stop(server: ViserServer) -> None:
     """Stop the server."""
     with redirect_stdout(io.StringIO()):
@@ -152,16 +120,6 @@ def address(server: ViserServer) -> str:
     return f"http://{HOST}:{server.get_port()}"
 
 
-def _is_free(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((HOST, port))
-        except (OSError, OverflowError):
-            return False
-    return True
-
-
 def choose_port(port: int | None) -> int:
     """Return a port if it is free, or for None the first free one from 8080 on.
 
@@ -170,11 +128,11 @@ def choose_port(port: int | None) -> int:
     InputError
         If it is in use.
     """
+    for candidate in range(PORT, PORT + _MAX_PORTS) if port is None else (port,):
+        with socket.socket() as probe, suppress(OSError, OverflowError):
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((HOST, candidate))
+            return candidate
     if port is None:
-        free = next((p for p in range(PORT, PORT + _MAX_PORTS) if _is_free(p)), None)
-        if free is None:
-            raise InputError(f"no port from {PORT} on is free", where="--port", remedy="use it")
-        return free
-    if not _is_free(port):
-        raise InputError("is in use", where=f"--port {port}", remedy="use another, or none")
-    return port
+        raise InputError(f"no port from {PORT} on is free", where="--port", remedy="use it")
+    raise InputError("is in use", where=f"--port {port}", remedy="use another, or none")

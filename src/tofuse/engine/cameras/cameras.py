@@ -131,17 +131,9 @@ class Pinhole:
             ]
             (a, c), (b, d) = (np.moveaxis(k, -1, 0) for k in columns)
             determinant = a * d - b * c
+            e, f = error.T
             with np.errstate(all="ignore"):
-                move = (
-                    np.stack(
-                        [
-                            d * error[..., 0] - b * error[..., 1],
-                            a * error[..., 1] - c * error[..., 0],
-                        ],
-                        -1,
-                    )
-                    / determinant[..., None]
-                )
+                move = np.stack([d * e - b * f, a * f - c * e], -1) / determinant[..., None]
             out[active] = guess - np.clip(move, -0.5, 0.5)
             active = active[np.abs(move).max(-1) >= 1e-12]
             if len(active) == 0:
@@ -295,12 +287,10 @@ class RayTable:
         v, u = np.mgrid[0 : self.height, 0 : self.width]
         ok = np.isfinite(self.table).all(-1)
         x, y = self.table[ok].astype(float).T
-        fx, cx = np.linalg.lstsq(
-            np.stack([x, np.ones_like(x)], 1), u[ok].astype(float), rcond=None
-        )[0]
-        fy, cy = np.linalg.lstsq(
-            np.stack([y, np.ones_like(y)], 1), v[ok].astype(float), rcond=None
-        )[0]
+        (fx, cx), (fy, cy) = (
+            np.linalg.lstsq(np.stack([a, np.ones_like(a)], 1), b[ok].astype(float), rcond=None)[0]
+            for a, b in ((x, u), (y, v))
+        )
         return Pinhole(self.width, self.height, float(fx), float(fy), float(cx), float(cy))
 
     @cached_property
@@ -325,13 +315,8 @@ class RayTable:
                 fu, fv = f[..., :1], f[..., 1:]
                 along_u = (r10 - r00) * (1 - fv) + (r11 - r01) * fv
                 along_v = (r01 - r00) * (1 - fu) + (r11 - r10) * fu
-                error = (
-                    r00
-                    + (r10 - r00) * fu
-                    + (r01 - r00) * fv
-                    + (r00 - r10 - r01 + r11) * fu * fv
-                    - target
-                )
+                bilinear = r00 + (r10 - r00) * fu + (r01 - r00) * fv
+                error = bilinear + (r00 - r10 - r01 + r11) * fu * fv - target
                 det = along_u[..., 0] * along_v[..., 1] - along_u[..., 1] * along_v[..., 0]
                 du = (along_v[..., 1] * error[..., 0] - along_v[..., 0] * error[..., 1]) / det
                 dv = (along_u[..., 0] * error[..., 1] - along_u[..., 1] * error[..., 0]) / det
@@ -364,17 +349,11 @@ def check_intrinsics(camera: Pinhole) -> None:
         if not np.isfinite(value):
             raise InputError(f"is {value}", where=f"camera {f.name}", remedy="use a finite number")
     if not (2 <= camera.width <= 16384 and 2 <= camera.height <= 16384):
-        raise InputError(
-            f"is {camera.width} x {camera.height}",
-            where="camera width x height",
-            remedy="set the image size in pixels",
-        )
+        problem, remedy = f"is {camera.width} x {camera.height}", "set the image size in pixels"
+        raise InputError(problem, where="camera width x height", remedy=remedy)
     if camera.fx <= 0 or camera.fy <= 0:
-        raise InputError(
-            f"is {camera.fx}, {camera.fy}",
-            where="camera fx, fy",
-            remedy="use positive focal lengths in pixels",
-        )
+        problem, remedy = f"is {camera.fx}, {camera.fy}", "use positive focal lengths in pixels"
+        raise InputError(problem, where="camera fx, fy", remedy=remedy)
 
 
 def scaled(camera: Pinhole, width: int, height: int) -> Pinhole:

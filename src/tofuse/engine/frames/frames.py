@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,10 @@ IMAGES = (
     "shared_sigma_image",
     "normal_image",
 )
+
+
+# Names of the columns (N, ...) of a `CloudFrame`.
+COLUMNS = ("points", "normals", "sigma", "amplitude", "color")
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,40 +103,33 @@ class RangeFrame:
 
     def __post_init__(self) -> None:
         _check_frame(self)
+        where = f"frame {self.index}"
         if not isinstance(self.camera, Camera):
             raise InputError(
                 f"is a {type(self.camera).__name__}, not a camera",
-                where=f"frame {self.index}: camera",
+                where=f"{where}: camera",
                 remedy="pass a camera, such as tofuse.Pinhole",
             )
         for kind, known in (("depth_kind", DepthKind), ("amplitude_kind", AmplitudeKind)):
-            if getattr(self, kind) not in get_args(known):
-                raise InputError(
-                    f"is {getattr(self, kind)!r}",
-                    where=f"frame {self.index}: {kind}",
-                    remedy=f"use one of {', '.join(get_args(known))}",
-                )
+            value, choices = getattr(self, kind), get_args(known)
+            if value not in choices:
+                remedy = f"use one of {', '.join(choices)}"
+                raise InputError(f"is {value!r}", where=f"{where}: {kind}", remedy=remedy)
         shape = (self.camera.height, self.camera.width)
         for name in IMAGES:
             image = getattr(self, name)
             if image is None:
                 continue
             ndim = 3 if name in ("color_image", "normal_image") else 2
-            if (
-                not isinstance(image, np.ndarray)
-                or image.ndim != ndim
-                or image.dtype.kind not in "biuf"
-            ):
-                raise InputError(
-                    f"is a {type(image).__name__}, not an array of numbers with {ndim} axes",
-                    where=f"frame {self.index}: {name}",
-                    remedy="pass a NumPy array",
-                )
+            is_array = isinstance(image, np.ndarray) and image.dtype.kind in "biuf"
+            if not is_array or image.ndim != ndim:
+                problem = f"is a {type(image).__name__}, not an array of numbers with {ndim} axes"
+                raise InputError(problem, where=f"{where}: {name}", remedy="pass a NumPy array")
             if image.shape[:2] != shape:
                 raise InputError(
                     f"{name} is {image.shape[1]} x {image.shape[0]}, the camera "
                     f"{shape[1]} x {shape[0]}",
-                    where=f"frame {self.index}",
+                    where=where,
                     remedy="use the camera of these images",
                 )
         depth = np.asarray(self.depth, np.float32)
@@ -160,20 +157,16 @@ class RangeFrame:
     @cached_property
     def z(self) -> Float32:
         """(H, W) z depth in m, 0 where invalid."""
-        return (
-            self.depth
-            if self.depth_kind == "z"
-            else depth_conversion.z_from_range(self.camera, self.depth)
-        )
+        if self.depth_kind == "z":
+            return self.depth
+        return depth_conversion.z_from_range(self.camera, self.depth)
 
     @cached_property
     def radial_range(self) -> Float32:
         """(H, W) radial range in m, 0 where invalid."""
-        return (
-            self.depth
-            if self.depth_kind == "range"
-            else depth_conversion.range_from_z(self.camera, self.depth)
-        )
+        if self.depth_kind == "range":
+            return self.depth
+        return depth_conversion.range_from_z(self.camera, self.depth)
 
     @cached_property
     def point_image(self) -> Float32:
@@ -315,14 +308,9 @@ class CloudFrame:
 
     def keep(self, mask: Bool) -> Self:
         """Return the view with only the points of the (N,) mask."""
-        return replace(
-            self,
-            points=self.points[mask],
-            normals=None if self.normals is None else self.normals[mask],
-            sigma=None if self.sigma is None else self.sigma[mask],
-            amplitude=None if self.amplitude is None else self.amplitude[mask],
-            color=None if self.color is None else self.color[mask],
-        )
+        columns = {name: getattr(self, name) for name in COLUMNS}
+        kept: dict[str, Any] = {n: v if v is None else v[mask] for n, v in columns.items()}
+        return replace(self, **kept)
 
 
 Frame = RangeFrame | CloudFrame

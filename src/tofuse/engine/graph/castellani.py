@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -26,8 +26,6 @@ from tofuse.engine.graph.graph import Optimisation, Optimiser, PoseGraph
 from tofuse.engine.graph.levenberg import check_motions
 from tofuse.engine.graph.sparse import first_of_parts
 from tofuse.engine.parts import part
-
-Normalisation = Literal["thesis", "fusiello"]
 
 _ZERO = 1e-9  # m or rad: smaller lengths and angles are no normalisation factors
 
@@ -53,9 +51,9 @@ class Problem:
     sigma_translation: Float64
 
     @classmethod
-    def of(cls, graph: PoseGraph, normalisation: Normalisation) -> Problem:
+    def of(cls, graph: PoseGraph) -> Problem:
         """Return the problem of a graph; see `normalisation_factors`."""
-        sigma_angle, sigma_translation = normalisation_factors(graph, normalisation)
+        sigma_angle, sigma_translation = normalisation_factors(graph)
         R, t = graph.measurements[:, :3, :3], graph.measurements[:, :3, 3]
         return cls(graph.edges, R, t, sigma_angle, sigma_translation)
 
@@ -104,20 +102,15 @@ class Problem:
         return rotation, arm + t[i] - t[j], arm
 
 
-def normalisation_factors(
-    graph: PoseGraph, normalisation: Normalisation
-) -> tuple[Float64, Float64]:
-    """Return sigma_a (rad) and sigma_t (m), (M,) each.
+def normalisation_factors(graph: PoseGraph) -> tuple[Float64, Float64]:
+    """Return sigma_a (rad) and sigma_t (m), (M,) each, as section 3.5 of the thesis.
 
-    "thesis" (section 3.5): root mean square of the screw angles, and of the lengths, of the
-    sequential relative transformations; of all edges where none is sequential. "fusiello"
-    (Fusiello et al. 2002): pi, and the length of each edge's own translation. A factor that
-    would be zero, as for pure rotation or pure translation, is 1 (rad or m).
+    Root mean square of the screw angles, and of the lengths, of the sequential relative
+    transformations; of all edges where none is sequential. A factor that would be zero, as for pure
+    rotation or pure translation, is 1 (rad or m).
     """
     m = len(graph.edges)
     length = np.linalg.norm(graph.measurements[:, :3, 3], axis=1)
-    if normalisation == "fusiello":
-        return np.full(m, np.pi), np.where(length > _ZERO, length, 1.0)
     used = ~graph.loop if (~graph.loop).any() else np.ones(m, bool)
     angle = se3.angle(graph.measurements)
     factors = [
@@ -137,15 +130,12 @@ class Castellani(Optimiser):
 
     Attributes
     ----------
-    normalisation
-        "thesis" or "fusiello", see `normalisation_factors`.
     max_iterations
         Maximum number of steps.
     tolerance
         Iterations stop when a step lowers the objective by a smaller fraction.
     """
 
-    normalisation: Normalisation = "thesis"
     max_iterations: int = 200
     tolerance: float = 1e-9
 
@@ -155,7 +145,7 @@ class Castellani(Optimiser):
         Raises InputError if a pose or a measurement is not a rigid motion.
         """
         check_motions(graph)
-        problem = Problem.of(graph, self.normalisation)
+        problem = Problem.of(graph)
         q = quaternion.from_matrix(graph.poses[:, :3, :3])
         t = graph.poses[:, :3, 3].copy()
         free = free_vertices(graph)

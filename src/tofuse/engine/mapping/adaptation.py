@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -25,6 +25,8 @@ from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.sensor import Correction, Noise
 from tofuse.engine.tracking import Keyframes, given
 from tofuse.engine.views import RAW_RANGE_FALLOFF
+
+P = TypeVar("P", Correction, Filter)
 
 # Number of evenly spaced frames: enough for the background behind an object that turns once.
 _SAMPLE_FRAMES = 30
@@ -143,9 +145,9 @@ def _fitted(config: Config, recording: Recording) -> Config:
     """Return the configuration with its parts fitted to a sample of frames."""
     frames = recording.readable(_SAMPLE_FRAMES)
     check_views(config, kind_of(frames[0]) if frames else "range")
-    corrections, frames = _fitted_corrections(config.corrections, frames)
-    filters, frames = _fitted_filters(config.filters, frames)
-    model_filters, _ = _fitted_filters(config.model_filters, frames)
+    corrections, frames = _fitted_parts(config.corrections, frames, _correcting)
+    filters, frames = _fitted_parts(config.filters, frames, _filtering)
+    model_filters, _ = _fitted_parts(config.model_filters, frames, _filtering)
     return replace(config, corrections=corrections, filters=filters, model_filters=model_filters)
 
 
@@ -184,42 +186,34 @@ def _changes(
 
 def _preparation(config: Config) -> Prepare:
     """Return the corrections and filters of single frames, without filters over time."""
-    correctors = [correction.start() for correction in config.corrections]
+    steps = [*map(_correcting, config.corrections), *map(_filtering, config.filters)]
 
     def prepare(frame: Frame) -> Frame:
-        for corrector in correctors:
-            frame = corrector.apply(frame)
-        for item in config.filters:
-            if item.window == 1:
-                frame = frame.keep(item.mask(frame, ()))
+        for step in steps:
+            frame = step(frame)
         return frame
 
     return prepare
 
 
-def _fitted_corrections(
-    corrections: Sequence[Correction], frames: list[Frame]
-) -> tuple[tuple[Correction, ...], list[Frame]]:
-    """Fit each correction to frames corrected by the preceding ones; and correct the frames."""
-    fitted = []
-    for item in corrections:
-        item = item.fit(frames) if item.needs_fit else item
-        corrector = item.start()
-        frames = [corrector.apply(frame) for frame in frames]
-        fitted.append(item)
-    return tuple(fitted), frames
+def _correcting(correction: Correction) -> Prepare:
+    return correction.start().apply
 
 
-def _fitted_filters(
-    filters: Sequence[Filter], frames: list[Frame]
-) -> tuple[tuple[Filter, ...], list[Frame]]:
-    """Fit each filter to frames filtered by the preceding ones; and filter the frames."""
+def _filtering(item: Filter) -> Prepare:
+    if item.window > 1:  # a single frame has no neighbours in time
+        return lambda frame: frame
+    return lambda frame: frame.keep(item.mask(frame, ()))
+
+
+def _fitted_parts(
+    parts: Sequence[P], frames: list[Frame], step_of: Callable[[P], Prepare]
+) -> tuple[tuple[P, ...], list[Frame]]:
+    """Fit each part to frames as the preceding ones leave them; and process the frames."""
     fitted = []
-    for item in filters:
-        item = item.fit(frames) if item.needs_fit else item
-        if item.window == 1:  # a sample has no neighbours in time
-            frames = [frame.keep(item.mask(frame, ())) for frame in frames]
-        fitted.append(item)
+    for item in parts:
+        fitted.append(item.fit(frames) if item.needs_fit else item)
+        frames = list(map(step_of(fitted[-1]), frames))
     return tuple(fitted), frames
 
 

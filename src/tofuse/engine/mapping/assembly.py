@@ -9,12 +9,9 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import threads
 from tofuse.engine.frames import frame_ranges
 from tofuse.engine.geometry import se3
-from tofuse.engine.loops import Group, Join, JoinKind, PriorLoop
-from tofuse.engine.mapping.backend import BackEnd
-from tofuse.engine.mapping.config import Config
+from tofuse.engine.loops import Group, JoinKind
+from tofuse.engine.mapping.backend import BackEnd, Job
 from tofuse.engine.mapping.frame_log import FrameLog, poses_in_world
-from tofuse.engine.mapping.observations import Observations
-from tofuse.engine.progress import Progress, Stopwatch
 from tofuse.engine.results import Component, Reconstruction
 
 # An unconnected component gets its own model if it has more frames than this.
@@ -37,17 +34,11 @@ class Assembly:
 
     Attributes
     ----------
-    observations
-        The store of observations.
-    prior_loops
-        Given loops.
+    job
+        The recording.
     """
 
-    config: Config
-    observations: Observations
-    prior_loops: tuple[PriorLoop, ...]
-    progress: Progress
-    watch: Stopwatch
+    job: Job
     seed: int
     threads: int
 
@@ -57,16 +48,17 @@ class Assembly:
             groups = self._join(log)
             log, components = self._components(log, groups)
             poses = poses_in_world(log, groups[0].T_group_component)
-            result = self._back_end(log, poses, groups[0].joins).run(components)
+            result = BackEnd(self.job, log, poses, groups[0].joins).run(components)
         return replace(result, seed=self.seed, threads=self.threads)
 
     def _join(self, log: FrameLog) -> list[Group]:
         """Decide from all views which components are connected, and how."""
-        components = log.tracked_components(self.observations.views)
+        components = log.tracked_components(self.job.observations.views)
         if len(components) > 1:
-            self.progress.stage("joining components")
-        with self.watch.timing("joining"):
-            return self.config.joining.join(components, log.links, self.config.search)
+            self.job.progress.stage("joining components")
+        with self.job.watch.timing("joining"):
+            config = self.job.config
+            return config.joining.join(components, log.links, config.search)
 
     def _components(
         self, log: FrameLog, groups: Sequence[Group]
@@ -87,22 +79,10 @@ class Assembly:
                 frames = [e.record.index for e in numbered.posed if e.record.component == k]
                 component_log = log.of(frames)  # in its own model it is the main component
                 poses = poses_in_world(component_log, part.group.T_group_component)
-                back_end = self._back_end(component_log, poses, part.group.joins)
+                back_end = BackEnd(self.job, component_log, poses, part.group.joins)
                 result = replace(back_end.run(()), seed=self.seed, threads=self.threads)
             components.append(Component(ranges, part.T_main_component, part.connection, result))
         return numbered, tuple(components)
-
-    def _back_end(self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]) -> BackEnd:
-        return BackEnd(
-            self.config,
-            log,
-            poses,
-            joins,
-            self.prior_loops,
-            self.observations,
-            self.progress,
-            self.watch,
-        )
 
 
 def _parts(groups: Sequence[Group]) -> list[_Part]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,40 +30,49 @@ from tofuse.engine.results import Component, Diagnostics, Reconstruction
 _MAX_SEARCHES = 2
 
 
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What all parts of a recording have in common.
+
+    Attributes
+    ----------
+    config
+        The configuration.
+    observations
+        Stored observations.
+    prior_loops
+        Given loops.
+    progress, watch
+        Receive stages and times.
+    """
+
+    config: Config
+    observations: Observations
+    prior_loops: Sequence[PriorLoop]
+    progress: Progress
+    watch: Stopwatch
+
+
 class BackEnd:
     """Closes loops, optimises, refines, fuses and judges one connected part of a recording.
 
     Parameters
     ----------
-    config
-        The configuration.
+    job
+        The recording.
     log
         The frames of the part.
     poses
         (4, 4) T_world_camera by frame index; that of the first frame is the identity.
     joins
         Edges between components.
-    prior_loops
-        Given loops.
-    observations
-        Stored observations.
-    progress, watch
-        Receive stages and times.
     """
 
     def __init__(
-        self,
-        config: Config,
-        log: FrameLog,
-        poses: dict[int, Float64],
-        joins: Sequence[Join],
-        prior_loops: Sequence[PriorLoop],
-        observations: Observations,
-        progress: Progress,
-        watch: Stopwatch,
+        self, job: Job, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]
     ) -> None:
-        self._config, self._log, self._prior_loops = config, log, prior_loops
-        self._observations, self._progress, self._watch = observations, progress, watch
+        self._config, self._log, self._prior_loops = job.config, log, job.prior_loops
+        self._observations, self._progress, self._watch = job.observations, job.progress, job.watch
         posed = [e for e in log.posed if e.record.index in poses]
         self._tracked = TrackedGraph(posed, poses, joins)
 
@@ -168,9 +177,7 @@ class BackEnd:
         graph = closed.optimisation.graph
         self._progress.stage("refining")
         with self._watch.timing("refinement"):
-            refinement = self._observations.refiner.finish(
-                graph.ids.tolist(), graph.poses, closed.sensors
-            )
+            refinement = self._observations.refiner.finish(graph, closed.sensors)
             if refinement.kept:
                 graph = self._tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
                 graph = external_sensors.with_sensors(graph, closed.sensors)

@@ -15,6 +15,7 @@ from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.assembly import Assembly
+from tofuse.engine.mapping.backend import Job
 from tofuse.engine.mapping.config import Config, check_views, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog, FrameSequence, record_of
 from tofuse.engine.mapping.live_poses import LivePoses
@@ -248,7 +249,8 @@ class Mapper:
             self._observations.finish()
         del self._sequence, self._tracker  # the last frame, and keyframes
         trim_memory()
-        result = self._assembly().run(self._log)
+        job = Job(self.config, self._observations, self._prior_loops, self._progress, self.watch)
+        result = Assembly(job, self.seed, self.threads).run(self._log)
         diagnostics = replace(
             result.diagnostics,
             removed=self._preparation.counts.fractions,
@@ -256,17 +258,6 @@ class Mapper:
             samples=self._observations.samples.all,
         )
         return replace(result, diagnostics=diagnostics, shift=self._shift)
-
-    def _assembly(self) -> Assembly:
-        return Assembly(
-            self.config,
-            self._observations,
-            self._prior_loops,
-            self._progress,
-            self.watch,
-            self.seed,
-            self.threads,
-        )
 
     def _check(self, frame: Frame, T_odometry: Float64 | None) -> tuple[Frame, Float64 | None]:
         """Return the frame and the odometry, those of clouds relative to the first one's shift."""

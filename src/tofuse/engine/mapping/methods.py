@@ -38,7 +38,7 @@ def thesis(kind: ViewKind) -> Config:
             per_frame=6,
             confirmation=Confirmation(min_fraction=0.45),
         ),
-        optimiser=castellani.Castellani(normalisation="thesis"),
+        optimiser=castellani.Castellani(),
         fusion=Fusion(),
     )
 

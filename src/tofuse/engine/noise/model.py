@@ -257,52 +257,30 @@ def _check_finite(model: Any, where: str) -> None:
 # `tofuse.lab.simulation.models.noise_of` (a test compares them): the SR4000's is fitted to a real
 # recording, the others have the scale stated by their makers. docs/noise.md states the sources of
 # the other numbers.
+# Name, a, b, shot, dark, floor and ceiling_m.
+_MODULATED = (
+    ("kinect2", 0.0006945997474067945, 0.0012238444427074412,
+     0.05964181449046179, 0.975503822378152, 5.7735026918962585e-05, 5.4089142602287374),
+    ("azure-nfov", 0.0005893874299221687, 0.0008695790154781212,
+     0.02385672579618471, 0.11476647344371813, 0.0002886751345948129, 2.884754272121993),
+    ("pico-flexx", 0.002480693695628617, 0.00658911277394305,
+     0.05940419769966313, 0.5889829590671571, 7.216878364870322e-05, 2.1549459204098556),
+    ("ifm-o3r", 0.0012030820534330766, 0.0024885608246149353,
+     0.05964181449046179, 0.7897981570141338, 4.4048329863710466e-05, 4.32713140818299),
+)  # fmt: skip
 NOISE: dict[str, NoiseModel] = {
     model.name: model
     for model in (
         NoiseModel(
             "sr4000",
             RangeLaw(a=0.0021324099655231693, b=0.00382317908289003),
-            AmplitudeLaw(
-                shot=0.15915494309189537,
-                dark=2.3546327036097847,
-                floor=2.8867513459481293e-05,
-                falloff=4.0,
-            ),
+            AmplitudeLaw(0.15915494309189537, 2.3546327036097847, 2.8867513459481293e-05, 4.0),
             ConfidenceLaw((0.6, 0.20, 0.13, 0.094, 0.062, 0.041, 0.028, 0.016)),
             ceiling_m=1.4433756729740645,
         ),
-        NoiseModel(
-            "kinect2",
-            RangeLaw(a=0.0006945997474067945, b=0.0012238444427074412),
-            AmplitudeLaw(
-                shot=0.05964181449046179, dark=0.975503822378152, floor=5.7735026918962585e-05
-            ),
-            ceiling_m=5.4089142602287374,
-        ),
-        NoiseModel(
-            "azure-nfov",
-            RangeLaw(a=0.0005893874299221687, b=0.0008695790154781212),
-            AmplitudeLaw(
-                shot=0.02385672579618471, dark=0.11476647344371813, floor=0.0002886751345948129
-            ),
-            ceiling_m=2.884754272121993,
-        ),
-        NoiseModel(
-            "pico-flexx",
-            RangeLaw(a=0.002480693695628617, b=0.00658911277394305),
-            AmplitudeLaw(
-                shot=0.05940419769966313, dark=0.5889829590671571, floor=7.216878364870322e-05
-            ),
-            ceiling_m=2.1549459204098556,
-        ),
-        NoiseModel(
-            "ifm-o3r",
-            RangeLaw(a=0.0012030820534330766, b=0.0024885608246149353),
-            AmplitudeLaw(
-                shot=0.05964181449046179, dark=0.7897981570141338, floor=4.4048329863710466e-05
-            ),
-            ceiling_m=4.32713140818299,
+        *(
+            NoiseModel(name, RangeLaw(a, b), AmplitudeLaw(*law), ceiling_m=ceiling)
+            for name, a, b, *law, ceiling in _MODULATED
         ),
         NoiseModel("pico-zense", RangeLaw(0.0, 0.013)),
         NoiseModel(

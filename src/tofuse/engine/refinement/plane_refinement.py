@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Measured, external_sensors
+from tofuse.engine.graph import Measured, PoseGraph, external_sensors
 from tofuse.engine.parts import part
 from tofuse.engine.refinement.common_planes import (
     SUPPORT_NOISE,
@@ -83,14 +83,9 @@ class _Planes(Refiner):
         """See `Refiner.push`."""
         self._store.push(SampledPoints.of(view, self._options.points), T_component_camera)
 
-    def finish(
-        self,
-        ids: Sequence[int],
-        poses: Float64,
-        measured: external_sensors.SensorPriors | None = None,
-    ) -> Refinement:
+    def finish(self, graph: PoseGraph, sensors: external_sensors.SensorPriors) -> Refinement:
         """See `Refiner.finish`."""
-        row = {int(index): k for k, index in enumerate(ids)}
+        poses, row = graph.poses, {int(index): k for k, index in enumerate(graph.ids)}
         views = [posed.view for posed in self._store.of(row)]
         if len(views) < 2:
             return Refinement(poses, views=len(views))

@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Measured, external_sensors
+from tofuse.engine.graph import Measured, PoseGraph, external_sensors
 from tofuse.engine.parts import part
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
@@ -51,6 +51,7 @@ _ERROR_INDEX: dict[CameraError, int] = {
 
 # Errors of the camera, and (m, rad) of the poses by halves of the images.
 _Evaluation = tuple[CalibrationCheck, tuple[float, float]]
+_Views = Sequence[PosedView[PreparedView]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,23 +125,8 @@ class Refiner(Protocol):
         """Add the next frame that has a pose, if `needs_points` is set."""
         return
 
-    def finish(
-        self,
-        ids: Sequence[int],
-        poses: Float64,
-        measured: external_sensors.SensorPriors | None = None,
-    ) -> Refinement:
-        """Refine the poses of all frames.
-
-        Parameters
-        ----------
-        ids
-            (N,) frame indices, ascending.
-        poses
-            (N, 4, 4) T_world_camera.
-        measured
-            Measurements by external sensors.
-        """
+    def finish(self, graph: PoseGraph, sensors: external_sensors.SensorPriors) -> Refinement:
+        """Refine the poses of all frames of a graph, with measurements by external sensors."""
         ...
 
 
@@ -165,14 +151,9 @@ class NoRefinement(RefinementMethod, Refiner):
         """See `RefinementMethod.start`."""
         return self
 
-    def finish(
-        self,
-        ids: Sequence[int],
-        poses: Float64,
-        measured: external_sensors.SensorPriors | None = None,
-    ) -> Refinement:
+    def finish(self, graph: PoseGraph, sensors: external_sensors.SensorPriors) -> Refinement:
         """See `Refiner.finish`."""
-        return Refinement(poses)
+        return Refinement(graph.poses)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,17 +174,12 @@ class AlreadyRefined(RefinementMethod, Refiner):
         """See `RefinementMethod.start`."""
         return self
 
-    def finish(
-        self,
-        ids: Sequence[int],
-        poses: Float64,
-        measured: external_sensors.SensorPriors | None = None,
-    ) -> Refinement:
+    def finish(self, graph: PoseGraph, sensors: external_sensors.SensorPriors) -> Refinement:
         """See `Refiner.finish`."""
-        posed = set(ids)
+        posed = set(graph.ids.tolist())
         edges = (*self.measured, *self.non_overlap_edges)
         return Refinement(
-            poses,
+            graph.poses,
             kept=True,
             edges=tuple(e for e in edges if {e.i, e.j} <= posed),
             non_overlap_edges=tuple((e.i, e.j) for e in self.non_overlap_edges),
@@ -250,24 +226,17 @@ class _Joint(Refiner):
         self._options, self._store = options, views
         self._error_indices = [_ERROR_INDEX[name] for name in options.calibrate]
 
-    def finish(
-        self,
-        ids: Sequence[int],
-        poses: Float64,
-        measured: external_sensors.SensorPriors | None = None,
-    ) -> Refinement:
+    def finish(self, graph: PoseGraph, sensors: external_sensors.SensorPriors) -> Refinement:
         """See `Refiner.finish`."""
-        options = self._options
-        row = {int(index): k for k, index in enumerate(ids)}
+        options, poses = self._options, graph.poses
+        row = {int(index): k for k, index in enumerate(graph.ids)}
         posed = self._store.of(row)
         positions = np.array([row[p.index] for p in posed], np.intp)
         if len(posed) < 2:
             return Refinement(poses, views=len(posed))
         before = poses[positions]
         refine_views = self._at_once if len(posed) <= options.submap else self._in_submaps
-        refined, evaluated = refine_views(
-            posed, before, measured or external_sensors.SensorPriors()
-        )
+        refined, evaluated = refine_views(posed, before, sensors)
         calibration = combine_checks([check for check, _ in evaluated])
         support = refined.before.of_views(len(posed)), refined.after.of_views(len(posed))
         mean = float(support[0].mean()), float(support[1].mean())
@@ -292,22 +261,16 @@ class _Joint(Refiner):
         )
 
     def _at_once(
-        self,
-        posed: Sequence[PosedView[PreparedView]],
-        poses: Float64,
-        measured: external_sensors.SensorPriors,
+        self, posed: _Views, poses: Float64, sensors: external_sensors.SensorPriors
     ) -> tuple[Refined, list[_Evaluation]]:
         views = [self._sampled(p) for p in posed]
-        priors = _priors([p.index for p in posed], measured)
+        priors = _priors([p.index for p in posed], sensors)
         alignment = self._options.alignment
         refined = refine(views, poses, alignment, calibrate=self._error_indices, priors=priors)
         return refined, [self._evaluate(RefinedSubmap(views, refined, priors))]
 
     def _in_submaps(
-        self,
-        posed: Sequence[PosedView[PreparedView]],
-        poses: Float64,
-        measured: external_sensors.SensorPriors,
+        self, posed: _Views, poses: Float64, sensors: external_sensors.SensorPriors
     ) -> tuple[Refined, list[_Evaluation]]:
         ids = [p.index for p in posed]
         return refine_submaps(
@@ -316,7 +279,7 @@ class _Joint(Refiner):
             self._options.alignment,
             self._options.submap,
             lambda subset: [self._sampled(posed[k]) for k in subset],
-            lambda subset: _priors(ids if subset is None else [ids[k] for k in subset], measured),
+            lambda subset: _priors(ids if subset is None else [ids[k] for k in subset], sensors),
             self._evaluate,
             self._error_indices,
         )

@@ -220,16 +220,13 @@ def _connections(e: Evidence) -> Iterator[Reason]:
         )
         # If all pose errors are bounded, later measurements connect both sides.
         if bridged and (e.accuracy.unbounded or not e.accuracy.assessed):
-            text = (
-                f"{_sentence(bridged)} {'is' if frame_ranges.is_single(bridged) else 'are'} "
-                f"connected to the rest by {motion} only."
-            )
+            text = f"{_are(bridged)} connected to the rest by {motion} only."
             yield Reason("bridged_gap", bridged, text)
     single_link = e.runs_of(e.single_link_frames)
     if single_link:
         text = (
-            f"{_sentence(single_link)} {'is' if frame_ranges.is_single(single_link) else 'are'} "
-            "connected to the rest by a single registration, which no other view confirms."
+            f"{_are(single_link)} connected to the rest by a single registration, which no other "
+            "view confirms."
         )
         yield Reason("single_link", single_link, text)
 
@@ -590,8 +587,7 @@ def cross_view_reasons(
         cross_view.frames, [support < MIN_SUPPORT for support in cross_view.support_of_views()]
     )
     if inconsistent:
-        verb = "is" if frame_ranges.is_single(inconsistent) else "are"
-        texts.append(f"{_sentence(inconsistent)} {verb} inconsistent with most overlapping frames.")
+        texts.append(f"{_are(inconsistent)} inconsistent with most overlapping frames.")
     # Consecutive images share the errors of the sensor, but have hardly any drift. The bounds
     # include distances of surfaces, but not the fraction of inconsistent measurements.
     consecutive = [p for p in cross_view.pairs if p.j == p.i + 1]
@@ -615,6 +611,10 @@ def ranges_with_status(
 def _sentence(ranges: Sequence[frame_ranges.Range]) -> str:
     """Return ranges as the start of a sentence: "Frame 3", "Frames 3-9, 20"."""
     return frame_ranges.in_words(ranges).capitalize()
+
+
+def _are(ranges: Sequence[frame_ranges.Range]) -> str:
+    return f"{_sentence(ranges)} {'is' if frame_ranges.is_single(ranges) else 'are'}"
 
 
 def _poses_of(ranges: Sequence[frame_ranges.Range]) -> str:

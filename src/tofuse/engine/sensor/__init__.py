@@ -2,8 +2,7 @@
 
 A `Correction` changes measurements before they are filtered; its `Corrector` does so for one
 recording. `Multipath`, `Unwrap`, `CameraErrors` and `Noise` are corrections; `Wrapped` is a filter,
-and a `DepthCorrection` is applied when a recording is read. `combined` unwraps the phases of
-several frequencies.
+and a `DepthCorrection` is applied when a recording is read.
 """
 
 from typing import TYPE_CHECKING
@@ -13,7 +12,6 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.sensor.base import Correction, Corrector, Noise
     from tofuse.engine.sensor.camera_errors import ERROR_OPTIONS, CameraErrors, DepthCorrection
-    from tofuse.engine.sensor.frequencies import DISAGREEMENT, SPEED_OF_LIGHT, combined
     from tofuse.engine.sensor.multipath_correction import Multipath
     from tofuse.engine.sensor.raw_amplitude import range_and_amplitude
     from tofuse.engine.sensor.unwrap import Unwrap, on_surface

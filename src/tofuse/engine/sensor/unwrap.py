@@ -9,8 +9,7 @@ Pixels with a weak signal have random ranges, and would get random wrap counts. 
 pixels that measure a surface together with their neighbours (`on_surface`) are unwrapped and used.
 
 Both cues are costs of a Markov random field over the image, which is minimised by belief
-propagation (Droeschel et al. 2010; McClure et al. 2010 for the amplitude). For several frequencies
-see `tofuse.engine.sensor.frequencies`.
+propagation (Droeschel et al. 2010; McClure et al. 2010 for the amplitude).
 """
 
 from __future__ import annotations

@@ -229,13 +229,13 @@ def read_rays(path: Path) -> RayTable:
     rays = np.array(table, float)
     finite = np.isfinite(rays)
     directions = rays[finite.all(2)]
-    with reading.named(path, "save (H, W, 2) float32"):
+    with reading.named(path), reading.about("rays", "save (H, W, 2) float32"):
         if (np.abs(rays[finite]) > MAX_SLOPE).any():
             raise InputError("contains rays at 90 degrees from the optical axis or more")
         if not len(directions):
             raise InputError("has no pixel with a ray")
         if len(directions) > 1 and not np.ptp(directions, axis=0).any():
-            raise InputError("has the same ray for all pixels")
+            raise InputError("has only equal rays")
         return RayTable(np.where(finite, rays, np.nan).astype(np.float32))
 
 

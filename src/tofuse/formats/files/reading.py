@@ -9,15 +9,18 @@ import os
 import re
 import struct
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 MAX_TEXT_BYTES = 256 << 20
 MAX_BYTES = 4 << 30
@@ -258,6 +261,28 @@ def files_named(path: Path, matches: Callable[[str], object]) -> list[Path]:
         return [p for p in list_folder(path) if matches(p.name) and is_file(p)]
     except InputError:
         return []
+
+
+def first_file(*paths: Path) -> Path | None:
+    """Return the first of the paths that is an accessible file; None if none is."""
+    return next((path for path in paths if is_file(path)), None)
+
+
+def first_readable(items: Iterable[T], read: Callable[[T], R], nothing: InputError) -> R:
+    """Return what `read` returns for the first item that can be read.
+
+    Raises
+    ------
+    InputError
+        The first error if none can be; `nothing` if there are no items.
+    """
+    first_error: InputError | None = None
+    for item in items:
+        try:
+            return read(item)
+        except InputError as error:
+            first_error = first_error or error
+    raise first_error or nothing
 
 
 def if_file(path: Path) -> Path | None:

@@ -191,10 +191,11 @@ class _Binary:
             return {name: rows[name].astype(kind) for name, kind in native.items()}
         columns = self._equal_lists(element) if len(element.properties) == 1 else None
         if columns is None:
-            rows = itertools.repeat(
-                lambda kind, n: self._take(self._dtype(kind), n, element), element.count
-            )
-            columns = _lists(element, rows)
+
+            def take(kind: str, n: int) -> NDArray[Any]:
+                return self._take(self._dtype(kind), n, element)
+
+            columns = _lists(element, itertools.repeat(take, element.count))
         return columns
 
     def _dtype(self, kind: str) -> np.dtype:

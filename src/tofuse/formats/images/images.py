@@ -146,25 +146,16 @@ def check_first_size(files: Sequence[Path], size: tuple[int, int], where: str, r
         except InputError:
             continue
         if (header.width, header.height) != size:
-            raise InputError(
-                f"is {header.width} x {header.height} pixels, {where} {size[0]} x {size[1]}",
-                where=path,
-                remedy=remedy,
-            )
+            problem = f"is {header.width} x {header.height} pixels, {where} {size[0]} x {size[1]}"
+            raise InputError(problem, where=path, remedy=remedy)
         return
 
 
 def first_size(files: Sequence[Path]) -> tuple[int, int]:
     """Return (width, height) of the first image with a readable header."""
-    first_error: InputError | None = None
-    for path in files:
-        try:
-            header = read_header(path)
-        except InputError as error:
-            first_error = first_error or error
-            continue
-        return header.width, header.height
-    raise first_error or InputError("has no images", where="depth", remedy="check the recording")
+    nothing = InputError("has no images", where="depth", remedy="check the recording")
+    header = reading.first_readable(files, read_header, nothing)
+    return header.width, header.height
 
 
 def read_image(

@@ -10,14 +10,15 @@ from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import Pcd, read_pcd
 from tofuse.formats.sources import (
     cloud_frames,
     cloud_sequence,
+    inputs,
     organised,
-    per_frame,
 )
 
 
@@ -53,52 +54,27 @@ class PcdClouds(cloud_sequence.CloudReader):
 def pcd_cloud(path: Path, index: int, timestamp: float) -> CloudFrame:
     """Read a file as a cloud; its viewpoint is the sensor's position."""
     pcd = read_pcd(path)
-    cloud = pcd.cloud
-    return cloud_frames.cloud_frame(
-        index,
-        timestamp,
-        cloud.points,
-        cloud.normals,
-        amplitude=cloud.amplitude,
-        color=cloud.color,
-        origin=pcd.viewpoint[:3],
-    )
+    return cloud_frames.cloud_frame(index, timestamp, pcd.cloud, origin=pcd.viewpoint[:3])
 
 
 def pcd_image(path: Path, index: int, timestamp: float, camera: Camera) -> Frame:
     """Read an organised file as an image of `camera`; see `organised_frame`."""
     pcd = read_pcd(path)
-    return organised.organised_frame(
-        _image(pcd),
-        camera,
-        index,
-        timestamp,
-        path,
-        amplitude=pcd.cloud.amplitude,
-        color=pcd.cloud.color,
-        normals=pcd.cloud.normals,
-    )
+    return organised.organised_frame(_image(pcd), pcd.cloud, camera, index, timestamp)
 
 
 def _camera(files: list[Path]) -> Camera | None:
     """Return the camera of organised files, from up to `SAMPLES` readable ones; or None."""
-    step = max(1, len(files) // organised.SAMPLES)
     images: list[Float32] = []
-    for file in files[::step][: organised.SAMPLES]:
-        try:
-            pcd = read_pcd(file)
-        except InputError:
-            continue
+    for file, pcd in organised.samples(len(files), lambda k: (files[k], read_pcd(files[k]))):
         if not pcd.organised or pcd.viewpoint[:3].any():
             return None
         images.append(_image(pcd))
-        points = images[-1].reshape(-1, 3)
-        if (
-            organised.find_raster(points, pcd.width) is None
-            and organised.find_raster(points, pcd.height) is not None
-        ):
+        points, size = images[-1].reshape(-1, 3), f"WIDTH {pcd.width} and HEIGHT {pcd.height}"
+        fits, fits_turned = (organised.find_raster(points, n) for n in (pcd.width, pcd.height))
+        if fits is None and fits_turned is not None:
             raise InputError(
-                f"has WIDTH {pcd.width} and HEIGHT {pcd.height}, but rows of {pcd.height} points",
+                f"has {size}, but rows of {pcd.height} points",
                 where=file,
                 remedy="swap WIDTH and HEIGHT",
             )
@@ -133,25 +109,23 @@ def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     table = tables.read_numbers(path)
     if table.shape[1] < 3:
         raise InputError(f"has {table.shape[1]} numbers per line", where=path, remedy="write x y z")
-    amplitude = normals = color = None
-    if table.shape[1] == 4:
-        amplitude = _float32(table[:, 3])
-    elif table.shape[1] >= 6:
+    normals = color = None
+    if table.shape[1] >= 6:
         columns = table[:, 3:6]
         if path.suffix.lower() == ".xyzrgb":
             color = np.clip(np.rint(np.nan_to_num(columns) * 255), 0, 255).astype(np.uint8)
         elif path.suffix.lower() == ".xyzn" or _are_unit(columns):
-            normals = _float32(columns)
+            normals = cloud_frames.to_float32(columns)
         elif ((columns >= 0) & (columns <= 255) & (columns == np.rint(columns))).all():
             color = columns.astype(np.uint8)
-    return cloud_frames.cloud_frame(
-        index, timestamp, table[:, :3], normals, amplitude=amplitude, color=color
-    )
+    cloud = GeometryRecord(table[:, :3], None, normals, color, scalars=_fourth(table))
+    return cloud_frames.cloud_frame(index, timestamp, cloud)
 
 
-def _float32(values: Float64) -> Float32:
-    with np.errstate(over="ignore"):
-        return values.astype(np.float32)
+def _fourth(table: Float64) -> dict[str, Float32]:
+    """The last column of four, which is an amplitude."""
+    four = table.shape[1] == 4
+    return {"amplitude": cloud_frames.to_float32(table[:, 3])} if four else {}
 
 
 def _are_unit(vectors: Float64) -> bool:
@@ -173,7 +147,7 @@ class Slam6d(cloud_sequence.CloudReader):
     def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
         """See `CloudReader.source`."""
         source = cloud_sequence.CloudFileSource(path, files, scan_frame)
-        poses = per_frame.poses_from_files(
+        poses = inputs.poses_from_files(
             source, [file.with_suffix(".pose") for file in files], read_pose
         )
         if poses is not None:
@@ -197,8 +171,8 @@ def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
         points = table[:, :3] * np.diag(FLIP) * CENTIMETRE
     # The scanner writes (0, 0, 0) for missing measurements.
     points[(points == 0).all(1)] = np.nan
-    amplitude = table[:, 3].astype(np.float32) if table.shape[1] == 4 else None
-    return cloud_frames.cloud_frame(index, timestamp, points, amplitude=amplitude)
+    cloud = GeometryRecord(points, scalars=_fourth(table))
+    return cloud_frames.cloud_frame(index, timestamp, cloud)
 
 
 def read_pose(path: Path) -> Float64:

@@ -35,7 +35,7 @@ class DepthPng(Reader):
             camera = path.parent / "camera.json"
         if camera is None:
             raise InputError("is a depth image without a camera", where=path, remedy=_remedy(path))
-        return DepthImageSource([path], np.zeros(1), None, 1.0, options=ReaderOptions(camera))
+        return DepthImageSource([path], np.zeros(1), None, options=ReaderOptions(camera))
 
 
 def _remedy(path: Path) -> str:

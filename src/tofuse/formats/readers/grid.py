@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, UInt8
+from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
@@ -59,14 +60,9 @@ class Grid(Reader):
         """See `Reader.open`."""
         inputs.refuse_camera(options, "grid")
         files = cloud_sequence.required_files(path, *_SUFFIXES)
-        step = max(1, len(files) // organised.SAMPLES)
         images: list[Float32] = []
         raster: organised.Raster | None = None
-        for file in files[::step][: organised.SAMPLES]:
-            try:
-                cells = read_cells(file)
-            except InputError:
-                continue
+        for cells in organised.samples(len(files), lambda k: read_cells(files[k])):
             raster = raster or cells.raster()
             if raster is not None and len(cells.points) == raster.width * raster.height:
                 images.append(raster.image(cells.points))
@@ -95,47 +91,42 @@ class Grid(Reader):
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Points (N, 3) in the file's unit, amplitude (N,), colour (N, 3), and the width, if stated."""
+    """A cloud in the file's unit, with NaN for invalid points, and its width, if stated."""
 
-    points: Float32
-    amplitude: Float32 | None = None
-    color: UInt8 | None = None
+    cloud: GeometryRecord
     width: int | None = None
+
+    @property
+    def points(self) -> Float32:
+        """(N, 3)."""
+        return cloud_frames.to_float32(self.cloud.points)
 
     def raster(self) -> organised.Raster | None:
         """See `find_raster`."""
-        return (
-            organised.find_raster(self.points, self.width)
-            if len(self.points) <= MAX_POINTS
-            else None
-        )
+        few = len(self.points) <= MAX_POINTS
+        return organised.find_raster(self.points, self.width) if few else None
 
 
 def read_cells(path: Path) -> Cells:
     """Read a file, with NaN for invalid points; raise InputError if it can't be read."""
-    cells = _read(path)
-    plausible = np.asarray((np.abs(cells.points) < se3.MAX_COORDINATE_M).all(1))
-    return replace(cells, points=np.where(plausible[:, None], cells.points, np.float32(np.nan)))
-
-
-def _read(path: Path) -> Cells:
-    suffix = path.suffix.lower()
+    suffix, width = path.suffix.lower(), None
     if suffix == ".pcd":
         pcd = read_pcd(path)
-        return _cells(pcd.cloud, pcd.width if pcd.organised else None)
-    if suffix == ".ply":
-        ply = read_ply(path)
-        declared = dict(line.split(None, 1) for line in ply.comments if len(line.split()) == 2)
-        width = declared.get("num_cols", "")
-        return _cells(ply, int(width) if width.isdecimal() else None)
-    return _read_csv(path)
+        cloud, width = pcd.cloud, pcd.width if pcd.organised else None
+    elif suffix == ".ply":
+        cloud = read_ply(path)
+        declared = dict(line.split(None, 1) for line in cloud.comments if len(line.split()) == 2)
+        stated = declared.get("num_cols", "")
+        width = int(stated) if stated.isdecimal() else None
+    else:
+        cloud = _read_csv(path)
+    points = cloud_frames.to_float32(cloud.points)
+    plausible = (np.abs(points) < se3.MAX_COORDINATE_M).all(1, keepdims=True)
+    points = np.where(plausible, points, np.float32(np.nan))
+    return Cells(replace(cloud, points=points, normals=None), width)
 
 
-def _cells(cloud: GeometryRecord, width: int | None) -> Cells:
-    return Cells(cloud_frames.to_float32(cloud.points), cloud.amplitude, cloud.color, width)
-
-
-def _read_csv(path: Path) -> Cells:
+def _read_csv(path: Path) -> GeometryRecord:
     text = reading.read_text(path)
     head = text[: text.find("\n")].lower().replace(";", ",").replace("\t", ",")
     names = [cell.strip(' "#').split("[")[0].split("(")[0].strip() for cell in head.split(",")]
@@ -148,10 +139,8 @@ def _read_csv(path: Path) -> Cells:
     column = next((columns[name] for name in _AMPLITUDES if name in columns), None)
     if not has_header and table.shape[1] == 4:
         column = 3
-    with np.errstate(over="ignore"):
-        points = cloud_frames.to_float32(table[:, indices])
-        amplitude = None if column is None else cloud_frames.to_float32(table[:, column])
-    return Cells(points, amplitude)
+    scalars = {} if column is None else {"amplitude": cloud_frames.to_float32(table[:, column])}
+    return GeometryRecord(table[:, indices], scalars=scalars)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,22 +154,15 @@ class _Frames:
 
     def load(self, path: Path, index: int, timestamp: float) -> RangeFrame:
         cells = read_cells(path)
+        cloud = cells.cloud
         complete = len(cells.points) == self.raster.width * self.raster.height
         points = self.raster.image(cells.points) if complete else cells.points
         points = _shifted(points * np.float32(self.scale), self.offset)
         if not complete:
-            points, cells = self._to_pixels(points, cells, path)
-        return organised.organised_frame(
-            points,
-            self.camera,
-            index,
-            timestamp,
-            path,
-            amplitude=cells.amplitude,
-            color=cells.color,
-        )
+            points, cloud = self._to_pixels(points, cloud)
+        return organised.organised_frame(points, cloud, self.camera, index, timestamp)
 
-    def _to_pixels(self, points: Float32, cells: Cells, path: Path) -> tuple[Float32, Cells]:
+    def _to_pixels(self, points: Float32, cloud: GeometryRecord) -> tuple[Float32, GeometryRecord]:
         """Assign points (n, 3), of a file without invalid ones, to pixels by their rays."""
         from scipy.spatial import cKDTree
 
@@ -205,19 +187,22 @@ class _Frames:
             raise InputError(
                 f"has {len(points)} points, not {self.raster.width} x {self.raster.height}, and "
                 "they are not on the rays of the previous files",
-                where=path,
                 remedy="export all points, including invalid ones",
             )
         image = np.full((count, 3), np.nan, np.float32)
         image[pixel] = points[measured]
-        columns: dict[str, Any] = {}
-        for name in ("amplitude", "color"):
-            values = getattr(cells, name)
-            if values is not None:
-                columns[name] = np.zeros((count, *values.shape[1:]), values.dtype)
-                columns[name][pixel] = values[measured]
-        shape = (self.raster.height, self.raster.width, 3)
-        return image.reshape(shape), Cells(image, **columns)
+
+        def arranged(values: NDArray[Any] | None) -> Any:
+            if values is None:
+                return None
+            out = np.zeros((count, *values.shape[1:]), values.dtype)
+            out[pixel] = values[measured]
+            return out
+
+        amplitude = arranged(cloud.amplitude)
+        scalars = {} if amplitude is None else {"amplitude": amplitude}
+        out = GeometryRecord(image, color=arranged(cloud.color), scalars=scalars)
+        return image.reshape(self.raster.height, self.raster.width, 3), out
 
 
 def _shifted(points: Float32, offset: float) -> Float32:

@@ -17,7 +17,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import read_raw
-from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, per_frame
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
 
 # The streams by preference, with their ambiguity range in m.
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
@@ -40,9 +40,10 @@ class HoloLens2(Reader):
         """See `Reader.open`."""
         inputs.refuse_camera(options, "hololens2", inputs.PER_FRAME)
         streams = _streams(path)
-        if not streams:
-            raise InputError("has no 'Depth Long Throw_lut.bin' with images", where=path)
-        source = HoloLens2Source(path, streams[0])
+        with reading.about(path, _REMEDY):
+            if not streams:
+                raise InputError("has no 'Depth Long Throw_lut.bin' with images")
+            source = HoloLens2Source(path, streams[0])
         if len(streams) > 1:
             source.warnings.append(f"{streams[1]} is ignored: {streams[0]} reaches farther")
         return source
@@ -52,6 +53,7 @@ class HoloLens2Source(FileSource):
     """Radial range in mm with active brightness, and the headset's poses as reference."""
 
     concurrent = True
+    remedy = _REMEDY
     kind = "range"
     amplitude_kind = "ir"
 
@@ -78,16 +80,9 @@ class HoloLens2Source(FileSource):
 
     def _size(self) -> tuple[int, int]:
         """(height, width) of the first image that can be read."""
-        first_error: InputError | None = None
-        for tick in self.ticks:
-            try:
-                height, width = self._image(tick, bright=False).shape
-            except InputError as error:
-                first_error = first_error or error
-                continue
-            return height, width
-        assert first_error is not None
-        raise first_error
+        nothing = InputError("contains no images")
+        image = reading.first_readable(self.ticks, lambda t: self._image(t, bright=False), nothing)
+        return image.shape[0], image.shape[1]
 
     def _read_poses(self, folder: Path, stream: str) -> None:
         """Read T_world_rig of each frame, and the pose of the camera in the rig."""
@@ -100,7 +95,7 @@ class HoloLens2Source(FileSource):
             self.warnings.append(f"{missing.name} is missing: there are no reference poses")
             return
         try:
-            T_camera_rig = per_frame.read_matrix_pose(
+            T_camera_rig = inputs.read_matrix_pose(
                 tables.read_numbers(extrinsics).reshape(4, 4), str(extrinsics)
             )
             table = tables.read_numbers(trajectory)
@@ -120,12 +115,10 @@ class HoloLens2Source(FileSource):
                 return None
             row = order[position]
             table_of_row = table[row, 1:].reshape(4, 4)
-            T_world_rig = per_frame.read_matrix_pose(table_of_row, f"{trajectory}, row {row}")
+            T_world_rig = inputs.read_matrix_pose(table_of_row, f"{trajectory}, row {row}")
             return T_world_rig @ se3.inverse(T_camera_rig)
 
-        self.reference = per_frame.poses_of(
-            self, zip(self.ticks, nearest.tolist(), strict=True), pose
-        )
+        self.reference = inputs.poses_of(self, zip(self.ticks, nearest.tolist(), strict=True), pose)
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
@@ -134,11 +127,9 @@ class HoloLens2Source(FileSource):
         bright = self._image(tick, bright=True) if (tick, True) in self.images else None
         for image in (depth, bright):
             if image is not None and image.shape != (self.camera.height, self.camera.width):
-                raise InputError(
-                    f"is {image.shape[1]} x {image.shape[0]} pixels, the first image "
-                    f"{self.camera.width} x {self.camera.height}",
-                    where=f"{tick}.pgm",
-                )
+                size = f"{image.shape[1]} x {image.shape[0]} pixels"
+                first = f"{self.camera.width} x {self.camera.height}"
+                raise InputError(f"is {size}, the first image {first}", where=f"{tick}.pgm")
         amplitude = None if bright is None else bright.astype(np.float32)
         return self.image(
             index, depth_counts.depth_from_counts(depth, self.unit), amplitude_image=amplitude

@@ -27,7 +27,6 @@ from tofuse.formats.sources import (
     ReaderOptions,
     Sniff,
     inputs,
-    per_frame,
     pixels,
 )
 
@@ -81,14 +80,13 @@ class IfmO3rSource(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         chunks = self.frames[index]
-        where = f"{self.path}: frame {index}"
+        where = self.where(index)
         if isinstance(chunks, InputError):
             raise chunks
         for kind, name in ((DISTANCE, "radial distance"), (INFO, "lens")):
             if kind not in chunks:
                 raise InputError(
                     f"has no {name} (chunk {kind})",
-                    where=where,
                     remedy="record with the chunks 100 (distance) and 420 (information)",
                 )
         info = _info(self.data, chunks[INFO], where)
@@ -124,7 +122,7 @@ def _times(frames: list[dict[int, Chunk] | InputError]) -> Float64:
             times[k] = next(iter(chunks.values())).time
     if not np.isfinite(times).any():
         return np.arange(len(times), dtype=float)
-    return per_frame.interpolated(times)
+    return inputs.interpolated(times)
 
 
 BOUGUET, FISHEYE = 0, 2
@@ -352,36 +350,37 @@ class IfmH5Source(FileSource):
                     return ticks * unit
         return np.arange(len(self.rows), dtype=float)
 
+    def where(self, index: int) -> str:
+        """See `FileSource.where`."""
+        return f"{self.path}: {self.name}, frame {index}"
+
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
-        where = f"{self.path}: {self.name}, frame {index}"
-        with reading.library_errors(where):
+        with reading.library_errors(self.where(index)):
             with self._lock:
                 row = self.rows[index]
-            return self._frame(row, index, where)
+            return self._frame(row, index)
 
-    def _frame(self, row: Any, index: int, where: str) -> RangeFrame:
-        counts = self._image(row, "distance", where)
+    def _frame(self, row: Any, index: int) -> RangeFrame:
+        counts = self._image(row, "distance")
         stored = np.asarray(row["intrinsicCalibModelParameters"], float).ravel()
         unit, model = float(row["distanceResolution"]), int(row["intrinsicCalibModelID"])
         parameters = tuple(stored[:_LENS_PARAMETERS].tolist())
-        info: HeadInfo = checked_info(unit, model, parameters, where)
+        info = checked_info(unit, model, parameters, self.where(index))
         images = {
-            name: self._image(row, field, where, counts.shape)
+            name: self._image(row, field, counts.shape)
             for name, field in _FIELDS.items()
             if field in self.fields
         }
         time = float(self.timestamps[index])
         return head_frame(index, time, info, str(self.path), counts, **images)
 
-    def _image(
-        self, row: Any, name: str, where: str, shape: tuple[int, ...] | None = None
-    ) -> NDArray[Any]:
+    def _image(self, row: Any, name: str, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
         image = np.asarray(row[name])
         if image.ndim != 2 or min(image.shape) < 2 or image.dtype.kind not in "uif":
-            raise InputError(f"{name} is of shape {image.shape}", where=where)
+            raise InputError(f"{name} is of shape {image.shape}")
         if shape is not None and image.shape != shape:
-            raise InputError(f"{name} is of shape {image.shape}, distance {shape}", where=where)
+            raise InputError(f"{name} is of shape {image.shape}, distance {shape}")
         return image
 
 

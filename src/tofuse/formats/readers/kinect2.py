@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,6 @@ class Kinect2(Reader):
             files,
             np.arange(len(files), dtype=float),
             None if options.camera else _camera(path, first_size(files)),
-            0.001,
             color=color if any(color) else None,
             sensor="Kinect v2 (ToF)",
             options=options,
@@ -62,8 +62,7 @@ class Kinect2(Reader):
 
 def _color(file: Path) -> Path | None:
     stem = file.name[: -len("_depth.png")]
-    candidates = (file.with_name(f"{stem}_color{suffix}") for suffix in (".jpg", ".png"))
-    return next((path for path in candidates if reading.is_file(path)), None)
+    return reading.first_file(*(file.with_name(f"{stem}_color{s}") for s in (".jpg", ".png")))
 
 
 def _calibration(folder: Path, name: str) -> Path | None:
@@ -105,7 +104,6 @@ def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
 
 
 def _numbers(text: str) -> Float64:
-    try:
+    with suppress(ValueError):
         return np.array([float(cell) for cell in text.replace(",", " ").split()])
-    except ValueError:
-        return np.zeros(0)
+    return np.zeros(0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras import Camera, Pinhole, depth_conversion
+from tofuse.engine.arrays import Float64
+from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.parts import part
-from tofuse.engine.sensor import DISAGREEMENT, SPEED_OF_LIGHT, DepthCorrection, combined
+from tofuse.engine.sensor import DepthCorrection
 from tofuse.formats.cameras import camera_file, corrected_depth, read_correction
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import check_first_size, read_color, read_image
@@ -27,7 +26,6 @@ from tofuse.formats.sources import (
     cloud_frames,
     gravity_at,
     inputs,
-    per_frame,
     pixels,
 )
 
@@ -79,7 +77,6 @@ class NativeSource(FileSource):
         self.color = self._channel_files("color", *_IMAGES)
         self.sigma = self._channel_files("sigma", ".png")
         self.rays = self._channel_files("rays", ".npy")
-        self.by_frequency = self._frequencies()
         if camera_path is not None:
             self.rays = []  # the camera passed by the user applies to all frames
         self.correction = self._read_correction()
@@ -102,12 +99,8 @@ class NativeSource(FileSource):
         if self.camera is None:
             return cloud_frames.ply_frame(self.files[index], index, timestamp)
         camera = self._camera_of(index, self.camera)
-        if self.by_frequency:
-            depth = self._unwrapped_depth(index, camera)
-        else:
-            depth = depth_counts.depth_from_counts(
-                self._read(self.files, index, "uint16"), self.unit
-            )
+        counts = self._read(self.files, index, "uint16")
+        depth = depth_counts.depth_from_counts(counts, self.unit)
         if self.correction is not None:
             depth = corrected_depth(self.correction, camera, depth, self.kind)
         images: dict[str, Any] = {"camera": camera}
@@ -177,7 +170,7 @@ class NativeSource(FileSource):
                 )
             return lenses[row]
 
-        return per_frame.cameras_of(rows, lens)
+        return inputs.cameras_of(rows, lens)
 
     def _read_camera(
         self, camera_path: Path | None
@@ -203,46 +196,6 @@ class NativeSource(FileSource):
         if [f.stem for f in files] != [f.stem for f in self.files]:
             self.warnings.append(f"{folder}: names differ from those in depth/; paired in order")
         return files
-
-    def _frequencies(self) -> dict[float, list[Path]]:
-        """The depth images by modulation frequency in Hz, if several were recorded separately."""
-        folder = self.folder / "frequencies"
-        if self.is_clouds or not reading.is_folder(folder):
-            return {}
-        images: dict[float, list[Path]] = {}
-        for subfolder in reading.list_folder(folder):
-            try:
-                hertz = float(subfolder.name)
-            except ValueError:
-                hertz = math.nan
-            if not 1e5 <= hertz <= 1e10 or not reading.is_folder(subfolder):
-                raise InputError(
-                    "isn't a frequency",
-                    where=subfolder,
-                    remedy="name the folder in Hz, as 30000000",
-                )
-            images[hertz] = reading.files_with(subfolder, ".png")
-            if len(images[hertz]) != len(self.files):
-                raise self._count_error(subfolder, f"{len(images[hertz])} images")
-        if len(images) == 1:
-            raise InputError(
-                "has only one frequency", where=folder, remedy="use two or more, or remove it"
-            )
-        return images
-
-    def _unwrapped_depth(self, index: int, camera: Camera) -> Float32:
-        """Depth unwrapped with all frequencies; 0 where they are inconsistent."""
-        kind = self.kind
-        periods = [SPEED_OF_LIGHT / (2 * hertz) for hertz in self.by_frequency]
-        ranges = []
-        for files in self.by_frequency.values():
-            depth = depth_counts.depth_from_counts(self._read(files, index, "uint16"), self.unit)
-            ranges.append(
-                depth if kind == "range" else depth_conversion.range_from_z(camera, depth)
-            )
-        radial, disagreement = combined(ranges, periods)
-        consistent = np.where(disagreement < DISAGREEMENT * min(periods), radial, np.float32(0))
-        return consistent if kind == "range" else depth_conversion.z_from_range(camera, consistent)
 
     def _read_correction(self) -> DepthCorrection | None:
         path = self.folder / "correction.npz"

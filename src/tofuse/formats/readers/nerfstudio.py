@@ -24,7 +24,6 @@ from tofuse.formats.sources import (
     ReaderOptions,
     Sniff,
     inputs,
-    per_frame,
     pixels,
 )
 
@@ -93,7 +92,7 @@ class NerfstudioSource(FileSource):
             self.warnings.append(f"{file}: {without_depth} frames have no depth: skipped")
         if not timed:
             self.warnings.append(f"{file}: no timestamps: frame numbers serve as seconds")
-        self.reference = per_frame.poses_of(self, self.frames, _Frame.pose)
+        self.reference = inputs.poses_of(self, self.frames, _Frame.pose)
 
     def full_resolution_color(self, index: int) -> UInt8 | None:
         """See `FileSource.full_resolution_color`."""
@@ -165,8 +164,7 @@ class _Frame:
         base = self.path("file_path")
         if base is None:
             return None
-        candidates = (base.with_name(base.name + suffix) for suffix in _IMAGES)
-        return next((path for path in candidates if reading.is_file(path)), None)
+        return reading.first_file(*(base.with_name(base.name + suffix) for suffix in _IMAGES))
 
     def pose(self) -> Float64:
         where = f"{self.where}: transform_matrix"
@@ -174,7 +172,7 @@ class _Frame:
         if isinstance(rows, list) and len(rows) == 3:
             rows = [*rows, [0, 0, 0, 1]]
         table = reading.matrix_of(rows, where, _REMEDY)
-        return per_frame.read_matrix_pose(table, where) @ OPENGL
+        return inputs.read_matrix_pose(table, where) @ OPENGL
 
     def number_of(self, name: str, default: float | None = None) -> float:
         if name in self.entry:

@@ -22,7 +22,6 @@ from tofuse.formats.sources import (
     ReaderOptions,
     Sniff,
     inputs,
-    per_frame,
     pixels,
 )
 
@@ -85,7 +84,7 @@ class NpzSource(FileSource):
             if name in arrays
         }
         super().__init__(self._times(arrays))
-        per_frame.check_timestamps(self.timestamps, Path(f"{path}: timestamps"), self.warnings)
+        inputs.check_timestamps(self.timestamps, Path(f"{path}: timestamps"), self.warnings)
         self.reference = self._poses(arrays, "reference")
         self.odometry = self._poses(arrays, "odometry")
         self.metadata |= {"depth_kind": self.kind}
@@ -205,9 +204,7 @@ class NpzSource(FileSource):
         if poses.shape != (len(self.depth), 4, 4):
             raise self._error(name, f"has shape {poses.shape}", "save (N, 4, 4) T_world_camera")
         where = f"{self.path}: {name}"
-        return np.stack(
-            [per_frame.read_matrix_pose(T, f"{where}[{k}]") for k, T in enumerate(poses)]
-        )
+        return np.stack([inputs.read_matrix_pose(T, f"{where}[{k}]") for k, T in enumerate(poses)])
 
     def _floats(self, arrays: dict[str, NDArray[Any]], name: str) -> Float64:
         if arrays[name].dtype.kind not in "fui":

@@ -14,7 +14,7 @@ from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import first_size
-from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, per_frame, phones
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, phones
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 _LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and 255
@@ -55,7 +55,7 @@ class PolycamSource(phones.PhoneSource):
             color=[reading.if_file(folder / "images" / f"{file.stem}.jpg") for file in files],
         )
         paths = [folder / "cameras" / f"{file.stem}.json" for file in files]
-        self.cameras = per_frame.cameras_of(
+        self.cameras = inputs.cameras_of(
             paths, lambda path: _lens(reading.read_json(path), size, path)
         )
         self._read_poses(folder)
@@ -67,7 +67,7 @@ class PolycamSource(phones.PhoneSource):
             self.metadata[POSES_BY] = "Polycam"
         else:
             paths = [folder / "cameras" / path.name for path in paths]
-        self.reference = per_frame.poses_from_files(
+        self.reference = inputs.poses_from_files(
             self, paths, lambda path: _pose(reading.read_json(path), path)
         )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -57,12 +56,9 @@ class Record3DSource(FileSource):
         times = metadata.times()
         numbers = np.array(store.numbers)
         # Poses and timestamps cover all frames; an export may contain a subset.
-        if times is None or numbers.max() >= len(times):
-            rate = metadata.frame_rate()
-            times = np.arange(numbers.max() + 1) / rate
-            has_times = False
-        else:
-            has_times = True
+        has_times = times is not None and numbers.max() < len(times)
+        if times is None or not has_times:
+            times = np.arange(numbers.max() + 1) / metadata.frame_rate()
         super().__init__(times[numbers])
         if not has_times:
             self.warnings.append(
@@ -123,11 +119,8 @@ class _Folder:
         return None
 
     def color(self, number: int) -> tuple[bytes, Path] | None:
-        for suffix in (".jpg", ".png"):
-            path = self.path / "rgb" / f"{number}{suffix}"
-            if reading.is_file(path):
-                return reading.read_bytes(path, limit=MAX_MEMBER_BYTES), path
-        return None
+        path = reading.first_file(*(self.path / "rgb" / f"{number}{s}" for s in (".jpg", ".png")))
+        return None if path is None else (reading.read_bytes(path, limit=MAX_MEMBER_BYTES), path)
 
 
 class _Archive:
@@ -189,14 +182,7 @@ class _Archive:
             raise InputError("is missing", where=where, remedy="export it again") from error
         except OSError as error:
             raise reading.input_error(error, where) from error
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            ValueError,
-            NotImplementedError,
-            RuntimeError,
-            EOFError,
-        ) as error:
+        except Exception as error:
             raise InputError("is damaged", where=where, remedy="copy the file again") from error
         if len(data) > MAX_MEMBER_BYTES:
             raise InputError("is too large", where=where, remedy="check the file")

@@ -67,7 +67,6 @@ class Redwood(Reader):
             files,
             _timestamps(files),
             camera,
-            0.001,
             color=_color_files(path, files, warnings),
             # Open3D's recorders write this format with other cameras.
             sensor=SENSOR if first_size(files) == SIZE else "",

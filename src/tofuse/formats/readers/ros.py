@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -91,15 +92,12 @@ class RosSource(bags.BagSource):
         """See `BagSource.read_frame`."""
         if self.connection.msgtype != CLOUD:
             return super().read_frame(index, where)
-        content, time = bags.cloud(self.depth.message(index), where), float(self.timestamps[index])
+        time, message = float(self.timestamps[index]), self.depth.message(index)
+        cloud = bags.cloud(message, where)
         if self.raster is None:
-            return cloud_frames.cloud_frame(
-                index, time, content.points, amplitude=content.amplitude
-            )
-        points = content.points.reshape(content.height, content.width, 3)
-        return organised.organised_frame(
-            points, self.raster, index, time, where, amplitude=content.amplitude
-        )
+            return cloud_frames.cloud_frame(index, time, cloud)
+        points = cloud.points.reshape(message.height, message.width, 3)
+        return organised.organised_frame(points, cloud, self.raster, index, time)
 
     def read_depth(self, index: int, where: str) -> Float32:
         """See `BagSource.read_depth`."""
@@ -284,15 +282,12 @@ class RosSource(bags.BagSource):
     def _organised(self) -> Camera | None:
         """The camera of organised clouds, if they are in x right, y down, z forward; else None."""
         images = []
-        step = max(1, len(self.depth) // organised.SAMPLES)
-        for k in range(0, len(self.depth), step)[: organised.SAMPLES]:
-            try:
-                content = bags.cloud(self.depth.message(k), self.where(k))
-            except InputError:
-                continue
-            if min(content.width, content.height) < 2:
-                return None
-            images.append(content.points.reshape(content.height, content.width, 3))
+        for k, message in organised.samples(len(self.depth), lambda k: (k, self.depth.message(k))):
+            with suppress(InputError):
+                points = bags.cloud(message, self.where(k)).points
+                if min(message.width, message.height) < 2:
+                    return None
+                images.append(points.reshape(message.height, message.width, 3))
         return organised.common_camera(images)
 
 

@@ -15,7 +15,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading
 from tofuse.formats.images import first_size
-from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, per_frame, phones
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, phones
 
 _DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
 _REMEDY = "export the recording again"
@@ -58,8 +58,8 @@ class ScannerApp(Reader):
             entries.append(entry)
         if not np.isfinite(source.timestamps).any():
             raise next(c for c in source.cameras if isinstance(c, InputError))
-        source.timestamps = per_frame.interpolated(source.timestamps)
-        source.reference = per_frame.poses_of(
+        source.timestamps = inputs.interpolated(source.timestamps)
+        source.reference = inputs.poses_of(
             source, entries, lambda entry: None if entry is None else entry.pose()
         )
         return source

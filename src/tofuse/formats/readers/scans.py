@@ -13,6 +13,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading
@@ -24,7 +25,6 @@ from tofuse.formats.sources import (
     cloud_frames,
     cloud_sequence,
     inputs,
-    per_frame,
 )
 
 MAX_POINTS = 100_000_000
@@ -45,11 +45,16 @@ class LasScans(cloud_sequence.CloudReader):
 
 
 def _las_header(path: Path) -> Any:
+    with reading.about(path, _COPY):
+        return _checked_header(path)
+
+
+def _checked_header(path: Path) -> Any:
     import laspy
 
     head = reading.read_head(path, 375)
     if head[:4] != b"LASF":
-        raise InputError("isn't a LAS file", where=path, remedy="check the file")
+        raise InputError("isn't a LAS file")
     _check_records(head, path)
     with reading.library_errors(path, _COPY), laspy.open(path) as file:
         header = file.header
@@ -57,11 +62,7 @@ def _las_header(path: Path) -> Any:
     file_size = path.stat().st_size
     compressed = bool(getattr(header, "are_points_compressed", False))
     if count > MAX_POINTS or count * size > file_size * (_MAX_COMPRESSION if compressed else 1):
-        raise InputError(
-            f"point count: {count} points don't fit into {file_size} bytes",
-            where=path,
-            remedy=_COPY,
-        )
+        raise InputError(f"point count: {count} points don't fit into {file_size} bytes")
     if compressed and count:
         with reading.library_errors(path, _COPY):
             _check_chunks(path, header)
@@ -74,9 +75,7 @@ def _check_records(head: bytes, path: Path) -> None:
     extended = int.from_bytes(head[243:247], "little") if head[25:26] >= b"\x04" else 0
     if 54 * count + 60 * extended > path.stat().st_size:  # header sizes in bytes
         raise InputError(
-            f"header: {count + extended} variable-length records don't fit into the file",
-            where=path,
-            remedy=_COPY,
+            f"header: {count + extended} variable-length records don't fit into the file"
         )
 
 
@@ -94,9 +93,7 @@ def _check_chunks(path: Path, header: Any) -> None:
     if layout.item_size() != header.point_format.size:
         raise InputError(
             f"LASzip record: a point has {layout.item_size()} bytes, in the header"
-            f" {header.point_format.size}",
-            where=path,
-            remedy=_COPY,
+            f" {header.point_format.size}"
         )
     with path.open("rb") as file:
         file.seek(start)
@@ -105,27 +102,19 @@ def _check_chunks(path: Path, header: Any) -> None:
             file.seek(-8, os.SEEK_END)
             (table,) = struct.unpack("<q", file.read(8))
         if not start + 8 <= table <= size - 8:
-            raise InputError(
-                f"chunk table: offset {table} is outside the point data", where=path, remedy=_COPY
-            )
+            raise InputError(f"chunk table: offset {table} is outside the point data")
         file.seek(table)
         _, count = struct.unpack("<II", file.read(8))
         # Each chunk begins with an uncompressed point.
         if count * layout.item_size() > table - start:
-            raise InputError(
-                f"chunk table: {count} chunks don't fit into {table - start} bytes",
-                where=path,
-                remedy=_COPY,
-            )
+            raise InputError(f"chunk table: {count} chunks don't fit into {table - start} bytes")
         file.seek(start)
         chunks = lazrs.read_chunk_table(file, layout)
     points, compressed = (sum(column) for column in zip(*chunks, strict=True)) if chunks else (0, 0)
     if compressed > table - start or points < header.point_count:
         raise InputError(
             f"chunk table: {points} points in {compressed} bytes, while the file has"
-            f" {header.point_count} in {table - start}",
-            where=path,
-            remedy=_COPY,
+            f" {header.point_count} in {table - start}"
         )
 
 
@@ -149,19 +138,16 @@ def _las_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     with reading.library_errors(path, _COPY):
         xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1)
         names = set(points.point_format.dimension_names)
-        amplitude = np.asarray(points["intensity"], np.float32)
+        intensity = np.asarray(points["intensity"], np.float32)
         color = None
         if {"red", "green", "blue"} <= names:
             values = np.stack([np.asarray(points[c]) for c in ("red", "green", "blue")], 1)
             # The standard uses 16 bits; many programs write 8-bit values.
             color = (values >> 8 if values.max(initial=0) > 255 else values).astype(np.uint8)
-    return cloud_frames.cloud_frame(
-        index,
-        timestamp,
-        xyz,
-        amplitude=amplitude if amplitude.any() else None,
-        color=color if color is not None and color.any() else None,
-    )
+    color = color if color is not None and color.any() else None
+    scalars = {"intensity": intensity} if intensity.any() else {}
+    cloud = GeometryRecord(xyz, color=color, scalars=scalars)
+    return cloud_frames.cloud_frame(index, timestamp, cloud)
 
 
 @part("reader", "e57")
@@ -199,10 +185,10 @@ class E57Source(FileSource):
                 "contains no scan", where=path, remedy="export scans, not only pictures"
             )
         super().__init__(np.arange(len(self.counts), dtype=float))
-        self.reference = per_frame.poses_of(
+        self.reference = inputs.poses_of(
             self,
             range(len(poses)),
-            lambda k: per_frame.read_matrix_pose(poses[k], f"{path}: scan {k}"),
+            lambda k: inputs.read_matrix_pose(poses[k], f"{path}: scan {k}"),
         )
 
     def load(self, index: int) -> CloudFrame:
@@ -223,14 +209,9 @@ class E57Source(FileSource):
         if all(f"color{c}" in data for c in ("Red", "Green", "Blue")):
             color = np.stack([np.asarray(data[f"color{c}"]) for c in ("Red", "Green", "Blue")], 1)
             color = color.astype(np.uint8)
-        amplitude = data.get("intensity")
-        return cloud_frames.cloud_frame(
-            index,
-            float(index),
-            points,
-            amplitude=None if amplitude is None else np.asarray(amplitude, np.float32),
-            color=color,
-        )
+        scalars = {"intensity": data["intensity"]} if "intensity" in data else {}
+        cloud = GeometryRecord(points, color=color, scalars=scalars)
+        return cloud_frames.cloud_frame(index, float(index), cloud)
 
     def _pose(self, header: Any) -> Float64:
         if not header.has_pose():

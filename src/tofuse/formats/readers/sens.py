@@ -25,7 +25,6 @@ from tofuse.formats.sources import (
     ReaderOptions,
     Sniff,
     inputs,
-    per_frame,
     pixels,
 )
 
@@ -66,6 +65,8 @@ class _Entry:
 class SensSource(FileSource):
     """Frames located in one pass over the file, and read on demand."""
 
+    remedy = "copy the file again"
+
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.path = path
         super().__init__(np.zeros(0))
@@ -79,14 +80,14 @@ class SensSource(FileSource):
         self.entries = [entry for entry, _, _ in frames]
         times = np.array([time for _, time, _ in frames]) / _TIMES_PER_S
         self.timestamps = times if times.any() else np.arange(len(frames)) / _RATE_HZ
-        per_frame.check_timestamps(self.timestamps, path, self.warnings)
+        inputs.check_timestamps(self.timestamps, path, self.warnings)
         if len(frames) < count:
             self.warnings.append(f"{path}: cut off after {len(frames)} of {count} frames")
         # The format stores minus infinity where tracking was lost.
-        self.reference = per_frame.poses_of(
+        self.reference = inputs.poses_of(
             self,
             range(len(frames)),
-            lambda k: per_frame.read_matrix_pose(frames[k][2], f"{path}: pose of frame {k}"),
+            lambda k: inputs.read_matrix_pose(frames[k][2], f"{path}: pose of frame {k}"),
         )
         if options.camera is not None:
             self.use_camera(options.camera, self.depth_size)
@@ -102,7 +103,7 @@ class SensSource(FileSource):
         entry, where = self.entries[index], f"{self.path}: frame {index}"
         data = reading.read_part(self.path, entry.start, entry.color + entry.depth)
         packed_color, packed_depth = data[: entry.color], data[entry.color :]
-        counts = self._depth(packed_depth, where)
+        counts = self._depth(packed_depth)
         frame = self.image(index, depth_counts.depth_from_counts(counts, self.unit))
         if not packed_color or self.color_camera is None:
             return frame
@@ -146,7 +147,7 @@ class SensSource(FileSource):
         """T_color_depth (4, 4); identity if not given."""
         try:
             poses = [
-                per_frame.read_matrix_pose(T, f"{self.path}: extrinsics")
+                inputs.read_matrix_pose(T, f"{self.path}: extrinsics")
                 for T in (T_device_color, T_device_depth)
             ]
         except InputError as error:
@@ -171,7 +172,7 @@ class SensSource(FileSource):
                 return
             yield _Entry(start, color, depth), time, np.array(pose).reshape(4, 4)
 
-    def _depth(self, data: bytes, where: str) -> UInt16:
+    def _depth(self, data: bytes) -> UInt16:
         width, height = self.depth_size
         expected = 2 * width * height
         if self.depth_packing == ZLIB:
@@ -179,15 +180,9 @@ class SensSource(FileSource):
             try:
                 data = decompressor.decompress(data, expected + 1)
             except zlib.error as error:
-                raise InputError(
-                    f"has damaged depth ({error})", where=where, remedy="copy the file again"
-                ) from error
+                raise InputError(f"has damaged depth ({error})") from error
         if len(data) != expected:
-            raise InputError(
-                f"has {len(data)} bytes of depth, not {expected}",
-                where=where,
-                remedy="copy the file again",
-            )
+            raise InputError(f"has {len(data)} bytes of depth, not {expected}")
         return np.frombuffer(data, "<u2").reshape(height, width)
 
     def _color(self, data: bytes, where: str) -> UInt8:

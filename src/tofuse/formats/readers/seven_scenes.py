@@ -15,7 +15,7 @@ from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import first_size
-from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs, per_frame
+from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs
 
 FRAME_RATE_HZ = 30.0
 SENSOR, SIZE = "Kinect v1 (structured light)", (640, 480)
@@ -44,7 +44,6 @@ class SevenScenes(Reader):
             files,
             numbers / FRAME_RATE_HZ,
             None if options.camera else _camera(path, files),
-            0.001,
             color=color if complete else None,
             color_registered=False,
             # Other programs write this format too, with other cameras.
@@ -58,7 +57,7 @@ class SevenScenes(Reader):
         elif color:
             source.warnings.append("colour is not registered to depth in 7-Scenes: used unchanged")
         stems = [file.name[: -len(".depth.png")] for file in files]
-        source.reference = per_frame.poses_from_files(
+        source.reference = inputs.poses_from_files(
             source, [path / f"{stem}.pose.txt" for stem in stems], read_pose
         )
         source.metadata["frame_rate_hz"] = FRAME_RATE_HZ
@@ -67,7 +66,7 @@ class SevenScenes(Reader):
 
 def read_pose(path: Path) -> Float64:
     """Return T_world_camera (4, 4) of a .pose.txt; NaN if tracking was lost."""
-    return per_frame.read_matrix_pose(tables.read_numbers(path), str(path))
+    return inputs.read_matrix_pose(tables.read_numbers(path), str(path))
 
 
 def _depth_files(path: Path) -> list[tuple[int, Path]]:
@@ -78,10 +77,7 @@ def _depth_files(path: Path) -> list[tuple[int, Path]]:
 
 def _color(file: Path) -> Path | None:
     stem = file.name[: -len(".depth.png")]
-    for suffix in (".color.png", ".color.jpg"):
-        if reading.is_file(file.with_name(stem + suffix)):
-            return file.with_name(stem + suffix)
-    return None
+    return reading.first_file(*(file.with_name(f"{stem}.color.{s}") for s in ("png", "jpg")))
 
 
 def _camera(folder: Path, files: Sequence[Path]) -> Pinhole:

@@ -13,7 +13,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading
-from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, per_frame
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
 
 FRAME_RATE_HZ = 32.0
 # Modulated at 30 MHz, the factory default.
@@ -90,7 +90,7 @@ class Sr4000Source(FileSource):
             return
         if missing:
             self.warnings.append(f"{missing} frames have no timestamp: interpolated")
-        times = per_frame.interpolated(times)
+        times = inputs.interpolated(times)
         # Frames stay in sequence where the camera's counter restarts.
         step = np.diff(times, prepend=times[0])
         if (step < 0).any():

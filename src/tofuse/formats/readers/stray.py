@@ -18,7 +18,6 @@ from tofuse.formats.sources import (
     Sniff,
     gravity_at,
     inputs,
-    per_frame,
     phones,
 )
 
@@ -140,7 +139,7 @@ class StraySource(phones.PhoneSource):
             )
         if not valid.all():
             self.warnings.append(f"{path}: {int((~valid).sum())} frames have no row: interpolated")
-        self.timestamps = per_frame.interpolated(times)
+        self.timestamps = inputs.interpolated(times)
         poses = np.full((len(row), 4, 4), np.nan)
         table = np.stack([columns[name] for name in _POSE], 1)[row]
         posed = (row >= 0) & np.isfinite(table).all(1) & (np.abs(table) < 1e6).all(1)

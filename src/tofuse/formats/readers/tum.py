@@ -13,7 +13,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading
 from tofuse.formats.poses import associate
-from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, per_frame
+from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs
 
 DEPTH_UNIT_M = 1 / 5000
 COLOR_LIMIT_S = 0.1
@@ -54,7 +54,7 @@ class Tum(Reader):
                 remedy="pass the colour camera with --camera camera.json",
             )
         warnings: list[str] = []
-        per_frame.check_timestamps(times, path / "depth.txt", warnings)
+        inputs.check_timestamps(times, path / "depth.txt", warnings)
         color: list[Path | None] | None = None
         if reading.is_file(path / "rgb.txt"):
             color_times, color_files = _read_list(path / "rgb.txt")
@@ -73,14 +73,14 @@ class Tum(Reader):
             files,
             times,
             camera,
-            DEPTH_UNIT_M,
+            depth_unit_m=DEPTH_UNIT_M,
             color=color,
             sensor="" if camera is None else SENSOR,
             options=options,
         )
         source.warnings += warnings
         if reading.is_file(path / "groundtruth.txt"):
-            source.reference = per_frame.tum_poses(source, path / "groundtruth.txt")
+            source.reference = inputs.tum_poses(source, path / "groundtruth.txt")
         return source
 
 

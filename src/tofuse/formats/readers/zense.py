@@ -52,7 +52,6 @@ class Zense(Reader):
             files,
             np.arange(len(files)) / rate,
             camera,
-            0.001,
             sensor="Pico Zense (ToF)",
             options=options,
         )

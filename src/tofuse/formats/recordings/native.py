@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -162,19 +162,14 @@ class RecordingWriter:
         self._check_channels(frame, *(name for name, image in images.items() if image is not None))
         depth = frame.z if self.depth_kind == "z" else frame.radial_range
         write_png(self._frame_path("depth", ".png"), self._counts(depth))
-        if frame.amplitude_image is not None:
-            write_png(self._frame_path("amplitude", ".png"), self._amplitude(frame.amplitude_image))
-        if frame.confidence_image is not None:
-            confidence = frame.confidence_image.astype(np.uint8, copy=False)
-            write_png(self._frame_path("confidence", ".png"), confidence)
-        if frame.color_image is not None:
-            write_png(self._frame_path("color", ".png"), frame.color_image)
-        if self.sigma_unit_m is not None and frame.sigma_image is not None:
-            counts = np.rint(frame.sigma_image.astype(float) / self.sigma_unit_m)
-            write_png(
-                self._frame_path("sigma", ".png"),
-                np.clip(counts, 0, depth_counts.MAX_COUNTS).astype(np.uint16),
-            )
+        stored: dict[str, Callable[[Any], UInt16]] = {
+            "amplitude": self._amplitude,
+            "sigma": self._sigma,
+        }
+        for name, image in images.items():
+            if image is not None:
+                pixels = stored[name](image) if name in stored else image.astype(np.uint8)
+                write_png(self._frame_path(name, ".png"), pixels)
         if self.camera_per_frame:
             self._write_camera(frame.camera, camera)
 
@@ -209,6 +204,10 @@ class RecordingWriter:
         overflow = counts >= depth_counts.INVALID_DEPTH
         self.out_of_range += int(overflow.sum())
         return np.where(overflow, 0, counts).astype(np.uint16)
+
+    def _sigma(self, sigma: Float32) -> UInt16:
+        counts = np.rint(sigma.astype(float) / (self.sigma_unit_m or 1.0))
+        return np.clip(counts, 0, depth_counts.MAX_COUNTS).astype(np.uint16)
 
     def _amplitude(self, amplitude: Float32) -> UInt16:
         counts = np.rint(np.nan_to_num(amplitude.astype(float)))

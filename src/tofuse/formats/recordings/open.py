@@ -197,14 +197,15 @@ def _resolve_as(path: Path, format: str) -> list[_Located]:  # noqa: A002
         )
     reader = choices[format]
     if reader.joinable and path.is_dir() and _sniff_as(reader, path) is None:
-        parts = [
-            p
-            for p in reading.list_folder(path)
-            if reading.is_folder(p) and _sniff_as(reader, p) is not None
-        ]
+        parts = [p for p in _folders_in(path) if _sniff_as(reader, p) is not None]
         if parts:
             return [_Located(p, reader) for p in parts]
     return [_Located(path, reader)]
+
+
+def _folders_in(path: Path) -> list[Path]:
+    children = reading.list_folder(path) if reading.is_folder(path) else []
+    return [child for child in children if reading.is_folder(child)]
 
 
 def _sniff_as(reader: Reader, path: Path) -> Sniff | None:
@@ -227,12 +228,8 @@ def is_recording(path: Path) -> bool:
 
 def _recordings_in(path: Path) -> list[_Located]:
     """The recordings in a folder, if any; InputError if they can't be joined."""
-    if not reading.is_folder(path):
-        return []
     format_of: dict[Path, str] = {}
-    for folder in reading.list_folder(path):
-        if not reading.is_folder(folder):
-            continue
+    for folder in _folders_in(path):
         sniffs = _sniff(folder)
         confident = [name for name, s in sniffs.items() if s.confidence >= Sniff.CERTAIN]
         if confident:
@@ -288,24 +285,15 @@ def _check_depths(min_depth: float | None, max_depth: float | None) -> None:
 
 def _check_usable(source: Source, path: str | Path) -> None:
     """Refuse a recording without a readable frame; stops at the first readable one."""
-    first_error: UnreadableFrameError | None = None
-    for index in range(len(source.timestamps)):
-        try:
-            source.read(index)
-            return
-        except UnreadableFrameError as error:
-            first_error = first_error or error
-    if first_error is None:
-        raise InputError("has no frames", where=path, remedy="pass a recording")
     count = len(source.timestamps)
-    problem = (
-        first_error.problem if count == 1 else f"none of {count} frames can be read: {first_error}"
-    )
-    raise InputError(
-        problem,
-        where=first_error.where if count == 1 else path,
-        remedy=first_error.remedy if count == 1 else None,
-    )
+    nothing = InputError("has no frames", where=path, remedy="pass a recording")
+    try:
+        reading.first_readable(range(count), source.read, nothing)
+    except UnreadableFrameError as first:
+        if count > 1:
+            problem = f"none of {count} frames can be read: {first}"
+            raise InputError(problem, where=path) from first
+        raise InputError(first.problem, where=first.where, remedy=first.remedy) from first
 
 
 def _short_names(paths: list[Path]) -> list[str]:
@@ -328,15 +316,9 @@ def read_reference(path: str | Path) -> TimedPoses:
     readers_of_poses = [lambda: read_poses(poses_file), lambda: open_recording(path)]
     if not poses_file.is_file():  # else the images are not needed
         readers_of_poses = [lambda: open_recording(path), lambda: read_poses(path)]
-    errors: list[InputError] = []
-    for read in readers_of_poses:
-        try:
-            found = read()
-        except InputError as error:
-            errors.append(error)
-            continue
-        return found if isinstance(found, TimedPoses) else _reference_of(found, path)
-    raise errors[0] from None
+    nothing = InputError("has no poses", where=path)
+    found = reading.first_readable(readers_of_poses, lambda read: read(), nothing)
+    return found if isinstance(found, TimedPoses) else _reference_of(found, path)
 
 
 def _reference_of(recording: Recording, path: Path) -> TimedPoses:

@@ -1,9 +1,9 @@
 """What readers of formats share: the interface of a `Reader`, and sources of frames to derive from.
 
 A reader detects its format (`Sniff`) and opens a `FileSource`, or one of the more specific sources
-in `bags`, `phones` and `cloud_sequence`. `inputs` finds the files of a recording, `per_frame`
-reads what each frame has (pose, time, camera), `pixels` and `cloud_frames` make images and clouds,
-and `organised` finds the camera of clouds that were images.
+in `bags`, `phones` and `cloud_sequence`. `inputs` finds the files of a recording, and reads what
+belongs to each frame (pose, time, camera); `pixels` and `cloud_frames` make images and clouds, and
+`organised` finds the camera of clouds that were images.
 """
 
 from typing import TYPE_CHECKING
@@ -17,12 +17,11 @@ if TYPE_CHECKING:
         cloud_sequence,
         inputs,
         organised,
-        per_frame,
         phones,
         pixels,
     )
     from tofuse.formats.sources.file_source import DepthImageSource, FileSource
     from tofuse.formats.sources.imu import gravity_at
-    from tofuse.formats.sources.reader import Reader, ReaderOptions, Sniff
+    from tofuse.formats.sources.inputs import Reader, ReaderOptions, Sniff
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -18,13 +18,14 @@ from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import as_color, parse_image
 from tofuse.formats.sources.file_source import FileSource
+from tofuse.formats.sources.inputs import ReaderOptions
 from tofuse.formats.sources.pixels import finite_float32, sampled_color
-from tofuse.formats.sources.reader import ReaderOptions
 
 REMEDY = "check the bag, or reindex it"
 MAX_GAP_S = 0.02  # between the images of one frame
@@ -415,18 +416,8 @@ def lens(message: Any, where: str) -> Pinhole:
     return camera_file.checked_lens(MODELS[name], info.size, info.values | coefficients, where)
 
 
-@dataclass(frozen=True)
-class Cloud:
-    """Points (N, 3) of a PointCloud2, their amplitude (N,) or None, and their organised size."""
-
-    points: Float32
-    amplitude: Float32 | None
-    width: int
-    height: int
-
-
-def cloud(message: Any, where: str) -> Cloud:
-    """Read a PointCloud2.
+def cloud(message: Any, where: str) -> GeometryRecord:
+    """Read points and amplitude of a PointCloud2.
 
     Raises
     ------
@@ -455,8 +446,9 @@ def cloud(message: Any, where: str) -> Cloud:
             return values.astype(np.float32)
 
     points = np.stack([column(name) for name in "xyz"], 1)
-    amplitude = next((column(name) for name in _AMPLITUDES if name in fields), None)
-    return Cloud(points, amplitude, int(message.width), int(message.height))
+    amplitude = next((name for name in _AMPLITUDES if name in fields), None)
+    scalars = {} if amplitude is None else {"amplitude": column(amplitude)}
+    return GeometryRecord(points, scalars=scalars)
 
 
 _ROS2_TYPE = "tf2_msgs/msg/TFMessage"

@@ -8,18 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.frames import CloudFrame, map_shift
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.formats.geometry import read_ply
 
 
 def ply_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     """Read a PLY cloud; non-finite points are dropped."""
-    ply = read_ply(path)
-    return cloud_frame(
-        index, timestamp, ply.points, ply.normals, amplitude=ply.amplitude, color=ply.color
-    )
+    return cloud_frame(index, timestamp, read_ply(path))
 
 
 def to_float32(values: NDArray[Any]) -> Float32:
@@ -31,17 +29,15 @@ def to_float32(values: NDArray[Any]) -> Float32:
 def cloud_frame(
     index: int,
     timestamp: float,
-    points: NDArray[np.floating],
-    normals: Float32 | None = None,
+    cloud: GeometryRecord,
     *,
-    amplitude: Float32 | None = None,
-    color: UInt8 | None = None,
     origin: Float64 | None = None,
 ) -> CloudFrame:
-    """Return a cloud of (N, 3) points in m with columns (N, ...), without invalid points.
+    """Return a cloud of a file as a view, without invalid points.
 
     Map coordinates are shifted in the precision of the points, and so is the `origin` (3,).
     """
+    points = cloud.points
     with np.errstate(over="ignore", invalid="ignore"):  # signalling NaN as well
         shift = map_shift(points)
         points = points - shift if shift.any() else points
@@ -53,9 +49,9 @@ def cloud_frame(
         index,
         timestamp,
         to_float32(points),
-        normals,
-        amplitude=amplitude,
-        color=color,
+        cloud.normals,
+        amplitude=cloud.amplitude,
+        color=cloud.color,
         origin=(np.zeros(3) if origin is None else origin) - shift,
         shift=shift,
     )

@@ -18,8 +18,8 @@ from tofuse.engine.parts import name_of
 from tofuse.formats.files import reading, tables
 from tofuse.formats.sources import inputs
 from tofuse.formats.sources.file_source import FileSource
-from tofuse.formats.sources.organised import SAMPLES, Deprojection, find_deprojection
-from tofuse.formats.sources.reader import Reader, ReaderOptions, Sniff
+from tofuse.formats.sources.inputs import Reader, ReaderOptions, Sniff
+from tofuse.formats.sources.organised import Deprojection, find_deprojection, samples
 
 LoadFrame = Callable[[Path, int, float], Frame]
 
@@ -59,6 +59,10 @@ class CloudFileSource(FileSource):
         if self._deprojection is not None:
             self.metadata["depth_kind"] = "z"
 
+    def where(self, index: int) -> str:
+        """See `FileSource.where`."""
+        return str(self.files[index])
+
     def load(self, index: int) -> Frame:
         """See `FileSource.load`."""
         cached = self._cached.pop(index, None)
@@ -74,13 +78,7 @@ class CloudFileSource(FileSource):
         """The camera from which all clouds were deprojected, determined from a few of them."""
         clouds: list[CloudFrame] = []
         candidate: Deprojection | None = None
-        for index in range(0, len(self.files), max(1, len(self.files) // SAMPLES)):
-            if len(clouds) == SAMPLES:
-                break
-            try:
-                frame = self._cached[index] if index in self._cached else self._read(index)
-            except InputError:
-                continue
+        for frame in samples(len(self.files), lambda k: self._cached.get(k) or self._read(k)):
             if not isinstance(frame, CloudFrame):
                 return None
             clouds.append(frame)

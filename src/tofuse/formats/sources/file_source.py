@@ -20,8 +20,7 @@ from tofuse.engine.frames import (
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import check_first_size, read_color, read_image
-from tofuse.formats.sources.per_frame import read_timestamps, tum_poses
-from tofuse.formats.sources.reader import ReaderOptions
+from tofuse.formats.sources.inputs import ReaderOptions, read_timestamps, tum_poses
 
 
 class FileSource(ABC):
@@ -40,7 +39,7 @@ class FileSource(ABC):
     """
 
     concurrent = False
-    path: Path | None = None
+    path: Path  # of a single file
     remedy: str | None = None
     camera: Camera
     unit: float = 0.001
@@ -59,7 +58,8 @@ class FileSource(ABC):
 
     def where(self, index: int) -> str:
         """Return the name of a frame for errors."""
-        return f"{self.path}: frame {index}" if self.path else f"frame {index}"
+        path = getattr(self, "path", None)
+        return f"frame {index}" if path is None else f"{path}: frame {index}"
 
     @abstractmethod
     def load(self, index: int) -> Frame:
@@ -152,8 +152,8 @@ class DepthImageSource(FileSource):
         files: Sequence[Path],
         timestamps: Float64,
         camera: Camera | None,
-        depth_unit_m: float,
         *,
+        depth_unit_m: float = 0.001,
         color: Sequence[Path | None] | None = None,
         color_registered: bool = True,
         sensor: str = "",

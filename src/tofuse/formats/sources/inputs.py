@@ -1,13 +1,92 @@
-"""The files that a recording consists of, and options that do not apply to it."""
+"""The interface of a reader, the files of a recording, and what belongs to each frame."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import ClassVar, Protocol, TypeVar
 
+import numpy as np
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import reading
-from tofuse.formats.sources.reader import ReaderOptions
+from tofuse.engine.frames import Source
+from tofuse.engine.geometry import se3
+from tofuse.formats.files import reading, tables
+from tofuse.formats.poses import associated_poses, read_tum
+
+
+@dataclass(frozen=True)
+class Sniff:
+    """A reader's guess whether a path has its format.
+
+    Attributes
+    ----------
+    confidence
+        0 to 1; a path is opened automatically from `CERTAIN` on, not if `UNCERTAIN`. 1 is for names
+        and contents that no other format has.
+    evidence
+        The evidence for the format, for messages.
+    remedy
+        What to do if the confidence is below `CERTAIN`.
+    """
+
+    CERTAIN: ClassVar[float] = 0.9
+    UNCERTAIN: ClassVar[float] = 0.5
+
+    confidence: float
+    evidence: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class ReaderOptions:
+    """Options of the user for opening a recording.
+
+    Attributes
+    ----------
+    camera
+        A camera.json that replaces the recording's own.
+    topic
+        Of a bag, instead of the detected one.
+    """
+
+    camera: Path | None = None
+    topic: str | None = None
+
+
+@dataclass(frozen=True)
+class Reader(Protocol):
+    """A reader of one format, registered by ``@part("reader", name)`` in a module of `readers`.
+
+    Attributes
+    ----------
+    joinable
+        Whether a folder of such recordings is joined to one recording, in name order.
+    """
+
+    part_kind: ClassVar[str] = "reader"
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """Detect the format from names and first bytes; None if it is another one.
+
+        An InputError, if something can't be read, is taken for None.
+        """
+        ...
+
+    def open(self, path: Path, options: ReaderOptions) -> Source:
+        """Open a file or folder.
+
+        Raises
+        ------
+        InputError
+            If the recording as a whole is unusable.
+        """
+        ...
+
 
 PER_FRAME = "a camera per frame"
 
@@ -69,3 +148,112 @@ def files_at(path: Path, *suffixes: str) -> list[Path]:
     if reading.is_file(path):
         return [path] if path.suffix.lower() in suffixes else []
     return reading.files_with(path, *suffixes) if reading.is_folder(path) else []
+
+
+def tum_poses(source: Source, path: Path) -> Float64:
+    """Return (N, 4, 4) poses of a TUM file at the source's timestamps, NaN without a match."""
+    times, poses = read_tum(path)
+    out = associated_poses(source.timestamps, times, poses)
+    posed = int(np.isfinite(out[:, 0, 0]).sum())
+    if posed < len(out):
+        source.warnings.append(
+            f"{path}: {posed} of {len(out)} frames have a pose within 0.02 s of their timestamp"
+        )
+    return out
+
+
+def poses_of(
+    source: Source, items: Iterable[T], read: Callable[[T], Float64 | None]
+) -> Float64 | None:
+    """Return the poses (N, 4, 4) of all frames; None if none is known.
+
+    Parameters
+    ----------
+    source
+        Receives a warning if poses can't be read.
+    items
+        One for each frame: what its pose is read from.
+    read
+        Returns the pose (4, 4), NaN or None if unknown; raises InputError if it can't be read.
+    """
+    poses, errors = [], []
+    for item in items:
+        pose = None
+        try:
+            pose = read(item)
+        except InputError as error:
+            errors.append(error)
+        poses.append(np.full((4, 4), np.nan) if pose is None else pose)
+    if errors:
+        source.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
+    return np.stack(poses) if np.isfinite(poses).any() else None
+
+
+def poses_from_files(
+    source: Source, files: Iterable[Path], read: Callable[[Path], Float64]
+) -> Float64 | None:
+    """Return the poses of one file per frame, which may be missing; see `poses_of`."""
+    return poses_of(source, files, lambda path: read(path) if reading.is_file(path) else None)
+
+
+def read_matrix_pose(table: Float64, where: str) -> Float64:
+    """Check a (4, 4) pose of a file, and orthonormalise its rotation.
+
+    Non-finite entries, which trackers write where they are lost, give NaN.
+    """
+    if table.shape != (4, 4):
+        raise InputError(
+            f"has {table.shape[0]} rows of {table.shape[-1]} numbers",
+            where=where,
+            remedy="write the pose as four rows of four numbers",
+        )
+    if not np.isfinite(table).all():
+        return np.full((4, 4), np.nan)
+    return se3.orthonormalise(se3.check_pose(table, where=where))
+
+
+def read_timestamps(path: Path, count: int, warnings: list[str]) -> Float64:
+    """Read a timestamps.txt: (N,) seconds for `count` frames."""
+    table = tables.read_numbers(path)
+    if table.shape != (count, 1):
+        raise InputError(
+            f"has {len(table)} lines of {table.shape[-1]} numbers for {count} frames",
+            where=path,
+            remedy="use one time in seconds for each frame, or remove it",
+        )
+    times = table[:, 0]
+    check_timestamps(times, path, warnings)
+    return times
+
+
+def cameras_of(items: Iterable[T], read: Callable[[T], Pinhole]) -> list[Pinhole | InputError]:
+    """Return the camera of each frame, or the error that makes only this frame unusable."""
+    cameras: list[Pinhole | InputError] = []
+    for item in items:
+        try:
+            cameras.append(read(item))
+        except InputError as error:
+            cameras.append(error)
+    return cameras
+
+
+def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
+    """Raise InputError if timestamps are not finite; warn if they repeat or decrease."""
+    if not np.isfinite(times).all():
+        k = int(np.argmin(np.isfinite(times)))
+        raise InputError(
+            f"line {k + 1} is {times[k]}", where=path, remedy="assign every frame a time in seconds"
+        )
+    steps = np.diff(times)
+    if (steps < 0).any():
+        k = int(np.argmax(steps < 0)) + 1
+        warnings.append(f"{path}: time decreases at frame {k}; frames stay in the order of files")
+    elif (steps == 0).any():
+        k = int(np.argmax(steps == 0)) + 1
+        warnings.append(f"{path}: frames {k - 1} and {k} have the same timestamp")
+
+
+def interpolated(times: Float64) -> Float64:
+    """Return timestamps (N,) of frames, some of them finite, with the others interpolated."""
+    known, index = np.isfinite(times), np.arange(len(times))
+    return np.where(known, times, np.interp(index, index[known], times[known]))

@@ -10,18 +10,19 @@ and rows is fitted to increasingly large parts of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
+from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.cameras import Camera, RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, RangeFrame
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import KdTree, se3
 
 SAMPLES = 8
@@ -34,7 +35,18 @@ MAX_SLOPE = 100.0  # of a ray: 89.4 degrees off the axis
 # Largest mean deviation of x/z along a column of pixels, as a fraction of its range in the image.
 COLUMN_FRACTION = 0.05
 MIN_CELLS = 256
+_REMEDY = "keep the clouds of each camera apart"
 MIN_SPREAD_M = 0.1  # of z in a pixel, to determine the origin of its ray
+
+
+S = TypeVar("S")
+
+
+def samples(count: int, read: Callable[[int], S]) -> Iterator[S]:
+    """Yield what `read` returns for evenly spaced ones of `count` frames, if they can be read."""
+    for k in range(0, count, max(1, count // SAMPLES))[:SAMPLES]:
+        with suppress(InputError):
+            yield read(k)
 
 
 @dataclass(frozen=True)
@@ -158,17 +170,9 @@ def common_camera(images: Sequence[Float32]) -> Camera | None:
 
 
 def organised_frame(
-    points: Float32,
-    camera: Camera,
-    index: int,
-    timestamp: float,
-    where: str | Path,
-    *,
-    amplitude: Float32 | None = None,
-    color: UInt8 | None = None,
-    normals: Float32 | None = None,
+    points: Float32, cloud: GeometryRecord, camera: Camera, index: int, timestamp: float
 ) -> RangeFrame:
-    """Return points (H, W, 3) with columns (H * W, ...) as an image of `camera`.
+    """Return points (H, W, 3) with the columns (H * W, ...) of a cloud as an image of `camera`.
 
     Raises
     ------
@@ -180,23 +184,19 @@ def organised_frame(
         raise InputError(
             f"is organised as {points.shape[1]} x {points.shape[0]}, the previous clouds "
             f"{camera.width} x {camera.height}",
-            where=where,
-            remedy="keep the clouds of each camera apart",
+            remedy=_REMEDY,
         )
     z = points[..., 2]
     measured = _measured(points)
     rays = camera.rays()
     has_ray = np.asarray(np.isfinite(rays).all(-1))
     if not _fits(points, measured & has_ray, rays):
-        raise InputError(
-            "has points off the rays of the previous clouds",
-            where=where,
-            remedy="keep the clouds of each camera apart",
-        )
+        raise InputError("has points off the rays of the previous clouds", remedy=_REMEDY)
     if (measured & ~has_ray).any():
         # Pixels without measurements in the sampled clouds get the ray of their point.
         point_slopes = points[..., :2] / np.where(measured, z, np.nan)[..., None]
         camera = RayTable(np.where(has_ray[..., None], rays, point_slopes))
+    amplitude, color, normals = cloud.amplitude, cloud.color, cloud.normals
     return RangeFrame(
         index,
         timestamp,
@@ -288,11 +288,7 @@ class Deprojection:
         points = cloud.points
         pixel, on_lattice = self.lattice.pixels(points)
         if len(points) and on_lattice.mean() < _MIN_FRACTION:
-            raise InputError(
-                "has points off the rays of the previous clouds",
-                where=f"frame {cloud.index}",
-                remedy="keep the clouds of each camera apart",
-            )
+            raise InputError("has points off the rays of the previous clouds", remedy=_REMEDY)
         camera = self.camera
         shape = camera.height, camera.width
         on_lattice &= (pixel >= 0).all(1) & (pixel < (camera.width, camera.height)).all(1)

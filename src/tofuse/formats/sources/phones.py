@@ -15,7 +15,7 @@ from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import read_color, read_image
 from tofuse.formats.sources.file_source import FileSource
-from tofuse.formats.sources.per_frame import read_matrix_pose
+from tofuse.formats.sources.inputs import read_matrix_pose
 from tofuse.formats.sources.pixels import resized
 
 # ARKit's camera looks along -z with y up.

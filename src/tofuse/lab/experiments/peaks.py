@@ -10,7 +10,14 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.frames import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Measured, Optimiser, PoseGraph, build_graph, castellani
+from tofuse.engine.graph import (
+    Measured,
+    Optimiser,
+    PoseGraph,
+    build_graph,
+    castellani,
+    external_sensors,
+)
 from tofuse.engine.icp import CoarseToFine, algorithm_1
 from tofuse.engine.mapping import default, reconstructing
 from tofuse.engine.refinement import plane_refinement
@@ -145,7 +152,8 @@ def refine_peaks(sigma: float, seed: int) -> tuple[PoseErrors, PoseErrors]:
         poses.append(poses[-1] if T is None else T)
         refiner.push(view, poses[-1])
     start = np.array(poses)
-    refined = refiner.finish([view.index for view in views], start).poses
+    graph = build_graph([view.index for view in views], start, [], [])
+    refined = refiner.finish(graph, external_sensors.SensorPriors()).poses
     return PoseErrors.of(start, truth), PoseErrors.of(refined, truth)
 
 

@@ -17,7 +17,7 @@ from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
-from tofuse.engine.graph import external_sensors
+from tofuse.engine.graph import PoseGraph, external_sensors
 from tofuse.engine.icp import icp_kernels, surface_shape
 from tofuse.engine.refinement import (
     Refinement,
@@ -132,14 +132,9 @@ class _Relaxation(Refiner):
             plane_refinement.SampledPoints.of(view, self._method.points), T_component_camera
         )
 
-    def finish(
-        self,
-        ids: Sequence[int],
-        poses: Float64,
-        measured: external_sensors.SensorPriors | None = None,
-    ) -> Refinement:
+    def finish(self, graph: PoseGraph, sensors: external_sensors.SensorPriors) -> Refinement:
         """See `Refiner.finish`; rejected if the support decreases."""
-        row = {int(index): k for k, index in enumerate(ids)}
+        poses, row = graph.poses, {int(index): k for k, index in enumerate(graph.ids)}
         sampled = [posed.view for posed in self._store.of(row)]
         sampled = [k for k in sampled if len(k.points) >= _MIN_POINTS]
         if len(sampled) < 2:

@@ -13,12 +13,12 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from scipy.constants import speed_of_light
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import BrownConrady, Pinhole, Rational
 from tofuse.engine.errors import InputError
 from tofuse.engine.noise import AmplitudeLaw, NoiseModel, RangeLaw
-from tofuse.engine.sensor import SPEED_OF_LIGHT
 
 # Typical ambient light indoors, as a fraction of that on a white wall in a bright office.
 _TYPICAL_AMBIENT = 0.15
@@ -111,12 +111,12 @@ class CameraModel:
     @property
     def period_m(self) -> float:
         """Ambiguity range of the fine frequency, m."""
-        return SPEED_OF_LIGHT / (2 * self.modulation_hz)
+        return speed_of_light / (2 * self.modulation_hz)
 
     @property
     def ambiguity_m(self) -> float:
         """Ambiguity range of the camera, m."""
-        return SPEED_OF_LIGHT / (2 * (self.unwrap_hz or self.modulation_hz))
+        return speed_of_light / (2 * (self.unwrap_hz or self.modulation_hz))
 
     @property
     def frequencies(self) -> tuple[float, ...]:

@@ -7,11 +7,11 @@ from functools import cache
 
 import numpy as np
 from scipy import ndimage
+from scipy.constants import speed_of_light
 
 from tofuse.engine.arrays import Bool, Float64, Int32
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.compute import run_chunks
-from tofuse.engine.sensor import SPEED_OF_LIGHT
 from tofuse.lab.simulation import phasor_kernels as phasor
 from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.world import Scene
@@ -213,7 +213,7 @@ def bounce_weights(grid: RayGrid, returns: Returns, frequency: float) -> Float64
 
 
 def _pool(grid: RayGrid, strength: Float64, path: Float64, frequency: float) -> Float64:
-    wave_number = 2 * np.pi * frequency / SPEED_OF_LIGHT
+    wave_number = 2 * np.pi * frequency / speed_of_light
     rows, columns = grid.directions.shape[:2]
     fine = np.empty((rows * columns, phasor.CHANNELS))
     strength, path = np.ascontiguousarray(strength), np.ascontiguousarray(path)
@@ -303,7 +303,7 @@ def single_bounce_light(
     beam[valid] = _beam(model, (points[valid] - lamp) @ T_room_camera[:3, :3])
     out = []
     for frequency in model.frequencies:
-        wave_number = 2 * np.pi * frequency / SPEED_OF_LIGHT
+        wave_number = 2 * np.pi * frequency / speed_of_light
         coarse = np.empty((shape[0] * shape[1], phasor.CHANNELS))
         phasor.ray_phasors(
             strengths.reshape(-1, _BOUNCE_RAYS),

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from scipy.constants import speed_of_light
 
 from tofuse.engine.arrays import Bool, Complex128, Float32, Float64, UInt8
 from tofuse.engine.frames import SATURATED_AMPLITUDE
-from tofuse.engine.sensor import SPEED_OF_LIGHT, DepthCorrection
+from tofuse.engine.sensor import DepthCorrection
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel
 
@@ -194,7 +195,7 @@ def _measure_known_range(model: CameraModel, effects: Effects, true: Float64) ->
     harmonics = scaled_harmonics(model, effects)
     phasors = []
     for frequency in model.frequencies:
-        phase = 4 * np.pi * frequency / SPEED_OF_LIGHT * true
+        phase = 4 * np.pi * frequency / speed_of_light * true
         light = np.stack(
             [
                 np.ones_like(phase),

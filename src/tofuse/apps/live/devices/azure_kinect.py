@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from tofuse.apps.live import TIMEOUT_S, DeviceError, Settings, Stream, no_frame, not_started, vendor
+from tofuse.apps.live import TIMEOUT_S, Device, DeviceError, Settings, Stream, no_frame
 from tofuse.engine.cameras import Rational
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
@@ -15,75 +15,36 @@ from tofuse.engine.parts import part
 Mode = Literal["NFOV_2X2BINNED", "NFOV_UNBINNED", "WFOV_2X2BINNED", "WFOV_UNBINNED"]
 
 
-@part("device", "azure-kinect")
-@dataclass(frozen=True)
-class AzureKinect:
-    """An Azure Kinect: depth and the infrared image.
-
-    Attributes
-    ----------
-    mode
-        Field of view and resolution.
-    frame_rate_hz
-        5, 15 or 30; at most 15 with WFOV_UNBINNED.
-    device
-        Number of the camera, if several are connected.
-    """
-
-    package: ClassVar[tuple[str, str]] = ("pyk4a", "pyk4a")
-    mode: Mode = "NFOV_UNBINNED"
-    frame_rate_hz: int = 15
-    device: int = 0
-
-    def open(self) -> AzureKinectStream:
-        """See `Device.open`."""
-        return AzureKinectStream(self)
-
-
 class AzureKinectStream(Stream):
     """See `Stream`."""
 
-    def __init__(self, options: AzureKinect) -> None:
-        k4a: Any = vendor(options.package)
+    def start(self, package: Any, options: Any) -> None:
+        """See `Stream.start`."""
         rates = {5: "FPS_5", 15: "FPS_15", 30: "FPS_30"}
         if options.frame_rate_hz not in rates:
             raise DeviceError(
                 f"is {options.frame_rate_hz}", where="frame_rate_hz", remedy="use 5, 15 or 30"
             )
-        self._errors: tuple[type[Exception], ...] = (k4a.K4AException, k4a.K4ATimeoutException)
-        try:
-            self._device = k4a.PyK4A(
-                k4a.Config(
-                    color_resolution=k4a.ColorResolution.OFF,
-                    depth_mode=k4a.DepthMode[options.mode],
-                    camera_fps=k4a.FPS[rates[options.frame_rate_hz]],
-                    synchronized_images_only=False,
-                ),
-                device_id=options.device,
-            )
-            self._device.start()
-        except self._errors as error:
-            raise not_started("Azure Kinect", error) from error
-        try:
-            # The image size of the mode is not part of the calibration, so it is taken from a
-            # frame.
-            depth = self._capture().depth
-            lens = self._device.calibration
-            K = np.asarray(lens.get_camera_matrix(k4a.CalibrationType.DEPTH), float)
-            k = np.asarray(lens.get_distortion_coefficients(k4a.CalibrationType.DEPTH), float)
-            self.settings = Settings(
-                "Azure Kinect",
-                Rational(
-                    depth.shape[1], depth.shape[0], K[0, 0], K[1, 1], K[0, 2], K[1, 2], *k.ravel()
-                ),
-                0.001,
-                "z",
-                float(options.frame_rate_hz),
-                "ir",
-            )
-        except BaseException:
-            self.close()
-            raise
+        self._k4a = package
+        self._frame_rate_hz = float(options.frame_rate_hz)
+        config = package.Config(
+            color_resolution=package.ColorResolution.OFF,
+            depth_mode=package.DepthMode[options.mode],
+            camera_fps=package.FPS[rates[options.frame_rate_hz]],
+            synchronized_images_only=False,
+        )
+        self._device = package.PyK4A(config, device_id=options.device)
+        self._device.start()
+
+    def read_settings(self) -> Settings:
+        """See `Stream.read_settings`."""
+        # The image size of the mode is not part of the calibration, so it is taken from a frame.
+        rows, columns = self._capture().depth.shape
+        lens, sensor = self._device.calibration, self._k4a.CalibrationType.DEPTH
+        K = np.asarray(lens.get_camera_matrix(sensor), float)
+        k = np.asarray(lens.get_distortion_coefficients(sensor), float)
+        camera = Rational(columns, rows, K[0, 0], K[1, 1], K[0, 2], K[1, 2], *k.ravel())
+        return Settings("Azure Kinect", camera, 0.001, "z", self._frame_rate_hz, "ir")
 
     def read(self, index: int) -> RangeFrame:
         """See `Stream.read`."""
@@ -99,8 +60,31 @@ class AzureKinectStream(Stream):
         for _ in range(8):
             try:
                 capture = self._device.get_capture(timeout=int(TIMEOUT_S * 1000))
-            except self._errors as error:
+            except (self._k4a.K4AException, self._k4a.K4ATimeoutException) as error:
                 raise no_frame("Azure Kinect") from error
             if capture.depth is not None:
                 return capture
         raise no_frame("Azure Kinect")
+
+
+@part("device", "azure-kinect")
+@dataclass(frozen=True)
+class AzureKinect(Device):
+    """An Azure Kinect: depth and the infrared image.
+
+    Attributes
+    ----------
+    mode
+        Field of view and resolution.
+    frame_rate_hz
+        5, 15 or 30; at most 15 with WFOV_UNBINNED.
+    device
+        Number of the camera, if several are connected.
+    """
+
+    maker: ClassVar[str] = "Azure Kinect"
+    package: ClassVar[tuple[str, str]] = ("pyk4a", "pyk4a")
+    stream: ClassVar[type[Stream]] = AzureKinectStream
+    mode: Mode = "NFOV_UNBINNED"
+    frame_rate_hz: int = 15
+    device: int = 0

@@ -8,75 +8,39 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.apps.live import TIMEOUT_S, Settings, Stream, no_frame, not_started, vendor
+from tofuse.apps.live import TIMEOUT_S, Device, Settings, Stream, no_frame
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 from tofuse.formats.readers import head_camera, head_frame, read_info
 
 
-@part("device", "ifm-o3r")
-@dataclass(frozen=True)
-class IfmO3r:
-    """A head of an O3R: radial range, its standard deviation, amplitude.
-
-    Attributes
-    ----------
-    address
-        Network address of the processing unit.
-    port
-        Port of the head.
-    """
-
-    package: ClassVar[tuple[str, str]] = ("ifm3dpy", "ifm3dpy")
-    address: str = "192.168.0.69"
-    port: str = "port2"
-
-    def open(self) -> IfmO3rStream:
-        """See `Device.open`."""
-        return IfmO3rStream(self)
-
-
 class IfmO3rStream(Stream):
     """See `Stream`."""
 
-    def __init__(self, options: IfmO3r) -> None:
-        vendor(options.package)
-        from ifm3dpy.device import O3R, Error
+    def start(self, package: Any, options: Any) -> None:
+        """See `Stream.start`."""
+        from ifm3dpy.device import O3R
         from ifm3dpy.framegrabber import FrameGrabber, buffer_id
 
         self._id: Any = buffer_id
-        try:
-            unit = O3R(options.address)
-            self._grabber = FrameGrabber(unit, pcic_port=unit.port(options.port).pcic_port)
-            unit.set({"ports": {options.port: {"state": "RUN"}}})
-            self._grabber.start(
-                [
-                    buffer_id.RADIAL_DISTANCE_IMAGE,
-                    buffer_id.RADIAL_DISTANCE_NOISE,
-                    buffer_id.NORM_AMPLITUDE_IMAGE,
-                    buffer_id.CONFIDENCE_IMAGE,
-                    buffer_id.TOF_INFO,
-                ]
-            )
-            state = unit.get([f"/ports/{options.port}"])["ports"][options.port]
-        except Error as error:
-            raise not_started(f"ifm O3R at {options.address}", error) from error
-        try:
-            frame = self._wait()
-            self._info = read_info(bytes(frame.get_buffer(buffer_id.TOF_INFO)), "ifm O3R: TOF_INFO")
-            height, width = self._buffer(frame, "RADIAL_DISTANCE_IMAGE").shape
-            rate = state.get("acquisition", {}).get("framerate", 10.0)
-            self.settings = Settings(
-                "ifm O3R (ToF)",
-                head_camera(self._info, width, height, "ifm O3R"),
-                self._info.distance_unit_m,
-                "range",
-                float(rate),
-                "raw",
-            )
-        except BaseException:
-            self.close()
-            raise
+        unit, port = O3R(options.address), options.port
+        self._grabber = FrameGrabber(unit, pcic_port=unit.port(port).pcic_port)
+        unit.set({"ports": {port: {"state": "RUN"}}})
+        images = ("RADIAL_DISTANCE_IMAGE", "RADIAL_DISTANCE_NOISE", "NORM_AMPLITUDE_IMAGE")
+        buffers = (*images, "CONFIDENCE_IMAGE", "TOF_INFO")
+        self._grabber.start([getattr(buffer_id, name) for name in buffers])
+        state = unit.get([f"/ports/{port}"])["ports"][port]
+        self._frame_rate_hz = float(state.get("acquisition", {}).get("framerate", 10.0))
+
+    def read_settings(self) -> Settings:
+        """See `Stream.read_settings`."""
+        frame = self._wait()
+        info = bytes(frame.get_buffer(self._id.TOF_INFO))
+        self._info = read_info(info, "ifm O3R: TOF_INFO")
+        height, width = self._buffer(frame, "RADIAL_DISTANCE_IMAGE").shape
+        camera = head_camera(self._info, width, height, "ifm O3R")
+        unit_m = self._info.distance_unit_m
+        return Settings("ifm O3R (ToF)", camera, unit_m, "range", self._frame_rate_hz, "raw")
 
     def read(self, index: int) -> RangeFrame:
         """See `Stream.read`."""
@@ -104,3 +68,23 @@ class IfmO3rStream(Stream):
 
     def _buffer(self, frame: Any, name: str) -> NDArray[Any]:
         return np.asarray(frame.get_buffer(getattr(self._id, name)))
+
+
+@part("device", "ifm-o3r")
+@dataclass(frozen=True)
+class IfmO3r(Device):
+    """A head of an O3R: radial range, its standard deviation, amplitude.
+
+    Attributes
+    ----------
+    address
+        Network address of the processing unit.
+    port
+        Port of the head.
+    """
+
+    maker: ClassVar[str] = "ifm O3R"
+    package: ClassVar[tuple[str, str]] = ("ifm3dpy", "ifm3dpy")
+    stream: ClassVar[type[Stream]] = IfmO3rStream
+    address: str = "192.168.0.69"
+    port: str = "port2"

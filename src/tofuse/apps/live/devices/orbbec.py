@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from tofuse.apps.live import TIMEOUT_S, DeviceError, Settings, Stream, no_frame, not_started, vendor
+from tofuse.apps.live import TIMEOUT_S, Device, DeviceError, Settings, Stream, no_frame
 from tofuse.engine.arrays import Float32
-from tofuse.engine.cameras import DISTORTION_ORDER, Camera
+from tofuse.engine.cameras import DISTORTION_ORDER
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import lenses
@@ -18,68 +18,59 @@ from tofuse.formats.cameras import lenses
 _POLL_MS = 100
 
 
-@part("device", "orbbec")
-@dataclass(frozen=True)
-class Orbbec:
-    """An Orbbec camera: depth, and the infrared image of the same sensor if it has one.
-
-    Attributes
-    ----------
-    infrared
-        Whether to record the infrared image.
-    """
-
-    package: ClassVar[tuple[str, str]] = ("pyorbbecsdk", "pyorbbecsdk")
-    infrared: bool = True
-
-    def open(self) -> OrbbecStream:
-        """See `Device.open`."""
-        return OrbbecStream(self)
-
-
 class OrbbecStream(Stream):
     """See `Stream`."""
 
-    def __init__(self, options: Orbbec) -> None:
-        ob: Any = vendor(options.package)
+    def start(self, package: Any, options: Any) -> None:
+        """See `Stream.start`."""
+        self._pipeline = package.Pipeline()
+        config = package.Config()
+        self._profile = _default_profile(self._pipeline, package.OBSensorType.DEPTH_SENSOR)
+        config.enable_stream(self._profile)
+        self._infrared = options.infrared and self._add_infrared(package, config)
+        self._pipeline.start(config)
+
+    def _add_infrared(self, package: Any, config: Any) -> bool:
+        """Enable the infrared image, if the camera has one with the pixels of depth."""
         try:
-            self._pipeline = ob.Pipeline()
-            config = ob.Config()
-            profile = _default_profile(self._pipeline, ob.OBSensorType.DEPTH_SENSOR)
+            profile = _default_profile(self._pipeline, package.OBSensorType.IR_SENSOR)
+        except package.OBError:
+            return False
+        has_pixels_of_depth = _size(profile) == _size(self._profile)
+        if has_pixels_of_depth:
             config.enable_stream(profile)
-            size = (int(profile.get_width()), int(profile.get_height()))
-            self._infrared = options.infrared and _add_infrared(ob, self._pipeline, config, size)
-            self._pipeline.start(config)
-        except ob.OBError as error:
-            raise not_started("Orbbec", error) from error
-        try:
-            depth = self._frames().get_depth_frame()
-            name = self._pipeline.get_device().get_device_info().get_name()
-            self.settings = Settings(
-                str(name),
-                _camera(profile.get_intrinsic(), profile.get_distortion(), size),
-                float(depth.get_depth_scale()) / 1000.0,
-                "z",
-                float(profile.get_fps()),
-                "ir" if self._infrared else None,
-            )
-        except BaseException:
-            self._pipeline.stop()
-            raise
+        return has_pixels_of_depth
+
+    def read_settings(self) -> Settings:
+        """See `Stream.read_settings`."""
+        depth = self._frames().get_depth_frame()
+        lens, distortion = self._profile.get_intrinsic(), self._profile.get_distortion()
+        intrinsics = {name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")}
+        names = DISTORTION_ORDER["rational"]
+        coefficients = {name: float(getattr(distortion, name)) for name in names}
+        size = _size(self._profile)
+        return Settings(
+            str(self._pipeline.get_device().get_device_info().get_name()),
+            lenses.simplest_lens(size, intrinsics, coefficients, "Orbbec"),
+            float(depth.get_depth_scale()) / 1000.0,
+            "z",
+            float(self._profile.get_fps()),
+            "ir" if self._infrared else None,
+        )
 
     def read(self, index: int) -> RangeFrame:
         """See `Stream.read`."""
         frames = self._frames()
         depth = frames.get_depth_frame()
-        amplitude = None
-        if self._infrared:
-            infrared = frames.get_ir_frame()
-            amplitude = (
-                np.zeros((self.settings.camera.height, self.settings.camera.width), np.float32)
-                if infrared is None
-                else _image(infrared)
-            )
-        return self.frame(index, depth.get_timestamp() / 1000.0, _image(depth), amplitude)
+        infrared = frames.get_ir_frame() if self._infrared else None
+        image = _image(depth)
+        amplitude = np.zeros_like(image) if self._infrared else None
+        return self.frame(
+            index,
+            depth.get_timestamp() / 1000.0,
+            image,
+            amplitude if infrared is None else _image(infrared),
+        )
 
     def close(self) -> None:
         """See `Stream.close`."""
@@ -95,24 +86,33 @@ class OrbbecStream(Stream):
         raise no_frame("Orbbec")
 
 
+@part("device", "orbbec")
+@dataclass(frozen=True)
+class Orbbec(Device):
+    """An Orbbec camera: depth, and the infrared image of the same sensor if it has one.
+
+    Attributes
+    ----------
+    infrared
+        Whether to record the infrared image.
+    """
+
+    maker: ClassVar[str] = "Orbbec"
+    package: ClassVar[tuple[str, str]] = ("pyorbbecsdk", "pyorbbecsdk")
+    stream: ClassVar[type[Stream]] = OrbbecStream
+    infrared: bool = True
+
+
 def _default_profile(pipeline: Any, sensor: Any) -> Any:
     return pipeline.get_stream_profile_list(sensor).get_default_video_stream_profile()
 
 
-def _add_infrared(ob: Any, pipeline: Any, config: Any, size: tuple[int, int]) -> bool:
-    """Enable the infrared image, if the camera has one with the pixels of depth."""
-    try:
-        profile = _default_profile(pipeline, ob.OBSensorType.IR_SENSOR)
-    except ob.OBError:
-        return False
-    if (profile.get_width(), profile.get_height()) != size:
-        return False
-    config.enable_stream(profile)
-    return True
+def _size(image: Any) -> tuple[int, int]:
+    return int(image.get_width()), int(image.get_height())
 
 
 def _image(frame: Any) -> Float32:
-    height, width = int(frame.get_height()), int(frame.get_width())
+    width, height = _size(frame)
     data = np.frombuffer(frame.get_data(), np.uint8)
     if data.size == 2 * height * width:
         data = data.view(np.uint16)
@@ -123,9 +123,3 @@ def _image(frame: Any) -> Float32:
             remedy="choose an uncompressed format (Y16, Y8) in the camera's settings",
         )
     return data.reshape(height, width).astype(np.float32)
-
-
-def _camera(lens: Any, distortion: Any, size: tuple[int, int]) -> Camera:
-    intrinsics = {name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")}
-    coefficients = {name: float(getattr(distortion, name)) for name in DISTORTION_ORDER["rational"]}
-    return lenses.simplest_lens(size, intrinsics, coefficients, "Orbbec")

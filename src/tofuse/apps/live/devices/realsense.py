@@ -7,71 +7,42 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from tofuse.apps.live import TIMEOUT_S, DeviceError, Settings, Stream, no_frame, not_started, vendor
+from tofuse.apps.live import TIMEOUT_S, Device, DeviceError, Settings, Stream, no_frame
 from tofuse.engine.cameras import BrownConrady, Camera, Pinhole
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import lenses
 
 
-@part("device", "realsense")
-@dataclass(frozen=True)
-class RealSense:
-    """A RealSense: depth, and the infrared image of ToF models (L515).
-
-    Attributes
-    ----------
-    serial
-        Serial number of the camera, if several are connected.
-    width, height
-        Of the depth image; 0 for the camera's default.
-    frame_rate_hz
-        An integer rate that the camera supports.
-    """
-
-    package: ClassVar[tuple[str, str]] = ("pyrealsense2", "pyrealsense2")
-    serial: str = ""
-    width: int = 0
-    height: int = 0
-    frame_rate_hz: int = 30
-
-    def open(self) -> RealSenseStream:
-        """See `Device.open`."""
-        return RealSenseStream(self)
-
-
 class RealSenseStream(Stream):
     """See `Stream`."""
 
-    def __init__(self, options: RealSense) -> None:
-        rs: Any = vendor(options.package)
-        self._pipeline = rs.pipeline()
-        config = rs.config()
+    def start(self, package: Any, options: Any) -> None:
+        """See `Stream.start`."""
+        self._rs, self._pipeline = package, package.pipeline()
+        config = package.config()
         if options.serial:
             config.enable_device(options.serial)
         size = (options.width, options.height)
-        try:
-            self._infrared = _is_tof(rs, options.serial)
-            config.enable_stream(rs.stream.depth, *size, rs.format.z16, options.frame_rate_hz)
-            if self._infrared:
-                config.enable_stream(rs.stream.infrared, *size, rs.format.y8, options.frame_rate_hz)
-            profile = self._pipeline.start(config)
-        except RuntimeError as error:
-            raise not_started("RealSense", error) from error
-        try:
-            device = profile.get_device()
-            stream = profile.get_stream(rs.stream.depth).as_video_stream_profile()
-            self.settings = Settings(
-                str(device.get_info(rs.camera_info.name)),
-                _camera(rs, stream.get_intrinsics()),
-                float(device.first_depth_sensor().get_depth_scale()),
-                "z",
-                float(stream.fps()),
-                "ir" if self._infrared else None,
-            )
-        except BaseException:
-            self._pipeline.stop()
-            raise
+        stream, rate = package.stream, options.frame_rate_hz
+        self._infrared = _is_tof(package, options.serial)
+        config.enable_stream(stream.depth, *size, package.format.z16, rate)
+        if self._infrared:
+            config.enable_stream(stream.infrared, *size, package.format.y8, rate)
+        self._profile = self._pipeline.start(config)
+
+    def read_settings(self) -> Settings:
+        """See `Stream.read_settings`."""
+        device = self._profile.get_device()
+        stream = self._profile.get_stream(self._rs.stream.depth).as_video_stream_profile()
+        return Settings(
+            str(device.get_info(self._rs.camera_info.name)),
+            _camera(self._rs, stream.get_intrinsics()),
+            float(device.first_depth_sensor().get_depth_scale()),
+            "z",
+            float(stream.fps()),
+            "ir" if self._infrared else None,
+        )
 
     def read(self, index: int) -> RangeFrame:
         """See `Stream.read`."""
@@ -89,6 +60,30 @@ class RealSenseStream(Stream):
     def close(self) -> None:
         """See `Stream.close`."""
         self._pipeline.stop()
+
+
+@part("device", "realsense")
+@dataclass(frozen=True)
+class RealSense(Device):
+    """A RealSense: depth, and the infrared image of ToF models (L515).
+
+    Attributes
+    ----------
+    serial
+        Serial number of the camera, if several are connected.
+    width, height
+        Of the depth image; 0 for the camera's default.
+    frame_rate_hz
+        An integer rate that the camera supports.
+    """
+
+    maker: ClassVar[str] = "RealSense"
+    package: ClassVar[tuple[str, str]] = ("pyrealsense2", "pyrealsense2")
+    stream: ClassVar[type[Stream]] = RealSenseStream
+    serial: str = ""
+    width: int = 0
+    height: int = 0
+    frame_rate_hz: int = 30
 
 
 def _is_tof(rs: Any, serial: str) -> bool:

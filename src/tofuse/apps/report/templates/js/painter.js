@@ -125,7 +125,7 @@ function makePainter(canvas, scene) {
   }
 
   // Draws sets {place, color, normal, value, ends, faces, count, low, extent, spacing} as seen by a view.
-  function model(sets, view, section, { ratio, peel, peelPoints, fat, probing }) {
+  function model(sets, view, section, { ratio, peel, probing }) {
     const of = probing ? probe : tint, u = of.uniforms, m = view.matrices();
     gl.useProgram(of.p);
     gl.uniformMatrix4fv(u.view, false, m.view);
@@ -133,7 +133,7 @@ function makePainter(canvas, scene) {
     gl.uniform3fv(u.eye, view.place());
     gl.uniform3fv(u.from, section.from);
     gl.uniform3fv(u.to, section.to);
-    gl.uniform1f(u.least, fat ? 2 * ratio : 1);
+    gl.uniform1f(u.least, 1);
     gl.uniform1f(u.most, 10 * ratio);
     if (probing) gl.uniform1f(u.far, m.far);
     for (const set of sets) {
@@ -143,7 +143,7 @@ function makePainter(canvas, scene) {
       gl.uniform1f(u.byValue, set.value && !probing ? 1 : 0);
       gl.uniform2fv(u.ends, set.ends || [0, 1]);
       gl.uniform1f(u.shade, set.normal ? 1 : 0);
-      gl.uniform1f(u.peel, !set.faces && peelPoints && set.normal ? 1 : 0);
+      gl.uniform1f(u.peel, !set.faces && peel && set.normal ? 1 : 0);
       attribute(of, "value", set.value, gl.UNSIGNED_BYTE, true, 1);
       attribute(of, "place", set.place, gl.UNSIGNED_SHORT, true);
       attribute(of, "color", set.color, gl.UNSIGNED_BYTE, true);

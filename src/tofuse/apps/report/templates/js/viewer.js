@@ -29,18 +29,6 @@ async function startViewer(box, scene, bus) {
   for (const name in scene.fields || {}) {
     fields[name] = { ...scene.fields[name], values: await buffered(scene.fields[name].values, Uint8Array, 1) };
   }
-  // Several views in several states: each layer is drawn in one state, where its view is switched on.
-  const arrays = {};
-  for (const name in scene.arrays || {}) {
-    const kind = name.endsWith("normals") ? Int8Array : name.endsWith("colors") ? Uint8Array : Uint16Array;
-    arrays[name] = await buffered(scene.arrays[name], kind, 3);
-  }
-  const layers = (scene.layers || []).map((layer) => ({
-    ...layer,
-    place: arrays[layer.points],
-    color: layer.colors ? arrays[layer.colors] : layer.color.map((value) => value / 255),
-    normal: layer.normals ? arrays[layer.normals] : null,
-  }));
   const lines = {};
   const inks = { reference: [0.85, 0.86, 0.88], loops: [0.37, 0.85, 0.55] };
   for (const name in scene.lines) {
@@ -62,7 +50,6 @@ async function startViewer(box, scene, bus) {
 
   const chosenOf = (name) => { const input = box.querySelector(`[name=${name}]`); return input ? input.value : ""; };
   const on = (name) => { const input = box.querySelector(`[name=${name}]`); return Boolean(input && input.checked); };
-  const mode = () => { const input = box.querySelector("[name=mode]:checked"); return input ? input.value : ""; };
   const view = makeEye(canvas, scene, draw);
   const section = makeSection(box, scene, draw);
   const sigmaOf = (value) => {
@@ -80,10 +67,9 @@ async function startViewer(box, scene, bus) {
     const out = [];
     if (surface && on("mesh")) out.push(dressed(detail ? coarse[detail - 1] : surface));
     if (points && on("points")) out.push(dressed(points));
-    for (const layer of layers) if (layer.mode === mode() && on(layer.view)) out.push(layer);
     return out;
   }
-  const options = () => ({ peel: on("peel"), peelPoints: on("peel"), fat: layers.length > 0 });
+  const options = () => ({ peel: on("peel") });
 
   // While it moves, a machine that can't keep up draws fewer triangles and fewer pixels. Once the
   // view rests all of them are drawn, and more pixels than are seen, for smooth edges.
@@ -116,13 +102,11 @@ async function startViewer(box, scene, bus) {
     overlay.place();
   }
 
-  // Outermost points of what is to be seen.
-  const framed = () => (scene.outlines ? scene.outlines[mode()] : scene.framed);
   const START = { yaw: scene.yaw, pitch: scene.pitch };
   const views = {
     above: { yaw: 0, pitch: 1.57 }, side: { yaw: 1.5708, pitch: 0 }, front: { yaw: 0, pitch: 0 }, start: START,
   };
-  const reset = () => view.flyTo(START, framed());
+  const reset = () => view.flyTo(START, scene.framed);
 
   function recolor() {
     const bar = box.querySelector(".bar"), field = fields[chosenOf("by")];
@@ -223,7 +207,7 @@ async function startViewer(box, scene, bus) {
     const button = e.target.closest("button");
     if (!button) return;
     const { view: from, zoom, tool } = button.dataset;
-    if (from) view.flyTo(views[from], framed());
+    if (from) view.flyTo(views[from], scene.framed);
     if (zoom) view.zoom(Number(zoom));
     if (tool === "shot") shoot();
     if (tool === "full") fill();
@@ -233,17 +217,14 @@ async function startViewer(box, scene, bus) {
       button.setAttribute("aria-pressed", String(!panel.hidden));
     }
   });
-  let outline = String(framed());
   box.addEventListener("change", (e) => {
-    box.dataset.mode = mode();
     if (e.target.name === "by") recolor();
-    if (String(framed()) !== outline) { outline = String(framed()); view.look(START, framed()); }
     draw();
   });
   canvas.addEventListener("webglcontextlost", () => box.classList.replace("live", "without"));
   box.classList.add("live");
   recolor();
-  view.look(START, framed());
+  view.look(START, scene.framed);
   new ResizeObserver(draw).observe(canvas);
 }
 
