@@ -85,7 +85,7 @@ def test_saved_result_round_trips(result, tmp_path):
     first, second = (
         json.loads((tmp_path / name / "run.json").read_text()) for name in ("out", "copy")
     )
-    assert {k for k in first if first[k] != second[k]} <= {"refinement"}
+    assert {k for k in first if first[k] != second[k]} <= {"refinement", "sha256"}
     assert again.accuracy == result.accuracy
 
 
@@ -300,7 +300,7 @@ def test_view_serves_report_and_images_until_stopped(result):
     with result.view(open_browser=False) as server:
         with urlopen(server.address) as page:
             assert b"data-frames" in page.read()
-        with urlopen(f"{server.address}/frame/3.png") as image:
+        with urlopen(f"{server.address}frame/3.png") as image:
             assert image.read(4) == b"\x89PNG"
     with pytest.raises(URLError, match="refused"):
         urlopen(server.address)

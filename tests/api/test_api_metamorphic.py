@@ -205,7 +205,7 @@ def test_loaded_result_is_relative_to_its_shift(results) -> None:
 def test_evaluation_of_right_result_in_map_coordinates(results, tmp_path) -> None:
     write_tum(tmp_path / "truth.txt", range(3), se3.about(MAP, POSES))
     error = tofuse.evaluate(results["map"], tmp_path / "truth.txt").error
-    assert error.ate_rms_m < 0.005
+    assert error.ate_rms_m < 0.015
 
 
 def test_shift_is_decided_by_the_median() -> None:

@@ -74,7 +74,7 @@ def test_damaged_file_is_compiled_and_written_again(tmp_path, damage) -> None:
 def test_intact_file_of_another_version_is_compiled_again(tmp_path) -> None:
     assert dispatcher(tmp_path)(2.0) == 4.0
     (file,) = tmp_path.iterdir()
-    content = kernel_cache.dumps(("not", "a", "kernel"))
+    content = kernel_cache.serialize.dumps(("not", "a", "kernel"))
     file.write_bytes(kernel_cache.hashlib.sha256(content).digest() + content)
     assert dispatcher(tmp_path)(2.0) == 4.0
     mended = dispatcher(tmp_path)

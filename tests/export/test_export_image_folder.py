@@ -18,10 +18,13 @@ import pytest
 from posed_results import BROWN, DISTANCE, NORMAL, POSED, POSES, SIZE, made_result, plane
 from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import export
+from tofuse.apps.results.run_json import read_run_json
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
 from tofuse.engine.errors import OutputError
 from tofuse.formats.geometry.ply import read_ply
+from tofuse.formats.poses.trajectory import read_tum, write_tum
 from tofuse.formats.poses.trajectory_formats import read_poses
+from written_run_json import change_run
 
 PLAIN = Pinhole(*SIZE, 40.0, 41.0, 23.0, 18.0)
 BENT = BrownConrady(*SIZE, 40.0, 41.0, 23.0, 18.0, k1=-0.1, k2=0.02, k3=0.01)
@@ -124,24 +127,20 @@ def _gone(result: Path) -> None:
 
 
 def _longer(result: Path) -> None:
-    path = result / "run.json"
-    run = json.loads(path.read_text())
-    for frame in run["frames"]:
+    frames = read_run_json(result / "run.json")["frames"]
+    for frame in frames:
         frame["timestamp"] += 1.0
-    path.write_text(json.dumps(run))
+    times, poses = read_tum(result / "trajectory.txt")
+    write_tum(result / "trajectory.txt", times + 1.0, poses)
+    change_run(result, frames=frames)
 
 
 def _damaged(result: Path) -> None:
-    path = result / "run.json"
-    run = json.loads(path.read_text())
-    del run["input"]
-    path.write_text(json.dumps(run))
+    change_run(result, input=None)
 
 
 def _with_invalid_corrections(result: Path) -> None:
-    path = result / "run.json"
-    run = json.loads(path.read_text())
-    path.write_text(json.dumps(run | {"config": {"corrections": [3]}}))
+    change_run(result, config={"corrections": [3]})
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +20,7 @@ from tofuse.engine.geometry import se3
 from tofuse.formats.geometry import las
 from tofuse.formats.geometry.ply import read_ply, write_ply
 from tofuse.formats.poses.trajectory import write_tum
+from written_run_json import write_run
 
 TIMES, POSES = np.array([0.1, 0.2, 0.5]), se3.exp(np.random.default_rng(1).normal(size=(3, 6)))
 POSES[0] = np.eye(4)
@@ -33,9 +33,6 @@ def result(tmp_path: Path) -> Path:
     folder = tmp_path / "result"
     folder.mkdir()
     frames = [{"index": k, "timestamp": t} for k, t in ((1, 0.1), (2, 0.2), (3, 0.3), (5, 0.5))]
-    fields = {"T_up_world": T_UP_WORLD.tolist(), "frames": frames}
-    text = json.dumps({"schema": 1, "version": "0", "verdict": "good"} | fields)
-    (folder / "run.json").write_text(text)
     write_tum(folder / "trajectory.txt", TIMES, POSES)
     rng = np.random.default_rng(0)
     x, y = np.meshgrid(np.arange(6.0), np.arange(5.0))
@@ -55,6 +52,7 @@ def result(tmp_path: Path) -> Path:
     }
     write_ply(folder / "cloud.ply", GeometryRecord(points, **columns))
     write_ply(folder / "mesh.ply", GeometryRecord(points, faces=faces, **columns))
+    write_run(folder, T_up_world=T_UP_WORLD.tolist(), frames=frames)
     return folder
 
 

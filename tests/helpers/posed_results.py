@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import Opening
+from written_run_json import write_run
 
 SIZE = (48, 36)
 
@@ -68,17 +68,14 @@ def made_result(folder: Path, camera: Camera, *, color: str = "color", config=No
         }
         for k in range(5)
     ]
-    run = {
-        "schema": 1,
-        "version": "0",
-        "verdict": "good",
-        "frames": frames,
-        "config": config or {"corrections": []},
-        "components": [{"frames": [[0, 4]], "T_main_component": np.eye(4).tolist()}],
-        "input": {"path": str(recording), "opening": Opening((recording,)).to_dict()},
-    }
-    (result / "run.json").write_text(json.dumps(run))
     write_tum(result / "trajectory.txt", 0.1 * np.array(POSED), POSES[POSED])
     points = np.random.default_rng(5).normal(size=(40, 3)).astype(np.float32)
     write_ply(result / "cloud.ply", GeometryRecord(points, color=np.full((40, 3), 77, np.uint8)))
+    write_run(
+        result,
+        frames=frames,
+        config=config or {"corrections": []},
+        components=[{"frames": [[0, 4]], "T_main_component": np.eye(4).tolist(), "joined": None}],
+        input={"path": str(recording), "opening": Opening((recording,)).to_dict()},
+    )
     return result

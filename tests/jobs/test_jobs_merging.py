@@ -26,9 +26,9 @@ from tofuse.engine.fusion import texture
 from tofuse.engine.fusion.texture import textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Silent
-from tofuse.formats.poses.trajectory import read_tum
+from tofuse.formats.poses.trajectory import read_tum, write_tum
 from tofuse.formats.recordings.native import RecordingWriter
-from written_run_json import run_json
+from written_run_json import change_run, run_json
 
 HERE, THERE = made_sessions.HERE[::2], made_sessions.THERE[::2]
 N = len(HERE)
@@ -64,11 +64,6 @@ def copied(folder: Path, to: Path) -> Path:
     """A result next to its recording, in another folder."""
     shutil.copytree(folder, to / "out")
     return to / "out"
-
-
-def changed_run_json(folder: Path, **changes: object) -> None:
-    path = folder / "run.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
 def test_two_sessions_in_one_room_give_one_map(both) -> None:
@@ -195,7 +190,7 @@ def test_missing_recording_is_named_with_remedy(session_results, tmp_path) -> No
     again = copied(session_results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
     run["input"]["opening"]["paths"] = [str(tmp_path / "was-here")]
-    changed_run_json(again, input=run["input"])
+    change_run(again, input=run["input"])
     refused(
         [session_results["here"], again], str(tmp_path / "was-here"), "doesn't exist", "put it back"
     )
@@ -205,7 +200,9 @@ def test_changed_recording_is_refused(session_results, tmp_path) -> None:
     again = copied(session_results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
     frames = [{**f, "timestamp": f["timestamp"] + 1.0} for f in run["frames"]]
-    changed_run_json(again, frames=frames)
+    times, poses = read_tum(again / "trajectory.txt")
+    write_tum(again / "trajectory.txt", times + 1.0, poses)
+    change_run(again, frames=frames)
     refused(
         [session_results["here"], again],
         "does not match the frames",
@@ -223,7 +220,7 @@ def test_results_of_clouds_are_refused(session_results, tmp_path) -> None:
     again = copied(session_results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
     run["input"]["opening"]["paths"] = [str(tmp_path / "clouds")]
-    changed_run_json(again, input=run["input"])
+    change_run(again, input=run["input"])
     refused([session_results["here"], again], "clouds", "pass their clouds together")
 
 
@@ -232,5 +229,5 @@ def test_results_of_clouds_are_refused(session_results, tmp_path) -> None:
 )
 def test_damaged_result_is_refused(session_results, tmp_path, changes) -> None:
     again = copied(session_results["there"], tmp_path)
-    changed_run_json(again, **changes)
+    change_run(again, **changes)
     refused([session_results["here"], again], "damaged")

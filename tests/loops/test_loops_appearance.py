@@ -11,7 +11,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.loops.candidates import Appearance
+from tofuse.engine.loops.appearance import Appearance
 from tofuse.engine.loops.revisits import Revisits
 from tofuse.engine.search.search import SearchOptions
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.loops.candidates import InformationGain
+from tofuse.engine.loops.information_gain import InformationGain
 
 SIGMA2 = 0.02**2  # of a loop
 

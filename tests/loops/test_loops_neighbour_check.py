@@ -12,7 +12,7 @@ from tofuse.engine.graph.external_sensors import SensorPriors
 from tofuse.engine.graph.graph import LoopRecord
 from tofuse.engine.loops.loops import ClosedLoop
 from tofuse.engine.loops.revisits import degraded_neighbours
-from tofuse.engine.mapping.backend import BackEnd
+from tofuse.engine.mapping.backend import BackEnd, Job
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.progress import Stopwatch
 from tofuse.engine.tracking.base import Step
@@ -58,7 +58,8 @@ def chain(posed, truth, inflation, wrong):
     log = SimpleNamespace(posed=entries, entries=entries)
     kept = SimpleNamespace(views=SimpleNamespace(of=lambda row: posed))
     progress = SimpleNamespace(stage=lambda *_: None)
-    return BackEnd(from_method("default"), log, poses, (), (), kept, progress, Stopwatch())
+    job = Job(from_method("default"), kept, (), progress, Stopwatch())
+    return BackEnd(job, log, poses, ())
 
 
 def test_loop_gap_does_not_separate_consistent_images(posed_views) -> None:

@@ -13,7 +13,8 @@ from revisited_path import ALL, DRIFT, pushed
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import revisits
-from tofuse.engine.loops.candidates import InformationGain, revisited
+from tofuse.engine.loops.candidates import revisited
+from tofuse.engine.loops.information_gain import InformationGain
 from tofuse.engine.loops.loops import PriorLoop
 from tofuse.engine.loops.revisits import Revisits
 from tofuse.engine.search import verification

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording, evenly_spaced
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.quality.map_agreement import (
     Consistency,
     SurfaceImage,
@@ -26,6 +28,8 @@ from tofuse.engine.quality.map_agreement import (
     poses_of_frames,
 )
 from tofuse.formats.poses.trajectory import write_tum
+from tofuse.formats.readers.native import NativeSource
+from written_run_json import write_run
 
 # A synthetic room, and poses in it -------------------------------------------------------------
 
@@ -73,19 +77,18 @@ def test_images_use_self_calibrated_camera_of_result(tmp_path: Path) -> None:
     times = np.arange(12) / 10
     write_tum(tmp_path / "trajectory.txt", times, poses)
     write_tum(tmp_path / "true.txt", times, poses)
-    run = {"schema": 1, "version": "0", "verdict": "good"}
-    run["frames"] = [{"index": k, "timestamp": t} for k, t in enumerate(times.tolist())]
+    frames = [{"index": k, "timestamp": t} for k, t in enumerate(times.tolist())]
     found = []
     for focal in (0.0, 0.05):
         config = {"corrections": [{"part": "camera-errors", "focal": focal, "offset_m": 0.0}]}
-        (tmp_path / "run.json").write_text(json.dumps(run | {"config": config}))
+        write_run(tmp_path, frames=frames, config=config)
         for estimate in (tmp_path, tmp_path / "trajectory.txt"):
             score = evaluate(estimate, tmp_path / "true.txt", recording=recording).consistency
             found.append(score.rms_m)
         alone = evaluate(poses, tmp_path / "true.txt", recording=recording, config=config)
         assert alone.consistency.rms_m == pytest.approx(found[-1])
     assert found[0] == found[1] > 3 * found[2] == 3 * found[3]
-    (tmp_path / "run.json").write_text(json.dumps(run | {"config": {"corrections": [7]}}))
+    write_run(tmp_path, frames=frames, config={"corrections": [7]})
     with pytest.raises(InputError, match="is damaged"):
         evaluate(tmp_path, tmp_path / "true.txt", recording=recording)
 
@@ -281,3 +284,40 @@ def test_depths_are_requantized_to_recording_unit() -> None:
 
 
 # The reference tool ----------------------------------------------------------------------------
+
+
+# The reference tool ----------------------------------------------------------------------------
+
+
+def by_tool(shared_data: Path, recording: Path, trajectory: Path, frames: int) -> str:
+    tool = shared_data.parent / "tools" / "map_consistency.py"
+    if not tool.is_file():
+        pytest.skip("the tool that defines map consistency is not on this machine")
+    done = subprocess.run(
+        [sys.executable, str(tool), str(recording), str(trajectory), "--frames", str(frames)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.strip()
+
+
+def tool_format(found: Consistency) -> str:
+    return f"rms {found.rms_m:.5f} m, inliers {found.inlier_ratio:.4f}, pairs {found.pairs}"
+
+
+def ours(recording: Path, trajectory: Path, frames: int) -> Consistency:
+    opened = Recording.of(NativeSource(recording), recording, "native")
+    rows = np.loadtxt(trajectory)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = quaternion.to_matrix(rows[:, 4:8])
+    poses[:, :3, 3] = rows[:, 1:4]
+    return map_consistency(opened, poses_of_frames(opened.timestamps, rows[:, 0], poses), frames)
+
+
+@pytest.mark.nightly
+def test_output_matches_reference_tool_on_real_loop(shared_data: Path) -> None:
+    recording = shared_data / "kinectv2_loop" / "recording"
+    trajectory = recording / "reference_poses.txt"
+    expected = by_tool(shared_data, recording, trajectory, 9)
+    assert tool_format(ours(recording, trajectory, 9)) == expected

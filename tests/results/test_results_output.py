@@ -150,10 +150,11 @@ def test_run_json_matches_contract(tmp_path) -> None:
     text = (tmp_path / "run.json").read_text()
     data = json.loads(text, parse_constant=lambda c: pytest.fail(c))
     assert text == json.dumps(data, indent=1) + "\n"
+    assert data["shift_m"] == [0.0, 0.0, 0.0]
     assert " ".join(data) == (
         "schema version input warnings findings seed threads config seconds verdict "
-        "accuracy self_calibration reasons frames T_up_world rig components sessions "
-        "session_pairs changes loops optimiser priors refinement filters"
+        "accuracy self_calibration reasons frames T_up_world shift_m rig components sessions "
+        "session_pairs changes loops optimiser priors refinement filters sha256"
     )
     assert data["schema"] == 1
     assert data["input"] == {

@@ -10,6 +10,8 @@ import socket
 import subprocess
 import sys
 from dataclasses import replace
+from threading import Timer
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -69,6 +71,8 @@ def server(made):
 
 
 def ask(server, path: str, **headers: str) -> tuple[int, bytes]:
+    """Ask for a path below that of the address."""
+    path = urlsplit(server.address).path.removesuffix("/") + path
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
     connection.putrequest("GET", path, skip_host="Host" in headers, skip_accept_encoding=True)
     for name, value in headers.items():
@@ -85,7 +89,8 @@ def test_report_and_images_of_frames_are_served(made, server) -> None:
     status, page = ask(server, "/")
     assert status == 200
     report = (out / "report.html").read_bytes()
-    assert page == report.replace(b"<html", b'<html data-frames="/frame/"', 1) != report
+    opening = f'<html data-frames="{urlsplit(server.address).path}frame/"'.encode()
+    assert page == report.replace(b"<html", opening, 1) != report
     assert ask(server, "/component-1/report.html")[0] == 200
     for k in (0, 9, 23):  # lost frames, too
         status, png = ask(server, f"/frame/{k}.png")
@@ -108,6 +113,15 @@ def test_nothing_else_is_served(server, path) -> None:
     assert ask(server, path) == (404, b"not found\n")
 
 
+def test_nothing_is_served_without_the_path_of_the_address(server) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    for path in ("/", "/frame/0.png", "/AAAAAAAAAAAAAAAAAAAAAA/"):
+        connection.request("GET", path)
+        answer = connection.getresponse()
+        answer.read()
+        assert answer.status == 404
+
+
 def test_pages_of_other_sites_are_refused(server) -> None:
     for path in ("/", "/frame/0.png"):
         for headers in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
@@ -120,18 +134,21 @@ def test_command_serves_until_interrupted_and_without_recording(made, tmp_path) 
     out = shutil.copytree(made[1], tmp_path / "out")
     text = (out / "run.json").read_text()
     (out / "run.json").write_text(text.replace(str(made[1].parent), str(tmp_path / "gone")))
-    command = [sys.executable, "-m", "tofuse", "view", str(out), "--no-open"]
+    command = [sys.executable, "-m", "tofuse", "view", str(out), "--no-open", "--edited"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as p:
+        end = Timer(60, p.kill)  # else a failed assertion would wait for it
+        end.daemon = True
+        end.start()
         assert p.stderr is not None
         lines = [p.stderr.readline() for _ in range(3)]
         assert re.fullmatch(
             r"only small images .*gone/recording, which doesn't exist.*\n", lines[0]
         )
-        found = re.fullmatch(r"see (http://127\.0\.0\.1:(\d+))\n", lines[1])
+        found = re.fullmatch(r"see (http://127\.0\.0\.1:(\d+)(/\S+/))\n", lines[1])
         assert found is not None
         assert lines[2] == "press Ctrl-C to stop\n"
         connection = http.client.HTTPConnection("127.0.0.1", int(found[2]), timeout=20)
-        connection.request("GET", "/")
+        connection.request("GET", found[3])
         assert connection.getresponse().read() == (out / "report.html").read_bytes()
         p.send_signal(signal.SIGINT)
         rest, err = p.communicate(timeout=60)

@@ -10,6 +10,7 @@ import socket
 import pytest
 
 from tofuse.apps.report.html import secured
+from tofuse.apps.viewer import server as module
 from tofuse.apps.viewer.server import HOST, is_same_origin
 
 HOSTS: dict[str, tuple[list[str], list[str], bool]] = {
@@ -47,6 +48,10 @@ def port():
     stop(server)
 
 
+def with_token(port: int) -> str:
+    return f"/?token={module._tokens[port]}"
+
+
 def ask(port: int, path: str, **headers: str) -> http.client.HTTPResponse:
     connection = http.client.HTTPConnection(HOST, port, timeout=20)
     connection.putrequest("GET", path, skip_host="Host" in headers, skip_accept_encoding=True)
@@ -60,13 +65,24 @@ def ask(port: int, path: str, **headers: str) -> http.client.HTTPResponse:
 
 
 def test_server_answers_local_requests_only(port: int) -> None:
-    assert ask(port, "/").status == 200
-    assert ask(port, "/", Host="evil.example").status == 403
-    assert ask(port, "/", Origin="http://evil.example").status == 403
+    page = with_token(port)
+    assert ask(port, page).status == 200
+    assert ask(port, page, Host="evil.example").status == 403
+    assert ask(port, page, Origin="http://evil.example").status == 403
     upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec_WebSocket_Version": "13"}
     upgrade |= {"Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ=="}
-    assert ask(port, "/", **upgrade, Origin="http://evil.example").status == 403
-    assert ask(port, "/", **upgrade, Host="evil.example:80").status == 403
+    assert ask(port, page, **upgrade, Origin="http://evil.example").status == 403
+    assert ask(port, page, **upgrade, Host="evil.example:80").status == 403
+
+
+def test_other_users_of_this_machine_do_not_know_the_token(port: int) -> None:
+    for path in ("/", "/?token=", "/?token=guess", "/assets/index.js"):
+        assert ask(port, path).status == 403
+    cookie = ask(port, with_token(port)).getheader("Set-Cookie")
+    assert cookie is not None
+    assert "HttpOnly; SameSite=Strict" in cookie
+    assert ask(port, "/", Cookie=cookie.split(";")[0]).status == 200
+    assert ask(port, "/", Cookie=f"tofuse-{port}=guess").status == 403
 
 
 @pytest.mark.parametrize(
@@ -74,7 +90,8 @@ def test_server_answers_local_requests_only(port: int) -> None:
     ["/../../../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/..%5c..%5cetc/passwd", "//etc"],
 )
 def test_paths_outside_the_page_are_refused(port: int, path: str) -> None:
-    assert ask(port, path).status in (400, 403, 404)
+    cookie = f"tofuse-{port}={module._tokens[port]}"
+    assert ask(port, path, Cookie=cookie).status in (400, 403, 404)
 
 
 def test_server_does_not_listen_on_other_interfaces(port: int) -> None:

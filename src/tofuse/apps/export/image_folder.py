@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,8 +105,8 @@ def write_images(
             frame = replace(frame, sigma_image=noise.sigma(frame), color_image=image)
             if rectifier is None or frame.camera != camera:
                 camera = frame.camera
-                is_kept = isinstance(camera, Pinhole) and is_supported(camera)
-                rectifier = Rectifier(camera if is_kept else pinhole_of(camera))
+                is_kept = is_supported(camera) and isinstance(camera, Pinhole)
+                rectifier = Rectifier(cast(Pinhole, camera) if is_kept else pinhole_of(camera))
             rectified, image_camera = rectifier(frame), rectifier.pinhole
             image, sigma = rectified.color_image, rectified.sigma_image
             assert image is not None

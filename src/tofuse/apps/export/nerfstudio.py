@@ -52,7 +52,7 @@ def write_nerfstudio(result: Path, folder: Path, every: int, pinhole: bool = Fal
     lenses = [lens(posed.camera) for posed in images]
     frames: list[dict[str, Any]] = []
     for posed in images:
-        frame = {key: f"{kind}/{posed.name}" for key, kind in _FILES.items()}
+        frame: dict[str, Any] = {key: f"{kind}/{posed.name}" for key, kind in _FILES.items()}
         frame["transform_matrix"] = (posed.T_world_camera @ OPENGL).tolist()
         frame["timestamp"] = posed.timestamp
         if posed.covariance is not None:

@@ -15,6 +15,7 @@ from tofuse.engine.sensor import on_surface
 
 # Range of typical distances of ToF cameras, m.
 _MIN_DISTANCE_M, _MAX_DISTANCE_M = 0.15, 12.0
+_MAX_SCAN_M = 1000.0  # of laser scanners
 _MIN_VALID, _MAX_SATURATED = 0.1, 0.05
 # At an edge the surfaces _REACH pixels to both sides differ by the fraction _MIN_STEP of the depth,
 # and each changes by less than the fraction _MAX_CHANGE of that difference over two pixels; flying
@@ -33,10 +34,11 @@ _MIN_EDGES = 100
 
 
 def depths_of(frame: Frame) -> Float32:
-    """Return the valid depths or distances (N,) of a view, m."""
+    """Return the valid depths or distances (N,) of a view, m; in a map, from its middle."""
     if isinstance(frame, RangeFrame):
         return frame.depth[frame.valid]
-    return np.linalg.norm(frame.points - frame.origin.astype(np.float32), axis=1)
+    centre = np.median(frame.points, axis=0) if frame.shift.any() else frame.origin
+    return np.linalg.norm(frame.points - np.asarray(centre, np.float32), axis=1)
 
 
 def valid_fraction(frames: Sequence[Frame]) -> float:
@@ -60,8 +62,8 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
     evidence = {"median_m": median, "far_m": float(np.percentile(depths, 99))}
     if period is not None and median > period:
         problem = f"but the ambiguity range of this camera is {period:.3g} m"
-    elif median > _MAX_DISTANCE_M:
-        problem = "farther than ToF cameras measure"
+    elif median > (_MAX_DISTANCE_M if sample.images else _MAX_SCAN_M):
+        problem = f"farther than {'ToF cameras' if sample.images else 'scanners'} measure"
     elif median < _MIN_DISTANCE_M:
         problem = "nearer than ToF cameras measure"
     else:

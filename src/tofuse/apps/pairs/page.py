@@ -51,8 +51,7 @@ def write_pair_report(result: PairResult, path: Path) -> None:
         thinned=words.thinned(len(drawn.points), drawn.total, "points"),
         lines=pair_words.lines(result),
         rows=[
-            (name, v.view.path, str(v.view.index), v.view.format, f"{len(v.view.frame):,}")
-            for name, v in views.items()
+            (name, v.path, str(v.index), v.format, f"{len(v.frame):,}") for name, v in views.items()
         ],
     )
 

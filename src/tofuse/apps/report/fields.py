@@ -86,9 +86,9 @@ def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
     ticks = words.length(0.0), words.length((high - low) / 2), words.length(high - low)
     available.append(Field("height", "Height", -points[:, 1], low, high, ticks, (low, high)))
     if views is not None:
-        low, high = percentile_range(views)
-        ticks = f"{low:.0f}", "", f"{high:.0f}"
         counts = views.astype(float)
+        low, high = percentile_range(counts)
+        ticks = f"{low:.0f}", "", f"{high:.0f}"
         available.append(Field("views", "Number of views", counts, low, high, ticks, (low, high)))
     return available
 

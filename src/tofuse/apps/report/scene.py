@@ -281,7 +281,7 @@ def render(scene: Scene, size: tuple[int, int] = (960, 600), *, yaw: float = YAW
         points, colors = points[facing >= 0], colors[facing >= 0]
     radius = int(np.clip(np.ceil(1.5 * scene.spacing * lens["scale"]), 2, 6))
     rgba = thumbnails.splat(points, colors, T, size, radius=radius, **lens)
-    image = np.where(rgba[..., 3:] > 0, rgba[..., :3], np.uint8(thumbnails.BACKGROUND))
+    image = np.where(rgba[..., 3:] > 0, rgba[..., :3], np.array(thumbnails.BACKGROUND, np.uint8))
     for poses, color in ((scene.before, (240, 160, 60)), (scene.after, (90, 176, 245))):
         pixels, depths = thumbnails.project(poses[:, :3, 3], T, size, **lens)
         path = np.rint(pixels[np.isfinite(depths)]).astype(np.int32)

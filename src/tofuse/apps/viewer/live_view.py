@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -88,7 +89,7 @@ class LiveView:
         words = f"**{self._stage}**"
         if self._total:
             words += f" {self._done} of {self._total}"
-        self._status.content = f"{words}\n\n{detail}" if detail else words
+        self._status.content = f"{words}\n\n{_escaped(detail)}" if detail else words
 
     def _is_new_view(self, T: Float64) -> bool:
         if not self._shown:
@@ -152,3 +153,8 @@ class LiveView:
             self._server.scene.add_line_segments(
                 "/live_path", ends, _PATH, thickness=2.0, thickness_units="screen"
             )
+
+
+def _escaped(text: str) -> str:
+    """Return text, which may quote a file, so that Markdown shows it as it is."""
+    return re.sub(r"([\\`*_{}\[\]<>()#+!|~&-])", r"\\\1", text)

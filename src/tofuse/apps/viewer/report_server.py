@@ -1,12 +1,14 @@
 """The report of a result in the browser, with the images of its recording at full resolution.
 
-Only this machine is answered (see `server`), and only pages read at the start and images of frames
-have addresses: no path of a request reaches the file system.
+Only this machine is answered (see `server`), and only below a path that other users of it can't
+guess. Only pages read at the start and images of frames have addresses: no path of a request
+reaches the file system.
 """
 
 from __future__ import annotations
 
 import re
+import secrets
 import sys
 from collections.abc import Mapping, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -20,7 +22,7 @@ from tofuse.apps.viewer.server import HOST, choose_port, is_same_origin
 from tofuse.engine.frames import Recording
 from tofuse.formats.files import reading
 
-_FRAME = re.compile(r"/frame/(\d{1,9})\.png", re.ASCII)
+_FRAME = re.compile(r"frame/(\d{1,9})\.png", re.ASCII)
 _HTML, _PNG, _PLY = "text/html; charset=utf-8", "image/png", "application/octet-stream"
 
 
@@ -78,15 +80,17 @@ def report_pages(folder: Path) -> dict[str, tuple[str, bytes]]:
     Raises
     ------
     InputError
-        If the folder is not a result, or has no report.
+        If the folder is not a result, was edited, or has no report.
     """
     folders.check_result(folder)
-    pages = {"/": (_HTML, reading.read_bytes(folder / "report.html"))}
+    with run_json.opened(folder):
+        pass
+    pages = {"": (_HTML, reading.read_bytes(folder / "report.html"))}
     for path in sorted(folder.glob("component-*/report.html")):
         if folders.component_number(path.parent) is not None:
-            pages[f"/{path.parent.name}/report.html"] = _HTML, reading.read_bytes(path)
+            pages[f"{path.parent.name}/report.html"] = _HTML, reading.read_bytes(path)
     if (folder / "changes.ply").is_file():
-        pages["/changes.ply"] = _PLY, reading.read_bytes(folder / "changes.ply")
+        pages["changes.ply"] = _PLY, reading.read_bytes(folder / "changes.ply")
     return pages
 
 
@@ -118,6 +122,7 @@ class ReportServer(ThreadingHTTPServer):
     ) -> None:
         super().__init__((HOST, choose_port(port)), _Handler)
         self._pages, self._images = pages, images
+        self._root = f"/{secrets.token_urlsafe(16)}/"
         Thread(target=self.serve_forever, name="tofuse-report", daemon=True).start()
 
     def __exit__(self, *_: object) -> None:
@@ -126,7 +131,7 @@ class ReportServer(ThreadingHTTPServer):
     @property
     def address(self) -> str:
         """The address of the report."""
-        return f"http://{HOST}:{self.server_port}"
+        return f"http://{HOST}:{self.server_port}{self._root}"
 
     def stop(self) -> None:
         """Stop serving."""
@@ -135,10 +140,14 @@ class ReportServer(ThreadingHTTPServer):
 
     def content(self, path: str) -> tuple[str, bytes] | None:
         """Return type and content at the path of a request; None if there is nothing."""
+        if not path.startswith(self._root):
+            return None
+        path = path.removeprefix(self._root)
         if path in self._pages:
             kind, body = self._pages[path]
             if self._images is not None and kind == _HTML:
-                body = body.replace(b"<html", b'<html data-frames="/frame/"', 1)
+                frames = f'<html data-frames="{self._root}frame/"'
+                body = body.replace(b"<html", frames.encode(), 1)
             return kind, body
         frame = _FRAME.fullmatch(path)
         image = self._images and frame and self._images.png(int(frame[1]))

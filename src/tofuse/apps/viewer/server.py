@@ -1,17 +1,21 @@
 """The server of the live view, reachable from this machine only.
 
 It answers only requests whose Host and Origin are names of this machine, which excludes pages of
-other sites whose name resolves to this machine (DNS rebinding).
+other sites whose name resolves to this machine (DNS rebinding), and that know the token in its
+address, or the cookie set for that, which excludes other users of this machine.
 """
 
 from __future__ import annotations
 
 import io
 import logging
+import secrets
 import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
+from http.cookies import SimpleCookie
 from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, urlsplit
 
 from tofuse.engine.errors import InputError
 from tofuse.formats.files import reading
@@ -41,7 +45,8 @@ def serve(port: int | None = None) -> ViserServer:
     chosen = choose_port(port)
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     # Standard output is for results.
-    with redirect_stdout(io.StringIO()), _guarded() as guards:
+    token = _tokens[chosen] = secrets.token_urlsafe(16)
+    with redirect_stdout(io.StringIO()), _guarded(f"tofuse-{chosen}", token) as guards:
         server = viser.ViserServer(host=HOST, port=chosen, label="tofuse", verbose=False)
     if not guards:
         stop(server)
@@ -59,9 +64,13 @@ def serve(port: int | None = None) -> ViserServer:
     return server
 
 
+# Of the servers of this process, by port.
+_tokens: dict[int, str] = {}
+
+
 @contextmanager
-def _guarded() -> Iterator[list[int]]:
-    """Check each request to a server that is created in the block.
+def _guarded(cookie: str, token: str) -> Iterator[list[int]]:
+    """Check each request to a server that is created in the block, for a token too.
 
     viser has no hook for that, so its call of the websockets library is wrapped. Yields a list that
     is not empty once that has happened.
@@ -78,9 +87,18 @@ def _guarded() -> Iterator[list[int]]:
             host, origin = request.headers.get_all("Host"), request.headers.get_all("Origin")
             if not is_same_origin(host, origin):
                 return Response(403, "Forbidden", Headers(), b"not from this machine\n")
+            given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+            cookies = SimpleCookie("; ".join(request.headers.get_all("Cookie")))
+            known = cookies[cookie].value if cookie in cookies else ""
+            if not any(
+                secrets.compare_digest(each.encode(), token.encode()) for each in (given, known)
+            ):
+                return Response(403, "Forbidden", Headers(), b"the address lacks its token\n")
             response: Response | None = None
             if process_request is not None:
                 response = process_request(connection, request)
+            if response is not None and given:
+                response.headers["Set-Cookie"] = f"{cookie}={token}; HttpOnly; SameSite=Strict"
             return response
 
         guards.append(1)
@@ -116,8 +134,9 @@ def stop(server: ViserServer) -> None:
 
 
 def address(server: ViserServer) -> str:
-    """Return the address of the page."""
-    return f"http://{HOST}:{server.get_port()}"
+    """Return the address of the page, with its token."""
+    port = server.get_port()
+    return f"http://{HOST}:{port}/?token={_tokens[port]}"
 
 
 def choose_port(port: int | None) -> int:

@@ -13,6 +13,6 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.clouds import fpfh, robust_motion
     from tofuse.engine.clouds.near_origin import NearOrigin
-    from tofuse.engine.clouds.pair import AnyPair, register
+    from tofuse.engine.clouds.pair import AnyPair
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

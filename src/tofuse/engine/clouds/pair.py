@@ -219,9 +219,9 @@ def _registered(
     rng: np.random.Generator,
 ) -> Registration:
     with one_blas_thread():
-        if guess is None and not isinstance(registrar, AnyPair):
-            guess = np.eye(4)
-        return registrar.register(source, target, guess, rng)
+        if isinstance(registrar, AnyPair):
+            return registrar.register(source, target, guess, rng)
+        return registrar.register(source, target, np.eye(4) if guess is None else guess, rng)
 
 
 def _view(view: Frame | ArrayLike, name: str) -> Frame:

@@ -20,16 +20,16 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from numba.core import serialize
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
-from numba.core.serialize import dumps
 
 from tofuse.engine.errors import KernelCacheWarning
 
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
-class KernelCache(NullCache):  # type: ignore[misc]
+class KernelCache(NullCache):
     """Compiled variants of one kernel in a folder, as Numba's dispatchers ask for them.
 
     Parameters
@@ -63,7 +63,8 @@ class KernelCache(NullCache):  # type: ignore[misc]
         if digest != hashlib.sha256(compiled).digest():
             return None  # saving replaces the file
         try:
-            return CompileResult._rebuild(target_context, *pickle.loads(compiled))
+            rebuild: Any = CompileResult._rebuild
+            return rebuild(target_context, *pickle.loads(compiled))
         except Exception:  # whatever a file of another version may raise
             return None
 
@@ -72,7 +73,8 @@ class KernelCache(NullCache):  # type: ignore[misc]
         if self._folder is None:
             return
         path = self._path(sig, data.codegen)
-        compiled = dumps(data._reduce())
+        dump: Any = serialize.dumps
+        compiled = dump(data._reduce())
         temporary = path.with_suffix(f".{os.getpid()}")
         try:
             temporary.write_bytes(hashlib.sha256(compiled).digest() + compiled)

@@ -12,7 +12,6 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.frames import depth_counts, frame_ranges
     from tofuse.engine.frames.frames import (
-        MAP_COORDINATES_M,
         SATURATED_AMPLITUDE,
         AmplitudeKind,
         CloudFrame,

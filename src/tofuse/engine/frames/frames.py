@@ -316,7 +316,7 @@ class CloudFrame:
 Frame = RangeFrame | CloudFrame
 
 # The resolution of float32 is coarser than half a millimetre beyond.
-MAP_COORDINATES_M = 8192.0
+_MAP_COORDINATES_M = 8192.0
 _SHIFT_STEP_M = 1000.0
 _MAX_SAMPLED = 100_000  # points
 
@@ -324,14 +324,14 @@ _MAX_SAMPLED = 100_000  # points
 def map_shift(points: NDArray[np.floating]) -> Float64:
     """Return the `shift` (3,) in m to subtract from points (N, 3): zero but for map coordinates.
 
-    By the median of the finite points, so that no stray point decides it.
+    By the median of the plausible points, so that no stray point decides it.
     """
     sampled = points[:: max(1, len(points) // _MAX_SAMPLED)]
-    sampled = sampled[np.isfinite(sampled).all(1)]
+    sampled = sampled[(np.abs(sampled) <= se3.MAX_COORDINATE_M).all(1)]  # false for NaN
     if not len(sampled):
         return np.zeros(3)
     centre = np.median(sampled.astype(np.float64), axis=0)
-    if np.abs(centre).max() <= MAP_COORDINATES_M:
+    if np.abs(centre).max() <= _MAP_COORDINATES_M:
         return np.zeros(3)
     return np.asarray(np.round(centre / _SHIFT_STEP_M) * _SHIFT_STEP_M)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64, Int32, UInt8
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import MAP_COORDINATES_M
+from tofuse.engine.frames import map_shift
 
 _AMPLITUDES = (
     "amplitude",
@@ -103,8 +103,7 @@ class GeometryRecord:
 
     def written_points(self) -> NDArray[np.floating]:
         """Return the points as files hold them: "<f8" for map coordinates in float64, or "<f4"."""
-        far = np.abs(self.points).max(initial=0) > MAP_COORDINATES_M
-        double = self.points.dtype == np.float64 and far
+        double = self.points.dtype == np.float64 and bool(map_shift(self.points).any())
         return np.asarray(self.points, "<f8" if double else "<f4")
 
     def shifted(self, shift: Float64) -> GeometryRecord:

@@ -17,9 +17,9 @@ from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import LoopRecord
+from tofuse.engine.loops.appearance import Appearance
 from tofuse.engine.loops.candidates import (
     MAX_OVERLAP_BETWEEN,
-    Appearance,
     CandidateSelector,
     LoopView,
     Pair,

@@ -22,6 +22,6 @@ if TYPE_CHECKING:
     )
     from tofuse.formats.sources.file_source import DepthImageSource, FileSource
     from tofuse.formats.sources.imu import gravity_at
-    from tofuse.formats.sources.inputs import Reader, ReaderOptions, Sniff
+    from tofuse.formats.sources.reader import Reader, ReaderOptions, Sniff
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -24,8 +24,8 @@ from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import as_color, parse_image
 from tofuse.formats.sources.file_source import FileSource
-from tofuse.formats.sources.inputs import ReaderOptions
 from tofuse.formats.sources.pixels import finite_float32, sampled_color
+from tofuse.formats.sources.reader import ReaderOptions
 
 REMEDY = "check the bag, or reindex it"
 MAX_GAP_S = 0.02  # between the images of one frame

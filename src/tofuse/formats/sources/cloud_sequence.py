@@ -18,8 +18,8 @@ from tofuse.engine.parts import name_of
 from tofuse.formats.files import reading, tables
 from tofuse.formats.sources import inputs
 from tofuse.formats.sources.file_source import FileSource
-from tofuse.formats.sources.inputs import Reader, ReaderOptions, Sniff
 from tofuse.formats.sources.organised import Deprojection, find_deprojection, samples
+from tofuse.formats.sources.reader import Reader, ReaderOptions, Sniff
 
 LoadFrame = Callable[[Path, int, float], Frame]
 

@@ -20,7 +20,8 @@ from tofuse.engine.frames import (
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import check_first_size, read_color, read_image
-from tofuse.formats.sources.inputs import ReaderOptions, read_timestamps, tum_poses
+from tofuse.formats.sources.inputs import read_timestamps, tum_poses
+from tofuse.formats.sources.reader import ReaderOptions
 
 
 class FileSource(ABC):

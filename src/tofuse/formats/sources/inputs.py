@@ -1,11 +1,10 @@
-"""The interface of a reader, the files of a recording, and what belongs to each frame."""
+"""The files of a recording, and what belongs to each frame."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,77 +15,7 @@ from tofuse.engine.frames import Source
 from tofuse.engine.geometry import se3
 from tofuse.formats.files import reading, tables
 from tofuse.formats.poses import associated_poses, read_tum
-
-
-@dataclass(frozen=True)
-class Sniff:
-    """A reader's guess whether a path has its format.
-
-    Attributes
-    ----------
-    confidence
-        0 to 1; a path is opened automatically from `CERTAIN` on, not if `UNCERTAIN`. 1 is for names
-        and contents that no other format has.
-    evidence
-        The evidence for the format, for messages.
-    remedy
-        What to do if the confidence is below `CERTAIN`.
-    """
-
-    CERTAIN: ClassVar[float] = 0.9
-    UNCERTAIN: ClassVar[float] = 0.5
-
-    confidence: float
-    evidence: str
-    remedy: str = ""
-
-
-@dataclass(frozen=True)
-class ReaderOptions:
-    """Options of the user for opening a recording.
-
-    Attributes
-    ----------
-    camera
-        A camera.json that replaces the recording's own.
-    topic
-        Of a bag, instead of the detected one.
-    """
-
-    camera: Path | None = None
-    topic: str | None = None
-
-
-@dataclass(frozen=True)
-class Reader(Protocol):
-    """A reader of one format, registered by ``@part("reader", name)`` in a module of `readers`.
-
-    Attributes
-    ----------
-    joinable
-        Whether a folder of such recordings is joined to one recording, in name order.
-    """
-
-    part_kind: ClassVar[str] = "reader"
-    joinable: ClassVar[bool] = False
-
-    def sniff(self, path: Path) -> Sniff | None:
-        """Detect the format from names and first bytes; None if it is another one.
-
-        An InputError, if something can't be read, is taken for None.
-        """
-        ...
-
-    def open(self, path: Path, options: ReaderOptions) -> Source:
-        """Open a file or folder.
-
-        Raises
-        ------
-        InputError
-            If the recording as a whole is unusable.
-        """
-        ...
-
+from tofuse.formats.sources.reader import ReaderOptions
 
 PER_FRAME = "a camera per frame"
 
