@@ -429,7 +429,7 @@ def _splicing() -> Iterator[tuple[str, Callable[[int], Take]]]:
     half, order = FRAMES // 2, np.arange(FRAMES)
     yield "another place from the middle on", lambda seed: stress.two_places(room(seed), _far(seed))
     for step in (3, 8):
-        yield f"every {step}th frame of another place", partial(_mixed, step=step)
+        yield f"one frame in {step} of another place", partial(_mixed, step=step)
     yield (
         "random order",
         lambda seed: stress.shuffled(room(seed), np.random.default_rng([seed, 6])),
