@@ -1,10 +1,13 @@
-"""Attacks on the boundary of the program: fuzzed files, power cuts, hostile environments.
+"""Attacks on the boundary of the program, of the kinds in `attacks/`.
 
-    python benchmarks/attack.py [--quick] [--files N] [--cuts N] [--only files|cuts|environments]
+Fuzzed files, power cuts, hostile environments, damaged caches of kernels, edited results, changed
+pairs of clouds, and forked processes.
+
+    python benchmarks/attack.py [--quick] [--files N] [--cuts N] [--limit N] [--only KIND]
                                 [--journal FILE] [--minutes M]
 
 Prints how many of each kind were tried and how many passed; exits with 1 if any failed. The
-guarantees that are tested are in docs/evidence.md. All of it takes hours. With a journal, a
+guarantees that are tested are in docs/reliability.md. All of it takes hours. With a journal, a
 stopped run continues where it, or `--minutes`, ended; the table then covers all runs.
 """
 
@@ -15,21 +18,27 @@ import itertools
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
-from attacks import mutation
+from attacks import caches, contradictions, forks, metamorphic, mutation
 from attacks.environments import ENVIRONMENTS, Environment, attempt
 from attacks.journal import Journal
 from attacks.power import Power, PowerCut
 
 FILES, CUTS = 20_000, 500
-QUICK_FILES, QUICK_CUTS, QUICK_ENVIRONMENTS = 300, 60, 12
+QUICK_FILES, QUICK_CUTS = 300, 60
 FILES_IN_PIECE, CUTS_IN_PIECE = 200, 25
+CACHES, METAMORPHIC = 100, 200
+QUICK_LIMIT = 12
+PAIRS = 5  # of unchanged clouds
+KINDS = ("files", "cuts", "environments", "caches", "contradictions", "metamorphic", "forks")
 
+T = TypeVar("T")
 Work = Callable[[], tuple[int, list[str]]]
 
 
@@ -39,7 +48,8 @@ def main() -> int:
     parser.add_argument("--files", type=int, help=f"total of fuzzed files; default {FILES}")
     parser.add_argument("--cuts", type=int, help=f"power cuts; default {CUTS}")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", choices=("files", "cuts", "environments"))
+    parser.add_argument("--limit", type=int, help="at most this number of each other kind")
+    parser.add_argument("--only", choices=KINDS)
     parser.add_argument("--journal", type=Path, help="file of completed attacks, to continue from")
     parser.add_argument(
         "--minutes", type=float, default=np.inf, help="start no attack after that time"
@@ -48,13 +58,17 @@ def main() -> int:
     quick, only = arguments.quick, arguments.only
     files = arguments.files or (QUICK_FILES if quick else FILES)
     cuts = arguments.cuts or (QUICK_CUTS if quick else CUTS)
-    limit = QUICK_ENVIRONMENTS if quick else len(ENVIRONMENTS)
+    limit = arguments.limit or (QUICK_LIMIT if quick else sys.maxsize)
     begun = time.monotonic()
     journal = Journal(arguments.journal, {"seed": arguments.seed, "files": files, "cuts": cuts})
     with tempfile.TemporaryDirectory() as base:
         plan = {
             "cuts": lambda: power_cuts(cuts, arguments.seed),
             "environments": lambda: environments(limit, Path(base)),
+            "caches": lambda: damaged_caches(limit, arguments.seed, Path(base)),
+            "contradictions": lambda: edited_results(limit, Path(base)),
+            "metamorphic": lambda: changed_pairs(limit, arguments.seed),
+            "forks": lambda: forked(limit),
             "files": lambda: fuzzed_files(files, arguments.seed),
         }
         work = [part() for name, part in plan.items() if only in (None, name)]
@@ -156,7 +170,7 @@ def environments(limit: int, base: Path) -> Iterator[tuple[str, int, Work]]:
     """Runs in hostile environments."""
     from tofuse.lab.simulation.record import simulate
 
-    chosen = ENVIRONMENTS[:: max(1, len(ENVIRONMENTS) // limit)][:limit]
+    chosen = spread(ENVIRONMENTS, limit)
     recording = base / "rec"
 
     def work(environment: Environment) -> tuple[int, list[str]]:
@@ -169,6 +183,63 @@ def environments(limit: int, base: Path) -> Iterator[tuple[str, int, Work]]:
 
     for number, environment in enumerate(chosen):
         yield "hostile environments", number, lambda e=environment: work(e)
+
+
+def spread(items: Sequence[T], limit: int) -> Sequence[T]:
+    """Return at most `limit` of the items, from all parts."""
+    return items[:: max(1, len(items) // limit)][:limit]
+
+
+def one(fault: str, name: str) -> tuple[int, list[str]]:
+    """Return the outcome of one attack, whose `fault` is empty if it passed."""
+    return 1, [f"{name}: {fault}"] if fault else []
+
+
+def damaged_caches(limit: int, seed: int, base: Path) -> Iterator[tuple[str, int, Work]]:
+    """Damaged files of compiled kernels, of all kinds in turn."""
+    for number in range(min(limit, CACHES)):
+        kind = caches.KINDS[number % len(caches.KINDS)]
+        yield (
+            "damaged caches of kernels",
+            number,
+            lambda k=kind, n=number: one(caches.attack(k, 1_000_000 * seed + n, base), f"{k}, {n}"),
+        )
+
+
+def edited_results(limit: int, base: Path) -> Iterator[tuple[str, int, Work]]:
+    """Edited or contradictory results, each with the commands that read it."""
+    original = base / "results"
+
+    def work(edit: contradictions.Edit) -> tuple[int, list[str]]:
+        if not original.exists():
+            original.mkdir()
+            contradictions.made(original)
+        return len(edit.commands), contradictions.attack(edit, original, base / "edited")
+
+    for number, edit in enumerate(spread(list(contradictions.edits()), limit)):
+        yield "contradictory results", number, lambda e=edit: work(e)
+
+
+def changed_pairs(limit: int, seed: int) -> Iterator[tuple[str, int, Work]]:
+    """Pairs of clouds, changed in ways that must not change their pose."""
+    for number in range(min(limit, METAMORPHIC)):
+        name = list(metamorphic.CHANGES)[number % len(metamorphic.CHANGES)]
+        pair = PAIRS * seed + number // len(metamorphic.CHANGES) % PAIRS
+        yield (
+            "changed pairs of clouds",
+            number,
+            lambda n=number, k=name, p=pair: one(metamorphic.attack(k, n, p), f"{k}, {n}"),
+        )
+
+
+def forked(limit: int) -> Iterator[tuple[str, int, Work]]:
+    """Calls in a process and then in its forked children."""
+    for number, calls in enumerate(forks.SCENARIOS[:limit]):
+        yield (
+            "forked children",
+            number,
+            lambda c=calls: one(forks.attack(*c), " then ".join(c)),
+        )
 
 
 if __name__ == "__main__":

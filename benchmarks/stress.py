@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from scoring import Truth
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.cameras.cameras import BrownConrady
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
@@ -348,6 +349,18 @@ def farther(frame: RangeFrame, metres: float) -> RangeFrame:
         length = np.sqrt(1 + (np.nan_to_num(xy) ** 2).sum(-1))
     moved = np.where(depth > 0, depth + metres / length, 0)
     return replace(frame, depth=moved.astype(np.float32))
+
+
+def lens_off(
+    frame: RangeFrame, *, fx: float = 1.0, fy: float = 1.0, cx: float = 0.0, k1: float = 0.0
+) -> RangeFrame:
+    """State a lens that is wrong: factors of its focal lengths, `cx` in units of fx, distortion."""
+    camera = frame.camera
+    wrong = {"fx": fx * camera.fx, "fy": fy * camera.fy, "cx": camera.cx + cx * camera.fx}
+    if k1:
+        about = {**asdict(camera), **wrong, "k1": k1}
+        return replace(frame, camera=BrownConrady(**about))
+    return replace(frame, camera=replace(camera, **wrong))
 
 
 def timed(frames: Sequence[RangeFrame], times: Sequence[float] | Float64) -> tuple[RangeFrame, ...]:

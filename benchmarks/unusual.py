@@ -48,6 +48,8 @@ class Unusual:
         Functions of the seed.
     range_m
         Depth beyond is missing.
+    moving
+        Bodies that move: materials, meshes, and their poses in the room as functions of time.
     """
 
     scene: Callable[[int], scenes.Scene]
@@ -56,6 +58,7 @@ class Unusual:
     frames: int = 80
     rate_hz: float = 15.0
     range_m: float = np.inf
+    moving: tuple[tuple[Material, meshes.Mesh, Path], ...] = ()
 
 
 def pinhole(model: str, width: int, height: int, degrees: float) -> CameraModel:
@@ -372,7 +375,7 @@ def _in_room(*more: Callable[[np.random.Generator], Path]) -> Callable[[int], Pa
     return made
 
 
-def _fixed(path: Path, metres: float = 0.02, degrees: float = 1.5) -> Callable[[int], Path]:
+def fixed(path: Path, metres: float = 0.02, degrees: float = 1.5) -> Callable[[int], Path]:
     return lambda seed: together(path, handheld(np.random.default_rng([seed, 13]), metres, degrees))
 
 
@@ -416,50 +419,48 @@ UNUSUAL: dict[str, Unusual] = {
     ),
     "rotation in all directions": Unusual(known("room"), _in_room(slow_turns), IFM),
     "elsewhere in the flat": Unusual(known("flat"), _elsewhere_in_flat, IFM),
-    "up the stairs": Unusual(built("stairs", _stairs), _fixed(up_the_stairs), IFM, 90),
+    "up the stairs": Unusual(built("stairs", _stairs), fixed(up_the_stairs), IFM, 90),
     "things on a table": Unusual(
-        built("table", _table), _fixed(around(0.7, 0.5, (0, 0, 0.03), 8.0), 0.01, 1.0), IFM, 120
+        built("table", _table), fixed(around(0.7, 0.5, (0, 0, 0.03), 8.0), 0.01, 1.0), IFM, 120
     ),
-    "yard": Unusual(built("yard", _yard), _fixed(through_the_yard), IFM, 90),
-    "floor and chairs from above": Unusual(
-        built("chairs", _chairs), _fixed(over_the_floor), SR4000
-    ),
-    "ceiling": Unusual(known("room"), _fixed(below_the_ceiling), SR4000),
+    "yard": Unusual(built("yard", _yard), fixed(through_the_yard), IFM, 90),
+    "floor and chairs from above": Unusual(built("chairs", _chairs), fixed(over_the_floor), SR4000),
+    "ceiling": Unusual(known("room"), fixed(below_the_ceiling), SR4000),
     "chair in empty space": Unusual(
-        built("chair", _chair_alone), _fixed(around(1.5, 0.9, (0, 0, 0.5), 8.0)), IFM, 120
+        built("chair", _chair_alone), fixed(around(1.5, 0.9, (0, 0, 0.5), 8.0)), IFM, 120
     ),
     "stairwell": Unusual(
-        built("stairwell", _stairwell), _fixed(_up_the_stairwell, 0.01), IFM, 240, 10.0
+        built("stairwell", _stairwell), fixed(_up_the_stairwell, 0.01), IFM, 240, 10.0
     ),
     "aisle of identical shelves": Unusual(
-        built("aisle", _aisle), _fixed(along_the_aisle), IFM, 200, 10.0
+        built("aisle", _aisle), fixed(along_the_aisle), IFM, 200, 10.0
     ),
     "plants": Unusual(built("plants", _plants), _in_room(calm), IFM, 120),
-    "tunnel": Unusual(built("tunnel", _tunnel), _fixed(through_the_tunnel), IFM),
+    "tunnel": Unusual(built("tunnel", _tunnel), fixed(through_the_tunnel), IFM),
     "attic": Unusual(
         built("attic", _attic),
-        _fixed(_in_the_attic, 0.02, 2.0),
+        fixed(_in_the_attic, 0.02, 2.0),
         camera_model("pico-flexx"),
         120,
         10.0,
     ),
     "bathroom": Unusual(
         built("bathroom", _bathroom),
-        _fixed(_in_the_bathroom, 0.04, 3.0),
+        fixed(_in_the_bathroom, 0.04, 3.0),
         pinhole("azure-nfov", 320, 288, 75),
         120,
         10.0,
     ),
     "bookshelf": Unusual(
         built("bookshelf", _bookshelf),
-        _fixed(straight(paths.look_at((-1.8, -0.75, 1.2), (-1.8, 0.3, 1.15)), (0.35, 0, 0))),
+        fixed(straight(paths.look_at((-1.8, -0.75, 1.2), (-1.8, 0.3, 1.15)), (0.35, 0, 0))),
         camera_model("pico-flexx"),
         100,
         10.0,
     ),
     "car": Unusual(
         built("car", _car),
-        _fixed(around(3.3, 1.5, (0, 0, 0.6), 16.0)),
+        fixed(around(3.3, 1.5, (0, 0, 0.6), 16.0)),
         pinhole("azure-nfov", 320, 288, 75),
         160,
         10.0,
@@ -488,9 +489,14 @@ def record(one: Unusual, seed: int, *without: str) -> Recording:
         Effects to switch off; by default multipath and smear.
     """
     sequence = scenes.Sequence(one.frames, 1, one.rate_hz, one.path(seed))
+    scene = one.scene(seed)
+    if one.moving:
+        bodies = [body.of_surface(k) for k, (_, body, _) in enumerate(one.moving)]
+        scene = scene.with_passing([material for material, _, _ in one.moving], bodies)
+        sequence = sequence.with_passing([path for _, _, path in one.moving])
     model = replace(one.camera, frame_rate_hz=one.rate_hz)
     effects = Effects().without(*(without or ("multipath", "smear")))
-    made = RecordingPlan(one.scene(seed), sequence, model, effects, seed, np.arange(one.frames))
+    made = RecordingPlan(scene, sequence, model, effects, seed, np.arange(one.frames))
     factory = sensor.factory_correction(model, effects)
     frames = [
         replace(

@@ -132,18 +132,6 @@ def recorded(scene: str, camera: str, seed: int, *, multipath: bool) -> Recordin
     return open_recording(path)
 
 
-def wrong_focal(frame: RangeFrame) -> RangeFrame:
-    """The frame with a wrong focal length."""
-    camera = frame.camera
-    return replace(frame, camera=replace(camera, fx=FOCAL * camera.fx, fy=FOCAL * camera.fy))
-
-
-def wrong_principal_point(frame: RangeFrame) -> RangeFrame:
-    """The frame with a principal point that is off by a fraction of the focal length."""
-    camera = frame.camera
-    return replace(frame, camera=replace(camera, cx=camera.cx + CENTER * camera.fx))
-
-
 def variants(recording: Recording) -> Iterator[tuple[str, Recording]]:
     """Yield variants of a recording."""
     yield UNCHANGED, recording
@@ -153,8 +141,8 @@ def variants(recording: Recording) -> Iterator[tuple[str, Recording]]:
     yield "gap", replace(recording, indices=recording.indices[kept])
     frames = [f for f in recording if isinstance(f, RangeFrame)]
     changed = {
-        "focal 5 % off": [wrong_focal(f) for f in frames],
-        "principal point 2 % off": [wrong_principal_point(f) for f in frames],
+        "focal 5 % off": [stress.lens_off(f, fx=FOCAL, fy=FOCAL) for f in frames],
+        "principal point 2 % off": [stress.lens_off(f, cx=CENTER) for f in frames],
         "depth 3 cm off": [stress.farther(f, OFFSET_M) for f in frames],
     }
     for name, made in changed.items():

@@ -262,7 +262,7 @@ def _small() -> dict[str, Subject]:
         "disagreement": [{"a": "a", "b": "b", "median_m": 0.01, "pixels": 9}]}  # fmt: skip
     toml = "method = 'default'\ntolerance_m = 0.03\n[fusion]\nvoxel_m = 0.01\n"
     toml += "[[filters]]\npart = 'distance'\nminimum = 0.1\nmaximum = 4.0\n"
-    jobs = "[all]\nevery = 2\n[[job]]\nrecording = 'original'\nseed = 1\n"
+    jobs = 'recording,every,seed\noriginal,2,1\n"other",3,\n'
 
     def configure(path: Path) -> None:
         changed(from_method("default"), read_changes(path), where=str(path))
@@ -292,7 +292,7 @@ def _small() -> dict[str, Subject]:
         "loops": ("loops.txt", "0 3 0 0 0 0 0 0 1\n1 2\n", read_loops),
         "columns": ("imu.csv", "t,ax,ay\n" + "0.1,1,2\n" * 5, read_columns),
         "config": ("a.toml", toml, configure),
-        "jobs": ("a.toml", jobs, lambda path: read_jobs([path], run_arguments)),
+        "jobs": ("a.csv", jobs, lambda path: read_jobs([path], run_arguments)),
         "noise.json": ("noise.json", json.dumps(noise), read_noise),
     }  # fmt: skip
     found = {}

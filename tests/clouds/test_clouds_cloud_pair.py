@@ -320,6 +320,41 @@ def test_guess_resolves_symmetry():
     assert off(found.T_target_source, np.eye(4), other)[0] < 0.01
 
 
+def surface(boxes, seed):
+    """Points on boxes (size, centre), with noise of 2 mm."""
+    r = np.random.default_rng(seed)
+    parts = []
+    for size, centre in boxes:
+        points = r.uniform(-0.5, 0.5, (4000, 3))
+        points[np.arange(4000), np.arange(4000) % 3] = r.choice([-0.5, 0.5], 4000)
+        parts.append(np.asarray(centre) + points * size)
+    points = np.concatenate(parts)
+    return points + r.normal(0, 0.002, points.shape)
+
+
+LEGS = [((0.05, 0.05, 0.7), (x, y, 0.35)) for x in (-0.7, 0.7) for y in (-0.35, 0.35)]
+
+
+@pytest.mark.parametrize(
+    ("boxes", "degrees"),
+    [
+        ([((0.6, 0.4, 0.3), (0, 0, 0))], 180),
+        ([((0.6, 0.4, 0.3), (0, 0, 0))], 178),
+        ([((0.4, 0.4, 0.4), (0, 0, 0))], 90),
+        ([((1.6, 0.8, 0.04), (0, 0, 0.72)), *LEGS], 180),  # without distinct features
+    ],
+)
+def test_body_turned_by_its_symmetry_needs_guess(boxes, degrees) -> None:
+    T = turn([0, 0, 1], degrees, np.zeros(3))
+    source, target = se3.transform(se3.inverse(T), surface(boxes, 1)), surface(boxes, 2)
+    found = tofuse.register(source, target)
+    assert not found.believed
+    assert found.runner_up is not None
+    guessed = tofuse.register(source, target, guess=T)
+    assert guessed.believed
+    assert se3.is_within(se3.inverse(T) @ guessed.T_target_source, 0.01, 0.02)
+
+
 def test_result_is_independent_of_threads(scans, registered):
     with threads(2):
         found = tofuse.register(*scans[:2])

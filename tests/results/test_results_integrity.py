@@ -89,7 +89,7 @@ def mirrored(run: dict[str, Any]) -> None:
         (lambda run: run["reasons"].append({"code": "x", "text": ""}), "code is 'x'"),
         (lambda run: set_covariance(run, lambda C: -C), "covariance of frame"),
         (lambda run: set_covariance(run, lambda C: C + np.eye(6, k=1)), "covariance of frame"),
-        (mirrored, "T_up_world"),
+        (mirrored, r"run\.json: T_up_world"),
         (lambda run: run["frames"][1].update(timestamp=7e9), "other timestamps"),
     ],
 )
@@ -116,3 +116,24 @@ def test_result_of_an_earlier_version_counts_as_edited(result) -> None:
         load_result(result)
     with integrity.accepting_edits(), run_json.opened(result) as found:
         assert found == run
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda path: path.write_text(""), "run.json"),
+        (lambda path: edit(path.parent, lambda run: run.update(frames=[])), "lists 0 frames"),
+        (
+            lambda path: edit(path.parent, lambda run: run["frames"][1].update(timestamp=7e9)),
+            "other timestamps",
+        ),
+    ],
+)
+@pytest.mark.parametrize("place", [0, 1])
+def test_contradictory_result_is_not_evaluated(result, tmp_path, change, problem, place) -> None:
+    reference = Path(shutil.copy(result / "trajectory.txt", tmp_path / "reference.txt"))
+    sources = [result, reference] if place == 0 else [reference, result]
+    assert tofuse.evaluate(*sources).error.ate_rms_m < 1e-6
+    change(result / "run.json")
+    with pytest.raises(InputError, match=problem):
+        tofuse.evaluate(*sources)

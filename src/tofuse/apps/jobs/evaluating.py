@@ -96,6 +96,8 @@ def evaluate(
         str(source) if isinstance(source, str | Path) else name
         for source, name in ((estimate, "estimate"), (reference, "reference"))
     ]
+    for source in (estimate, reference):
+        _check_result(source)
     clock = run_json.frame_clock(Path(estimate)) if isinstance(estimate, str | Path) else None
     if recording is not None:
         clock = recording.timestamps, recording.indices
@@ -159,9 +161,19 @@ def _result_folder(poses: Poses) -> Path | None:
     """Return the result that poses are read from; None if there is none."""
     if not isinstance(poses, str | Path):
         return None
-    folder = Path(poses)
-    folder = folder.parent if folder.name == _TRAJECTORY else folder
-    return folder if folders.is_result(folder) else None
+    path = Path(poses)
+    if path.name == _TRAJECTORY:
+        return path.parent if folders.is_result(path.parent) else None
+    # Nothing else that is read has a run.json, so that a damaged one is reported.
+    return path if (path / "run.json").is_file() else None
+
+
+def _check_result(poses: Poses) -> None:
+    """Check that the files of a result, if poses are read from one, fit each other."""
+    folder = _result_folder(poses)
+    if folder is not None:
+        with run_json.opened(folder) as run:
+            run_json.main_poses(folder, run)
 
 
 def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:

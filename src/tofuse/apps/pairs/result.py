@@ -88,7 +88,7 @@ class PairResult:
 
     @cached_property
     def covariance(self) -> Float64 | None:
-        """(6, 6) of the right perturbation at the source's `center`; None if unbounded."""
+        """(6, 6) of the right perturbation at the source's `shift`; None if unbounded."""
         if len(self.registration.unobservable):
             return None
         return self._observed_covariance

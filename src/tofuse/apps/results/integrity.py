@@ -75,6 +75,7 @@ def check(folder: Path, run: Mapping[str, Any]) -> None:
         )
     for problem in _problems(run):
         raise InputError(problem, where=folder / _SELF, remedy="run again")
+    se3.check_pose(run["T_up_world"], where=f"{folder / _SELF}: T_up_world")
 
 
 def _edited(folder: Path, run: Mapping[str, Any]) -> str | None:
@@ -119,7 +120,6 @@ def _problems(run: Mapping[str, Any]) -> Iterator[str]:
     if not all(bound is None or bound >= 0 for bound in bounds):
         yield "accuracy has a negative bound"
     yield from _wrong_covariances(run["frames"])
-    se3.check_pose(run["T_up_world"], where="T_up_world")
     numbers = {f["component"] for f in run["frames"] if f["component"] is not None}
     if run["components"] and not numbers <= set(range(len(run["components"]))):
         yield "frames are in components that are not listed"

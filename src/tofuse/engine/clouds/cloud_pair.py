@@ -1,9 +1,10 @@
 """Global registration of two clouds, with a probability of being right.
 
-The clouds are first aligned from the guess. If their agreement makes that pose practically
-certain, it is returned. Else poses are proposed by feature matching (`registration.fpfh`); each is
-aligned and evaluated by the agreement of both clouds (`registration.cloud_agreement`) and by its
-lead over rival poses.
+The clouds are first aligned from the guess. If one is given, and their agreement makes that pose
+practically certain, it is returned. Else poses are proposed by feature matching
+(`registration.fpfh`); each is aligned and evaluated by the agreement of both clouds
+(`registration.cloud_agreement`) and by its lead over rival poses. Without a guess rivals are
+searched in any case: however well a symmetric body fits, it fits as well in another pose.
 """
 
 from __future__ import annotations
@@ -202,24 +203,27 @@ def _registered(
     views = _CloudViews.of(source, target, rng)
     start = np.eye(4) if guess is None else guess
     local = replace(views.refined(start), guess=start)
-    if views.evidence(local).probability >= pose_probability.CERTAIN and not always_search:
-        registration = _registration(views, local)
-        if (registration.probability or 0.0) >= pose_probability.CERTAIN and not len(
-            registration.unobservable
-        ):
-            return views.with_information(registration)
+    certain = None if always_search else _certain(views, local)
+    if certain is not None and guess is not None:
+        return views.with_information(certain)
     poses = (
         [local]
         if image_registration is None
         else [local, views.evaluated(image_registration.T_target_source)]
     )
     poses += _proposed(views, start)
+    if certain is not None:
+        poses += _turned(views, local)
     poses.sort(key=lambda pose: -pose.agreement.score)
     best = poses[0]
     if guess is not None:
         tied = [p for p in poses if p.agreement.score >= best.agreement.score - _MIN_LEAD]
         best = min(tied, key=lambda p: _pose_distance(p.T_target_source, guess))
     registration = _registration(views, best, poses)
+    if certain is not None and registration.believed:
+        T = registration.T_target_source
+        if not views.are_distinct_poses(T, certain.T_target_source):
+            return views.with_information(certain)
     if guess is None or best.guess is not None or not len(registration.unobservable):
         return views.with_information(registration)
     # If the poses differ along degenerate directions only, these keep the guess.
@@ -230,6 +234,16 @@ def _registered(
     if views.are_distinct_poses(local.T_target_source, local.T_target_source @ across):
         return views.with_information(registration)
     return views.with_information(_registration(views, local, [best]))
+
+
+def _certain(views: _CloudViews, local: _Pose) -> Registration | None:
+    """Return the registration at a pose whose agreement makes it practically certain, or None."""
+    if views.evidence(local).probability < pose_probability.CERTAIN:
+        return None
+    registration = _registration(views, local)
+    if (registration.probability or 0.0) < pose_probability.CERTAIN:
+        return None
+    return None if len(registration.unobservable) else registration
 
 
 def _scale_exponent(source: Frame, target: Frame) -> int:
@@ -305,6 +319,18 @@ def _proposed(views: _CloudViews, start: Float64) -> list[_Pose]:
     if not poses and failure is not None:
         raise failure
     return poses
+
+
+def _turned(views: _CloudViews, pose: _Pose) -> list[_Pose]:
+    """Return a pose after half and quarter turns about the principal axes of the source.
+
+    A symmetric body fits in some of them, also one without distinct features.
+    """
+    points = views.source_map.view.points.astype(np.float64)
+    _, axes = np.linalg.eigh(np.cov(points.T))
+    turns = [[0.0, 0.0, 0.0, *(angle * axis)] for axis in axes.T for angle in (np.pi / 2, np.pi)]
+    centre = points.mean(0)
+    return [views.refined(pose.T_target_source @ se3.about(centre, se3.exp(w))) for w in turns]
 
 
 def _pose_distance(a: Float64, b: Float64) -> float:

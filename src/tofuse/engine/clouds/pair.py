@@ -156,7 +156,8 @@ def register(
     images, and clouds detected to be seen from their origin, are searched exhaustively
     (`registration.search`: rotations up to 63 degrees about the vertical and 52 about any axis,
     translations up to 0.6 of the median depth). Clouds are also registered by feature matching
-    (`registration.fpfh`), under any rotation.
+    (`registration.fpfh`), under any rotation; without a guess in any case, as a symmetric body fits
+    as well in another pose.
 
     Parameters
     ----------
