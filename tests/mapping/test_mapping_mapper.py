@@ -259,3 +259,17 @@ def test_unreadable_neighbours_are_left_out(recording, room_recording, tmp_path)
     result = reconstruct(tofuse.open(copy).select(0, None, 3), config)
     assert [(i, past) for i, past, _ in SeesHistory.seen] == [(0, []), (3, [1]), (6, [4, 5])]
     assert result.has_pose.all()
+
+
+def test_failed_run_states_no_bound(room_recording) -> None:
+    """Most frames show nothing: the few poses say little about the whole."""
+    frames = [*tofuse.open(room_recording).select(end=3)]
+    blank = replace(frames[0], depth=np.zeros_like(frames[0].depth))
+    frames += [replace(blank, index=k, timestamp=float(k)) for k in range(3, 10)]
+    mapper = Mapper("default")
+    for frame in frames:
+        mapper.push(frame)
+    d = mapper.finish().diagnostics
+    assert d.verdict == "failed"
+    assert not np.isfinite(d.accuracy.position_m)
+    assert "uncertain_poses" not in {reason.code for reason in d.reasons}

@@ -131,6 +131,9 @@ class Assessment:
             single_link_frames=single_link_frames(self.tracked, loops),
         )
         verdict, reasons = checks.judge(evidence)
+        if verdict == "failed":  # its evidence is contradicted, or says little about the rest
+            accuracy = accuracy.without_bound()
+            reasons = tuple(reason for reason in reasons if reason.code != "uncertain_poses")
         more = [*self._correction_reasons(), *self._surface_reasons(model)]
         return Assessed(verdict, verdicts.ranked([*reasons, *more]), accuracy, records, model)
 
