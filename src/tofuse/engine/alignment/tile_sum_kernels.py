@@ -39,7 +39,7 @@ def tile_sums(
     tiles_x: int,
     tiles_y: int,
 ) -> tuple[Float64, Float64]:
-    """Sum over every `stride`-th pixel of every `stride`-th row; see `alignment.accumulate`.
+    """Sum over every `stride`-th pixel of every `stride`-th row; see `residual_kernels.accumulate`.
 
     The image is divided into `tiles_y` x `tiles_x` tiles.
 

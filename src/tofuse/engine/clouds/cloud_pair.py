@@ -2,8 +2,8 @@
 
 The clouds are first aligned from the guess. If one is given, and their agreement makes that pose
 practically certain, it is returned. Else poses are proposed by feature matching
-(`registration.fpfh`); each is aligned and evaluated by the agreement of both clouds
-(`registration.cloud_agreement`) and by its lead over rival poses. Without a guess rivals are
+(`clouds.fpfh`); each is aligned and evaluated by the agreement of both clouds
+(`clouds.cloud_agreement`) and by its lead over rival poses. Without a guess rivals are
 searched in any case: however well a symmetric body fits, it fits as well in another pose.
 """
 

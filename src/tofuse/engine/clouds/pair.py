@@ -38,9 +38,9 @@ _PROPOSALS, _DESCRIBED_POINTS = 8, 1500
 class AnyPair(Registrar):
     """Registration of two views with a wide baseline, with verification of the pose.
 
-    Images, and clouds seen from their origin, are registered as images (`registration.view_pair`).
+    Images, and clouds seen from their origin, are registered as images (`search.view_pair`).
     Other clouds, clouds whose image registration is rejected, and images with too few planes
-    are registered as clouds (`registration.cloud_pair`).
+    are registered as clouds (`clouds.cloud_pair`).
 
     Attributes
     ----------
@@ -154,9 +154,9 @@ def register(
     certain, it is returned, within milliseconds for images. Else poses are searched; the best one
     is aligned and evaluated by the agreement of both views and by its lead over the best rival. Two
     images, and clouds detected to be seen from their origin, are searched exhaustively
-    (`registration.search`: rotations up to 63 degrees about the vertical and 52 about any axis,
+    (`search.search`: rotations up to 63 degrees about the vertical and 52 about any axis,
     translations up to 0.6 of the median depth). Clouds are also registered by feature matching
-    (`registration.fpfh`), under any rotation; without a guess in any case, as a symmetric body fits
+    (`clouds.fpfh`), under any rotation; without a guess in any case, as a symmetric body fits
     as well in another pose.
 
     Parameters

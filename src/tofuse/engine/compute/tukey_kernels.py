@@ -4,6 +4,10 @@ Its argument is e2, the square of a residual relative to the cut-off, beyond whi
 weight: callers leave out residuals with e2 >= 1. With f = 1 - e2 the weight of a residual r is f^2,
 its influence r f^2, and its cost proportional to 1 - f^3.
 
+Another kernel in its place changes all alignments. It needs a cut-off, where its influence is zero
+(`consistency` has two meanings only then), and a weight that determines e2 (`support` and
+`relative_slope` take the weight).
+
 The kernels give float32 for float32 and float64 for float64.
 """
 
@@ -62,7 +66,7 @@ def consistency(cutoff: float) -> float:
     for k in range(_STEPS):
         e = (k + 0.5) / _STEPS
         r2 = (cutoff * e) ** 2
-        expected = (1 - e * e) ** 2 * np.exp(-0.5 * r2)
+        expected = weight(e * e) * np.exp(-0.5 * r2)
         weights += expected
         squares += expected * r2
     return squares / weights

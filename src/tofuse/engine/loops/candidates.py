@@ -139,7 +139,10 @@ class CandidateSelector:
     def most_informative(
         self, pairs: Collection[Pair], count: int, *, min_gain: float = 0.0
     ) -> list[Pair]:
-        """Choose overlapping pairs greedily: the largest gain given those before, then overlap."""
+        """Choose overlapping pairs greedily: the largest gain given those before, then overlap.
+
+        `pairs` are some of `overlapping`, which has been called, as has `condition`.
+        """
         remaining = list(pairs)
         chosen: list[Pair] = []
         while remaining and len(chosen) < count:

@@ -107,7 +107,7 @@ _MAX_MOTION = 0.1
 class Revisits(Bounded, LoopDetector):
     """Registers views that overlap, according to the trajectory, after the camera left the place.
 
-    A loop is registered from the relative pose of the trajectory (`registration.view_pair.follow`),
+    A loop is registered from the relative pose of the trajectory (`search.follow`),
     and accepted if it is verified and constrained in most directions. The best of the other
     candidates are searched exhaustively (`register_pair`). The result of a search is accepted if
     its margin is large enough or another loop nearby is consistent with it: places may look

@@ -1,7 +1,7 @@
 """Registration of two range images with a wide baseline, with a probability of being right.
 
 The views are first aligned from the guess. If their agreement makes that pose practically certain,
-it is returned. Else all poses are searched (`registration.search`); the best one is aligned and
+it is returned. Else all poses are searched (`search.search`); the best one is aligned and
 evaluated by the agreement of both images and by its lead over rival poses.
 """
 

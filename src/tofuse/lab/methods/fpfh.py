@@ -22,7 +22,7 @@ from tofuse.lab.methods.sample_consensus import Method, SampleOptions, registrat
 class Fpfh(Bounded, Registrar):
     """Fast point feature histograms (Rusu et al. 2009) with robust consensus of the matches.
 
-    Of the poses that matches agree on (`registration.fpfh.candidates`) the one under which most
+    Of the poses that matches agree on (`clouds.fpfh.candidates`) the one under which most
     points of the source fit is chosen and refined. The guess is not used.
 
     Attributes
