@@ -63,6 +63,16 @@ def test_reconstruction_from_arrays_matches_reference(result):
     assert re.fullmatch(r"Evaluation: ATE 0\.00\d+ m, .* over 6 poses", repr(found))
 
 
+def test_result_changed_by_hand_is_not_saved(result, tmp_path) -> None:
+    changed = tofuse.load(result.save(tmp_path / "out"))
+    with pytest.raises(OutputError, match=r"pass --overwrite \(Python: overwrite=True\)"):
+        changed.save(tmp_path / "out")
+    changed.trajectory[:] = 0
+    with pytest.raises(InputError, match=r"trajectory\[0\]"):
+        changed.save(tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
 def test_saved_result_round_trips(result, tmp_path):
     assert result.save(tmp_path / "out") == tmp_path / "out"
     again = tofuse.load(tmp_path / "out")

@@ -29,6 +29,7 @@ from tofuse.apps.results import folders, integrity, load_result, write_result
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Foreground
 from tofuse.engine.frames import Recording
+from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import Config, adaptation, changed, from_method, reconstructing
 from tofuse.engine.progress import Progress
@@ -96,9 +97,12 @@ class Result(Reconstruction):
 
         Raises
         ------
+        InputError
+            If the trajectory was changed and is none.
         OutputError
             If the folder contains anything but a result, or a result and `overwrite` is not set.
         """
+        se3.check_poses(self.trajectory, where="trajectory", count=len(self.timestamps))
         # BLAS results depend on its number of threads.
         with folders.OutputFolder(folder, overwrite=overwrite) as out, threadpool_limits(1):
             write_result(self, out, self._write_report)
