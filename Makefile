@@ -20,7 +20,7 @@ demo: .venv/.ready          ## simulate a recording, reconstruct it, leave a mod
 # Compiled modules are kept, even where the environment says otherwise: many tests start processes.
 PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile
 # Rooms whose tests need no whole run: a first verdict within a minute.
-FIRST = $(addprefix tests/,alignment cameras clouds compute files filters geometry graph icp images loops noise poses search sensor stored_views views)
+FIRST = $(addprefix tests/,alignment cameras compute files filters geometry graph images noise poses sensor stored_views views)
 test: .venv/.ready          ## run the tests of every change: the quick rooms, and if they pass the others, 6 minutes
 	$(PYTEST) -m "not nightly and not nightly_part" $(FIRST)
 	$(PYTEST) -m "not nightly and not nightly_part" tests $(addprefix --ignore=,$(FIRST))

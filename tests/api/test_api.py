@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.formats.export.conversion import convert
