@@ -196,6 +196,6 @@ def test_method_is_a_part_or_its_name() -> None:
     np.testing.assert_array_equal(by_name.T_target_source, by_part.T_target_source)
     for wrong in ("ecp", CoarseToFine, 3):
         with pytest.raises(
-            InputError, match=r"method: is .*; use one of any-pair, .*coarse-to-fine"
+            InputError, match=r"method: is .*; use one of any-pair, .*icp"
         ):
             tofuse.register(source, target, method=wrong)
