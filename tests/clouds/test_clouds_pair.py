@@ -195,7 +195,5 @@ def test_method_is_a_part_or_its_name() -> None:
     by_part = tofuse.register(source, target, method=CoarseToFine())
     np.testing.assert_array_equal(by_name.T_target_source, by_part.T_target_source)
     for wrong in ("ecp", CoarseToFine, 3):
-        with pytest.raises(
-            InputError, match=r"method: is .*; use one of any-pair, .*icp"
-        ):
+        with pytest.raises(InputError, match=r"method: is .*; use one of any-pair, .*icp"):
             tofuse.register(source, target, method=wrong)
