@@ -188,6 +188,22 @@ def test_run_keeps_georeference_of_clouds(results, tmp_path) -> None:
     np.testing.assert_allclose(*spans, rtol=0, atol=0.1)
 
 
+def test_clouds_with_different_shifts_make_one_model() -> None:
+    """Where medians round to different kilometres."""
+    views = [view(T, k) for k, T in enumerate(POSES[:2])]
+    east = 500_500 - np.mean([np.median(points[:, 0]) for points in views])
+    offset = np.array([east, 4_000_000, 100])
+    clouds = [CloudFrame.of(p + offset, index=k, timestamp=k) for k, p in enumerate(views)]
+    assert clouds[0].shift[0] != clouds[1].shift[0]
+    mapper = tofuse.Mapper("default")
+    for cloud in clouds:
+        mapper.push(cloud)
+    result = mapper.finish()
+    np.testing.assert_array_equal(result.shift, clouds[0].shift)
+    in_files = se3.about(result.shift, result.trajectory[1])
+    agree(in_files, se3.about(offset, POSES[1]), offset)
+
+
 def test_stray_point_leaves_cloud_as_dense(results) -> None:
     counts = [len(read_ply(results[n] / "cloud.ply").points) for n in ("plain", "stray")]
     assert counts[1] == pytest.approx(counts[0], rel=0.02)

@@ -187,6 +187,29 @@ def test_clouds_alone_give_a_model(frames) -> None:
     assert result.cloud.color is None
 
 
+def test_given_tracker_tracks_clouds_too(frames) -> None:
+    """An interrupted run goes on with one that repeats what was tracked."""
+    clouds = [CloudFrame.of(f.points[::6], index=f.index, timestamp=f.index) for f in frames[:2]]
+    config = from_method("default", "cloud")
+
+    class Counting:
+        def __init__(self) -> None:
+            self.tracker, self.pushed = config.odometry.start(0, config.search), 0
+
+        def push(self, *arguments):
+            self.pushed += 1
+            return self.tracker.push(*arguments)
+
+        def __getattr__(self, name):
+            return getattr(self.tracker, name)
+
+    given = Counting()
+    mapper = Mapper(config, tracker=given)
+    for cloud in clouds:
+        mapper.push(cloud)
+    assert given.pushed == 2
+
+
 def test_covariances_are_relative_to_first_pose(whole) -> None:
     first, second, *_, last = whole.diagnostics.frames
     np.testing.assert_array_equal(first.covariance, 0)

@@ -76,11 +76,13 @@ class Mapper:
         self._log = FrameLog()
         self._finished = False
         self._shift: Float64 = np.zeros(3)
-        self._start_method(tracker)
+        self._given_tracker = tracker
+        self._start_method()
 
-    def _start_method(self, tracker: Tracker | None = None) -> None:
+    def _start_method(self) -> None:
         self._preparation = Preparation(self.config)
-        self._tracker = tracker or self.config.odometry.start(self.seed, self.config.search)
+        started = self._given_tracker or self.config.odometry.start(self.seed, self.config.search)
+        self._tracker: Tracker = started
         self._observations = Observations(self.config, self.seed, self._prior_loops)
         self._live_poses = LivePoses(self._observations.loops, self.config.optimiser)
         self._component = 0
@@ -247,7 +249,7 @@ class Mapper:
         self._live_poses.finish()
         with self.watch.timing("fusion"):
             self._observations.finish()
-        del self._sequence, self._tracker  # the last frame, and keyframes
+        del self._sequence, self._tracker, self._given_tracker  # the last frame, and keyframes
         trim_memory()
         job = Job(self.config, self._observations, self._prior_loops, self._progress, self.watch)
         result = Assembly(job, self.seed, self.threads).run(self._log)
@@ -271,10 +273,10 @@ class Mapper:
         self._sequence.check_order(frame.index)
         kind = kind_of(frame)
         if self._sequence.check_kind(frame):
-            self._shift = frame.shift
-            if self._method is not None and kind == "cloud":
-                self.config = from_method(self._method, kind)
             if kind == "cloud":
+                if self._method is not None:
+                    self.config = from_method(self._method, kind)
+                self._shift = frame.shift
                 self._prior_loops = tuple(p.about(-self._shift) for p in self._prior_loops)
                 self._start_method()
             check_views(self.config, kind)
