@@ -44,7 +44,7 @@ def console() -> int:
 
 
 def prepare_process() -> None:
-    """Set environment variables that libraries read when they are loaded, and plain warnings."""
+    """Set how warnings are printed, and variables that libraries read when they are loaded."""
     warnings.formatwarning = _format_warning
     # BLAS is limited to one thread later, but reserves memory for more; if that fails, it hangs.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -59,7 +59,7 @@ def _format_warning(
     lineno: int,
     line: str | None = None,
 ) -> str:
-    """Format those of this package as its other messages."""
+    """Format a warning of this package like its other messages, and others as Python does."""
     from tofuse.engine.errors import KernelCacheWarning
 
     if issubclass(category, KernelCacheWarning):

@@ -130,9 +130,8 @@ def _kitti(result: _Result, path: Path) -> None:
 
 
 def _log(result: _Result, path: Path) -> None:
-    clock = run_json.frame_clock(result.folder)
-    assert clock is not None
-    times, index = clock
+    with run_json.opened(result.folder) as run:
+        times, index = run_json.frame_clock(run)
     stamps_of_poses, poses = result.trajectory
     write_log(path, poses, index[associate(stamps_of_poses, times, limit=1e-6)])
 

@@ -17,6 +17,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.quality import map_agreement, trajectory_errors
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors, Corrector
+from tofuse.formats.files import reading
 from tofuse.formats.poses import Clock, TimedPoses, read_poses
 from tofuse.formats.recordings import open_recording, read_reference
 
@@ -96,9 +97,10 @@ def evaluate(
         str(source) if isinstance(source, str | Path) else name
         for source, name in ((estimate, "estimate"), (reference, "reference"))
     ]
-    for source in (estimate, reference):
-        _check_result(source)
-    clock = run_json.frame_clock(Path(estimate)) if isinstance(estimate, str | Path) else None
+    of_estimate, _ = _result_of(estimate), _result_of(reference)
+    clock = None
+    if of_estimate is not None and of_estimate.folder == Path(str(estimate)):
+        clock = of_estimate.clock
     if recording is not None:
         clock = recording.timestamps, recording.indices
     timed = _poses(estimate, names[0]), _poses(reference, names[1], is_reference=True)
@@ -112,10 +114,11 @@ def evaluate(
     times, poses = _timed(timed[0], estimate, clock, names[0])
     reference_times, reference_poses = _timed(timed[1], reference, clock, names[1])
     # About the clouds: errors of rotation have long lever arms at the origin of map coordinates.
-    shift = _shift(estimate)
-    reference_poses = se3.about(-shift, reference_poses)
-    if not isinstance(estimate, Reconstruction):
-        poses = se3.about(-shift, poses)
+    if isinstance(estimate, Reconstruction):  # which is so already
+        reference_poses = se3.about(-estimate.shift, reference_poses)
+    elif of_estimate is not None:
+        shift = run_json.shift_of(of_estimate.run, of_estimate.folder / "run.json")
+        poses, reference_poses = se3.about(-shift, poses), se3.about(-shift, reference_poses)
     frame_times = None if recording is None else recording.timestamps
     try:
         error = trajectory_errors.evaluate_trajectory(
@@ -128,33 +131,42 @@ def evaluate(
     if recording is not None:
         frame_poses = map_agreement.poses_of_frames(recording.timestamps, times, poses)
         consistency = map_agreement.map_consistency(
-            recording, frame_poses, correctors=_correctors(estimate, config)
+            recording, frame_poses, correctors=_correctors(estimate, of_estimate, config)
         )
     return Evaluation(error, interval, consistency)
 
 
-def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corrector, ...]:
+@dataclass(frozen=True)
+class _Result:
+    """The result that poses are read from: its folder, checked `run.json`, times of frames."""
+
+    folder: Path
+    run: dict[str, Any]
+    clock: Clock
+
+
+def _result_of(poses: Poses) -> _Result | None:
+    """Return the result that poses are read from, whose files fit each other; None without one."""
+    folder = _result_folder(poses)
+    if folder is None:
+        return None
+    with run_json.opened(folder) as run:
+        run_json.main_poses(folder, run)
+        return _Result(folder, run, run_json.frame_clock(run))
+
+
+def _correctors(
+    estimate: Poses, result: _Result | None, config: Mapping[str, Any] | None
+) -> tuple[Corrector, ...]:
     """Return the correctors of the result that the poses belong to; none without a result."""
     if config is not None:
         return CameraErrors.made_with(config)
     if isinstance(estimate, Reconstruction):
         return CameraErrors.made_with(estimate.config)
-    folder = _result_folder(estimate)
-    if folder is None:
+    if result is None:
         return ()
-    with run_json.opened(folder) as run:
-        return CameraErrors.made_with(run["config"])
-
-
-def _shift(estimate: Poses) -> Float64:
-    """Return the shift (3,) in m of the clouds of a result; zero for other poses."""
-    if isinstance(estimate, Reconstruction):
-        return estimate.shift
-    folder = _result_folder(estimate)
-    if folder is None:
-        return np.zeros(3)
-    with run_json.opened(folder) as run:
-        return run_json.shift_of(run, folder / "run.json")
+    with reading.damage_reported(result.folder / "run.json", "a run.json"):
+        return CameraErrors.made_with(result.run["config"])
 
 
 def _result_folder(poses: Poses) -> Path | None:
@@ -166,14 +178,6 @@ def _result_folder(poses: Poses) -> Path | None:
         return path.parent if folders.is_result(path.parent) else None
     # Nothing else that is read has a run.json, so that a damaged one is reported.
     return path if (path / "run.json").is_file() else None
-
-
-def _check_result(poses: Poses) -> None:
-    """Check that the files of a result, if poses are read from one, fit each other."""
-    folder = _result_folder(poses)
-    if folder is not None:
-        with run_json.opened(folder) as run:
-            run_json.main_poses(folder, run)
 
 
 def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:

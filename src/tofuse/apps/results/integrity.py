@@ -149,4 +149,4 @@ def _wrong_covariances(frames: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         lowest < -_ROUNDING * size
     )
     for k in np.flatnonzero(wrong)[:1]:
-        yield f"the covariance of frame {known[k]['index']} is none"
+        yield f"the covariance of frame {known[k]['index']} is not symmetric and non-negative"

@@ -13,7 +13,6 @@ import numpy as np
 
 from tofuse._version import __version__
 from tofuse.apps.results import integrity
-from tofuse.apps.results.folders import is_result
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
@@ -126,13 +125,10 @@ def _frame(f: FrameRecord, result: Reconstruction) -> dict[str, Any]:
     return {**vars(f), "covariance": covariance, "session": session}
 
 
-def frame_clock(folder: Path) -> tuple[Float64, Intp] | None:
-    """Return (N,) timestamps in s and (N,) indices of a result's frames; None for other folders."""
-    if not is_result(folder):
-        return None
-    with opened(folder) as run:
-        times = np.array([frame["timestamp"] for frame in run["frames"]], float)
-        return times, np.array([frame["index"] for frame in run["frames"]], np.intp)
+def frame_clock(run: Mapping[str, Any]) -> tuple[Float64, Intp]:
+    """Return (N,) timestamps in s and (N,) indices of the frames of a `run.json`."""
+    times = np.array([frame["timestamp"] for frame in run["frames"]], float)
+    return times, np.array([frame["index"] for frame in run["frames"]], np.intp)
 
 
 def accuracy_json(a: pose_accuracy.Accuracy) -> dict[str, Any]:

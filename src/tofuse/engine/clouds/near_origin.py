@@ -57,7 +57,7 @@ class NearOrigin:
             if np.linalg.norm(centres[0] - centres[1]) <= max_distance:
                 centres[0] = centres[1]
         if guess is not None:
-            guess = translation(-centres[1]) @ guess @ translation(centres[0])
+            guess = se3.translation(-centres[1]) @ guess @ se3.translation(centres[0])
             # Projected onto a rotation: rounded entries would move points far from the origin.
             guess = se3.orthonormalise(guess)
         near = [
@@ -70,7 +70,8 @@ class NearOrigin:
         """Return a registration of these views in the coordinates of their files."""
         if not (self.source.shift.any() or self.target.shift.any()):
             return registration
-        return registration.between(translation(self.target.shift), translation(-self.source.shift))
+        to_target_file = se3.translation(self.target.shift)
+        return registration.between(to_target_file, se3.translation(-self.source.shift))
 
 
 def _box(view: Frame) -> Float64:
@@ -79,10 +80,3 @@ def _box(view: Frame) -> Float64:
         return np.zeros((2, 3))
     box: Float64 = np.percentile(view.points.astype(float), [5, 95], axis=0)
     return box + view.shift
-
-
-def translation(t: Float64) -> Float64:
-    """Return the translation by t (3,) as a pose (4, 4)."""
-    T = np.eye(4)
-    T[:3, 3] = t
-    return T

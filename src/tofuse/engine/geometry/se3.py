@@ -189,11 +189,14 @@ def transform(T: ArrayLike, points: ArrayLike) -> Float64:
 def about(centre: ArrayLike, T: ArrayLike) -> Float64:
     """Return the motions (..., 4, 4) that act about a centre (3,) as T does about the origin."""
     centre, T = np.asarray(centre, float), np.asarray(T, float)
-    if not centre.any():
-        return T
-    to, back = np.eye(4), np.eye(4)
-    to[:3, 3], back[:3, 3] = centre, -centre
-    return np.asarray(to @ T @ back)
+    return np.asarray(translation(centre) @ T @ translation(-centre)) if centre.any() else T
+
+
+def translation(t: ArrayLike) -> Float64:
+    """Return the translation (4, 4) by t (3,)."""
+    T = np.eye(4)
+    T[:3, 3] = t
+    return T
 
 
 def point_jacobian(points: ArrayLike) -> Float64:

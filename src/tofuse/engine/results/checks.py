@@ -391,9 +391,9 @@ def _scene(e: Evidence) -> Iterator[Reason]:
     if open_frames := open_motion(e.moving):
         where = e.runs_of(open_frames)
         text = (
-            f"What moves covers more than {_percent(MAX_MOVING)} of the image in "
-            f"{frame_ranges.in_words(where)}: whether it moves, or the camera with it, is open, so "
-            "no bound of the pose errors is stated."
+            f"Moving objects cover more than {_percent(MAX_MOVING)} of the image in "
+            f"{frame_ranges.in_words(where)}: the camera may have moved with them instead, so no "
+            "bound on the pose errors is stated."
         )
         yield Reason("open_motion", where, text)
     doubtful = e.runs_of(e.doubtful)
