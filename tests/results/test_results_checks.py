@@ -207,6 +207,7 @@ CASES = {
     "single_link": replace(evidence(), single_link_frames=(5, 6, 7, 8)),
     "moving_objects": evidence(moving=((3, 0.1), (4, 0.234), (6, 0.0))),
     "open_motion": evidence(moving=((3, 0.1), (4, 0.26))),
+    "ambiguous_steps": replace(evidence(), ambiguous=(2, 5)),
     "doubtful_poses": evidence(doubtful=(2, 3, 6)),
 }
 

@@ -18,11 +18,16 @@ from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph
 from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.parts import name_of
-from tofuse.engine.quality import cross_view_agreement, pose_accuracy, trajectory_errors
+from tofuse.engine.quality import (
+    cross_view_agreement,
+    pose_accuracy,
+    rival_steps,
+    trajectory_errors,
+)
 from tofuse.engine.refinement import Refinement, calibration_check
 from tofuse.engine.results import Component, FrameRecord, Reason, Verdict, checks, verdicts
 from tofuse.engine.sensor import CameraErrors
-from tofuse.engine.tracking import given
+from tofuse.engine.tracking import FrameTime, given
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +102,8 @@ class Assessment:
         moving = tuple(
             (e.record.index, e.moving_fraction) for e in self.tracked.posed if e.moving_fraction > 0
         )
-        if checks.open_motion(moving):
+        ambiguous = self._ambiguous(graph)
+        if ambiguous or checks.open_motion(moving):
             accuracy = accuracy.without_bound()
         if observations.has_covariances:
             model = self._with_pose_errors(model, graph, covariances)
@@ -129,6 +135,7 @@ class Assessment:
             moving=moving,
             doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
             single_link_frames=single_link_frames(self.tracked, loops),
+            ambiguous=ambiguous,
         )
         verdict, reasons = checks.judge(evidence)
         if verdict == "failed":  # its evidence is contradicted, or says little about the rest
@@ -253,6 +260,15 @@ class Assessment:
             if len(frames) > 1
             else None
         )
+
+    def _ambiguous(self, graph: PoseGraph) -> tuple[int, ...]:
+        """Return frames to which another step fits as well; odometry would exclude that."""
+        posed = self.tracked.posed
+        if not self._is_tracked or any(e.T_odometry is not None for e in posed):
+            return ()
+        poses = dict(zip(graph.ids.tolist(), graph.poses, strict=True))
+        moments = [FrameTime(e.record.index, e.record.timestamp) for e in posed]
+        return rival_steps.ambiguous_frames(self.observations.views.of(poses), poses, moments)
 
     def _checked_images(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
         """Return the images for the final comparison, and their positions in the graph."""

@@ -97,6 +97,8 @@ class Evidence:
         Indices of the frames that fit worse than usual for this camera.
     single_link_frames
         Indices of the frames that a single registration connects to the first one.
+    ambiguous
+        Indices of examined frames to which another step fits as well.
     """
 
     records: tuple[FrameRecord, ...]
@@ -120,6 +122,7 @@ class Evidence:
     moving: tuple[tuple[int, float], ...] = ()
     doubtful: tuple[int, ...] = ()
     single_link_frames: tuple[int, ...] = ()
+    ambiguous: tuple[int, ...] = ()
 
     @property
     def full_range(self) -> tuple[frame_ranges.Range, ...]:
@@ -267,6 +270,13 @@ def _motion(e: Evidence) -> Iterator[Reason]:
             f"that of frame {frames[0]} is {deviation}."
         )
         yield Reason("jumped", jumped, text)
+    if ambiguous := e.runs_of(e.ambiguous):
+        text = (
+            f"Around {frame_ranges.in_words(ambiguous)} the scene repeats itself: another step "
+            "between two frames fits as well as the tracked one, so no bound on the pose errors is "
+            "stated."
+        )
+        yield Reason("ambiguous_steps", ambiguous, text)
     repeated = e.runs_of(e.repeated)
     if repeated:
         n = sum(record.index in e.repeated for record in e.records)

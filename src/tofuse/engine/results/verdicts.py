@@ -43,6 +43,10 @@ REASONS: dict[str, tuple[str, str]] = {
         "A correction was not applied: the views do not show the error that it removes.",
     ),
     "open_motion": ("degraded", "So much of the view moves that what stands still is open."),
+    "ambiguous_steps": (
+        "degraded",
+        "The scene repeats itself: other steps between frames fit as well.",
+    ),
     "moving_objects": ("note", "Objects move in front of the camera; they are excluded."),
     "not_improved": ("note", "The optimiser did not improve on the initial poses."),
     "not_refined": ("note", "Global refinement did not improve consistency and was discarded."),
@@ -78,6 +82,8 @@ ADVICE: dict[str, str] = {
     "not_converged": "Use more iterations, or record with smaller steps between frames.",
     "inconsistent_poses": "Use the refined poses, or find what distorted the given ones.",
     "open_motion": "Record again with less that moves in view, or from farther away.",
+    "ambiguous_steps": "Record at a higher frame rate or move more slowly, and keep things that "
+    "don't repeat in view.",
     "uncertain_poses": "Return to places seen before, or keep corners and texture in view there.",
     "calibration_alarm": "Check the camera's calibration against a known distance and a right "
     "angle.",

@@ -22,6 +22,8 @@ from tofuse.engine.geometry import distance_and_angle, retract, se3, twist_betwe
 # last frame over _GATE_SECONDS; at most _MAX_GATE_SCALE times, which is reached after 0.6 s.
 GATE = np.array([0.06, np.radians(4.0)])
 _GATE_SECONDS, _MAX_GATE_SCALE = 0.2, 10.0
+# Speed of a person who walks, m/s: a recording may begin in motion.
+_WALKING = 1.5
 # Largest velocity of a handheld camera, m/s and rad/s.
 HANDHELD = np.array([3.0, 6.0])
 # The gate is wider by this factor times the largest of the recent deviations from the prediction.
@@ -130,7 +132,7 @@ class MotionModel:
                 return np.full(2, np.inf)
             minimum = GATE * max(elapsed, 1.0)
         else:
-            minimum = GATE * min(max((seconds / _GATE_SECONDS) ** 2, 1.0), _MAX_GATE_SCALE)
+            minimum = _minimum_gate(seconds)
         return np.asarray(
             minimum + _DEVIATION_FACTOR * typical_deviation * max(elapsed, 1.0), np.float64
         )
@@ -255,6 +257,20 @@ class MotionModel:
         if self._T_last is None or self._last_time is None or velocity is None:
             return None
         return retract(self._T_last, velocity * now.since(self._last_time))
+
+
+def reach_m(seconds: float) -> float:
+    """Return how far the true step between two frames may lie from the tracked one, m.
+
+    Beyond, a camera that a person carries would be too fast, or accelerated too much.
+    """
+    return float(max(_minimum_gate(seconds)[0], _WALKING * seconds))
+
+
+def _minimum_gate(seconds: float) -> Float64:
+    """Return the gate (2,), m and rad, of a steady camera, this time after the last frame."""
+    scale = min(max((seconds / _GATE_SECONDS) ** 2, 1.0), _MAX_GATE_SCALE)
+    return np.asarray(GATE * scale, np.float64)
 
 
 def is_small(T: Float64) -> bool:

@@ -1,0 +1,77 @@
+"""Scenes that repeat themselves: a rival step within reach is found, and only there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tests.helpers.made_rooms import CAMERA, at, seen, surface
+
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.quality.rival_steps import ambiguous_frames
+from tofuse.engine.stored_views.view_store import PosedView
+from tofuse.engine.tracking.motion import FrameTime
+
+PERIOD = 0.3
+STEP = (0.02, 0.01, 0.0)
+
+
+def tiles(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The height of a floor that is the same after a period in x and in y."""
+    return 0.02 * (np.sin(2 * np.pi * x / PERIOD) + np.cos(2 * np.pi * y / PERIOD))
+
+
+def relief(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The height of a floor that never repeats itself."""
+    return 0.02 * (np.sin(9 * x + 3 * y**2) + np.cos(8 * y + 4 * x**2))
+
+
+def flat(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The height of a floor along which the motion is not determined at all."""
+    return 0.0 * x
+
+
+def floor_from_above(height, k: int, noise: float = 0.001) -> RangeFrame:
+    """The k-th view of a floor 1.5 m away, a step further each time."""
+    rays = CAMERA.rays()
+    z = np.full((CAMERA.height, CAMERA.width), 1.5)
+    origin = k * np.array(STEP)
+    for _ in range(30):
+        z = 1.5 - height(*(rays * z[..., None] + origin[:2]).transpose(2, 0, 1))
+    z += noise * np.random.default_rng(k).standard_normal(z.shape)
+    return RangeFrame(k, 0.5 * k, CAMERA, z.astype(np.float32), "z")
+
+
+def found(frames, poses, seconds: float) -> tuple[int, ...]:
+    """The frames to which another step fits, if they were taken this long after each other."""
+    views = [PosedView(surface(frame), T) for frame, T in zip(frames, poses, strict=True)]
+    moments = [FrameTime(k, 5.0 + seconds * k) for k in range(len(frames))]
+    return ambiguous_frames(views, dict(enumerate(poses)), moments)
+
+
+def above(height, seconds: float, count: int = 3) -> tuple[int, ...]:
+    poses = [se3.translation(k * np.array(STEP)) for k in range(count)]
+    return found([floor_from_above(height, k) for k in range(count)], poses, seconds)
+
+
+def test_floor_of_tiles_is_ambiguous_where_a_step_by_a_tile_is_possible() -> None:
+    assert above(tiles, 0.5) == (1, 2)
+    assert above(tiles, 0.1) == ()  # 3 m/s would be necessary
+
+
+@pytest.mark.parametrize("height", [relief, flat])
+def test_other_floors_are_not(height) -> None:
+    assert above(height, 0.5) == ()
+
+
+def test_ordinary_room_has_no_rival_steps() -> None:
+    poses = [at(0.1 * k, -0.5, 0.1 * k) for k in range(4)]
+    assert found([seen(T, k) for k, T in enumerate(poses)], poses, 0.5) == ()
+
+
+def test_frames_without_times_are_not_examined() -> None:
+    frames = [floor_from_above(tiles, k) for k in range(2)]
+    views = [PosedView(surface(frame), se3.translation(np.array(STEP) * frame.index))
+             for frame in frames]  # fmt: skip
+    poses = {view.index: view.T_component_camera for view in views}
+    assert ambiguous_frames(views, poses, [FrameTime(k, float(k)) for k in range(2)]) == ()
