@@ -309,6 +309,24 @@ class CloudFrame:
         values: dict[str, Any] = {**columns, "origin": origin, "shift": shift}
         return cls(index, timestamp, array.astype(np.float32), **values)
 
+    @property
+    def radial_range(self) -> Float64:
+        """(N,) distance of the points from the sensor, m.
+
+        Raises
+        ------
+        InputError
+            For map coordinates without the position of the sensor.
+        """
+        if self.shift.any() and np.array_equal(self.origin, -self.shift):
+            raise InputError(
+                "is in map coordinates, and without the sensor's position there is no depth",
+                where=f"frame {self.index}",
+                remedy="leave out --min-depth, --max-depth and filters of distance",
+            )
+        ranges: Float64 = np.linalg.norm(self.points - self.origin, axis=1)
+        return ranges
+
     def relative_to(self, shift: Float64) -> Self:
         """Return the view with another `shift` (3,), m, of the same coordinates of the file."""
         step = self.shift - shift
