@@ -23,7 +23,9 @@ RECORDING = "recording"  # written by `tofuse demo` next to its result, and kept
 _FILE = (
     r"trajectory\.(txt|kitti\.txt|log)|rig_trajectory\.txt|pose_graph\.g2o|changes\.ply|"
     r"cloud\.(ply|pcd|las|laz|e57)|mesh\.(ply|glb|gltf|obj|mtl|png|jpg|stl)|"
-    r"report\.html|(run|judge)\.json"
+    r"report\.html|(run|judge)\.json|"
+    # Of version 0.2 only.
+    r"view\.npz|mesh\.usdz|tiles/(tileset\.json|\d{1,4}(-\d{1,9}){3}\.glb)"
 )
 # The model of a separate component is in its own folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
