@@ -117,7 +117,7 @@ class OutputFolder(staging.StagedFolder):
                 raise OutputError(
                     f"is a link to {os.readlink(self.path)}, which doesn't exist",
                     where=self.path,
-                    remedy="create its target, or pass another --out",
+                    remedy="create its target, or pass another folder",
                 )
             return
         entries = {p.name for p in folder.iterdir() if not p.name.startswith(atomic.UNFINISHED)}
@@ -127,7 +127,7 @@ class OutputFolder(staging.StagedFolder):
             raise OutputError(
                 f"contains {min(entries)}, but no earlier result of this command",
                 where=self.path,
-                remedy="pass a new or empty folder as --out",
+                remedy="pass a new or empty folder",
             )
         if not self._overwrite:
             recording = entries == {RECORDING}
@@ -140,7 +140,7 @@ class OutputFolder(staging.StagedFolder):
             raise OutputError(
                 "is not a file of an earlier result",
                 where=self.path / foreign,
-                remedy="move it away, or choose another --out",
+                remedy="move it away, or choose another folder",
             )
 
 
@@ -222,7 +222,7 @@ def check_result(folder: Path) -> None:
         raise InputError(
             "is not a result (no run.json)" if folder.exists() else "doesn't exist",
             where=folder,
-            remedy="pass the --out of `tofuse run`",
+            remedy="pass the folder of a result",
         )
 
 
