@@ -37,8 +37,9 @@ class Distance(Interval, Filter):
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
-        is_depth = isinstance(frame, RangeFrame) and self.measure == "z"
-        return self.contains(frame.z if is_depth else frame.radial_range)
+        if isinstance(frame, RangeFrame) and self.measure == "z":
+            return self.contains(frame.z)
+        return self.contains(frame.radial_range)
 
 
 @part("filter", "confidence", label="validated")
