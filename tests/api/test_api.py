@@ -67,6 +67,10 @@ def test_result_changed_by_hand_is_not_saved(result, tmp_path) -> None:
     changed = tofuse.load(result.save(tmp_path / "out"))
     with pytest.raises(OutputError, match=r"pass --overwrite \(Python: overwrite=True\)"):
         changed.save(tmp_path / "out")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/notes.txt").touch()
+    with pytest.raises(OutputError, match=r"notes.txt.*; pass a new or empty folder$"):
+        changed.save(tmp_path / "full")
     changed.trajectory[:] = 0
     with pytest.raises(InputError, match=r"trajectory\[0\]"):
         changed.save(tmp_path / "other")

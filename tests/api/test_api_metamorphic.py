@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from tofuse.apps.cli.program import main
 from tofuse.apps.export import export
 from tofuse.apps.results import load_result
 from tofuse.engine.frames import CloudFrame, map_shift
@@ -234,3 +235,17 @@ def test_shift_is_decided_by_the_median() -> None:
     np.testing.assert_allclose(frame.points + frame.shift, points[300:] + MAP, atol=1e-4)
     moved = frame.relative_to(frame.shift + 1000)
     np.testing.assert_allclose(moved.points + moved.shift, points[300:] + MAP, atol=1e-3)
+
+
+def test_depth_in_map_coordinates_needs_sensor(tmp_path, pose, capsys) -> None:
+    """Points are not measured from the origin of a map."""
+    for k, points in enumerate((SOURCE, TARGET)):
+        write(tmp_path / "in" / f"{k}.xyz", points + MAP)
+    with pytest.raises(tofuse.InputError, match=r"frame 0: is in map coordinates.*--max-depth"):
+        tofuse.open(tmp_path / "in", max_depth=5.0)[0]
+    arguments = ["run", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--max-depth", "5"]
+    assert main(arguments) == 2
+    assert "frame 0: is in map coordinates" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    seen = CloudFrame.of(SOURCE + MAP, origin=MAP)
+    np.testing.assert_allclose(seen.radial_range, np.linalg.norm(SOURCE, axis=1), atol=1e-3)

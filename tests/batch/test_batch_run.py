@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -249,6 +250,7 @@ def test_dask_outcomes_are_translated() -> None:
     scheduler = pytest.importorskip("distributed.scheduler", reason="Dask is not installed")
     workers = object.__new__(DaskWorkers)
     workers._address = "tcp://there"
+    workers._client = SimpleNamespace(status="running")
 
     def handed(status: str, outcome: object = None) -> Future[Record]:
         future: Future[Record] = Future()
@@ -273,6 +275,9 @@ def test_dask_outcomes_are_translated() -> None:
     assert handed("cancelled").cancelled()
     # The scheduler disappeared between two calls.
     assert handed("finished", OSError("gone")).cancelled()
+    workers._client.status = "connecting"
+    assert handed("error", AttributeError("no attribute 'send'")).cancelled()
+    assert "tcp://there: the Dask scheduler no longer answers; start it" in str(workers.lost())
 
 
 @pytest.mark.parametrize(

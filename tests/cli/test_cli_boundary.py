@@ -13,6 +13,7 @@ from paths import BENCHMARKS
 from tofuse.apps.cli import program as cli
 from tofuse.apps.cli.program import main, run_command
 from tofuse.apps.cli.streams import SafeStream, safe_streams
+from tofuse.apps.results.folders import TRACKED
 from tofuse.engine.compute import jit
 from tofuse.engine.compute import thread_pool as cores
 from tofuse.engine.errors import Ended
@@ -167,6 +168,21 @@ def test_command_failures_are_reported_in_one_line(error, status, says, capfd) -
     stderr = capfd.readouterr().err
     assert says in stderr
     assert stderr.count("\n") == 1
+
+
+def test_interruption_states_what_repeating_does(tmp_path, monkeypatch, capfd) -> None:
+    def interrupt(*_arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tofuse.apps.jobs.running._open", interrupt)
+    out = tmp_path / "out"
+    words = ["run", str(tmp_path), "--out", str(out)]
+    assert main(words) == 130
+    assert capfd.readouterr().err.endswith("; the same command starts again from the beginning\n")
+    out.mkdir()
+    (out / TRACKED).touch()  # whether it is of this run is not known yet
+    assert main(words) == 130
+    assert "the same command" not in capfd.readouterr().err
 
 
 def test_program_bug_is_one_line_unless_traceback_is_requested(capfd, monkeypatch) -> None:

@@ -11,6 +11,7 @@ import tofuse
 from registration_scenes import box_walls, bumpy_ball, turn
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.clouds import cloud_pair
 from tofuse.engine.clouds.cloud_agreement import CloudMap, cloud_agreement
 from tofuse.engine.clouds.cloud_pair import register_clouds
 from tofuse.engine.clouds.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
@@ -285,9 +286,30 @@ def test_views_without_overlap_are_rejected(scans):
         assert reason in found.reason
 
 
+def test_wrong_unit_is_found_with_few_points(scans, monkeypatch):
+    """As fast as the registration of clouds in the right unit, however many points they have."""
+    source, target, _ = scans
+    sizes = []
+    registered = cloud_pair._registered
+
+    def counting(source, target, *arguments, **options):
+        sizes.append((len(source), len(target)))
+        return registered(source, target, *arguments, **options)
+
+    monkeypatch.setattr(cloud_pair, "_registered", counting)
+    many = np.random.default_rng(0).permutation(np.concatenate([source, source + 1e-4]))
+    found = tofuse.register(1000 * many, target)
+    assert found.believed is False
+    assert found.reason == "the views fit with the source 0.001 times as large: check its unit"
+    assert len(sizes) == 1
+    assert max(sizes[0]) <= cloud_pair._UNIT_POINTS < len(many)
+
+
 def test_views_of_different_extent_raise_error(scans, frames):
     ball = bumpy_ball(5000, 1)
-    with pytest.raises(RegistrationError, match="does not fit; check the units"):
+    with pytest.raises(
+        RegistrationError, match=r"about 0\.\d+ times .* does not fit; check the units"
+    ):
         tofuse.register(ball, scans[0])
     with pytest.raises(RegistrationError, match="0 points of the views correspond"):
         tofuse.register(frames[0].points, ball * 4)

@@ -39,6 +39,23 @@ def test_links_are_never_followed(tmp_path, what) -> None:
     assert contents(tmp_path) == before
 
 
+@pytest.mark.parametrize("foreign", [None, "tiles/notes.txt", "component-1/view.npy"])
+def test_result_of_version_0_2_is_replaced_without_foreign_files(tmp_path, foreign) -> None:
+    out = tmp_path / "out"
+    write_result(torn(), OutputFolder(out))
+    of_version = ["view.npz", "mesh.usdz", "tiles/tileset.json", "tiles/3-0-1-12.glb"]
+    of_version += ["component-1/view.npz", "component-1/tiles/tileset.json"]
+    for name in (*of_version, foreign or "view.npz"):
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).touch()
+    if foreign:
+        with pytest.raises(OutputError, match=rf"{foreign}: is not a file of an earlier result"):
+            OutputFolder(out, overwrite=True)
+        return
+    write_result(torn(seed=3), OutputFolder(out, overwrite=True))
+    assert not any((out / name).exists() for name in of_version)
+
+
 HOLD = """
 import sys
 from tofuse.apps.results.folders import OutputFolder

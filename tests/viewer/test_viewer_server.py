@@ -5,8 +5,11 @@ from __future__ import annotations
 import base64
 import hashlib
 import http.client
+import select
 import socket
+from time import sleep
 
+import numpy as np
 import pytest
 
 from tofuse.apps.report.html import secured
@@ -83,6 +86,49 @@ def test_other_users_of_this_machine_do_not_know_the_token(port: int) -> None:
     assert "HttpOnly; SameSite=Strict" in cookie
     assert ask(port, "/", Cookie=cookie.split(";")[0]).status == 200
     assert ask(port, "/", Cookie=f"tofuse-{port}=guess").status == 403
+
+
+def connect(port: int, *, reads: bool) -> tuple[int, socket.socket]:
+    """Open a page's connection; return the status of the answer, and the connection."""
+    import viser
+
+    page = socket.create_connection((HOST, port), timeout=5)
+    lines = (
+        f"GET {with_token(port)} HTTP/1.1",
+        f"Host: {HOST}:{port}",
+        "Upgrade: websocket",
+        "Connection: Upgrade",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+        f"Sec-WebSocket-Protocol: viser-v{viser.__version__}",
+    )
+    page.sendall("".join(f"{line}\r\n" for line in (*lines, "")).encode())
+    status = int(page.recv(12).split()[1])
+    while reads and select.select([page], [], [], 0.3)[0] and page.recv(1 << 20):
+        pass
+    return status, page
+
+
+@pytest.mark.parametrize("reads", [True, False])
+def test_few_pages_are_open_at_a_time(reads: bool) -> None:
+    """A page that reads stays; one that does not makes room for the next."""
+    pytest.importorskip("viser")
+    server = module.serve()
+    try:
+        colors = np.zeros((500_000, 3), np.uint8)
+        server.scene.add_point_cloud("/big", np.zeros(colors.shape, np.float32), colors)
+        limit = module._MAX_PAGES
+        answers = []
+        for _ in range(limit + 4):
+            answers.append(connect(server.get_port(), reads=reads))
+            sleep(0.0 if reads else 0.3)  # until it is sent the scene
+        statuses = [status for status, _ in answers]
+        assert statuses == [101] * limit + [503 if reads else 101] * 4
+        assert len(server.get_clients()) <= limit
+        for _, page in answers:
+            page.close()
+    finally:
+        module.stop(server)
 
 
 @pytest.mark.parametrize(

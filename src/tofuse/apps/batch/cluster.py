@@ -47,9 +47,9 @@ class DaskWorkers(Workers):
         if self._client.status == "running":
             return None
         return InputError(
-            "the scheduler disappeared",
+            "the Dask scheduler no longer answers",
             where=self._address,
-            remedy="restart it, and run the same command again to resume",
+            remedy="start it again, and run the same command again to resume",
         )
 
     def close(self) -> None:
@@ -69,7 +69,7 @@ class DaskWorkers(Workers):
 
         if remote.status == "finished":
             future.set_result(remote.result())
-        elif remote.status == "error":
+        elif remote.status == "error" and self.lost() is None:
             error = remote.exception()
             if isinstance(error, KilledWorker):
                 future.set_result(Record("", "killed", reason="its workers were killed"))

@@ -17,6 +17,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
 from time import sleep
 from typing import TYPE_CHECKING
 
@@ -142,9 +143,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         except SystemExit as stop:  # help or an error has been printed
             raise SystemExit(_status_after_output(int(stop.code or 0), None)) from None
         check_machine(getattr(arguments, "threads", None))
-        with _edits_accepted(getattr(arguments, "edited", False)):
+        out = getattr(arguments, "out", None)
+        with _edits_accepted(getattr(arguments, "edited", False)), _repeatable(out):
             status: int = arguments.command(arguments)
-        return _status_after_output(status, getattr(arguments, "out", None))
+        return _status_after_output(status, out)
 
     return run_command(command)
 
@@ -155,6 +157,25 @@ def _edits_accepted(accepted: bool) -> AbstractContextManager[None]:
     from tofuse.apps.results import integrity
 
     return integrity.accepting_edits()
+
+
+@contextmanager
+def _repeatable(out: Path | None) -> Iterator[None]:
+    """Add to an interruption of a command with an output that repeating it starts again.
+
+    Not where the command has added a note itself, nor where a run has left its tracked frames.
+    """
+    from tofuse.engine.errors import Ended
+
+    try:
+        yield
+    except (KeyboardInterrupt, Ended) as error:
+        from tofuse.apps.results import folders
+
+        noted = bool(getattr(error, "__notes__", ()))
+        if out is not None and not noted and not (out / folders.TRACKED).exists():
+            error.add_note("the same command starts again from the beginning")
+        raise
 
 
 def _status_after_output(status: int, out: object) -> int:

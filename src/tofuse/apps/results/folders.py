@@ -23,7 +23,9 @@ RECORDING = "recording"  # written by `tofuse demo` next to its result, and kept
 _FILE = (
     r"trajectory\.(txt|kitti\.txt|log)|rig_trajectory\.txt|pose_graph\.g2o|changes\.ply|"
     r"cloud\.(ply|pcd|las|laz|e57)|mesh\.(ply|glb|gltf|obj|mtl|png|jpg|stl)|"
-    r"report\.html|(run|judge)\.json"
+    r"report\.html|(run|judge)\.json|"
+    # Of version 0.2 only.
+    r"view\.npz|mesh\.usdz|tiles/(tileset\.json|\d{1,4}(-\d{1,9}){3}\.glb)"
 )
 # The model of a separate component is in its own folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
@@ -115,7 +117,7 @@ class OutputFolder(staging.StagedFolder):
                 raise OutputError(
                     f"is a link to {os.readlink(self.path)}, which doesn't exist",
                     where=self.path,
-                    remedy="create its target, or pass another --out",
+                    remedy="create its target, or pass another folder",
                 )
             return
         entries = {p.name for p in folder.iterdir() if not p.name.startswith(atomic.UNFINISHED)}
@@ -125,7 +127,7 @@ class OutputFolder(staging.StagedFolder):
             raise OutputError(
                 f"contains {min(entries)}, but no earlier result of this command",
                 where=self.path,
-                remedy="pass a new or empty folder as --out",
+                remedy="pass a new or empty folder",
             )
         if not self._overwrite:
             recording = entries == {RECORDING}
@@ -138,7 +140,7 @@ class OutputFolder(staging.StagedFolder):
             raise OutputError(
                 "is not a file of an earlier result",
                 where=self.path / foreign,
-                remedy="move it away, or choose another --out",
+                remedy="move it away, or choose another folder",
             )
 
 
@@ -220,7 +222,7 @@ def check_result(folder: Path) -> None:
         raise InputError(
             "is not a result (no run.json)" if folder.exists() else "doesn't exist",
             where=folder,
-            remedy="pass the --out of `tofuse run`",
+            remedy="pass the folder of a result",
         )
 
 

@@ -2,7 +2,8 @@
 
 It answers only requests whose Host and Origin are names of this machine, which excludes pages of
 other sites whose name resolves to this machine (DNS rebinding), and that know the token in its
-address, or the cookie set for that, which excludes other users of this machine.
+address, or the cookie set for that, which excludes other users of this machine. It keeps only a few
+pages open, as each that does not read what it is sent keeps a copy of the scene.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 HOST, PORT = "127.0.0.1", 8080
 _NAMES = ("127.0.0.1", "localhost")  # of this machine, in a browser on it
 _MAX_PORTS = 100  # that are tried if none is given
+_MAX_PAGES = 8  # open at the same time
 
 
 def serve(port: int | None = None) -> ViserServer:
@@ -97,6 +99,8 @@ def _guarded(cookie: str, token: str) -> Iterator[list[int]]:
             response: Response | None = None
             if process_request is not None:
                 response = process_request(connection, request)
+            if response is None and not _has_room(connection.server.connections):
+                return Response(503, "Busy", Headers(), b"too many pages are open: close one\n")
             if response is not None and given:
                 response.headers["Set-Cookie"] = f"{cookie}={token}; HttpOnly; SameSite=Strict"
             return response
@@ -109,6 +113,18 @@ def _guarded(cookie: str, token: str) -> Iterator[list[int]]:
         yield guards
     finally:
         library.serve = original  # type: ignore[misc]
+
+
+def _has_room(pages: set[Any]) -> bool:
+    """Whether another page may connect, for which one that does not read is disconnected."""
+    if len(pages) < _MAX_PAGES:
+        return True
+    transports = [page.transport for page in pages]
+    slowest = max(transports, key=lambda transport: transport.get_write_buffer_size())
+    if not slowest.get_write_buffer_size():
+        return False
+    slowest.abort()
+    return True
 
 
 def is_same_origin(hosts: Sequence[str], origins: Sequence[str]) -> bool:

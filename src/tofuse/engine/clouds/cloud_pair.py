@@ -48,6 +48,8 @@ _MIN_SUPPORT = 1 / 3
 _MAX_SCORE_LOSS = 0.02
 # Points used to test whether a rival converges to the best pose.
 _RIVAL_POINTS = 2500
+# Points of each view that decide whether its unit is wrong.
+_UNIT_POINTS = 30_000
 # Finest resolution, in spacings of this number of points.
 _MIN_SPACING_RATIO, _SPACING_POINTS = 0.5, 5000
 
@@ -163,7 +165,7 @@ def register_clouds(
     Returns
     -------
     The registration. If the views fit only with the source scaled by a power of ten from 0.001 to
-    1000, the pose is that of the scaled source, not accepted, and `reason` states the scale.
+    1000, the pose is roughly that of the scaled source, not accepted; `reason` states the scale.
 
     Raises
     ------
@@ -184,10 +186,11 @@ def register_clouds(
     except RegistrationError as error:
         if not power:
             raise
+        ratio = float(f"{extent(source.points) / extent(target.points):.2g}")
         raise RegistrationError(
-            f"its extent is about {10.0**-power:g} times that of the target, and it does not fit",
+            f"its extent is about {ratio:g} times that of the target, and it does not fit",
             where=f"frame {source.index}",
-            remedy="check the units of both clouds",
+            remedy="check the units of both clouds, and scale them to metres",
         ) from error
 
 
@@ -258,14 +261,18 @@ def _scale_exponent(source: Frame, target: Frame) -> int:
 def _registered_scaled(
     source: Frame, target: Frame, scale: float, rng: np.random.Generator
 ) -> Registration | None:
-    """Register the scaled source; None if the result is not accepted."""
-    points = source.points * np.float32(scale)
-    scaled = CloudFrame(source.index, source.timestamp, points, origin=scale * source.origin)
+    """Register the scaled source, with few points; None if the result is not accepted."""
     try:
-        registration = _registered(scaled, target, None, rng)
+        registration = _registered(_thinned(source, scale), _thinned(target, 1.0), None, rng)
     except RegistrationError:
         return None
     return registration if registration.believed else None
+
+
+def _thinned(view: Frame, scale: float) -> CloudFrame:
+    """Return a view as a scaled cloud of few points."""
+    points = view.points[:: -(-len(view) // _UNIT_POINTS)] * np.float32(scale)
+    return CloudFrame(view.index, view.timestamp, points, origin=scale * view.origin)
 
 
 def with_cloud_information(

@@ -28,7 +28,7 @@ class Distance(Interval, Filter):
         Limits in m, inclusive; None for no upper limit.
     measure
         "z" for depth along the optical axis, "range" for radial range. A cloud has no optical axis:
-        its distance is always that to its origin.
+        its distance is always that to its origin; map coordinates without one are refused.
     """
 
     measure: Literal["z", "range"] = "z"
@@ -37,11 +37,9 @@ class Distance(Interval, Filter):
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
-        if isinstance(frame, RangeFrame):
-            distance = frame.z if self.measure == "z" else frame.radial_range
-        else:
-            distance = np.linalg.norm(frame.points - frame.origin, axis=1)
-        return self.contains(distance)
+        if isinstance(frame, RangeFrame) and self.measure == "z":
+            return self.contains(frame.z)
+        return self.contains(frame.radial_range)
 
 
 @part("filter", "confidence", label="validated")

@@ -268,8 +268,16 @@ class CloudFrame:
             )
 
     @classmethod
-    def of(cls, points: ArrayLike, *, index: int = 0, timestamp: float = 0.0) -> Self:
-        """Make a view of points (N, 3) in m, in any coordinates, dropping non-finite ones.
+    def of(
+        cls,
+        points: ArrayLike,
+        *,
+        index: int = 0,
+        timestamp: float = 0.0,
+        origin: Float64 | None = None,
+        **columns: NDArray[Any] | None,
+    ) -> Self:
+        """Make a view of points (N, 3) in m, in any coordinates, dropping invalid ones.
 
         Parameters
         ----------
@@ -277,6 +285,10 @@ class CloudFrame:
             (N, 3) m.
         index, timestamp
             Frame index, and s.
+        origin
+            (3,) m, in the coordinates of the points; None for their origin.
+        columns
+            `normals`, `amplitude` and `color` of all points.
         """
         array = np.asarray(points)
         if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
@@ -285,10 +297,35 @@ class CloudFrame:
                 where="points",
                 remedy="pass (N, 3) numbers in metres",
             )
-        array = array[np.isfinite(array).all(1)]
-        shift = map_shift(array)
-        array = array - shift if shift.any() else array
-        return cls(index, timestamp, array.astype(np.float32), origin=-shift, shift=shift)
+        with np.errstate(over="ignore", invalid="ignore"):  # signalling NaN as well
+            shift = map_shift(array)
+            array = array - shift if shift.any() else array
+            # False for NaN; the squares of the remaining coordinates fit into float32.
+            valid = (np.abs(array) < se3.MAX_COORDINATE_M).all(1)
+        if not valid.all():
+            array = array[valid]
+            columns = {name: v if v is None else v[valid] for name, v in columns.items()}
+        origin = (np.zeros(3) if origin is None else origin) - shift
+        values: dict[str, Any] = {**columns, "origin": origin, "shift": shift}
+        return cls(index, timestamp, array.astype(np.float32), **values)
+
+    @property
+    def radial_range(self) -> Float64:
+        """(N,) distance of the points from the sensor, m.
+
+        Raises
+        ------
+        InputError
+            For map coordinates without the position of the sensor.
+        """
+        if self.shift.any() and np.array_equal(self.origin, -self.shift):
+            raise InputError(
+                "is in map coordinates, and without the sensor's position there is no depth",
+                where=f"frame {self.index}",
+                remedy="leave out --min-depth, --max-depth and filters of distance",
+            )
+        ranges: Float64 = np.linalg.norm(self.points - self.origin, axis=1)
+        return ranges
 
     def relative_to(self, shift: Float64) -> Self:
         """Return the view with another `shift` (3,), m, of the same coordinates of the file."""

@@ -101,7 +101,5 @@ class LimitedSource:
     def read(self, index: int) -> Frame:
         """See `Source.read`."""
         frame = self.source.read(index)
-        if isinstance(frame, RangeFrame):
-            return frame.keep((frame.z >= self.min_depth) & (frame.z <= self.max_depth))
-        distance = np.linalg.norm(frame.points - frame.origin, axis=1)
+        distance = frame.z if isinstance(frame, RangeFrame) else frame.radial_range
         return frame.keep((distance >= self.min_depth) & (distance <= self.max_depth))
