@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -226,6 +227,7 @@ FAULTS = {
     "other_intrinsics": lambda f: seen_by(f, Pinhole(96, 72, 500.0, 500.0, 480.0, 270.0)),
     "mirrored": lambda f: [replace(a, amplitude_image=a.amplitude_image[:, ::-1]) for a in f],
     "color_unregistered": lambda f: colored(f, 7),
+    "delayed": lambda f: [replace(b, amplitude_image=a.amplitude_image) for a, b in pairwise(f)],
     "time_unsorted": lambda f: stamped(f, TIMES[[0, 2, 1, *range(3, 8)]]),
     "time_repeated": lambda f: stamped(f, TIMES[[0, 1, 1, *range(3, 8)]]),
     "frames_missing": lambda f: stamped(f, TIMES + 0.4 * (TIMES > 0.3)),
@@ -248,7 +250,7 @@ def test_good_recording_has_no_findings(turn) -> None:
 @pytest.mark.nightly_part
 @pytest.mark.parametrize("code", FAULTS)
 def test_faults_are_detected(code, few, turn) -> None:
-    if code == "color_unregistered":  # needs more edges
+    if code in ("color_unregistered", "delayed"):  # needs more edges, or slower motion
         found = tofuse.inspect(of(FAULTS[code](turn)))
     else:
         found = tofuse.inspect(of(FAULTS[code](few)), quick=True)

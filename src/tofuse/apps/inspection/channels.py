@@ -11,6 +11,7 @@ from tofuse.apps.inspection.finding import Finding, is_significant
 from tofuse.apps.inspection.sample import Sample
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.geometry import se3
 
 # Images are downscaled to this width.
 _COLUMNS = 160
@@ -32,6 +33,13 @@ _MIN_FRAMES = 3
 # direction correlate at many shifts.
 _MIN_COLOR_CORRELATION, _MIN_COLOR_LEAD, _MAX_COLOR_UNSHIFTED = 0.42, 0.16, 0.68
 _MAX_ELSEWHERE, _PEAK_RADIUS_PX = 0.95, 4
+# A delay shows if the image moves by at least a pixel of the downscaled images from frame to frame,
+# and its edges by this many pixels; and by at most a fraction of the width.
+_MIN_MOTION_PX, _MIN_DELAY_PX, _MAX_DELAY_SHIFT = 1.0, 1.5, 0.2
+# Minimum and maximum delay in frames, over which the motion is taken as constant; and fraction of
+# the images in which it explains the shift, up to half of it, as edges in one direction hardly
+# determine the other. Few random shifts lie as near.
+_MIN_DELAY, _MAX_DELAY, _MIN_DELAYED, _MAX_UNEXPLAINED = 0.7, 8.5, 0.6, 0.5
 
 
 def check_mirrored(sample: Sample) -> Iterator[Finding]:
@@ -94,6 +102,64 @@ def check_color(sample: Sample) -> Iterator[Finding]:
             "Add the colour camera's intrinsics and T_color_depth, or remove the colour.",
             {"shift_px": pixels, "lead": float(lead.mean())},
         )
+
+
+def check_delay(sample: Sample) -> Iterator[Finding]:
+    """Check that amplitude and depth are of the same time: the later one lies behind in motion."""
+    shifts, motions = [], []
+    for pair in sample.pairs:
+        indices = pair.first.index, pair.second.index
+        for frame in sample.images:
+            amplitude = _amplitude(frame)
+            if pair.fits and frame.index in indices and amplitude is not None:
+                edges = _edges(_log_depth(frame)), _edges(amplitude)
+                columns = edges[0].shape[1]
+                max_shift, scale = round(_MAX_DELAY_SHIFT * columns), columns / frame.camera.width
+                shifts.append(_peak(_correlations([edges], max_shift)[0]) - max_shift)
+                motions.append(scale * _image_motion(frame, pair.alignment.T_world_source))
+    shift, motion = np.reshape(shifts, (-1, 2)), np.reshape(motions, (-1, 2))
+    moves = np.linalg.norm(motion, axis=1) >= _MIN_MOTION_PX
+    shift, motion = shift[moves], motion[moves]
+    if len(shift) < _MIN_FRAMES:
+        return
+    delay = float(np.median(-(shift * motion).sum(1) / (motion * motion).sum(1)))
+    expected = -delay * motion
+    size = np.linalg.norm(expected, axis=1)
+    explained = np.linalg.norm(shift - expected, axis=1) <= _MAX_UNEXPLAINED * size
+    is_clear = np.median(size) >= _MIN_DELAY_PX and explained.mean() >= _MIN_DELAYED
+    if is_clear and _MIN_DELAY <= abs(delay) <= _MAX_DELAY:
+        late, early = ("Amplitude", "depth") if delay > 0 else ("Depth", "amplitude")
+        yield Finding(
+            "delayed",
+            f"{late} lags behind {early} by {abs(delay):.1f} frames: where the camera moves, their "
+            "edges lie apart.",
+            "Pair the images by their time stamps, and switch off filters over time in the camera.",
+            {"delay_frames": delay},
+        )
+
+
+def _image_motion(frame: RangeFrame, T_first_second: Float64) -> Float64:
+    """Median motion (2,) of the image until the next frame, pixels."""
+    z = frame.z[frame.valid]
+    rays = frame.camera.rays()[frame.valid]
+    points = np.column_stack([rays * z[:, None], z])
+    moved = se3.transform(se3.inverse(T_first_second), points)
+    focal = frame.camera.width / np.ptp(frame.camera.rays()[..., 0])
+    return np.asarray(np.nanmedian(moved[:, :2] / moved[:, 2:] - rays, axis=0) * focal, np.float64)
+
+
+def _peak(scores: Float64) -> Float64:
+    """Position (2,) of the largest score, x and y, by parabolas through its neighbours."""
+    row, column = np.unravel_index(int(scores.argmax()), scores.shape)
+    along = scores[row, column - 1 : column + 2], scores[row - 1 : row + 2, column]
+    return np.array([column, row]) + [_vertex(s) if len(s) == 3 else 0.0 for s in along]
+
+
+def _vertex(scores: Float64) -> float:
+    """Offset of the vertex of a parabola through three scores from the middle one."""
+    before, at, after = scores
+    curvature = before - 2 * at + after
+    return float(0.5 * (before - after) / curvature) if curvature < 0 else 0.0
 
 
 def _amplitude(frame: RangeFrame) -> Float32 | None:

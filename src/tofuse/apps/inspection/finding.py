@@ -17,8 +17,8 @@ SEVERITIES: tuple[Severity, ...] = ("severe", "warning", "note")
 CODES: dict[str, Severity] = {
     **dict.fromkeys(
         ("depth_unit", "range_taken_for_z", "z_taken_for_range", "focal_length", "mirrored",
-         "other_intrinsics", "lens_distortion", "color_unregistered", "time_unsorted",
-         "phase_wrap"), "severe"),
+         "other_intrinsics", "lens_distortion", "color_unregistered", "delayed",
+         "time_unsorted", "phase_wrap"), "severe"),
     # The effect of the last two is measured by tracking, and decides the verdict.
     **dict.fromkeys(
         ("time_unit", "time_repeated", "frames_missing", "frames_repeated", "saturated",

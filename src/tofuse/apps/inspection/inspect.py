@@ -37,6 +37,7 @@ CHECKS: tuple[Check, ...] = (
     geometry.check_lens,
     channels.check_mirrored,
     channels.check_color,
+    channels.check_delay,
     times.check_times,
     times.check_repeats,
     values.check_wrap,

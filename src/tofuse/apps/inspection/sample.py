@@ -156,13 +156,14 @@ class Pair:
 
     Attributes
     ----------
-    first
-        The view that the other one is aligned to.
+    first, second
+        The view that is aligned to, and the other one.
     alignment
         The best alignment.
     """
 
     first: PreparedView
+    second: PreparedView
     alignment: projective.Aligned
 
     @classmethod
@@ -178,7 +179,7 @@ class Pair:
                 xi[3 + axis] = sign * fraction * fov
                 candidate = _aligned(second, first, se3.exp(xi))
                 best = max(best, candidate, key=lambda a: a.score)
-        return cls(first, best)
+        return cls(first, second, best)
 
     @cached_property
     def angle(self) -> float:
