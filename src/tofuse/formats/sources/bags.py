@@ -22,6 +22,7 @@ from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
+from tofuse.formats.geometry.ply import stacked
 from tofuse.formats.images import as_color, parse_image
 from tofuse.formats.sources.file_source import FileSource
 from tofuse.formats.sources.pixels import finite_float32, sampled_color
@@ -435,17 +436,16 @@ def cloud(message: Any, where: str) -> GeometryRecord:
         raise InputError("is cut off", where=where, remedy="check the bag")
     rows = data[: count * step].reshape(count, step)
 
-    def column(name: str) -> Float32:
+    def column(name: str) -> NDArray[Any]:
         field = fields[name]
         dtype = np.dtype(order + _FIELD_TYPES[field.datatype])
         start = int(field.offset)
         if start + dtype.itemsize > step:
             raise InputError(f"has its field {name!r} outside of a point", where=where)
         values = np.ascontiguousarray(rows[:, start : start + dtype.itemsize]).view(dtype)[:, 0]
-        with np.errstate(all="ignore"):
-            return values.astype(np.float32)
+        return values.astype(dtype.newbyteorder("="), copy=False)
 
-    points = np.stack([column(name) for name in "xyz"], 1)
+    points = stacked({name: column(name) for name in "xyz"}, "xyz")
     amplitude = next((name for name in _AMPLITUDES if name in fields), None)
     scalars = {} if amplitude is None else {"amplitude": column(amplitude)}
     return GeometryRecord(points, scalars=scalars)
