@@ -340,3 +340,12 @@ def _check_frame(frame: Frame) -> None:
     """Raise InputError for an index or a timestamp that no frame can have."""
     check_number(frame.index, Bounds(), "index of a frame", whole=True)
     check_number(frame.timestamp, Bounds(), f"frame {frame.index}: timestamp")
+
+
+def mean_depth(frame: Frame) -> float:
+    """Mean depth of the valid pixels of an image, or distance of a cloud's points, m; 0 if none."""
+    if isinstance(frame, RangeFrame):
+        values = frame.depth[frame.valid]
+    else:
+        values = np.linalg.norm(frame.points - frame.origin, axis=1)
+    return float(values.mean(dtype=np.float64)) if len(values) else 0.0
