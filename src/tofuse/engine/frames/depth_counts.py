@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,7 +33,7 @@ def depth_from_numbers(numbers: NDArray[np.generic], unit_m: float) -> Float32:
     return depth
 
 
-def is_marked_invalid(numbers: NDArray[np.generic]) -> NDArray[np.bool_]:
+def is_marked_invalid(numbers: NDArray[Any]) -> NDArray[np.bool_]:
     """Whether stored depth is an integer for no depth: 65535, or the largest of its type."""
     if numbers.dtype.kind not in "ui":
         return np.zeros(numbers.shape, bool)
