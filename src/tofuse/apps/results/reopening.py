@@ -11,7 +11,7 @@ import numpy as np
 
 from tofuse.apps.results.folders import RECORDING
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Frame, Recording, Source, mean_depth
+from tofuse.engine.frames import Frame, Recording, Source
 from tofuse.formats.recordings import Opening
 
 # Frames whose times differ by more are not of the same recording, s.
@@ -165,6 +165,6 @@ class _Unchanged:
         """See `Source.read`."""
         frame = self._source.read(index)
         expected = self._depths.get(index)
-        if expected is not None and abs(mean_depth(frame) - expected) > _SAME_DEPTH * expected:
+        if expected is not None and abs(frame.mean_depth - expected) > _SAME_DEPTH * expected:
             raise _changed(self._folder, f"its recording at frame {index}")
         return frame

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
         Frame,
         RangeFrame,
         map_shift,
-        mean_depth,
     )
     from tofuse.engine.frames.recording import (
         NOISE_MODEL,

@@ -203,6 +203,12 @@ class RangeFrame:
         """(3,) position of the sensor in the frame's own coordinates: the optical centre."""
         return np.zeros(3)
 
+    @property
+    def mean_depth(self) -> float:
+        """The mean of the valid depth, m; 0 if there is none."""
+        depth = self.depth[self.valid]
+        return float(depth.mean(dtype=np.float64)) if len(depth) else 0.0
+
     def __len__(self) -> int:
         return int(np.count_nonzero(self.valid))
 
@@ -303,6 +309,12 @@ class CloudFrame:
         """(N,) mask: all points of a cloud are valid."""
         return np.ones(len(self.points), bool)
 
+    @property
+    def mean_depth(self) -> float:
+        """The mean distance of the points from the origin, m; 0 if there are none."""
+        distances = np.linalg.norm(self.points - self.origin, axis=1)
+        return float(distances.mean()) if len(distances) else 0.0
+
     def __len__(self) -> int:
         return len(self.points)
 
@@ -340,12 +352,3 @@ def _check_frame(frame: Frame) -> None:
     """Raise InputError for an index or a timestamp that no frame can have."""
     check_number(frame.index, Bounds(), "index of a frame", whole=True)
     check_number(frame.timestamp, Bounds(), f"frame {frame.index}: timestamp")
-
-
-def mean_depth(frame: Frame) -> float:
-    """Mean depth of the valid pixels of an image, or distance of a cloud's points, m; 0 if none."""
-    if isinstance(frame, RangeFrame):
-        values = frame.depth[frame.valid]
-    else:
-        values = np.linalg.norm(frame.points - frame.origin, axis=1)
-    return float(values.mean(dtype=np.float64)) if len(values) else 0.0

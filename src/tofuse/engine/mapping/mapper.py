@@ -11,7 +11,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import thread_count, threads, trim_memory
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import CloudFrame, Frame, RangeFrame, mean_depth
+from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.assembly import Assembly
@@ -133,7 +133,7 @@ class Mapper:
         with threads(self.threads, serial=busy):
             filtered = self._prepare(frame, history, prepared)
             step = self._track(filtered, T_odometry, repeated)
-            record = record_of(filtered.corrected, step, mean_depth(frame))
+            record = record_of(filtered.corrected, step, frame.mean_depth)
             self._log.add(record, step, T_odometry, gravity)
             self._store(filtered, step)
             with self.watch.timing("loops"):

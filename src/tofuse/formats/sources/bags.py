@@ -22,7 +22,6 @@ from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
-from tofuse.formats.geometry.ply import stacked
 from tofuse.formats.images import as_color, parse_image
 from tofuse.formats.sources.file_source import FileSource
 from tofuse.formats.sources.pixels import finite_float32, sampled_color
@@ -445,7 +444,9 @@ def cloud(message: Any, where: str) -> GeometryRecord:
         values = np.ascontiguousarray(rows[:, start : start + dtype.itemsize]).view(dtype)[:, 0]
         return values.astype(dtype.newbyteorder("="), copy=False)
 
-    points = stacked({name: column(name) for name in "xyz"}, "xyz")
+    xyz = [column(name) for name in "xyz"]
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        points = np.stack(xyz, 1).astype(np.result_type(np.float32, *(c.dtype for c in xyz)))
     amplitude = next((name for name in _AMPLITUDES if name in fields), None)
     scalars = {} if amplitude is None else {"amplitude": column(amplitude)}
     return GeometryRecord(points, scalars=scalars)
