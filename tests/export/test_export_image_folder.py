@@ -135,6 +135,11 @@ def _longer(result: Path) -> None:
     change_run(result, frames=frames)
 
 
+def _other_image(result: Path) -> None:
+    frames = read_run_json(result / "run.json")["frames"]
+    change_run(result, frames=[frame | {"mean_depth_m": 0.123} for frame in frames])
+
+
 def _damaged(result: Path) -> None:
     change_run(result, input=None)
 
@@ -148,6 +153,7 @@ def _with_invalid_corrections(result: Path) -> None:
     [
         (_gone, "which doesn't exist"),
         (_longer, "does not match the frames"),
+        (_other_image, "at frame 0, which has changed"),
         (_damaged, "is damaged"),
         (_with_invalid_corrections, "is damaged"),
     ],

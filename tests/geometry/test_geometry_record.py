@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.geometry.e57 import write_e57
 from tofuse.formats.geometry.glb import write_glb, write_gltf
@@ -55,3 +57,33 @@ def test_amplitude_column_aliases() -> None:
         np.testing.assert_array_equal(amplitude, column)
     table = np.zeros((3, 2))
     assert GeometryRecord(POINTS, scalars={"intensity": table}).amplitude is None
+
+
+def test_obj_that_fails_leaves_the_earlier_texture(tmp_path: Path) -> None:
+    image, path = tmp_path / "mesh.jpg", tmp_path / "mesh.obj"
+    image.write_bytes(b"earlier")
+    path.mkdir()  # so that it can't be written
+    mesh = GeometryRecord(
+        np.eye(3, dtype=np.float32),
+        np.array([[0, 1, 2]], np.int32),
+        uv=np.zeros((3, 2), np.float32),
+        texture=b"\xff\xd8",
+    )
+    with pytest.raises(OutputError, match=r"mesh\.obj"):
+        write_obj(path, mesh)
+    assert image.read_bytes() == b"earlier"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_full_disk_for_e57(tmp_path: Path) -> None:
+    pytest.importorskip("pye57")
+    resource = pytest.importorskip("resource")
+    cloud = GeometryRecord(np.random.default_rng(0).normal(size=(10_000, 3)).astype(np.float32))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, hard))
+    try:
+        with pytest.raises(OutputError, match=r"a\.e57: can't be written"):
+            write_e57(tmp_path / "a.e57", cloud)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())

@@ -6,6 +6,7 @@ to the right and y down, in steps of 0.25 mm; blaze: mm, 0 where invalid; pmd's 
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import cv2
@@ -89,3 +90,15 @@ def make_tiff3d(folder: Path, count: int = 3) -> None:
         cv2.imwrite(f"{stem}.range.tif", distance)
         cv2.imwrite(f"{stem}.intens.tif", amplitudes(count)[k].astype(np.uint16))
         stem.with_suffix(".t3c").write_text("unknown\n")
+
+
+def tiff(image: np.ndarray, order: str, orientation: int) -> bytes:
+    """Return an uncompressed TIFF of the byte order "<" or ">"."""
+    pixels = image.astype(image.dtype.newbyteorder(order)).tobytes()
+    height, width = image.shape
+    tags = {256: width, 257: height, 258: 8 * image.itemsize, 259: 1, 262: 1, 273: 8}
+    tags |= {274: orientation, 277: 1, 278: height, 279: len(pixels)}
+    tags[339] = 3 if image.dtype.kind == "f" else 1
+    entries = [struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in sorted(tags.items())]
+    head = {"<": b"II*\0", ">": b"MM\0*"}[order] + struct.pack(f"{order}I", 8 + len(pixels))
+    return b"".join([head, pixels, struct.pack(f"{order}H", len(tags)), *entries, bytes(4)])

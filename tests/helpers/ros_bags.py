@@ -143,17 +143,23 @@ class Bag:
         self.write(topic, ros.INFO, 10.0, self.make(ros.INFO, self.header(10.0), *values))
 
     def cloud(
-        self, topic: str, time: float, points: np.ndarray, light: np.ndarray, height: int = 1
+        self,
+        topic: str,
+        time: float,
+        points: np.ndarray,
+        light: np.ndarray,
+        height: int = 1,
+        dtype: str = "<f4",
     ) -> None:
         field = "sensor_msgs/msg/PointField"
-        names = ("x", "y", "z", "intensity")
-        fields = [self.make(field, n, 4 * k, 7, 1) for k, n in enumerate(names)]
-        data = np.concatenate([points, light[:, None]], 1).astype("<f4")
+        names, size = ("x", "y", "z", "intensity"), np.dtype(dtype).itemsize
+        kind = {"f4": 7, "f8": 8}[dtype[1:]]
+        fields = [self.make(field, n, size * k, kind, 1) for k, n in enumerate(names)]
+        data = np.concatenate([points, light[:, None]], 1).astype(dtype)
         content = np.frombuffer(data.tobytes(), np.uint8)
         message = self.make(
-            ros.CLOUD, self.header(time), height, len(data) // height, fields, False, 16,
-            16 * len(data) // height,
-            content, True,
+            ros.CLOUD, self.header(time), height, len(data) // height, fields, dtype[0] == ">",
+            4 * size, 4 * size * len(data) // height, content, True,
         )  # fmt: skip
         self.write(topic, ros.CLOUD, time, message)
 

@@ -211,6 +211,18 @@ def test_changed_recording_is_refused(session_results, tmp_path) -> None:
     )
 
 
+def test_recording_with_other_images_is_refused(session_results, tmp_path) -> None:
+    again = copied(session_results["there"], tmp_path)
+    run = json.loads((again / "run.json").read_text())
+    scan = shutil.copytree(run["input"]["opening"]["paths"][0], tmp_path / "scan")
+    depth = sorted((scan / "depth").iterdir())
+    depth[-1].replace(depth[0])
+    shutil.copy(depth[1], depth[-1])
+    run["input"]["opening"]["paths"] = [str(scan)]
+    change_run(again, input=run["input"])
+    refused([session_results["here"], again], "at frame 0, which has changed")
+
+
 def test_results_of_clouds_are_refused(session_results, tmp_path) -> None:
     writer = RecordingWriter(tmp_path / "clouds", None, frame_rate_hz=10.0)
     points = np.random.default_rng(0).uniform(1, 2, (50, 3)).astype(np.float32)
@@ -220,7 +232,8 @@ def test_results_of_clouds_are_refused(session_results, tmp_path) -> None:
     again = copied(session_results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
     run["input"]["opening"]["paths"] = [str(tmp_path / "clouds")]
-    change_run(again, input=run["input"])
+    frames = [frame | {"mean_depth_m": None} for frame in run["frames"]]
+    change_run(again, input=run["input"], frames=frames)
     refused([session_results["here"], again], "clouds", "pass their clouds together")
 
 

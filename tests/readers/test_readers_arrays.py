@@ -12,6 +12,7 @@ import made_arrays as made
 import tofuse
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import RangeFrame
 from tofuse.formats.recordings.open import open_recording
 
 
@@ -110,3 +111,17 @@ def test_dates_are_converted_to_seconds() -> None:
     recording = tofuse.from_arrays(np.ones((3, 48, 64)), K, timestamps=times)
     np.testing.assert_allclose(np.diff(recording.timestamps), 0.04, atol=1e-6)
     assert recording.timestamps[0] == 1704067200
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("kind", ["u1", "i2", "u2", "i4", "u4", "f4"])
+def test_largest_number_is_no_depth(tmp_path: Path, kind: str, order: str) -> None:
+    depth = np.full((2, 4, 6), 7, order + kind)
+    depth[0, 0, 0] = (np.finfo if kind == "f4" else np.iinfo)(kind).max
+    K = np.array([[5, 0, 2.5], [0, 5, 1.5], [0, 0, 1]])
+    np.savez(tmp_path / "a.npz", depth=depth, K=K, depth_unit_m=0.001)
+    recordings = (tofuse.open(tmp_path / "a.npz"), tofuse.from_arrays(depth, K, depth_unit_m=0.001))
+    for frame in (recording[0] for recording in recordings):
+        assert isinstance(frame, RangeFrame)
+        assert (frame.depth[0, 0], frame.valid.sum()) == (0, 23)
+        assert frame.depth.dtype == np.float32

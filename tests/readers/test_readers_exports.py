@@ -139,6 +139,21 @@ def test_other_tiffs_are_depth_on_request(tmp_path: Path) -> None:
         open_recording(folder, format="tiff", camera=small)
 
 
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("kind", ["u2", "f4"])
+def test_tiffs_of_either_byte_order(tmp_path: Path, order: str, kind: str) -> None:
+    """They give the same values; a turned or mirrored image is refused."""
+    image = made.depths()[0].astype(kind)
+    for orientation in (1, 2, 3):
+        path = tmp_path / "a.tif"
+        path.write_bytes(made.tiff(image, order, orientation))
+        if orientation == 1:
+            np.testing.assert_array_equal(read_tiff(path), image)
+            continue
+        with pytest.raises(InputError, match="turned or mirrored by its tag Orientation"):
+            read_tiff(path)
+
+
 def test_damaged_tiffs_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     cv2.imwrite(str(path), np.zeros((24, 32, 3), np.uint8))

@@ -90,6 +90,15 @@ def test_clouds(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame.amplitude, light[keep])
 
 
+@pytest.mark.parametrize("order", "<>")
+def test_clouds_in_map_coordinates(tmp_path: Path, order: str) -> None:
+    bag = Bag(tmp_path, "ros2")
+    points = RNG.normal((4e5, 5e6, 100), size=(50, 3))
+    bag.cloud("/points", 10, points, np.ones(50), dtype=f"{order}f8")
+    frame = open_recording(bag.close())[0]
+    np.testing.assert_allclose(frame.points + frame.shift, points, rtol=0, atol=1e-5)
+
+
 def test_organised_clouds_become_images(tmp_path: Path) -> None:
     """Organised clouds on the rays of a camera keep the grid, and get the camera."""
     bag = Bag(tmp_path, "ros2")

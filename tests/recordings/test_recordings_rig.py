@@ -42,6 +42,12 @@ def test_round_trip(tmp_path: Path) -> None:
         (lambda d: d["cameras"][1].update(name="left"), "two cameras called 'left'"),
         (lambda d: d["cameras"][1].update(T_rig_camera=[1, 2, 3]), "4 x 4 finite numbers"),
         (lambda d: d["cameras"][1].update(T_rig_camera=(2 * np.eye(4)).tolist()), "rotation"),
+        (
+            lambda d: d["cameras"][1].update(
+                T_rig_camera=(np.eye(4) + 400 * np.eye(4, k=3)).tolist()
+            ),
+            "is 400 m from the first camera; use metres",
+        ),
         (lambda d: d["cameras"][0].update(d["cameras"][1], name="x"), "not the identity"),
         (lambda d: d["cameras"][1].update(covariance=[-1.0] + [0.0] * 35), "not a covariance"),
         (lambda d: d["cameras"][1].update(time_offset_s="soon"), "is 'soon'"),

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
@@ -16,6 +17,7 @@ from tofuse.apps.results.folders import OutputFolder, check_output, finish_inter
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import read_run_json
 from tofuse.engine.errors import InputError, OutputError
+from tofuse.formats.files import staging
 from tofuse.formats.files.staging import beside
 from tofuse.lab.demo import _check_simulated
 
@@ -197,3 +199,18 @@ def test_demo_does_not_replace_recording_with_foreign_files(tmp_path, theirs) ->
         (recording / theirs).write_text("mine")
     with pytest.raises(OutputError, match="or holds something else"):
         _check_simulated(recording)
+
+
+def test_refused_process_leaves_the_folder_that_the_other_one_creates(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "out"
+
+    def taken(*_args: object, **_options: object) -> NoReturn:
+        folder.mkdir()  # by the other process, which has the lock
+        raise OutputError("is being written by another process")
+
+    monkeypatch.setattr(staging, "Claim", taken)
+    with pytest.raises(OutputError, match="another process"):
+        OutputFolder(folder)
+    assert folder.is_dir()

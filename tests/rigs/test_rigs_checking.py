@@ -68,3 +68,12 @@ def test_systematic_errors_recur_in_same_scene() -> None:
     found = compare_in_scene(*rigs)
     assert [m.name for m in found if m.moved] == ["2"]
     assert found[2].chance < 0.01 < found[2].chance_elsewhere
+
+
+def test_camera_without_common_surface_is_not_compared() -> None:
+    rng = np.random.default_rng(5)
+    before, after = measured(truth(), rng), measured(truth(), rng)
+    alone = replace(after.cameras[2], covariance=np.full((6, 6), np.inf))
+    found = compare(before, replace(after, cameras=(*after.cameras[:2], alone, after.cameras[3])))
+    assert found[2].reason.startswith("it shares no surface with")
+    assert not any(motion.moved for motion in found)

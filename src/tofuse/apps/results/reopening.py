@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from tofuse.apps.results.folders import RECORDING
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Recording
+from tofuse.engine.frames import Frame, Recording, Source
 from tofuse.formats.recordings import Opening
 
 # Frames whose times differ by more are not of the same recording, s.
 _MAX_TIME_DIFFERENCE = 1e-6
+# Relative difference of mean depths of the same image, by rounding on another machine.
+_SAME_DEPTH = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +36,8 @@ class StoredRecording:
         Offset of its frame indices in the result.
     times
         s, by the index of the frame in the recording; None in merged results, which shift them.
+    depths
+        Mean depth of the frames as they were read, m, by index, where known.
     frames
         Indices in the recording of the frames that the result contains.
     """
@@ -43,6 +47,7 @@ class StoredRecording:
     config: dict[str, Any]
     first: int
     times: dict[int, float] | None
+    depths: dict[int, float]
     frames: list[int]
 
 
@@ -66,6 +71,9 @@ def stored_recordings(folder: Path, run: Mapping[str, Any]) -> Iterator[StoredRe
     times = {int(f["index"]): float(f["timestamp"]) for f in run["frames"]}
     if not times:
         raise ValueError("no frames")
+    depths = {int(f["index"]): f.get("mean_depth_m") for f in run["frames"]}
+    if not run["input"]["opening"]:  # any frames may have been made of it in Python
+        depths = {}
     sessions = run.get("sessions") or []
     single = {
         "name": folder.resolve().name,
@@ -83,6 +91,7 @@ def stored_recordings(folder: Path, run: Mapping[str, Any]) -> Iterator[StoredRe
             dict(part["config"]),
             first,
             None if sessions else part_times,
+            {k: float(d) for k in part_times if (d := depths.get(first + k)) is not None},
             list(part_times),
         )
 
@@ -128,14 +137,34 @@ def reopen(part: StoredRecording, folder: Path) -> Recording:
     recording = opening.open()
     is_part = np.isin(recording.indices, part.frames)
     matches = int(is_part.sum()) == len(part.frames)
-    recording = replace(recording, indices=recording.indices[is_part])
+    source = cast(Source, _Unchanged(recording.source, part.depths, folder))
+    recording = replace(recording, source=source, indices=recording.indices[is_part])
     if matches and part.times is not None:
         times = np.array([part.times[k] for k in recording.indices.tolist()])
         matches = bool(np.allclose(times, recording.timestamps, rtol=0, atol=_MAX_TIME_DIFFERENCE))
     if not matches:
-        raise InputError(
-            f"does not match the frames of {recording.path}, which has changed",
-            where=folder,
-            remedy="run `tofuse run` again",
-        )
+        raise _changed(folder, recording.path)
     return recording
+
+
+def _changed(folder: Path, what: str) -> InputError:
+    problem = f"does not match the frames of {what}, which has changed"
+    return InputError(problem, where=folder, remedy="run `tofuse run` again")
+
+
+class _Unchanged:
+    """A source whose frames must have the mean depths of a result's."""
+
+    def __init__(self, source: Source, depths: Mapping[int, float], folder: Path) -> None:
+        self._source, self._depths, self._folder = source, depths, folder
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._source, name)
+
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        frame = self._source.read(index)
+        expected = self._depths.get(index)
+        if expected is not None and abs(frame.mean_depth - expected) > _SAME_DEPTH * expected:
+            raise _changed(self._folder, f"its recording at frame {index}")
+        return frame

@@ -150,6 +150,9 @@ def _test_motion(
     # The covariance of the file, transformed from the previous frame of the camera to the new one.
     A = se3.adjoint(se3.inverse(T))
     C = A @ C_before @ A.T + C_after
+    if not np.isfinite(C).all():
+        reason = f"it shares no surface with {reference.name}"
+        return CameraMotion(camera.name, None, 1.0, False, reason=reason)
     chance = float(chi2.sf(xi @ np.linalg.pinv(C, hermitian=True) @ xi, 6))
     position, rotation = se3.largest_sigmas(C).tolist()
     return CameraMotion(camera.name, T, chance, chance < limit, chance, position, rotation)

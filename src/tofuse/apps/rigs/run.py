@@ -222,7 +222,7 @@ def _with_reasons_of_rig(
     """Return the result with reasons for a rig instead of a single camera.
 
     `cameras` (F,) are the cameras of all frames, as indices into `names`; `displaced` those that
-    differ from the calibration.
+    differ from the calibration, or can't be compared with it.
     """
     d = result.diagnostics
     reasons = [r for r in d.reasons if r.code not in _TRACKING_REASONS]
@@ -230,13 +230,19 @@ def _with_reasons_of_rig(
     if not moves and worst is not None:
         name = names[cameras[worst.frame]]
         reasons = [_calibration_reason(r, worst.frame, name) for r in reasons]
-    if displaced:
-        changes = ", ".join(
-            f"{m.name} by {1000 * m.distance_m:.0f} mm and {np.degrees(m.angle_rad):.1f} degrees"
-            for m in displaced
-        )
+    whole = ((d.frames[0].index, d.frames[-1].index),)
+    unrelated = ", ".join(m.name for m in displaced if not m.moved)
+    if unrelated and all(reason.code != "uncertain_rig" for reason in reasons):
+        text = f"No surface is seen by {unrelated} and another camera: their poses are unchecked."
+        reasons.append(Reason("uncertain_rig", whole, text))
+    changes = ", ".join(
+        f"{m.name} by {1000 * m.distance_m:.0f} mm and {np.degrees(m.angle_rad):.1f} degrees"
+        for m in displaced
+        if m.moved
+    )
+    if changes:
         text = f"Camera poses differ from those of the rig: {changes}."
-        reasons.append(Reason("rig_changed", ((d.frames[0].index, d.frames[-1].index),), text))
+        reasons.append(Reason("rig_changed", whole, text))
     ranked = verdicts.ranked(reasons)
     d = replace(d, reasons=ranked, verdict=verdicts.verdict_of(ranked))
     return replace(result, diagnostics=replace(d, refinement=None, cloud_before=None))
@@ -260,7 +266,7 @@ def _calibration_reason(reason: Reason, worst: int, name: str) -> Reason:
 def _check_calibration(
     cameras: Sequence[Camera], recording: Recording
 ) -> tuple[list[CameraMotion], SurfaceDistances]:
-    """Return the cameras that differ from the calibration, after aligning their views.
+    """Return the cameras that differ from the calibration, or see nothing that others see.
 
     Also the distances between the surfaces of each pair at the calibrated poses, see `JointPoses`.
     """
@@ -280,7 +286,9 @@ def _check_calibration(
         replace(camera, T_rig_camera=T, covariance=C[:6, :6])
         for camera, T, C in zip(rig.cameras, refined.poses, refined.covariance, strict=True)
     )
-    displaced = [motion for motion in compare(rig, Rig(recalibrated)) if motion.moved]
+    displaced = [
+        motion for motion in compare(rig, Rig(recalibrated)) if motion.moved or motion.reason
+    ]
     return displaced, disagreements(views, calibrated)
 
 

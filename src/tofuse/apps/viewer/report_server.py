@@ -11,6 +11,7 @@ import re
 import secrets
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Lock, Thread
@@ -19,6 +20,7 @@ from typing import Any, Self
 from tofuse.apps.report import thumbnails
 from tofuse.apps.results import folders, reopening, run_json
 from tofuse.apps.viewer.server import HOST, choose_port, is_same_origin
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.formats.files import reading
 
@@ -61,7 +63,8 @@ class FrameImages:
         if index not in self._places:
             return None
         recording, row = self._places[index]
-        with self._lock:  # readers serve one thread
+        frame = None
+        with self._lock, suppress(InputError):  # readers serve one thread
             frame = recording.image(row)
         if frame is None:
             return None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,11 +24,17 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float) -> Float32:
 def depth_from_numbers(numbers: NDArray[np.generic], unit_m: float) -> Float32:
     """Return depth in m (float32) of stored integers or floats (H, W) in units of `unit_m`.
 
-    Depth that is not finite or implausibly large is 0, and so are integers of 65535.
+    Depth that is not finite or implausibly large is 0, and so are integers that mark no depth.
     """
     with np.errstate(all="ignore"):
         depth = numbers.astype(np.float32) * np.float32(unit_m)
         depth[~(np.abs(depth) < se3.MAX_COORDINATE_M)] = 0
-    if numbers.dtype.kind in "ui":
-        depth[numbers == INVALID_DEPTH] = 0
+    depth[is_marked_invalid(numbers)] = 0
     return depth
+
+
+def is_marked_invalid(numbers: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether stored depth is an integer for no depth: 65535, or the largest of its type."""
+    if numbers.dtype.kind not in "ui":
+        return np.zeros(numbers.shape, bool)
+    return (numbers == INVALID_DEPTH) | (numbers == np.iinfo(numbers.dtype).max)

@@ -203,6 +203,12 @@ class RangeFrame:
         """(3,) position of the sensor in the frame's own coordinates: the optical centre."""
         return np.zeros(3)
 
+    @property
+    def mean_depth(self) -> float:
+        """The mean of the valid depth, m; 0 if there is none."""
+        depth = self.depth[self.valid]
+        return float(depth.mean(dtype=np.float64)) if len(depth) else 0.0
+
     def __len__(self) -> int:
         return int(np.count_nonzero(self.valid))
 
@@ -339,6 +345,12 @@ class CloudFrame:
     def valid(self) -> Bool:
         """(N,) mask: all points of a cloud are valid."""
         return np.ones(len(self.points), bool)
+
+    @property
+    def mean_depth(self) -> float:
+        """The mean distance of the points from the origin, m; 0 if there are none."""
+        distances = np.linalg.norm(self.points - self.origin, axis=1)
+        return float(distances.mean()) if len(distances) else 0.0
 
     def __len__(self) -> int:
         return len(self.points)

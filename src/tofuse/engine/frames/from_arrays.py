@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.cameras import Camera, Pinhole, RayTable, pinhole_values
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import INVALID_DEPTH
+from tofuse.engine.frames.depth_counts import is_marked_invalid
 from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
@@ -43,8 +43,9 @@ def from_arrays(
     Parameters
     ----------
     depth
-        (N, H, W), or N images (H, W); 0 or NaN where invalid, in integers also 65535. Floats are in
-        metres and integers in millimetres, unless `depth_unit_m` is given.
+        (N, H, W), or N images (H, W); 0 or NaN where invalid, in integers also 65535 and the
+        largest value of their type. Floats are in metres and integers in millimetres, unless
+        `depth_unit_m` is given.
     camera
         A camera, or the matrix K (3, 3) of a pinhole camera without distortion, in pixels of the
         depth images.
@@ -85,7 +86,7 @@ def from_arrays(
     frames = []
     for k, image in enumerate(images):
         metres = to_metres(image)
-        valid = np.isfinite(metres) & (metres > 0)
+        valid = (metres > 0) & (metres < se3.MAX_COORDINATE_M)
         frames.append(
             RangeFrame(
                 k,
@@ -161,7 +162,7 @@ def _to_metres(
 
     def to_metres(image: NDArray[Any]) -> Float64:
         metres = image.astype(np.float64) * scale
-        return np.where(image == INVALID_DEPTH, 0.0, metres) if is_integer else metres
+        return np.where(is_marked_invalid(image), 0.0, metres)
 
     return to_metres
 

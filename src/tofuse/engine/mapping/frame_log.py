@@ -101,8 +101,8 @@ class Entry:
         return self.step is not None and self.step.T_component_camera is not None
 
 
-def record_of(frame: Frame, step: Step) -> FrameRecord:
-    """Return the record of a tracked frame."""
+def record_of(frame: Frame, step: Step, mean_depth_m: float) -> FrameRecord:
+    """Return the record of a tracked frame, whose mean depth was another one as it was read."""
     r = step.registration
     return FrameRecord(
         frame.index,
@@ -113,6 +113,7 @@ def record_of(frame: Frame, step: Step) -> FrameRecord:
         inlier_share=None if r is None else r.inlier_ratio,
         rms_m=None if r is None else r.rms_m,
         unobservable=np.zeros((0, 6)) if r is None else r.unobservable,
+        mean_depth_m=mean_depth_m,
     )
 
 

@@ -133,7 +133,9 @@ class Mapper:
         with threads(self.threads, serial=busy):
             filtered = self._prepare(frame, history, prepared)
             step = self._track(filtered, T_odometry, repeated)
-            self._store(filtered, step, T_odometry, gravity)
+            record = record_of(filtered.corrected, step, frame.mean_depth)
+            self._log.add(record, step, T_odometry, gravity)
+            self._store(filtered, step)
             with self.watch.timing("loops"):
                 self._live_poses.update(step, self._log)
             return self._report(filtered, step)
@@ -160,14 +162,7 @@ class Mapper:
             self._preparation.add_pose(filtered.for_tracking, step.T_component_camera)
         return step
 
-    def _store(
-        self,
-        filtered: FilteredFrame,
-        step: Step,
-        T_odometry: Float64 | None,
-        gravity: Float64 | None,
-    ) -> None:
-        self._log.add(record_of(filtered.corrected, step), step, T_odometry, gravity)
+    def _store(self, filtered: FilteredFrame, step: Step) -> None:
         lost = step.T_component_camera is None
         if step.moving is not None:
             filtered = replace(filtered, for_model=filtered.for_model.keep(~step.moving))

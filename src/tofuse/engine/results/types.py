@@ -69,6 +69,8 @@ class FrameRecord:
         (K, 6) orthonormal directions of the right perturbation that the data does not constrain.
     component
         Position in `Reconstruction.components`; None where the frame is in none.
+    mean_depth_m
+        Of the frame as read, by which its recording is recognised.
     """
 
     index: int
@@ -81,6 +83,7 @@ class FrameRecord:
     covariance: Float64 | None = None
     unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
     component: int | None = None
+    mean_depth_m: float | None = None
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ class StagedFolder:
         self._check, self._kept = check, kept
         self._claim: Claim | None = None
         self._complete = False
-        self._created = [p for p in (self.folder, *self.folder.parents) if not p.exists()]
+        self._created = [p for p in self.folder.parents if not p.exists()]
         try:
             _check_place(self.folder, path)
             self.new = beside(self.folder, "new")
@@ -72,6 +72,8 @@ class StagedFolder:
             self._claim = Claim(beside(self.folder, "lock"), target=path)
             finish_replacing(self.folder, kept)
             check(self.folder)
+            if not self.folder.exists():  # known only now: the holder of the lock creates it
+                self._created.insert(0, self.folder)
             self.folder.mkdir(exist_ok=True)
             _remove(self.new)
             _check_replaceable(self.folder, path)

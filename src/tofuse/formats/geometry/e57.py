@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.formats.files import atomic, reading
 
@@ -52,9 +52,16 @@ def write_e57(path: str | Path, cloud: GeometryRecord) -> None:
     with atomic.replacing(path) as temporary:
         file = pye57.E57(str(temporary), mode="w")
         try:
-            _write(file, pye57.libe57, columns, with_normals=cloud.normals is not None)
-        finally:
-            file.close()
+            try:
+                _write(file, pye57.libe57, columns, with_normals=cloud.normals is not None)
+            finally:
+                file.close()
+        except pye57.libe57.E57Exception as error:
+            file.close = lambda: None  # its destructor would try again, and print that it failed
+            reason = str(error).split("\n", 1)[0]
+            raise OutputError(
+                f"can't be written ({reason})", where=path, remedy="free some space"
+            ) from error
 
 
 def _write(file: Any, lib: Any, columns: Mapping[str, NDArray[Any]], *, with_normals: bool) -> None:

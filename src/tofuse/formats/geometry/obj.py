@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +35,12 @@ def write_obj(path: str | Path, mesh: GeometryRecord) -> None:
     path = Path(path)
     normals, color, uv, texture = mesh.normals, mesh.color, mesh.uv, mesh.texture
     table = np.asarray(mesh.points, np.float32).astype(float)
-    lines = []
+    lines, files = [], {}
     if texture is not None:
         image = path.with_suffix(".png" if texture.startswith(b"\x89PNG") else ".jpg")
         material = path.with_suffix(".mtl")
-        atomic.write_bytes(image, texture)
-        atomic.write_text(
-            material, f"newmtl surface\nKa 1 1 1\nKd 1 1 1\nillum 1\nmap_Kd {image.name}\n"
-        )
+        surface = f"newmtl surface\nKa 1 1 1\nKd 1 1 1\nillum 1\nmap_Kd {image.name}\n"
+        files = {image: texture, material: surface.encode()}
         lines += [f"mtllib {material.name}", "usemtl surface"]
     if color is not None:
         table = np.column_stack([table, np.asarray(color, float) / 255])
@@ -58,7 +57,10 @@ def write_obj(path: str | Path, mesh: GeometryRecord) -> None:
     faces = np.zeros((0, 3), int) if mesh.faces is None else mesh.faces
     indices = np.repeat(np.asarray(faces, np.int64) + 1, repeat, axis=1)
     lines += _rows("f", indices, " ".join([corner] * 3))
-    atomic.write_text(path, "\n".join(lines) + "\n")
+    files[path] = ("\n".join(lines) + "\n").encode()
+    with ExitStack() as stack:  # all are written before any is replaced
+        for file, data in files.items():
+            stack.enter_context(atomic.replacing(file)).write_bytes(data)
 
 
 def _rows(keyword: str, table: NDArray[Any], number_format: str) -> Sequence[str]:

@@ -287,7 +287,7 @@ def read_raw(path: str | Path, dtype: str, size: tuple[int, int], remedy: str) -
 
 
 # Tags of the TIFF 6.0 specification.
-_WIDTH, _HEIGHT, _SAMPLES = 256, 257, 277
+_WIDTH, _HEIGHT, _ORIENTATION, _SAMPLES = 256, 257, 274, 277
 _PIECES = ((273, 279), (324, 325))  # offsets and sizes of strips, or of tiles
 _CODES = {1: "B", 3: "H", 4: "I"}  # of the integer types
 _MAX_TAGS = 256
@@ -349,6 +349,8 @@ def tiff_size(data: bytes) -> tuple[int, int]:
         raise InputError(f"has {channels} channels", remedy="store one channel")
     if not complete:
         raise InputError("is cut off before its end")
+    if tags.get(_ORIENTATION, [1]) != [1]:  # OpenCV would turn the image relative to its camera
+        raise InputError("is turned or mirrored by its tag Orientation", remedy="set that to 1")
     return width, height
 
 

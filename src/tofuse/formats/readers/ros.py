@@ -96,7 +96,7 @@ class RosSource(bags.BagSource):
         cloud = bags.cloud(message, where)
         if self.raster is None:
             return cloud_frames.cloud_frame(index, time, cloud)
-        points = cloud.points.reshape(message.height, message.width, 3)
+        points = cloud_frames.to_float32(cloud.points).reshape(message.height, message.width, 3)
         return organised.organised_frame(points, cloud, self.raster, index, time)
 
     def read_depth(self, index: int, where: str) -> Float32:
@@ -284,7 +284,7 @@ class RosSource(bags.BagSource):
         images = []
         for k, message in organised.samples(len(self.depth), lambda k: (k, self.depth.message(k))):
             with suppress(InputError):
-                points = bags.cloud(message, self.where(k)).points
+                points = cloud_frames.to_float32(bags.cloud(message, self.where(k)).points)
                 if min(message.width, message.height) < 2:
                     return None
                 images.append(points.reshape(message.height, message.width, 3))

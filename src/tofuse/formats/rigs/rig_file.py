@@ -17,8 +17,8 @@ from tofuse.formats.files import atomic, reading
 
 SCHEMA = 1
 FILE_NAME = "rig.json"
-# Larger clock and depth offsets are in wrong units.
-_MAX_SECONDS, _MAX_METRES = 1e10, 10.0
+# Larger clock and depth offsets, and distances of cameras, are in wrong units.
+_MAX_SECONDS, _MAX_METRES, _MAX_DISTANCE_M = 1e10, 10.0, 100.0
 
 _REMEDY = "correct it, or write the file again by `tofuse rig calibrate`"
 
@@ -176,6 +176,13 @@ def _camera(row: dict[str, Any], where: str) -> RigCamera:
         if not isinstance(recording, str):
             raise InputError("recording is not a path")
     matrix = reading.numbers_in(row, "T_rig_camera", where, (4, 4), _REMEDY)
+    distance = np.linalg.norm(matrix[:3, 3])
+    if not distance <= _MAX_DISTANCE_M:
+        raise InputError(
+            f"is {distance:.0f} m from the first camera",
+            where=f"{where}: T_rig_camera",
+            remedy="use metres",
+        )
     random = None
     if row.get("random_covariance") is not None:
         random = _covariance(row, "random_covariance", where)

@@ -435,17 +435,18 @@ def cloud(message: Any, where: str) -> GeometryRecord:
         raise InputError("is cut off", where=where, remedy="check the bag")
     rows = data[: count * step].reshape(count, step)
 
-    def column(name: str) -> Float32:
+    def column(name: str) -> NDArray[Any]:
         field = fields[name]
         dtype = np.dtype(order + _FIELD_TYPES[field.datatype])
         start = int(field.offset)
         if start + dtype.itemsize > step:
             raise InputError(f"has its field {name!r} outside of a point", where=where)
         values = np.ascontiguousarray(rows[:, start : start + dtype.itemsize]).view(dtype)[:, 0]
-        with np.errstate(all="ignore"):
-            return values.astype(np.float32)
+        return values.astype(dtype.newbyteorder("="), copy=False)
 
-    points = np.stack([column(name) for name in "xyz"], 1)
+    xyz = [column(name) for name in "xyz"]
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        points = np.stack(xyz, 1).astype(np.result_type(np.float32, *(c.dtype for c in xyz)))
     amplitude = next((name for name in _AMPLITUDES if name in fields), None)
     scalars = {} if amplitude is None else {"amplitude": column(amplitude)}
     return GeometryRecord(points, scalars=scalars)
