@@ -28,7 +28,7 @@ from tofuse.engine.refinement.joint_alignment import (
     Priors,
     Refined,
     align_views,
-    refine,
+    mean_support,
     spread_evenly,
 )
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap
@@ -71,6 +71,11 @@ _INDEX = {
 # This many pairs determine errors that all views share; larger sets are subsampled to about as
 # many, with every n-th point.
 _MAX_PAIRS, _POINT_STRIDE = 500, 3
+# Iterations that realign the views without errors; and the change of an error, in units of 1 % and
+# 1 cm, below which its estimate has converged.
+_REALIGNMENT, _CONVERGED = (pair_equations.Round(6, 0.0, 0.0),), 0.05
+# Larger first estimates, as multiples of the tolerance, are sought from coarse to fine.
+_MAX_DIRECT = 3.0
 
 
 @dataclass(frozen=True)
@@ -192,18 +197,18 @@ def check_calibration(
     likely = [name for name in first.determined if first.is_likely(name)]
     if not likely:
         return _check_by_loop(views, refined, first, without_error, options)
-    estimator = _Estimator(views, refined, options, priors)
-    estimates = {name: estimator.alone(name) for name in likely}
-    joint: Refined | AlignedViews = estimates[likely[0]]
+    estimator = _Estimator(views, refined, options, priors, first)
+    estimates = {name: estimator.estimate([name]) for name in likely}
+    joint = estimates[likely[0]]
     if len(likely) > 1:  # errors are correlated: in a joint estimate, the true one remains
-        joint = estimator.together(likely)
+        joint = estimator.estimate(likely)
     best_name = max(likely, key=lambda name: abs(joint.errors[_INDEX[name]]) / TOLERANCES[name])
     best = estimates[best_name]
     errors = {name: float(e.errors[_INDEX[name]]) for name, e in estimates.items()}
     limits = {name: significance * first.sigmas[name] for name in errors}
     large = any(_large(name, error, limits[name]) for name, error in errors.items())
     certain = abs(errors[best_name]) > limits[best_name]
-    support, with_best = (float(s.of_views(len(views)).mean()) for s in (best.before, best.after))
+    support, with_best = estimator.support_of(best)
     improves = certain and with_best - support > _SUPPORT_NOISE
     gap = None
     if large or improves:
@@ -213,7 +218,7 @@ def check_calibration(
     if alarm:  # alternative explanations
         for name in first.determined:
             if name not in errors:
-                errors[name] = float(estimator.alone(name).errors[_INDEX[name]])
+                errors[name] = float(estimator.estimate([name]).errors[_INDEX[name]])
     else:
         by_loop = _check_by_loop(views, refined, first, without_error, options)
         if by_loop.alarm:
@@ -240,12 +245,15 @@ class _FirstEstimates:
     ----------
     errors, sigmas
         Estimates and standard deviations.
+    follow
+        (N, 6) twists by which the poses follow, per unit of each error.
     motion
         As in `CalibrationCheck`.
     """
 
     errors: dict[str, float]
     sigmas: dict[str, float]
+    follow: dict[str, Float64]
     motion: dict[str, tuple[float, float]]
 
     @classmethod
@@ -263,6 +271,7 @@ class _FirstEstimates:
         return cls(
             {name: float(errors[k]) for name, k in _INDEX.items()},
             {name: float(sigmas[k]) for name, k in _INDEX.items()},
+            {name: sensitivity.motion[k] for name, k in _INDEX.items()},
             {name: _motion(poses, sensitivity.motion[k]) for name, k in _INDEX.items()},
         )
 
@@ -290,7 +299,8 @@ class _FirstEstimates:
 class _Estimator:
     """Estimates errors from refined views: the overlaps are fixed, the poses are free.
 
-    The parameters are those of `check_calibration`; of many pairs, a part is used.
+    The parameters are those of `check_calibration`; of many pairs, a part is used. Estimates start
+    from the first ones, unless these are so large that the overlaps of the views may be wrong.
     """
 
     def __init__(
@@ -299,6 +309,7 @@ class _Estimator:
         refined: Refined,
         options: pair_equations.RefineOptions,
         priors: Priors,
+        first: _FirstEstimates,
     ) -> None:
         pairs, count = refined.pairs, len(refined.pairs)
         if count > _MAX_PAIRS:
@@ -306,19 +317,29 @@ class _Estimator:
             pairs = spread_evenly(pairs, -(-options.neighbours * _MAX_PAIRS // count))
         # An estimate of camera errors does not model errors that patches share, so it can't be
         # compared with the refined poses.
-        options = replace(options, rounds=COARSE_TO_FINE, shared=0.0)
-        self._refine = partial(refine, priors=priors, pairs=pairs)
-        self._align = partial(align_views, priors=priors, pairs=pairs)
-        poses = self._align(views, refined.poses, options).poses
-        self._problem = views, poses, options
+        self._views, self._first = views, first
+        self._options = replace(
+            options, rounds=COARSE_TO_FINE[-1:], shared=0.0, error_convergence=_CONVERGED
+        )
+        self._align = partial(align_views, views, priors=priors, pairs=pairs)
+        self._poses = self._align(refined.poses, replace(self._options, rounds=_REALIGNMENT)).poses
 
-    def alone(self, name: str) -> Refined:
-        """Estimate one error."""
-        return self._refine(*self._problem, calibrate=[_INDEX[name]])
+    def estimate(self, names: Sequence[str]) -> AlignedViews:
+        """Estimate one error, or several together."""
+        first, options, poses = self._first, self._options, self._poses
+        errors = np.zeros(kernels.ERRORS)
+        if any(abs(first.errors[name]) > _MAX_DIRECT * TOLERANCES[name] for name in names):
+            options = replace(options, rounds=COARSE_TO_FINE)
+        elif len(names) == 1:
+            (name,) = names
+            errors[_INDEX[name]] = first.errors[name]
+            poses = poses @ se3.exp(first.errors[name] * first.follow[name])
+        calibrate = [_INDEX[name] for name in names]
+        return self._align(poses, options, calibrate=calibrate, errors=errors)
 
-    def together(self, names: Sequence[str]) -> AlignedViews:
-        """Estimate several errors."""
-        return self._align(*self._problem, calibrate=[_INDEX[name] for name in names])
+    def support_of(self, estimate: AlignedViews) -> tuple[float, float]:
+        """Mean support of the views without and with the errors of an estimate."""
+        return mean_support(self._views, estimate, self._poses, self._options)
 
 
 def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:

@@ -270,6 +270,7 @@ def align_views(
     fixed_errors = np.ones(kernels.ERRORS, np.int64)
     fixed_errors[list(calibrate)] = 0
     motions: list[float] = []
+    error_changes = [np.inf]
     overlapping = _overlapping(views, poses, options, bodies) if pairs is None else pairs
     state = pair_equations.directed_pairs(views, overlapping, options)
     system = _system(state, len(views), priors, bodies)
@@ -294,8 +295,10 @@ def align_views(
             pair_equations.rescale(state, stage, options)
             motions.append(float(np.abs(step / projective.UNITS).max()))
             motion_since_overlaps += motions[-1] if pairs is None else 0.0
-            error_change = float(np.abs(error_step).max()) / _ERROR_UNIT
-            if max(motions[-1], error_change) < options.convergence:
+            error_changes.append(float(np.abs(error_step).max()) / _ERROR_UNIT)
+            if max(motions[-1], error_changes[-1]) < options.convergence:
+                break
+            if calibrate and max(error_changes[-2:]) < options.error_convergence:
                 break
     return AlignedViews(poses, errors, state, fixed_errors, tuple(motions))
 
@@ -309,8 +312,37 @@ def support_of(
     """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
     state = pair_equations.directed_pairs(views, refined.pairs, options)
     state.exposure, state.scale_g, state.scale_p = refined.scales.T.copy()
-    fixed_errors = (refined.errors == 0).astype(np.int64)
-    return _support(views, poses, refined.errors, fixed_errors, state, options.rounds[-1], options)
+    return _support_with(views, poses, refined.errors, state, options)
+
+
+def mean_support(
+    views: Sequence[SampledView],
+    aligned: AlignedViews,
+    start: Float64,
+    options: pair_equations.RefineOptions,
+) -> tuple[float, float]:
+    """Mean support of the views at poses (N, 4, 4) without errors of the camera, and as aligned.
+
+    Both with the sigmas of the aligned views.
+    """
+    candidates = (start, np.zeros_like(aligned.errors)), (aligned.poses, aligned.errors)
+    before, after = (
+        _support_with(views, poses, errors, aligned.state, options) for poses, errors in candidates
+    )
+    count = len(views)
+    return float(before.of_views(count).mean()), float(after.of_views(count).mean())
+
+
+def _support_with(
+    views: Sequence[SampledView],
+    poses: Float64,
+    errors: Float64,
+    state: pair_equations.DirectedPairs,
+    options: pair_equations.RefineOptions,
+) -> Support:
+    """Support at given poses and errors of the camera, none of which is estimated."""
+    known = np.ones(len(errors), np.int64)
+    return _support(views, poses, errors, known, state, options.rounds[-1], options)
 
 
 def align_pairs(

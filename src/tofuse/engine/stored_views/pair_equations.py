@@ -60,6 +60,9 @@ class RefineOptions:
     convergence
         Iterations end when no view moves by more, in units of 1 cm and 1 degree, and no error of
         the camera changes by more, in units of 1 % and 1 cm.
+    error_convergence
+        Where errors of the camera are estimated, iterations end as well when none of them changes
+        by more twice in succession: single views that are poorly determined keep moving.
     shared
         Depth errors that the pixels of a patch share, as a multiple of the disagreement of the
         patches; 0: none. Only in the last round, between views with albedo, and where no error of
@@ -75,6 +78,7 @@ class RefineOptions:
     photometric: bool = True
     max_sigma_m: float = 0.02
     convergence: float = 0.02
+    error_convergence: float = 0.0
     shared: float = 1.0
 
 
