@@ -68,9 +68,9 @@ _INDEX = {
     "center_y": kernels.CENTER_Y,
     "distortion": kernels.DISTORTION,
 }
-# This many pairs determine errors that all views share; larger sets are subsampled to about as
-# many, with every n-th point.
-_MAX_PAIRS, _POINT_STRIDE = 500, 3
+# This many points of pairs determine errors that all views share: of more, up to every n-th point
+# is used, and then fewer pairs.
+_MAX_POINTS, _MAX_STRIDE = 250_000, 3
 # Iterations that realign the views without errors; and the change of an error, in units of 1 % and
 # 1 cm, below which its estimate has converged.
 _REALIGNMENT, _CONVERGED = (pair_equations.Round(6, 0.0, 0.0),), 0.05
@@ -311,10 +311,11 @@ class _Estimator:
         priors: Priors,
         first: _FirstEstimates,
     ) -> None:
-        pairs, count = refined.pairs, len(refined.pairs)
-        if count > _MAX_PAIRS:
-            views = [v.with_points(np.s_[::_POINT_STRIDE]) for v in views]
-            pairs = spread_evenly(pairs, -(-options.neighbours * _MAX_PAIRS // count))
+        pairs, count = refined.pairs, len(refined.pairs) * options.points
+        stride = min(-(-count // _MAX_POINTS), _MAX_STRIDE)
+        views = [v.with_points(np.s_[::stride]) for v in views]
+        if count > stride * _MAX_POINTS:
+            pairs = spread_evenly(pairs, -(-options.neighbours * stride * _MAX_POINTS // count))
         # An estimate of camera errors does not model errors that patches share, so it can't be
         # compared with the refined poses.
         self._views, self._first = views, first
