@@ -118,7 +118,9 @@ def _function(cls: type[Command], name: str) -> Callable[[argparse.Namespace], i
             return function(options)
         from tofuse.engine.compute import compiling_in_background
 
-        with compiling_in_background():
+        with compiling_in_background() as is_first_run:
+            if is_first_run and sys.stderr.isatty():
+                sys.stderr.write("tofuse: compiling the numerical kernels, in the first run only\n")
             return function(options)
 
     return call
