@@ -18,7 +18,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 # The oldest systems that Numba's own wheels are for.
 _PLATFORMS = {
     "linux": f"manylinux_2_28_{platform.machine()}",
-    "darwin": "macosx_11_0_arm64",
+    "darwin": f"macosx_11_0_{platform.machine()}",
     "win32": "win_amd64",
 }
 _COMPILE = """

@@ -65,5 +65,12 @@ def test_failed_process_start_is_ignored(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(subprocess, "Popen", refused)
-    with ahead.compiling_in_background():
-        pass
+    with ahead.compiling_in_background() as is_first_run:
+        assert is_first_run
+
+
+def test_nothing_is_compiled_ahead_that_package_contains(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(jit, "shipped_kernels", lambda: (tmp_path, None))
+    with ahead.compiling_in_background() as is_first_run:
+        assert not is_first_run
