@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help demo test nightly nightly-part lint docs gallery format lock audit sbom clean
+.PHONY: help demo test nightly nightly-part lint docs gallery format lock wheel audit sbom clean
 
 help:                       ## this list
 	@awk -F ':.*## *' '/^[a-z-]+:.*##/ { printf "make %-12s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -61,6 +61,9 @@ lock: .venv/.ready          ## pin the newest versions that pyproject.toml allow
 	$(PIN) --extra dask --extra hdf5 --extra phones --extra ros --extra scan --extra texture --extra viewer pyproject.toml -c requirements/dev.txt -o requirements/runtime.txt
 	$(PIN) --all-extras pyproject.toml -o requirements/extras.txt
 	$(PIN) --group release -o requirements/release.txt
+
+wheel: .venv/.ready         ## a wheel for this system and Python with the compiled kernels, in dist/
+	HATCH_BUILD_HOOK_ENABLE_CUSTOM=true $(BIN)/python -m hatchling build --target wheel
 
 build/release/.ready: requirements/release.txt
 	$(PYTHON) -m venv build/release

@@ -1,11 +1,13 @@
 """Compilation time of the first run on a machine, alone and with a second compiling process.
 
     python benchmarks/compilation.py [RECORDING]
-    python benchmarks/compilation.py --list RECORDING [RECORDING ...]
+    python benchmarks/compilation.py --list RECORDING [RECORDING ...] [--others COMMAND ...]
 
 Each row is a `tofuse run` in its own process: with all kernels cached, with an empty cache, and
 with an empty cache and the second process (`tofuse.engine.compute.ahead`). `--list` writes the list
-of kernels that this process compiles, from those that runs of the recordings call.
+of kernels that this process compiles, from those that runs of the recordings call, and below them
+those that `--others` call as well, which only wheels contain compiled: commands such as
+"register a.ply b.ply --out OUT".
 """
 
 from __future__ import annotations
@@ -15,9 +17,11 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numba
 
@@ -79,35 +83,30 @@ def _text_of(kind: Any) -> str:
     return _NAMES[str(kind)]
 
 
-def called(recordings: list[Path]) -> list[str]:
-    """Lines of the list, in the order in which runs call the kernels."""
+def called(commands: list[list[str]]) -> list[str]:
+    """Lines of the list, in the order in which commands call the kernels."""
+    from numba.core.dispatcher import Dispatcher
+
+    from tofuse.apps.cli.program import main
+
     lines: dict[str, None] = {}
-    with tempfile.TemporaryDirectory() as cache:
-        os.environ["NUMBA_CACHE_DIR"] = cache
-        from numba.core import event
+    thread = threading.local()  # whose kernel calls others
+    compile_or_load = Dispatcher.compile
 
-        depth = 0
+    def recorded(dispatcher: Any, types: Any) -> Any:
+        kernel, caller = dispatcher.py_func, getattr(thread, "kernel", None)
+        if caller is None and kernel.__module__.startswith("tofuse."):
+            name = f"{kernel.__module__.removeprefix('tofuse.')}.{kernel.__name__}"
+            lines.setdefault(signature_line(name, types))
+        thread.kernel = caller or kernel
+        try:
+            return compile_or_load(dispatcher, types)
+        finally:
+            thread.kernel = caller
 
-        class Listener(event.Listener):
-            def on_start(self, event: Any) -> None:
-                nonlocal depth
-                kernel = event.data["dispatcher"].py_func
-                if depth == 0 and kernel.__module__.startswith("tofuse."):
-                    name = f"{kernel.__module__.removeprefix('tofuse.')}.{kernel.__name__}"
-                    lines.setdefault(signature_line(name, event.data["args"]))
-                depth += 1
-
-            def on_end(self, event: Any) -> None:
-                nonlocal depth
-                depth -= 1
-
-        with event.install_listener("numba:compile", Listener()):
-            from tofuse.apps.cli.program import main
-
-            for recording in recordings:
-                main(
-                    ["run", str(recording), "--every", "4", "--out", f"{cache}/out", "--overwrite"]
-                )
+    with patch.object(Dispatcher, "compile", recorded), tempfile.TemporaryDirectory() as folder:
+        for number, command in enumerate(commands):
+            main([word.replace("OUT", f"{folder}/{number}") for word in command])
     return list(lines)
 
 
@@ -116,9 +115,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("recordings", nargs="*", type=Path)
     parser.add_argument("--list", action="store_true")
+    parser.add_argument("--others", nargs="*", default=[], metavar="COMMAND")
     given = parser.parse_args()
     if given.list:
-        LIST.write_text("\n".join(called(given.recordings)) + "\n", encoding="ascii")
+        runs = [["run", str(path), "--every", "4", "--out", "OUT"] for path in given.recordings]
+        usual = called(runs)
+        others = [line for line in called(list(map(str.split, given.others))) if line not in usual]
+        LIST.write_text("\n".join([*usual, "", *others]) + "\n", encoding="ascii")
         return
     print_table(given.recordings[0])
 

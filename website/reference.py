@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import thesis
-from tofuse.apps.cli.parser import make_parser
+from tofuse.apps.cli.parser import Parser, make_parser
 from tofuse.engine import parts
 from tofuse.engine.bounds import Bounds, NotEmpty
 from tofuse.engine.graph.graph import LoopRecord
@@ -269,7 +269,8 @@ def record(name: str) -> str:
 def commands() -> dict[str, argparse.ArgumentParser]:
     """Return the parsers of the commands by name; those of subcommands too, `rig check`."""
 
-    def below(parser: argparse.ArgumentParser, path: str) -> Iterator[tuple[str, Any]]:
+    def below(parser: Parser, path: str) -> Iterator[tuple[str, Parser]]:
+        parser.add_options()
         for action in parser._actions:
             if isinstance(action, argparse._SubParsersAction):
                 for name, command_parser in action.choices.items():

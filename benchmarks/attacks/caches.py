@@ -31,7 +31,7 @@ def _twice(x: float) -> float:
 
 def _compiled(folder: Path | None) -> Any:
     compiled: Any = numba.njit(_twice)
-    compiled._cache = kernel_cache.KernelCache(_twice, folder)
+    compiled._cache = kernel_cache.KernelCache(_twice, lambda: folder)
     return compiled
 
 

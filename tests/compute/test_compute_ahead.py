@@ -14,12 +14,12 @@ from tofuse.engine.compute import ahead, jit
 
 
 def test_listed_kernels_exist() -> None:
-    listed = ahead.signatures()
+    listed = ahead.signatures(all_commands=True)
     for name, _ in listed:
         module, function = name.rsplit(".", 1)
         __import__(f"tofuse.{module}")
         assert hasattr(sys.modules[f"tofuse.{module}"], function)
-    assert len(listed) == len(set(listed)) > 50
+    assert len(listed) == len(set(listed)) > len(ahead.signatures()) > 50
 
 
 def test_listed_signatures_compile(tmp_path: Path) -> None:
@@ -65,5 +65,12 @@ def test_failed_process_start_is_ignored(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(subprocess, "Popen", refused)
-    with ahead.compiling_in_background():
-        pass
+    with ahead.compiling_in_background() as is_first_run:
+        assert is_first_run
+
+
+def test_nothing_is_compiled_ahead_that_package_contains(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(jit, "shipped_kernels", lambda: (tmp_path, None))
+    with ahead.compiling_in_background() as is_first_run:
+        assert not is_first_run

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import platform
 import warnings
 from pathlib import Path
 
 import numba
 import pytest
+from numba.core import registry
 
 from tofuse.engine.compute import kernel_cache
 from tofuse.engine.compute.kernel_cache import KernelCache, trusted_folder
@@ -21,7 +23,7 @@ def twice(x):
 
 def dispatcher(folder: Path | None):
     compiled = numba.njit(twice)
-    compiled._cache = KernelCache(twice, folder)
+    compiled._cache = KernelCache(twice, lambda: folder)
     return compiled
 
 
@@ -100,6 +102,32 @@ def test_without_folder_nothing_is_kept() -> None:
     compiled = dispatcher(None)
     assert compiled(2.0) == 4.0
     assert not was_loaded(compiled)
+
+
+def test_shipped_kernel_is_loaded_though_own_can_be_kept(tmp_path, monkeypatch) -> None:
+    shipped, own = tmp_path / "shipped", tmp_path / "own"
+    shipped.mkdir()
+    own.mkdir()
+    assert dispatcher(shipped)(2.0) == 4.0
+    here = kernel_cache._target(registry.cpu_target.target_context.codegen())
+    compiled = numba.njit(twice)
+    compiled._cache = KernelCache(twice, lambda: own, (shipped, here))
+    assert compiled(3.0) == 6.0
+    assert was_loaded(compiled)
+    assert compiled(3) == 6  # not shipped
+    assert len(list(own.iterdir())) == len(list(shipped.iterdir())) == 1
+
+
+@pytest.mark.parametrize("machine", ["x86_64", "AMD64", "aarch64", "arm64"])
+def test_shipped_kernels_are_for_each_family(monkeypatch, machine) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    processor = kernel_cache.shipped_processor()
+    assert processor is not None
+    present = dict.fromkeys(processor.features.replace("+", "").split(","), True)
+    monkeypatch.setattr(kernel_cache.binding, "get_host_cpu_features", lambda: present)
+    assert kernel_cache.runs_here(processor)
+    present["avx2"] = False
+    assert kernel_cache.runs_here(processor) == (processor.features == "")
 
 
 def test_own_folder_is_private(tmp_path, monkeypatch) -> None:

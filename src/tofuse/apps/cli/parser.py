@@ -23,7 +23,28 @@ _MAIN, _STATUS = "Attributes", "Exit status"
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line."""
+    """An argument parser whose errors are one line.
+
+    Parameters
+    ----------
+    command
+        The command whose options it gets when it is used, as it takes long to add those of all.
+    """
+
+    def __init__(self, *args: Any, command: type[Command] | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._without_options = command
+
+    def add_options(self) -> None:
+        """Add the options of the command, once."""
+        if self._without_options is not None:
+            _add_options(self, self._without_options)
+            self._without_options = None
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse what belongs to this command."""
+        self.add_options()
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit with 2."""
@@ -100,11 +121,11 @@ def _add_commands(parser: argparse.ArgumentParser, commands: Iterable[type[Comma
             description=texts.summary,
             epilog=texts.epilog or None,
             formatter_class=_Help if cls.subcommands else argparse.RawDescriptionHelpFormatter,
+            command=None if cls.subcommands else cls,
         )
         if cls.subcommands:
             _add_commands(p, cls.subcommands)
         else:
-            _add_options(p, cls)
             p.set_defaults(command=_function(cls, "_".join(words)), parser=p)
 
 
@@ -118,7 +139,9 @@ def _function(cls: type[Command], name: str) -> Callable[[argparse.Namespace], i
             return function(options)
         from tofuse.engine.compute import compiling_in_background
 
-        with compiling_in_background():
+        with compiling_in_background() as is_first_run:
+            if is_first_run and sys.stderr.isatty():
+                sys.stderr.write("tofuse: compiling the numerical kernels, in the first run only\n")
             return function(options)
 
     return call

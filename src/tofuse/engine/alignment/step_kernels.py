@@ -208,7 +208,9 @@ def iterate_level(
             finite = np.isfinite(step.sum())
         if not finite:  # planes fitted to mere noise can have unbounded coefficients
             return np.zeros(res.SIZE), np.zeros((6, 6)), np.eye(6), np.inf, iterations
-        T[:] = T_updated
+        for p in range(4):
+            for o in range(4):
+                T[p, o] = T_updated[p, o]
         iterations += 1
         step_size = 0.0
         for p in range(6):

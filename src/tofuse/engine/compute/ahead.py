@@ -44,20 +44,25 @@ DTYPES = {
 
 
 @contextmanager
-def compiling_in_background() -> Iterator[None]:
-    """Compile kernels in other processes during the block, unless they are in the cache.
+def compiling_in_background() -> Iterator[bool]:
+    """Compile kernels in other processes during the block, unless they have been compiled.
 
     The processes are terminated at the end of the block. Kernels that they have not compiled are
     compiled when called.
+
+    Yields
+    ------
+    Whether kernels have to be compiled.
     """
+    if _are_compiled():
+        yield False
+        return
     with ExitStack() as stack:
-        helpers = list(_start_helpers())
-        if helpers:
-            stack.enter_context(rare_garbage_collection())
-        for helper in helpers:
+        stack.enter_context(rare_garbage_collection())
+        for helper in _start_helpers():
             stack.callback(helper.wait)
             stack.callback(helper.terminate)
-        yield
+        yield True
 
 
 @contextmanager
@@ -71,9 +76,16 @@ def rare_garbage_collection() -> Iterator[None]:
         gc.set_threshold(*thresholds)
 
 
-def _start_helpers() -> Iterator[subprocess.Popen[bytes]]:
+def _are_compiled() -> bool:
+    """Whether the listed kernels are in the package or in the cache."""
+    if jit.shipped_kernels():
+        return True
     marker = compiled_marker()
-    if marker is None or marker.exists():
+    return marker is not None and marker.exists()
+
+
+def _start_helpers() -> Iterator[subprocess.Popen[bytes]]:
+    if jit.cache_folder() is None:
         return
     count = min(usable_cores() // 2, _MAX_HELPERS)
     for k in range(count):
@@ -89,28 +101,41 @@ def _start_helpers() -> Iterator[subprocess.Popen[bytes]]:
             return
 
 
-def signatures() -> list[tuple[str, tuple[Any, ...]]]:
-    """Return the kernels that runs call and their argument types, in the order of first use."""
+def signatures(all_commands: bool = False) -> list[tuple[str, tuple[Any, ...]]]:
+    """Return the kernels that runs call and their argument types, in the order of first use.
+
+    Parameters
+    ----------
+    all_commands
+        Whether those that only other commands, methods and recordings call follow.
+    """
     kernels = []
-    for line in _LIST.read_text(encoding="ascii").splitlines():
+    usual, _, others = _LIST.read_text(encoding="ascii").partition("\n\n")
+    listed = f"{usual}\n{others}" if all_commands else usual
+    for line in listed.splitlines():
         name, *types = line.split()
         kernels.append((name, tuple(_type_of(text) for text in types)))
     return kernels
 
 
 def compile_listed(helper: int = 0, helpers: int = 1) -> None:
-    """Compile all of `signatures` in reverse order, or load them from the cache.
+    """Compile `signatures` in reverse order, or load them from the cache.
 
     Each of several `helpers` starts at a different position in the list, and wraps around at its
     end.
     """
     listed = signatures()[::-1]
     first = len(listed) * helper // helpers
-    for name, types in listed[first:] + listed[:first]:
-        module, function = name.rsplit(".", 1)
-        getattr(import_module(f"tofuse.{module}"), function).compile(types)
+    compile_all(listed[first:] + listed[:first])
     if marker := compiled_marker():
         marker.touch()
+
+
+def compile_all(listed: list[tuple[str, tuple[Any, ...]]]) -> None:
+    """Compile kernels for their argument types, or load them from the cache."""
+    for name, types in listed:
+        module, function = name.rsplit(".", 1)
+        getattr(import_module(f"tofuse.{module}"), function).compile(types)
 
 
 def compiled_marker() -> Path | None:

@@ -45,11 +45,24 @@ def cache_folder() -> Path | None:
     return kernel_cache.trusted_folder(f"kernels-{source_hash()}")
 
 
+@cache
+def shipped_kernels() -> tuple[Path, kernel_cache.Processor] | None:
+    """Return the folder of the kernels in the installed package, and the processor they are for.
+
+    None if there are none, or if they are of other sources or versions, or for other processors.
+    """
+    folder = Path(__file__).with_name("compiled") / f"kernels-{source_hash()}"
+    processor = kernel_cache.shipped_processor()
+    if processor is None or not folder.is_dir() or not kernel_cache.runs_here(processor):
+        return None
+    return folder, processor
+
+
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function over arrays: nogil, cached, with reproducible IEEE arithmetic."""
     njit: Any = numba.njit  # its type hints lack an option
     # Kernels are not called from C, and the wrapper for it takes time to compile.
     compiled = njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
-    compiled._cache = kernel_cache.KernelCache(function, cache_folder())
+    compiled._cache = kernel_cache.KernelCache(function, cache_folder, shipped_kernels())
     result: Callable[P, R] = compiled
     return result

@@ -2,7 +2,8 @@
 
 One file holds one kernel compiled for one tuple of argument types, behind a digest of its bytes:
 whatever can't be read is a miss, and is compiled and written again. Compiled code is only loaded
-from a folder that no other user can have written to.
+from a folder that no other user can have written to, or that is part of the installed package:
+wheels contain kernels that run on any processor of the last ten years.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import contextlib
 import hashlib
 import os
 import pickle
+import platform
 import stat
 import sys
 import tempfile
@@ -18,8 +20,9 @@ import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from llvmlite import binding
 from numba.core import serialize
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
@@ -29,6 +32,35 @@ from tofuse.engine.errors import KernelCacheWarning
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
+class Processor(NamedTuple):
+    """What compiled code is for: a processor and its features, in LLVM's names."""
+
+    name: str
+    features: str
+
+
+# Processors that the kernels in wheels are for, by the family that `platform.machine` names. Those
+# of arm64 need no features beyond the family's.
+_SHIPPED = {
+    "x86_64": Processor("x86-64-v3", "+avx,+avx2,+bmi,+bmi2,+f16c,+fma,+lzcnt,+movbe,+popcnt"),
+    "aarch64": Processor("generic", ""),
+    "arm64": Processor("apple-m1", ""),
+}
+
+
+def shipped_processor() -> Processor | None:
+    """Return the processor that kernels in wheels for this system are for, if there are any."""
+    return _SHIPPED.get(platform.machine().lower().replace("amd64", "x86_64"))
+
+
+def runs_here(processor: Processor) -> bool:
+    """Whether the processor of this machine has the features of another one."""
+    if not processor.features:
+        return True
+    present = binding.get_host_cpu_features()
+    return all(present.get(feature.lstrip("+")) for feature in processor.features.split(","))
+
+
 class KernelCache(NullCache):
     """Compiled variants of one kernel in a folder, as Numba's dispatchers ask for them.
 
@@ -36,43 +68,41 @@ class KernelCache(NullCache):
     ----------
     function
         The kernel.
-    folder
-        Where its files are; None: nothing is kept.
+    own_folder
+        Returns where files are kept; None: nothing is kept.
+    shipped
+        A folder of the package with more files, and the processor that they are for.
     """
 
-    def __init__(self, function: Callable[..., Any], folder: Path | None) -> None:
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        own_folder: Callable[[], Path | None],
+        shipped: tuple[Path, Processor] | None = None,
+    ) -> None:
         self._name = f"{function.__module__}.{function.__qualname__}"
-        self._folder = folder
-
-    @property
-    def cache_path(self) -> str | None:
-        """The folder, if there is one."""
-        return None if self._folder is None else str(self._folder)
+        self._own_folder = own_folder
+        self._shipped = shipped
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the kernel compiled for argument types; None if it must be compiled."""
-        if self._folder is None:
-            return None
         target_context.refresh()
-        path = self._path(sig, target_context.codegen())
-        try:
-            content = path.read_bytes()
-        except OSError:
+        if self._shipped is not None:
+            folder, processor = self._shipped
+            compiled = _load(folder / self._file(sig, processor), target_context)
+            if compiled is not None:
+                return compiled
+        own = self._own_folder()
+        if own is None:
             return None
-        digest, compiled = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-        if digest != hashlib.sha256(compiled).digest():
-            return None  # saving replaces the file
-        try:
-            rebuild: Any = CompileResult._rebuild
-            return rebuild(target_context, *pickle.loads(compiled))
-        except Exception:  # whatever a file of another version may raise
-            return None
+        return _load(own / self._file(sig, _target(target_context.codegen())), target_context)
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep the kernel compiled for argument types; if that fails, there is a warning."""
-        if self._folder is None:
+        folder = self._own_folder()
+        if folder is None:
             return
-        path = self._path(sig, data.codegen)
+        path = folder / self._file(sig, _target(data.codegen))
         dump: Any = serialize.dumps
         compiled = dump(data._reduce())
         temporary = path.with_suffix(f".{os.getpid()}")
@@ -83,12 +113,33 @@ class KernelCache(NullCache):
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
             if not path.exists():  # on Windows a file that another process reads can't be replaced
-                _warn(f"{self._folder}: can't be written ({error.strerror or error})")
+                _warn(f"{folder}: can't be written ({error.strerror or error})")
 
-    def _path(self, sig: Any, codegen: Any) -> Path:
-        assert self._folder is not None
-        key = hashlib.sha256(f"{self._name} {sig} {codegen.magic_tuple()}".encode())
-        return self._folder / f"{self._name.removeprefix('tofuse.')}-{key.hexdigest()[:16]}.kernel"
+    def _file(self, sig: Any, processor: Processor) -> str:
+        key = hashlib.sha256(f"{self._name} {sig} {sys.platform} {tuple(processor)}".encode())
+        return f"{self._name.removeprefix('tofuse.')}-{key.hexdigest()[:16]}.kernel"
+
+
+def _target(codegen: Any) -> Processor:
+    """Return what this process compiles for: this processor, unless Numba was told otherwise."""
+    _, name, features = codegen.magic_tuple()
+    return Processor(name, features)
+
+
+def _load(path: Path, target_context: Any) -> Any:
+    """Return the kernel in a file; None if it can't be read."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    digest, compiled = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    if digest != hashlib.sha256(compiled).digest():
+        return None  # saving replaces the file
+    try:
+        rebuild: Any = CompileResult._rebuild
+        return rebuild(target_context, *pickle.loads(compiled))
+    except Exception:  # whatever a file of another version may raise
+        return None
 
 
 @cache

@@ -28,7 +28,8 @@ def number_keys(keys: Int64, number: Int64) -> Int64:
                 table = np.full(size, EMPTY, np.int64)
                 numbers = np.empty(size, np.int64)
                 larger = np.empty(size // 2, np.int64)
-                larger[:count] = first[:count]
+                for n in range(count):
+                    larger[n] = first[n]
                 first = larger
                 for n in range(count):
                     slot = slot_of(table, keys[first[n]])

@@ -551,7 +551,8 @@ def integrate(
     # Half a pixel, doubled as pixels of a lens with distortion differ in size.
     margin = max(cells.shape[2] / columns, cells.shape[1] / rows)
     coarse_frame = lookup_frame.copy()
-    coarse_frame[2:] /= 4
+    coarse_frame[2] /= 4
+    coarse_frame[3] /= 4
     # Frustum of the lookup.
     x0 = lookup_frame[0]
     y0 = lookup_frame[1]

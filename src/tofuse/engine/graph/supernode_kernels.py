@@ -81,10 +81,12 @@ def fill_in(start: Int64, rows: Int64) -> tuple[Int64, Int64]:
         below = np.sort(column_rows[:count])
         if out_start[k] + count + 1 > len(out):
             larger = np.empty(2 * len(out) + count + 1, np.int64)
-            larger[: out_start[k]] = out[: out_start[k]]
+            for index in range(out_start[k]):
+                larger[index] = out[index]
             out = larger
         out[out_start[k]] = k
-        out[out_start[k] + 1 : out_start[k] + 1 + count] = below
+        for index in range(count):
+            out[out_start[k] + 1 + index] = below[index]
         out_start[k + 1] = out_start[k] + count + 1
         if count:
             parent = below[0]
@@ -212,6 +214,21 @@ def _invert_triangle(L: Float64, out: Float64) -> None:
 
 
 @kernel
+def _copy(target: Float64, source: Float64) -> None:
+    """Copy a matrix. The assignment to a slice takes the compiler a hundred times as long."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@kernel
+def _subtract(target: Float64, source: Float64) -> None:
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] -= source[i, j]
+
+
+@kernel
 def _max_panel_shape(panels: Panels) -> tuple[int, int]:
     """Return the largest numbers of scalar rows and of scalar columns of a panel."""
     height = width = 1
@@ -292,7 +309,7 @@ def factorise(panels: Panels, values: Float64, signs: Float64) -> bool:
             row_count = (m - w) * k
             U = product[: row_count * w * k].reshape(row_count, w * k)
             np.dot(P[w * k :], Li.T, U)
-            P[w * k :] = U
+            _copy(P[w * k :], U)
             next_row[s] = w
             t = supernode[panel_rows[w]]
             next_pending[s] = first_pending[t]
@@ -389,19 +406,19 @@ def invert(panels: Panels, values: Float64) -> None:
                             G[(r - a) * k + x, (c - a) * k + y] = T[index * k + x, column + y]
             U = product[: row_count * wk].reshape(row_count, wk)
             np.dot(G, M[a * k : b * k], U)
-            Z[a * k :] -= U
+            _subtract(Z[a * k :], U)
             if b < m - w:
                 V = product[: columns * wk].reshape(columns, wk)
                 np.dot(G[columns:].T, M[b * k :], V)
-                Z[a * k : b * k] -= V
+                _subtract(Z[a * k : b * k], V)
             a = b
         panel_square = square[: wk * wk].reshape(wk, wk)
         np.dot(Li.T, Li, panel_square)
-        P[:wk] = panel_square
+        _copy(P[:wk], panel_square)
         if below:
             np.dot(M.T, Z, panel_square)
-            P[:wk] -= panel_square
-            P[wk:] = Z
+            _subtract(P[:wk], panel_square)
+            _copy(P[wk:], Z)
         for r in range(wk):
             for c in range(r):
                 mean = 0.5 * (P[r, c] + P[c, r])

@@ -443,7 +443,9 @@ def refine_poses(
                 and reach == reaches[-1]
             ):
                 break
-        poses[c] = T
+        for i in range(4):
+            for j in range(4):
+                poses[c, i, j] = T[i, j]
 
 
 @kernel

@@ -185,8 +185,10 @@ def accumulate(points: Float32, target: TargetImage, T: Float64, residuals: Resi
             low, high = sums[q, :width], sums[q, width:]
             for k in range(width):
                 low[k] += high[k]
-    out[:PROJECTED] = sums[:PROJECTED, 0]
-    out[INLIERS : INLIERS + _STATS] = sums[PROJECTED:, 0]
+    for q in range(PROJECTED):
+        out[q] = sums[q, 0]
+    for q in range(_STATS):
+        out[INLIERS + q] = sums[PROJECTED + q, 0]
     return out
 
 

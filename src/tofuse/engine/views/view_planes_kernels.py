@@ -255,7 +255,8 @@ def _add_row(w: Float32, rays: Float32, weight: Float32, above: Float64, below: 
     Both are (W + 1, _SUMS). Pixels with weight 0 are ignored, whatever their values.
     """
     t = np.zeros(_SUMS)
-    below[0] = above[0]
+    for q in range(_SUMS):
+        below[0, q] = above[0, q]
     for j in range(len(w)):
         g = np.float64(weight[j])
         if g > 0:
