@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import accumulate, pairwise, product
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from tofuse.apps.inspection.planar import Distortion, Region, fit_distortion, regions_of
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
+from tofuse.engine.compute import run_all
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames import Frame, RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
@@ -95,25 +96,24 @@ class Sample:
     @cached_property
     def views(self) -> dict[int, PreparedView]:
         """Prepared views of the range images, by position in `frames`."""
-        return {
-            k: prepare_view(f, _VIEW)
-            for k, f in enumerate(self.frames)
-            if isinstance(f, RangeFrame) and f.valid.any()
+        images = {
+            k: f for k, f in enumerate(self.frames) if isinstance(f, RangeFrame) and f.valid.any()
         }
+        prepared = run_all([partial(prepare_view, image, _VIEW) for image in images.values()])
+        return dict(zip(images, prepared, strict=True))
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
         """The aligned pairs of consecutive frames."""
         views = self.views
-        return tuple(
-            Pair.of(views[i], views[j]) for i, j in self.steps if i in views and j in views
-        )
+        steps = [(i, j) for i, j in self.steps if i in views and j in views]
+        return tuple(run_all([partial(Pair.of, views[i], views[j]) for i, j in steps]))
 
     @cached_property
     def distant_pairs(self) -> tuple[Pair, ...]:
         """The first view aligned with each other one."""
         first, *others = self.views.values()
-        return tuple(Pair.of(first, other) for other in others)
+        return tuple(run_all([partial(Pair.of, first, other) for other in others]))
 
     @cached_property
     def regions(self) -> tuple[Region, ...]:

@@ -19,14 +19,16 @@ unlike the cosine it is nearly free of noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import stdtrit
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
+from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.mapping.trial import pooled
 from tofuse.engine.search import pair_agreement, verification
@@ -113,7 +115,9 @@ def estimate_falloff(
     """
     views = _FalloffViews(recording, prepare, options)
     slopes: list[_Slope] = []
-    for start in np.unique(np.linspace(0, len(recording) - 1, _PAIRS + 1)[:-1].astype(int)):
+    starts = np.unique(np.linspace(0, len(recording) - 1, _PAIRS + 1)[:-1].astype(int))
+    views.load([k for start in starts.tolist() for k in (start, start + _STRIDE)])
+    for start in starts:
         # The initial exponent is the median so far: nearly compensated amplitude hardly biases.
         initial = float(np.median([s.exponent for s in slopes])) if slopes else 0.0
         slope = _slope_from(views, int(start), initial, law)
@@ -142,12 +146,27 @@ class _FalloffViews:
 
     def __init__(self, recording: Recording, prepare: Prepare, options: SurfaceOptions) -> None:
         self._recording, self._prepare, self._options = recording, prepare, options
+        self._views: dict[int, PreparedView | None] = {}
 
     def get(self, k: int) -> PreparedView | None:
         """Return the k-th view; None if there is none, or it has no amplitude."""
+        self.load([k])
+        return self._views[k]
+
+    def load(self, positions: Sequence[int]) -> None:
+        """Prepare views in parallel; corrections may depend on the frames before."""
+        missing = [k for k in positions if k not in self._views]
+        frames = [self._corrected(k) for k in missing]
+        views = run_all([partial(self._prepared, frame) for frame in frames])
+        self._views.update(zip(missing, views, strict=True))
+
+    def _corrected(self, k: int) -> RangeFrame | None:
         image = self._recording.image(k) if k < len(self._recording) else None
         frame = None if image is None else self._prepare(image)
-        if not isinstance(frame, RangeFrame) or not len(frame):
+        return frame if isinstance(frame, RangeFrame) and len(frame) else None
+
+    def _prepared(self, frame: RangeFrame | None) -> PreparedView | None:
+        if frame is None:
             return None
         view = prepare_view(frame, self._options)
         return view if view.has_albedo else None

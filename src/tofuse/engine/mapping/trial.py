@@ -16,13 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.special import stdtrit
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float32, Float64, Intp
+from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import robust_sigma
@@ -234,22 +235,31 @@ class _AlignedViews:
         self._steps: dict[tuple[int, int], projective.Aligned | None] = {}
 
     def _view(self, k: int) -> _TrialView | None:
-        if k not in self._views:
-            self._views[k] = self._prepared(k)
+        self._load([k])
         return self._views[k]
 
-    def _prepared(self, k: int) -> _TrialView | None:
+    def _load(self, positions: Sequence[int]) -> None:
+        """Prepare views in parallel; corrections may depend on the frames before."""
+        missing = [k for k in positions if k not in self._views]
+        frames = [self._corrected_pair(k) for k in missing]
+        views = run_all(
+            [partial(_TrialView.of, *both) if both else lambda: None for both in frames]
+        )
+        self._views.update(zip(missing, views, strict=True))
+
+    def _corrected_pair(self, k: int) -> tuple[RangeFrame, RangeFrame] | None:
         frame = self._recording.image(k) if k < len(self._recording) else None
         if frame is None:
             return None
         uncorrected, corrected = self._uncorrected(frame), self._corrected(frame)
         if not (isinstance(uncorrected, RangeFrame) and isinstance(corrected, RangeFrame)):
             return None
-        return _TrialView.of(uncorrected, corrected) if len(uncorrected) else None
+        return (uncorrected, corrected) if len(uncorrected) else None
 
     def _step(self, i: int, j: int) -> projective.Aligned | None:
         """Align view j to view i; None if they do not fit."""
         if (i, j) not in self._steps:
+            self._load([i, j])
             target, source = self._view(i), self._view(j)
             aligned = None
             if target is not None and source is not None:
@@ -284,11 +294,13 @@ class _AlignedViews:
 
     def run(self, start: int, stride: int) -> tuple[list[_TrialView], Float64]:
         """Return aligned views from `start` on, and their poses (N, 4, 4) relative to the first."""
+        positions = range(start, start + (_VIEWS - 1) * stride, stride)
+        self._load([*positions, positions[-1] + stride])
         first = self._view(start)
         if first is None:
             return [], np.zeros((0, 4, 4))
         views, poses = [first], [np.eye(4)]
-        for k in range(start, start + (_VIEWS - 1) * stride, stride):
+        for k in positions:
             step, view = self._step(k, k + stride), self._view(k + stride)
             if step is None or view is None:
                 break
