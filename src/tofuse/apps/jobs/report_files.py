@@ -23,6 +23,11 @@ _DRAWN_CLOUDS = 12  # views in the report, if they are clouds
 _TRUTH_POINTS = 100_000
 
 
+def load_report() -> None:
+    """Import what a report needs, which takes a second, while something else is computed."""
+    import tofuse.apps.report.sections  # noqa: F401
+
+
 def write_report_files(
     recording: Recording, config: Config, result: Reconstruction, folder: Path
 ) -> None:

@@ -26,7 +26,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy  # loads its parts when they are used
 from scipy.special import fdtri, gammaincinv
 
 from tofuse.engine.alignment import covariance, projective
@@ -300,7 +300,8 @@ class _Corrections:
             low -= _BRACKET_STEP
         while excess(high) > 0:
             high += _BRACKET_STEP
-        return x - self._remainder(x, float(np.exp(brentq(excess, low, high, xtol=1e-3))))
+        log_m = scipy.optimize.brentq(excess, low, high, xtol=1e-3)
+        return x - self._remainder(x, float(np.exp(log_m)))
 
     def _remainder(self, x: Float64, m: float) -> Float64:
         """Return (M + m S^-1)^-1 M x."""

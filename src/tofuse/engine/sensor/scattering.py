@@ -20,7 +20,7 @@ from typing import Annotated, ClassVar
 
 import cv2
 import numpy as np
-from scipy.optimize import nnls
+import scipy  # loads its parts when they are used
 
 from tofuse.engine.arrays import Bool, Complex128, Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
@@ -164,7 +164,7 @@ def estimate_fractions(
     if not np.diag(H).all():
         return zero
     scale = 1 / np.sqrt(np.diag(H))
-    fractions = nnls(H * np.outer(scale, scale), g * scale)[0] * scale
+    fractions = scipy.optimize.nnls(H * np.outer(scale, scale), g * scale)[0] * scale
     explained = float(2 * (fractions * g).sum() - fractions @ H @ fractions)
     noise = float(np.einsum("n,n->", b, b)) - explained
     if not explained * len(b) > _MIN_CHI2 * noise or fractions.sum() > _MAX_FRACTION:

@@ -20,8 +20,8 @@ from functools import partial
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
+import scipy  # loads its parts when they are used
 from numpy.typing import NDArray
-from scipy.ndimage import label, uniform_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -232,8 +232,8 @@ def _albedo_cost(
 ) -> Float32:
     """Return the cost (h, w, K) of each wrap count by the albedo that it implies."""
     phase = 2 * np.pi * blocks.range_m.astype(float) / period
-    real = uniform_filter(np.where(blocks.valid, np.cos(phase), 0), _WINDOW)
-    imaginary = uniform_filter(np.where(blocks.valid, np.sin(phase), 0), _WINDOW)
+    real = scipy.ndimage.uniform_filter(np.where(blocks.valid, np.cos(phase), 0), _WINDOW)
+    imaginary = scipy.ndimage.uniform_filter(np.where(blocks.valid, np.sin(phase), 0), _WINDOW)
     slope = _slope(_range_of(real, imaginary, period), period) / pitch
     cost = np.empty((*blocks.range_m.shape, options.periods + 1), np.float32)
     for k in range(options.periods + 1):
@@ -337,7 +337,7 @@ def _shift_surfaces(
 def _reset_isolated(blocks: _Blocks, best: Intp, period: float, options: UnwrapOptions) -> Intp:
     """Reset wrapped components that continue no unwrapped surface across the period."""
     wrapped = (best > 0) & blocks.valid
-    components, count = label(wrapped)
+    components, count = scipy.ndimage.label(wrapped)
     boundary = np.zeros(count + 1)
     entries = np.zeros(count + 1)
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
