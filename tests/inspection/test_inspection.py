@@ -264,6 +264,15 @@ def test_faults_are_detected(code, few, turn) -> None:
     assert str(named) in found.warnings
 
 
+@pytest.mark.nightly_part
+def test_amplitude_that_does_not_change_is_detected(turn) -> None:
+    held = [replace(f, amplitude_image=turn[0].amplitude_image) for f in turn]
+    (found,) = [f for f in tofuse.inspect(of(held), quick=True).findings if f.code == "delayed"]
+    assert "same image" in found.text
+    uniform = [replace(f, amplitude_image=np.full_like(f.amplitude_image, 100)) for f in turn]
+    assert "delayed" not in codes(uniform)
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize("factor", [0.8, 1.25])
 def test_wrong_focal_length_is_estimated_from_range(factor) -> None:

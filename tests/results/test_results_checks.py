@@ -18,6 +18,7 @@ from tofuse.engine.quality.pose_accuracy import Accuracy, ObservedErrors, accura
 from tofuse.engine.refinement.calibration_check import CalibrationCheck
 from tofuse.engine.refinement.loop_drift import Gap
 from tofuse.engine.refinement.refinement import Refinement
+from tofuse.engine.results import checks
 from tofuse.engine.results.checks import Evidence, judge
 from tofuse.engine.results.types import Component, FrameRecord, Reason
 from tofuse.engine.results.verdicts import ADVICE, REASONS, ranked, verdict_of
@@ -239,6 +240,15 @@ def test_each_reason_comes_from_its_own_evidence(code) -> None:
     # No other reasons, except those that follow from it.
     follows = {"few_poses": {"lost_frames"}, "open_motion": {"moving_objects"}}
     assert {r.code for r in reasons} - {code} <= follows.get(code, set())
+
+
+def test_frozen_images_are_told_from_single_repetitions() -> None:
+    assert checks.frozen(((3, 3), (6, 8)))
+    assert not checks.frozen(((3, 3), (5, 5)))
+    (reason,) = judge(evidence(repeated=(4, 5)))[1]
+    assert "no bound is stated" in reason.text
+    (reason,) = judge(evidence(repeated=(4,)))[1]
+    assert "no bound is stated" not in reason.text
 
 
 def test_loop_error_within_expected_drift_is_no_gap() -> None:

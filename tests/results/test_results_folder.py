@@ -117,6 +117,24 @@ def interrupted(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not out.exists()
 
 
+def test_signal_between_the_moves_leaves_the_new_result(tmp_path, monkeypatch) -> None:
+    out = tmp_path / "out"
+    write_result(result(seed=1), OutputFolder(out))
+    folder, move, signals = OutputFolder(out, overwrite=True), staging._move_into_place, [True]
+
+    def interrupted_once(*paths) -> None:
+        if signals:
+            signals.clear()
+            raise KeyboardInterrupt
+        move(*paths)
+
+    monkeypatch.setattr(staging, "_move_into_place", interrupted_once)
+    with pytest.raises(KeyboardInterrupt):
+        write_result(result(seed=2), folder)
+    assert read_run_json(out / "run.json")["seed"] == 2
+    assert list(tmp_path.iterdir()) == [out]
+
+
 @pytest.mark.parametrize("meanwhile", ["nothing", "an empty folder"])
 @pytest.mark.parametrize("by", ["a reader", "a run"])
 def test_interrupted_replacement_is_finished(tmp_path, monkeypatch, by, meanwhile) -> None:

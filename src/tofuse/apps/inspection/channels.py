@@ -106,6 +106,16 @@ def check_color(sample: Sample) -> Iterator[Finding]:
 
 def check_delay(sample: Sample) -> Iterator[Finding]:
     """Check that amplitude and depth are of the same time: the later one lies behind in motion."""
+    held = sum(_is_held(*images) for images in sample.consecutive_images)
+    if held >= max(2, len(sample.steps) / 2):
+        yield Finding(
+            "delayed",
+            f"Amplitude stays the same image, while depth changes, in {held} of "
+            f"{len(sample.steps)} pairs of consecutive frames.",
+            "Record again, or remove the amplitude.",
+            {"held": held, "pairs": len(sample.steps)},
+        )
+        return
     shifts, motions = [], []
     for pair in sample.pairs:
         indices = pair.first.index, pair.second.index
@@ -136,6 +146,14 @@ def check_delay(sample: Sample) -> Iterator[Finding]:
             "Pair the images by their time stamps, and switch off filters over time in the camera.",
             {"delay_frames": delay},
         )
+
+
+def _is_held(first: RangeFrame, second: RangeFrame) -> bool:
+    """Whether amplitude, other than a uniform one, is the same in two frames of different depth."""
+    a, b = first.amplitude_image, second.amplitude_image
+    if a is None or b is None or np.ptp(a) == 0:
+        return False
+    return np.array_equal(a, b) and not np.array_equal(first.depth, second.depth)
 
 
 def _image_motion(frame: RangeFrame, T_first_second: Float64) -> Float64:

@@ -93,6 +93,14 @@ class Sample:
         """The range images with valid pixels."""
         return tuple(f for f in self.frames if isinstance(f, RangeFrame) and f.valid.any())
 
+    @property
+    def consecutive_images(self) -> tuple[tuple[RangeFrame, RangeFrame], ...]:
+        """The pairs of consecutive frames that are images."""
+        pairs = [(self.frames[i], self.frames[j]) for i, j in self.steps]
+        return tuple(
+            (a, b) for a, b in pairs if isinstance(a, RangeFrame) and isinstance(b, RangeFrame)
+        )
+
     @cached_property
     def views(self) -> dict[int, PreparedView]:
         """Prepared views of the range images, by position in `frames`."""

@@ -9,7 +9,6 @@ import numpy as np
 from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.sample import Sample, part_starts
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames import RangeFrame
 
 # Relative tolerance of regular intervals; with a smaller fraction of regular ones the camera was
 # triggered manually, and gaps are meaningless.
@@ -105,12 +104,9 @@ def _is_regular(forward: Float64, interval: float) -> bool:
 
 def check_repeats(sample: Sample) -> Iterator[Finding]:
     """Check for consecutive images that are identical."""
-    repeated = compared = 0
-    for i, j in sample.steps:
-        a, b = sample.frames[i], sample.frames[j]
-        if isinstance(a, RangeFrame) and isinstance(b, RangeFrame):
-            compared += 1
-            repeated += bool(a.valid.any()) and np.array_equal(a.depth, b.depth)
+    pairs = sample.consecutive_images
+    compared = len(pairs)
+    repeated = sum(bool(a.valid.any()) and np.array_equal(a.depth, b.depth) for a, b in pairs)
     if repeated:
         yield Finding(
             "frames_repeated",

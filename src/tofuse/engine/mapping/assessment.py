@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.frames import RangeFrame
+from tofuse.engine.frames import RangeFrame, frame_ranges
 from tofuse.engine.fusion import Model, with_pose_errors
 from tofuse.engine.graph import LoopRecord, PoseGraph, external_sensors, graph_covariances
 from tofuse.engine.loops import PriorLoop, cut_edges
@@ -103,7 +103,9 @@ class Assessment:
             (e.record.index, e.moving_fraction) for e in self.tracked.posed if e.moving_fraction > 0
         )
         ambiguous = self._ambiguous(graph)
-        if ambiguous or checks.open_motion(moving):
+        indices = [e.record.index for e in self.log.entries]
+        repeated = frame_ranges.runs_of(indices, self.log.repeated)
+        if ambiguous or checks.open_motion(moving) or checks.frozen(repeated):
             accuracy = accuracy.without_bound()
         if observations.has_covariances:
             model = self._with_pose_errors(model, graph, covariances)

@@ -283,6 +283,8 @@ def _motion(e: Evidence) -> Iterator[Reason]:
         subject = "1 image repeats" if n == 1 else f"{n} images repeat"
         where = frame_ranges.in_words(repeated)
         text = f"{subject} the one before ({where}): nothing new was measured."
+        if frozen(repeated):
+            text += " Where the camera went meanwhile is unknown, so no bound is stated."
         yield Reason("repeated_images", repeated, text)
     T = e.optimisation.graph.poses
     moved = se3.inverse(T[:1]) @ T
@@ -420,6 +422,11 @@ def _scene(e: Evidence) -> Iterator[Reason]:
 def open_motion(moving: Sequence[tuple[int, float]]) -> set[int]:
     """Return the frames in which what moves, (frame index, fraction of the image), is too much."""
     return {frame for frame, fraction in moving if fraction > MAX_MOVING}
+
+
+def frozen(repeated: Sequence[frame_ranges.Range]) -> bool:
+    """Whether an image was repeated more than once: `repeated` are ranges of such frames."""
+    return any(last > first for first, last in repeated)
 
 
 def _drift(e: Evidence) -> Iterator[Reason]:

@@ -182,6 +182,9 @@ def replace_folder(new: Path, path: Path, kept: str | None = None) -> None:
             os.replace(new / kept, old / kept)
         os.replace(old, path)
         raise
+    except BaseException:  # a signal: the new content is complete
+        finish_replacing(path, kept)
+        raise
     with suppress(OSError):  # the next replacement removes it
         _remove(old)
 
