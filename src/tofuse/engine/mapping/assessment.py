@@ -19,9 +19,9 @@ from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph
 from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.parts import name_of
 from tofuse.engine.quality import (
+    ambiguous_frames,
     cross_view_agreement,
     pose_accuracy,
-    rival_steps,
     trajectory_errors,
 )
 from tofuse.engine.refinement import Refinement, calibration_check
@@ -270,7 +270,7 @@ class Assessment:
             return ()
         poses = dict(zip(graph.ids.tolist(), graph.poses, strict=True))
         moments = [FrameTime(e.record.index, e.record.timestamp) for e in posed]
-        return rival_steps.ambiguous_frames(self.observations.views.of(poses), poses, moments)
+        return ambiguous_frames(self.observations.views.of(poses), poses, moments)
 
     def _checked_images(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
         """Return the images for the final comparison, and their positions in the graph."""
