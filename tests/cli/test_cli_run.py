@@ -36,7 +36,7 @@ session_pairs changes T_up_world rig shift_m sha256
 """
 FRAME_KEYS = """
 index timestamp status reason valid_share inlier_share rms_m covariance unobservable
-component session
+component session mean_depth_m
 """
 LOOP_KEYS = """
 i j accepted reason overlap rms_m free_space_violation margin

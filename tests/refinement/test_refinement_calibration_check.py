@@ -17,7 +17,13 @@ from tofuse.engine.refinement.calibration_check import (
     significance_of,
 )
 from tofuse.engine.refinement.camera_response import response
-from tofuse.engine.refinement.joint_alignment import Priors, Refined, refine
+from tofuse.engine.refinement.joint_alignment import (
+    Priors,
+    Refined,
+    align_views,
+    mean_support,
+    refine,
+)
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, longest_loop
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views.pair_equations import Round
@@ -107,6 +113,20 @@ def test_estimate_converges_in_errors_too() -> None:
         views, refined.poses, options, calibrate=[kernels.OFFSET], pairs=refined.pairs
     )
     assert found.errors["offset"] == pytest.approx(converged.errors[kernels.OFFSET], abs=1e-4)
+
+
+def test_support_of_an_estimate_is_that_of_the_joint_alignment() -> None:
+    views, refined = kept(0.06)
+    options = replace(OPTIONS, rounds=(Round(2, 0.0, 0.0),), shared=0.0)
+    known = {"calibrate": [kernels.OFFSET], "pairs": refined.pairs}
+    joint = refine(views, refined.poses, options, **known)
+    aligned = align_views(views, refined.poses, options, **known)
+    expected = [float(s.of_views(len(views)).mean()) for s in (joint.before, joint.after)]
+    before, after = mean_support(views, aligned, refined.poses, options)
+    # By the same kernel: that for known errors is exact to first order only.
+    assert after == pytest.approx(expected[1], rel=1e-9)
+    assert before == pytest.approx(expected[0], abs=1e-3)
+    assert after > before
 
 
 def test_few_views_need_larger_error() -> None:

@@ -312,7 +312,8 @@ def support_of(
     """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
     state = pair_equations.directed_pairs(views, refined.pairs, options)
     state.exposure, state.scale_g, state.scale_p = refined.scales.T.copy()
-    return _support_with(views, poses, refined.errors, state, options)
+    fixed_errors = (refined.errors == 0).astype(np.int64)
+    return _support(views, poses, refined.errors, fixed_errors, state, options.rounds[-1], options)
 
 
 def mean_support(
@@ -325,24 +326,14 @@ def mean_support(
 
     Both with the sigmas of the aligned views.
     """
+    fixed_errors, state, stage = aligned.fixed_errors, aligned.state, options.rounds[-1]
     candidates = (start, np.zeros_like(aligned.errors)), (aligned.poses, aligned.errors)
     before, after = (
-        _support_with(views, poses, errors, aligned.state, options) for poses, errors in candidates
+        _support(views, poses, errors, fixed_errors, state, stage, options)
+        for poses, errors in candidates
     )
     count = len(views)
     return float(before.of_views(count).mean()), float(after.of_views(count).mean())
-
-
-def _support_with(
-    views: Sequence[SampledView],
-    poses: Float64,
-    errors: Float64,
-    state: pair_equations.DirectedPairs,
-    options: pair_equations.RefineOptions,
-) -> Support:
-    """Support at given poses and errors of the camera, none of which is estimated."""
-    known = np.ones(len(errors), np.int64)
-    return _support(views, poses, errors, known, state, options.rounds[-1], options)
 
 
 def align_pairs(
