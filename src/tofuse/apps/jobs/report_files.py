@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -20,15 +19,8 @@ from tofuse.engine.parts import name_of
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.geometry import read_ply
 
-_SVG = "matplotlib.backends.backend_svg"
 _DRAWN_CLOUDS = 12  # views in the report, if they are clouds
 _TRUTH_POINTS = 100_000
-
-
-def load_report() -> None:
-    """Import what a report needs, which takes a second, while something else is computed."""
-    for name in ("tofuse.apps.report.sections", "matplotlib.figure", _SVG):
-        import_module(name)
 
 
 def write_report_files(

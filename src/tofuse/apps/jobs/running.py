@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import threading
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from tofuse._version import __version__
 from tofuse.apps.inspection import Finding, inspect_recording
 from tofuse.apps.jobs.judging import device_sentence
-from tofuse.apps.jobs.report_files import load_report, write_report_files
+from tofuse.apps.jobs.report_files import write_report_files
 from tofuse.apps.jobs.run_options import Options, check_guess, check_unwrap, resolve, seed_of
 from tofuse.apps.jobs.tracked_file import TrackedFile
 from tofuse.apps.results import folders, run_json, write_result
@@ -64,8 +63,6 @@ def run(
     watch = Stopwatch()
     with watch.timing("opening"):
         job = _open(inputs, options, progress)
-    if not options.no_report:
-        threading.Thread(target=load_report, name="tofuse-report", daemon=True).start()
     tracked_file = _tracked_file(inputs, options, job, progress) if folder is None else None
     with (
         folders.OutputFolder(options.out, overwrite=options.overwrite)
