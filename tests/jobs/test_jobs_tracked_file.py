@@ -214,3 +214,9 @@ def test_full_disk_does_not_stop_run(tmp_path: Path, monkeypatch) -> None:
     stored(tmp_path / TRACKED, notes)
     assert "no space left" in notes[0].lower()
     assert os.listdir(tmp_path) == []
+
+
+def test_folder_in_place_of_the_file_is_left(tmp_path: Path) -> None:
+    (tmp_path / "a.npz").mkdir()
+    TrackedFile(tmp_path / "a.npz", "key", print).remove()
+    assert (tmp_path / "a.npz").is_dir()

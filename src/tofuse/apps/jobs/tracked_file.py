@@ -101,8 +101,9 @@ class TrackedFile:
         error.add_note(f"the same command {effect}")
 
     def remove(self) -> None:
-        """Remove the file, if there is one."""
-        self._path.unlink(missing_ok=True)
+        """Remove the file, if there is one; a folder in its place is named when it is written."""
+        if not self._path.is_dir():
+            self._path.unlink(missing_ok=True)
 
     def _replaying(self, tracker: Tracker) -> ReplayingTracker | None:
         if not self._path.exists():
