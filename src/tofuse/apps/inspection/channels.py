@@ -116,17 +116,20 @@ def check_delay(sample: Sample) -> Iterator[Finding]:
             {"held": held, "pairs": len(sample.steps)},
         )
         return
+    images = {frame.index: frame for frame in sample.images}
+    moving = [
+        (images[view.index], pair.alignment.T_world_source)
+        for pair in sample.pairs
+        if pair.fits
+        for view in (pair.first, pair.second)
+    ]
     shifts, motions = [], []
-    for pair in sample.pairs:
-        indices = pair.first.index, pair.second.index
-        for frame in sample.images:
-            amplitude = _amplitude(frame)
-            if pair.fits and frame.index in indices and amplitude is not None:
-                edges = _edges(_log_depth(frame)), _edges(amplitude)
-                columns = edges[0].shape[1]
-                max_shift, scale = round(_MAX_DELAY_SHIFT * columns), columns / frame.camera.width
-                shifts.append(_peak(_correlations([edges], max_shift)[0]) - max_shift)
-                motions.append(scale * _image_motion(frame, pair.alignment.T_world_source))
+    for frame, T_first_second in moving:
+        for edges in _edge_pairs([frame], _amplitude):
+            columns = edges[0].shape[1]
+            max_shift, scale = round(_MAX_DELAY_SHIFT * columns), columns / frame.camera.width
+            shifts.append(_peak(_correlations([edges], max_shift)[0]) - max_shift)
+            motions.append(scale * _image_motion(frame, T_first_second))
     shift, motion = np.reshape(shifts, (-1, 2)), np.reshape(motions, (-1, 2))
     moves = np.linalg.norm(motion, axis=1) >= _MIN_MOTION_PX
     shift, motion = shift[moves], motion[moves]
