@@ -48,7 +48,7 @@ def test_camera_error_changes_gradient_as_predicted_by_hessian(
     known = KNOWN.copy()
     known[error] = 0
     wide = (0.0, 1.0, scale_p, 0.3, 50.0, 0.5)  # so wide that the robust weights are 1
-    h = 1e-4
+    h = 1e-3  # points are in single precision
     plus, minus = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS)
     plus[error], minus[error] = h, -h
     # Where both views agree, so that second derivatives, which H leaves out, don't count.

@@ -50,6 +50,9 @@ HISTOGRAM = SUPPORT + 1  # as in `alignment`
 SIZE = HISTOGRAM + residual.BINS
 
 _EPSILON = 1e-6  # m or m^2, instead of 0 in a denominator
+# Rows of a block after those of `alignment`: Jacobians with respect to the camera errors.
+_RESPONSE = residual.ROWS
+_ROWS = residual.ROWS + ERRORS
 
 # Layout of the sums of a patch: of w, w r and w J.
 PATCH_WEIGHT = 0
@@ -120,188 +123,6 @@ class PairResiduals(NamedTuple):
 
 
 @kernel
-def displacement(B: Float64, x: float, y: float, z: float, radial: bool) -> None:
-    """Write to B (ERRORS, 3) the displacements of the point (x, y, z) by camera errors of size 1.
-
-    `radial`: whether the camera measures the distance along the ray, not z.
-    """
-    lateral2 = x * x + y * y
-    r2 = lateral2 + z * z
-    r = np.sqrt(r2)
-    B[OFFSET, 0] = x / r
-    B[OFFSET, 1] = y / r
-    B[OFFSET, 2] = z / r
-    B[SCALE, 0] = x
-    B[SCALE, 1] = y
-    B[SCALE, 2] = z
-    shortening = lateral2 / r2 if radial else 0.0
-    B[FOCAL, 0] = x - shortening * x
-    B[FOCAL, 1] = y - shortening * y
-    B[FOCAL, 2] = -shortening * z
-    for p, lateral in ((CENTER_X, x), (CENTER_Y, y)):
-        shortening = lateral * z / r2 if radial else 0.0
-        B[p, 0] = -shortening * x
-        B[p, 1] = -shortening * y
-        B[p, 2] = -shortening * z
-    B[CENTER_X, 0] += z
-    B[CENTER_Y, 1] += z
-    rho2 = lateral2 / max(z * z, _EPSILON)
-    for axis in range(3):
-        B[DISTORTION, axis] = rho2 * B[FOCAL, axis]
-
-
-@kernel
-def _calibration_equations(
-    points: Float32,
-    target: residual.TargetImage,
-    T: Float64,
-    residuals: residual.Residuals,
-    camera: CameraErrors,
-    out: Float64,
-) -> None:
-    """Add the normal equations of one pair, with camera errors among the unknowns."""
-    errors, known, radial_source, radial_target = camera
-    unknowns = UNKNOWNS
-    while unknowns > 7 and known[unknowns - 8]:
-        unknowns -= 1
-    estimated = unknowns - 7
-    exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
-    image, lookup, lookup_frame = target
-    rows, columns = image.shape[0], image.shape[1]
-    J = np.zeros(UNKNOWNS)
-    Bp = np.zeros((ERRORS, 3))
-    Bq = np.zeros((ERRORS, 3))
-    A = np.zeros((UNKNOWNS, UNKNOWNS))
-    g = np.zeros(UNKNOWNS)
-    limit2 = robust * robust
-    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
-    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
-    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
-    for k in range(points.shape[0]):
-        point = points[k]
-        px = np.float64(point[residual.POINT])
-        py = np.float64(point[residual.POINT + 1])
-        pz = np.float64(point[residual.POINT + 2])
-        displacement(Bp, px, py, pz, radial_source)
-        for p in range(ERRORS):
-            px += errors[p] * Bp[p, 0]
-            py += errors[p] * Bp[p, 1]
-            pz += errors[p] * Bp[p, 2]
-        z = r20 * px + r21 * py + r22 * pz + t2
-        if z <= projection_kernels.MIN_DEPTH:
-            continue
-        x = r00 * px + r01 * py + r02 * pz + t0
-        y = r10 * px + r11 * py + r12 * pz + t1
-        # Project with the corrected intrinsics of the target.
-        xn, yn = x / z - errors[CENTER_X], y / z - errors[CENTER_Y]
-        rho2 = xn * xn + yn * yn
-        ray_scale = 1.0 + errors[FOCAL] + errors[DISTORTION] * rho2
-        xn, yn = xn / ray_scale, yn / ray_scale
-        i, j = projection_kernels.nearest_pixel(xn, yn, lookup, lookup_frame, rows, columns)
-        if i < 0:
-            continue
-        pixel = image[i, j]
-        distance = np.float64(pixel[residual.DISTANCE])
-        if distance == 0:
-            continue
-        out[COMPARED] += 1
-        out[TERMS] += 1
-        n0 = np.float64(pixel[residual.PLANE])
-        n1 = np.float64(pixel[residual.PLANE + 1])
-        n2 = np.float64(pixel[residual.PLANE + 2])
-        height = n0 * x + n1 * y + n2 * z
-        r = height - distance
-        displacement(Bq, x, y, z, radial_target)
-        for p in range(ERRORS):
-            r -= errors[p] * (n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2])
-        source_sigma = (height - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(point[residual.SIGMA])
-        raw_variance = source_sigma * source_sigma + np.float64(pixel[residual.VARIANCE])
-        variance = raw_variance * scale_g * scale_g + inflation * inflation
-        r2 = r * r
-        out[HISTOGRAM + residual.histogram_bin(r2 / raw_variance)] += 1
-        e2 = r2 / variance / limit2
-        if e2 >= 1:
-            if r < 0 and e2 > residual.FREE_SPACE:
-                out[IN_FRONT] += 1
-            continue
-        m0 = r00 * n0 + r10 * n1 + r20 * n2
-        m1 = r01 * n0 + r11 * n1 + r21 * n2
-        m2 = r02 * n0 + r12 * n1 + r22 * n2
-        s0 = np.float64(point[residual.NORMAL])
-        s1 = np.float64(point[residual.NORMAL + 1])
-        s2 = np.float64(point[residual.NORMAL + 2])
-        if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
-            continue
-        weight = tukey.weight(e2)
-        out[SUPPORT] += tukey.support(weight)
-        # Mean of both views' normals, which halves the effect of either's noise.
-        m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
-        projection_kernels.jacobian_row(J, m0, m1, m2, px, py, pz)
-        J[EXPOSURE] = 0.0
-        # The same mean for the camera errors: otherwise the difference between the normals, which
-        # the pose cannot explain, would be attributed to them.
-        n0 = r00 * m0 + r01 * m1 + r02 * m2
-        n1 = r10 * m0 + r11 * m1 + r12 * m2
-        n2 = r20 * m0 + r21 * m1 + r22 * m2
-        for p in range(estimated):
-            J[7 + p] = (m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]) - (
-                n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2]
-            )
-            if known[p]:
-                J[7 + p] = 0.0
-        _add_residual(A, g, J, r, weight / variance, unknowns)
-
-        tx = np.float64(pixel[residual.ALBEDO_SLOPE])
-        source_albedo = np.float64(point[residual.POINT_ALBEDO])
-        if scale_p <= 0 or np.isnan(tx) or np.isnan(source_albedo):
-            continue
-        ty = np.float64(pixel[residual.ALBEDO_SLOPE + 1])
-        r = np.float64(pixel[residual.ALBEDO]) + tx * xn + ty * yn - source_albedo - exposure
-        out[TERMS] += 1
-        r2 = r * r
-        e2 = r2 / (scale_p * scale_p) / limit2
-        if e2 >= 1:
-            continue
-        weight = tukey.weight(e2)
-        out[WEIGHT_P] += weight
-        out[SQUARES_P] += weight * r2
-        out[SUPPORT] += tukey.support(weight)
-        # Gradient with respect to the transformed point, rotated back into the source frame.
-        d0 = tx / (z * ray_scale)
-        d1 = ty / (z * ray_scale)
-        d2 = -(tx * xn + ty * yn) / z
-        m0 = r00 * d0 + r10 * d1 + r20 * d2
-        m1 = r01 * d0 + r11 * d1 + r21 * d2
-        m2 = r02 * d0 + r12 * d1 + r22 * d2
-        s0 = np.float64(point[residual.POINT_ALBEDO_SLOPE])
-        s1 = np.float64(point[residual.POINT_ALBEDO_SLOPE + 1])
-        s2 = np.float64(point[residual.POINT_ALBEDO_SLOPE + 2])
-        m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
-        projection_kernels.jacobian_row(J, m0, m1, m2, px, py, pz)
-        J[EXPOSURE] = -1.0
-        for p in range(estimated):
-            J[7 + p] = 0.0 if known[p] else m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]
-        # Only errors of the intrinsics affect the rays of the target's pixels.
-        d0 = r00 * m0 + r01 * m1 + r02 * m2
-        d1 = r10 * m0 + r11 * m1 + r12 * m2
-        if estimated > FOCAL and not known[FOCAL]:
-            J[7 + FOCAL] -= d0 * (x - errors[CENTER_X] * z) + d1 * (y - errors[CENTER_Y] * z)
-        if estimated > CENTER_X and not known[CENTER_X]:
-            J[7 + CENTER_X] -= d0 * z
-        if estimated > CENTER_Y and not known[CENTER_Y]:
-            J[7 + CENTER_Y] -= d1 * z
-        if estimated > DISTORTION and not known[DISTORTION]:
-            J[7 + DISTORTION] -= rho2 * z * (d0 * xn + d1 * yn)
-        _add_residual(A, g, J, r, weight / (scale_p * scale_p), unknowns)
-    q = PRODUCTS
-    for p in range(UNKNOWNS):
-        out[GRADIENT + p] = g[p]
-        for o in range(p, UNKNOWNS):
-            out[q] = A[p, o]
-            q += 1
-
-
-@kernel
 def target_equations(
     sources: SourcePoints,
     views: Int64,
@@ -332,7 +153,7 @@ def target_equations(
         (K, SIZE), is overwritten.
     sums
         (K, patches, PATCH_SIZE), is overwritten by the sums of the distances' equations over each
-        patch. With 0 patches, or if camera errors are estimated, they are not computed.
+        patch. With 0 patches they are not computed.
     """
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     out[:] = 0.0
@@ -345,15 +166,12 @@ def target_equations(
             exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine
         )
         camera = CameraErrors(errors, known, sources.measures_range[view], radial_target)
-        if known.all():
-            patches = sources.patches[begin:end]
-            _pose_equations(points, patches, target, T[k], pair, camera, out[k], sums[k])
-        else:
-            _calibration_equations(points, target, T[k], pair, camera, out[k])
+        patches = sources.patches[begin:end]
+        _pair_equations(points, patches, target, T[k], pair, camera, out[k], sums[k])
 
 
 @kernel
-def _pose_equations(
+def _pair_equations(
     points: Float32,
     patches: Int64,
     target: residual.TargetImage,
@@ -363,15 +181,18 @@ def _pose_equations(
     out: Float64,
     sums: Float64,
 ) -> None:
-    """Add those with known camera errors, vectorised in blocks as in `alignment`."""
-    errors, _, radial_source, radial_target = camera
+    """Add those of one pair, vectorised in blocks as in `alignment`."""
+    errors, known, radial_source, radial_target = camera
     has_errors = (errors != 0).any()
+    estimated = np.flatnonzero(known == 0)
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     image, lookup, lookup_frame = target
-    block = np.zeros(residual.ROWS * residual.LANES, np.float32)
+    block = np.zeros(_ROWS * residual.LANES, np.float32)
     # Products of the rows of J and r, followed by counts and sums over columns.
     products, support = 36, 36 + residual.SQUARES_G - residual.INLIERS
     total = np.zeros((36 + residual.COUNT_P + 1 - residual.INLIERS, residual.LANES))
+    # Products with each estimated error: of J and r, and of the errors from this one on.
+    error_total = np.zeros((len(estimated), 8 + ERRORS, residual.LANES))
     for first in range(0, len(points), residual.LANES):
         count = min(residual.LANES, len(points) - first)
         residual.load_block(block, points[first : first + count])
@@ -391,10 +212,16 @@ def _pose_equations(
         if len(sums) > 0:
             _add_patches(sums, block, patches[first : first + count])
         residual.add_products(total, block, 8)
+        if len(estimated) > 0:
+            _respond_to_errors(block, T, radial_source, radial_target, True)
+            _add_error_products(error_total, block, estimated)
         _add_support(total[support], block, residual.WEIGHT_G)
         if scale_p > 0:
             residual.compare_albedos(block, T, exposure, scale_p, robust)
             residual.add_products(total, block, 8)
+            if len(estimated) > 0:
+                _respond_to_errors(block, T, radial_source, radial_target, False)
+                _add_error_products(error_total, block, estimated)
             _add_support(total[support], block, residual.WEIGHT_P)
         for statistic in (
             residual.IN_FRONT,
@@ -410,13 +237,7 @@ def _pose_equations(
             ]
             for k in range(residual.LANES):
                 column[k] += row[k]
-    width = residual.LANES
-    while width > 1:
-        width //= 2
-        for q in range(len(total)):
-            low, high = total[q, :width], total[q, width:]
-            for k in range(width):
-                low[k] += high[k]
+    _sum_columns(total)
     q, index = 0, PRODUCTS
     for p in range(8):
         for o in range(p, 8):
@@ -426,7 +247,15 @@ def _pose_equations(
             elif p < 7:
                 out[GRADIENT + p] = total[q, 0]
             q += 1
-        index += ERRORS  # products with the camera errors remain 0
+        index += ERRORS
+    for k in range(len(estimated)):
+        _sum_columns(error_total[k])
+        unknown = 7 + estimated[k]
+        for p in range(7):
+            out[_product(p, unknown)] = error_total[k, p, 0]
+        out[GRADIENT + unknown] = error_total[k, 7, 0]
+        for o in range(k, len(estimated)):
+            out[_product(unknown, 7 + estimated[o])] = error_total[k, 8 + o, 0]
     out[IN_FRONT] = total[products + residual.IN_FRONT - residual.INLIERS, 0]
     out[WEIGHT_P] = total[products + residual.WEIGHT_P - residual.INLIERS, 0]
     out[SQUARES_P] = total[products + residual.SQUARES_P - residual.INLIERS, 0]
@@ -435,8 +264,100 @@ def _pose_equations(
 
 
 @kernel
+def _product(p: int, o: int) -> int:
+    """Return the position in `out` of the product of two unknowns, p <= o."""
+    return PRODUCTS + p * UNKNOWNS - p * (p - 1) // 2 + o - p
+
+
+@kernel
+def _sum_columns(total: Float64) -> None:
+    """Add the columns of each row to its first one, in pairs."""
+    width = residual.LANES
+    while width > 1:
+        width //= 2
+        for q in range(len(total)):
+            low, high = total[q, :width], total[q, width:]
+            for k in range(width):
+                low[k] += high[k]
+
+
+@kernel
+def _respond_to_errors(
+    block: Float32, T: Float64, radial_source: bool, radial_target: bool, is_distance: bool
+) -> None:
+    """Write the Jacobians of a block's residuals with respect to the errors of the camera.
+
+    The displacement b(p) of a point by an error of size 1 is along p for those of the range; errors
+    of the intrinsics move it sideways, and along p so that the measured depth is kept. The same
+    mean of both views' normals or gradients is used for source and target: otherwise the difference
+    between these, which the pose cannot explain, would be attributed to the errors.
+    """
+    r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
+    r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
+    r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
+    one, zero, tiny = np.float32(1), np.float32(0), np.float32(_EPSILON)
+    radial_p = one if radial_source else zero
+    # The albedo of the target depends on the ray alone.
+    radial_q = one if radial_target and is_distance else zero
+    range_q = one if is_distance else zero
+    for k in range(residual.LANES):
+        m0 = block[residual.JACOBIAN * residual.LANES + k]
+        m1 = block[(residual.JACOBIAN + 1) * residual.LANES + k]
+        m2 = block[(residual.JACOBIAN + 2) * residual.LANES + k]
+        n0 = r00 * m0 + r01 * m1 + r02 * m2
+        n1 = r10 * m0 + r11 * m1 + r12 * m2
+        n2 = r20 * m0 + r21 * m1 + r22 * m2
+        px = block[residual.POINT * residual.LANES + k]
+        py = block[(residual.POINT + 1) * residual.LANES + k]
+        pz = block[(residual.POINT + 2) * residual.LANES + k]
+        qz = block[residual.Z * residual.LANES + k]
+        qx = qz * block[residual.XN * residual.LANES + k]
+        qy = qz * block[residual.YN * residual.LANES + k]
+        lateral_p, lateral_q = px * px + py * py, qx * qx + qy * qy
+        p2, q2 = max(lateral_p + pz * pz, tiny), max(lateral_q + qz * qz, tiny)
+        along_p = m0 * px + m1 * py + m2 * pz
+        along_q = n0 * qx + n1 * qy + n2 * qz
+        kept_p, kept_q = radial_p * along_p / p2, radial_q * along_q / q2
+        focal_p = m0 * px + m1 * py - lateral_p * kept_p
+        focal_q = n0 * qx + n1 * qy - lateral_q * kept_q
+        rho2_p = lateral_p / max(pz * pz, tiny)
+        rho2_q = lateral_q / max(qz * qz, tiny)
+        block[(_RESPONSE + OFFSET) * residual.LANES + k] = (
+            along_p / np.sqrt(p2) - range_q * along_q / np.sqrt(q2)
+        )
+        block[(_RESPONSE + SCALE) * residual.LANES + k] = along_p - range_q * along_q
+        block[(_RESPONSE + FOCAL) * residual.LANES + k] = focal_p - focal_q
+        block[(_RESPONSE + CENTER_X) * residual.LANES + k] = pz * (m0 - px * kept_p) - qz * (
+            n0 - qx * kept_q
+        )
+        block[(_RESPONSE + CENTER_Y) * residual.LANES + k] = pz * (m1 - py * kept_p) - qz * (
+            n1 - qy * kept_q
+        )
+        block[(_RESPONSE + DISTORTION) * residual.LANES + k] = rho2_p * focal_p - rho2_q * focal_q
+
+
+@kernel
+def _add_error_products(total: Float64, block: Float32, estimated: Int64) -> None:
+    """Add the products of the Jacobians of estimated errors with J and r, and with each other."""
+    for i in range(len(estimated)):
+        begin = (_RESPONSE + estimated[i]) * residual.LANES
+        a = block[begin : begin + residual.LANES]
+        for p in range(8):
+            b = block[(residual.JACOBIAN + p) * residual.LANES :]
+            row = total[i, p]
+            for k in range(residual.LANES):
+                row[k] += a[k] * b[k]
+        for o in range(i, len(estimated)):
+            begin = (_RESPONSE + estimated[o]) * residual.LANES
+            b = block[begin : begin + residual.LANES]
+            row = total[i, 8 + o]
+            for k in range(residual.LANES):
+                row[k] += a[k] * b[k]
+
+
+@kernel
 def _correct_points(block: Float32, errors: Float64, radial: bool) -> None:
-    """Displace the points of a block by camera errors, see `displacement`."""
+    """Displace the points of a block by camera errors, see `_respond_to_errors`."""
     x = block[residual.POINT * residual.LANES : (residual.POINT + 1) * residual.LANES]
     y = block[(residual.POINT + 1) * residual.LANES : (residual.POINT + 2) * residual.LANES]
     z = block[(residual.POINT + 2) * residual.LANES : (residual.POINT + 3) * residual.LANES]
@@ -503,18 +424,6 @@ def _add_support(total: Float64, block: Float32, statistic: int) -> None:
     row = block[index * residual.LANES : (index + 1) * residual.LANES]
     for k in range(residual.LANES):
         total[k] += tukey.support(row[k])
-
-
-@kernel
-def _add_residual(
-    A: Float64, g: Float64, J: Float64, r: float, weight: float, unknowns: int
-) -> None:
-    """Add w J J^T to the upper triangle of A, and w r J to g."""
-    for p in range(unknowns):
-        weighted = weight * J[p]
-        g[p] += weighted * r
-        for o in range(p, unknowns):
-            A[p, o] += weighted * J[o]
 
 
 @kernel
