@@ -72,6 +72,8 @@ _MAX_MOTION = 2.0
 # Gauss-Newton iterations of a single pair, and the motion in units of 1 cm and 1 degree below which
 # it has converged: small, as the errors of the pairs of a loop add up.
 _PAIR_ITERATIONS, _PAIR_CONVERGED = 8, 0.002
+# Largest ratio of successive steps that is extrapolated.
+_MAX_RATIO = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,6 +277,7 @@ def align_views(
     state = pair_equations.directed_pairs(views, overlapping, options)
     system = _system(state, len(views), priors, bodies)
     motion_since_overlaps = 0.0
+    earlier_error_step = np.zeros(kernels.ERRORS)
     for stage in options.rounds:
         if motion_since_overlaps >= _MAX_MOTION:
             overlapping = _overlapping(views, poses, options, bodies)
@@ -290,6 +293,8 @@ def align_views(
             if by_patch:
                 pair_equations.discount_shared(views, poses, state, options)
             step, error_step = _solve(poses, state, system, fixed_errors, priors, bodies)
+            factor, earlier_error_step = _extrapolation(error_step, earlier_error_step)
+            step, error_step = factor * step, factor * error_step
             poses = _apply_step(poses, step, bodies)
             errors = errors + error_step
             pair_equations.rescale(state, stage, options)
@@ -301,6 +306,17 @@ def align_views(
             if calibrate and max(error_changes[-2:]) < options.error_convergence:
                 break
     return AlignedViews(poses, errors, state, fixed_errors, tuple(motions))
+
+
+def _extrapolation(error_step: Float64, earlier: Float64) -> tuple[float, Float64]:
+    """Return the factor of a step by Aitken's extrapolation, and the step to compare the next with.
+
+    As correspondences follow the errors of the camera, steps shrink geometrically.
+    """
+    ratio = float(error_step @ earlier) / max(float(earlier @ earlier), 1e-30)
+    if 0 < ratio < _MAX_RATIO:
+        return 1 / (1 - ratio), np.zeros_like(error_step)
+    return 1.0, error_step
 
 
 def support_of(
