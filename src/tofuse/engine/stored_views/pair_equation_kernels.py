@@ -50,9 +50,11 @@ HISTOGRAM = SUPPORT + 1  # as in `alignment`
 SIZE = HISTOGRAM + residual.BINS
 
 _EPSILON = 1e-6  # m or m^2, instead of 0 in a denominator
-# Rows of a block after those of `alignment`: Jacobians with respect to the camera errors.
+# Rows of a block after those of `alignment`: Jacobians with respect to the camera errors, and the
+# points as measured.
 _RESPONSE = residual.ROWS
-_ROWS = residual.ROWS + ERRORS
+_MEASURED = _RESPONSE + ERRORS
+_ROWS = _MEASURED + 3
 
 # Layout of the sums of a patch: of w, w r and w J.
 PATCH_WEIGHT = 0
@@ -196,6 +198,10 @@ def _pair_equations(
     for first in range(0, len(points), residual.LANES):
         count = min(residual.LANES, len(points) - first)
         residual.load_block(block, points[first : first + count])
+        if len(estimated) > 0:
+            block[_MEASURED * residual.LANES :] = block[
+                residual.POINT * residual.LANES : (residual.POINT + 3) * residual.LANES
+            ]
         if has_errors:
             _correct_points(block, errors, radial_source)
         residual.transform_block(block, T)
@@ -307,9 +313,9 @@ def _respond_to_errors(
         n0 = r00 * m0 + r01 * m1 + r02 * m2
         n1 = r10 * m0 + r11 * m1 + r12 * m2
         n2 = r20 * m0 + r21 * m1 + r22 * m2
-        px = block[residual.POINT * residual.LANES + k]
-        py = block[(residual.POINT + 1) * residual.LANES + k]
-        pz = block[(residual.POINT + 2) * residual.LANES + k]
+        px = block[_MEASURED * residual.LANES + k]
+        py = block[(_MEASURED + 1) * residual.LANES + k]
+        pz = block[(_MEASURED + 2) * residual.LANES + k]
         qz = block[residual.Z * residual.LANES + k]
         qx = qz * block[residual.XN * residual.LANES + k]
         qy = qz * block[residual.YN * residual.LANES + k]
@@ -379,7 +385,8 @@ def _correct_points(block: Float32, errors: Float64, radial: bool) -> None:
 def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
     """Move the transformed points of a block to where the erroneous target would measure them.
 
-    To first order in the errors this is the inverse of `_correct_points`.
+    This is the inverse of `_correct_points`, except for terms of second order by a distortion or by
+    an error of a radial range.
     """
     xn = block[residual.XN * residual.LANES : (residual.XN + 1) * residual.LANES]
     yn = block[residual.YN * residual.LANES : (residual.YN + 1) * residual.LANES]
@@ -387,17 +394,20 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
     for k in range(residual.LANES):
         if not z[k] > projection_kernels.MIN_DEPTH:  # it is not projected
             continue
+        range_per_z = np.sqrt(xn[k] * xn[k] + yn[k] * yn[k] + 1)
+        xn[k] -= errors[CENTER_X]
+        yn[k] -= errors[CENTER_Y]
         lateral2 = xn[k] * xn[k] + yn[k] * yn[k]
-        r2 = lateral2 + 1
-        ray_scale_error = errors[FOCAL] + errors[DISTORTION] * lateral2
+        ray_scale = 1 + errors[FOCAL] + errors[DISTORTION] * lateral2
+        xn[k] /= ray_scale
+        yn[k] /= ray_scale
+        lateral2 = xn[k] * xn[k] + yn[k] * yn[k]
         shortening = 0.0
         if radial:
             center_term = errors[CENTER_X] * xn[k] + errors[CENTER_Y] * yn[k]
-            shortening = (ray_scale_error * lateral2 + center_term) / r2
-        depth_scale = 1 - errors[OFFSET] / (np.sqrt(r2) * z[k]) - errors[SCALE] + shortening
-        xn[k] = (xn[k] - errors[CENTER_X]) / (1 + ray_scale_error)
-        yn[k] = (yn[k] - errors[CENTER_Y]) / (1 + ray_scale_error)
-        z[k] *= depth_scale
+            shortening = ((ray_scale - 1) * lateral2 + center_term) / (lateral2 + 1)
+        z[k] -= errors[OFFSET] / range_per_z
+        z[k] /= 1 + errors[SCALE] - shortening
 
 
 @kernel
