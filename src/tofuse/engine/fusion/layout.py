@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -173,13 +174,11 @@ class Layout:
         return layout
 
     @classmethod
-    def levels(
-        cls, views: Views, poses: Float64, voxel_m: float, levels: Sequence[int]
-    ) -> list[Layout]:
+    def levels(cls, views: Views, poses: Float64, voxel_m: float, levels: range) -> list[Layout]:
         """Lay out the leaves of an octree, and what surrounds them, the coarsest first.
 
         Voxels of level l have an edge of 2^l `voxel_m`. A block is divided if a pixel of a surface
-        in it has a lower level (`RangeView.level`): the best view of a place decides.
+        in it resolves less than half a voxel: the best view of a place decides.
         """
         view_summaries = summaries(views)
         noise = [summary.sigma_m for summary in view_summaries if summary.sigma_m > 0]
@@ -190,33 +189,21 @@ class Layout:
         reaches = [
             v * float(np.clip(REACH_SIGMAS * sigma / v, _MIN_REACH, _MAX_REACH)) for v in voxels
         ]
+        surfaces = _surface_blocks(views, poses, voxel_m, levels, reaches, stride)
+        divided = np.unique(_parents(surfaces[-1].keys))
         layouts: list[Layout] = []
-        first, divided = 0, None
-        touched = _surface_blocks(views, poses, voxel_m, levels, reaches, stride)
+        first, max_sigma = 0, _MAX_SIGMA_VOXELS * voxel_m
         for k in reversed(range(len(levels))):
-            finer, keys = touched[k]
-            if divided is not None:
-                finer = finer[is_among(_parents(finer), divided)]
-            leaf = ~is_among(keys, finer)
-            if divided is not None:
-                leaf &= is_among(_parents(keys), divided)
+            keys, finer = surfaces[k]
+            finer = finer[is_among(_parents(finer), divided)]
+            leaf = is_among(_parents(keys), divided) & ~is_among(keys, finer)
             divided = finer
-            if len(levels) > 1:
+            if not leaf.all():
                 near = leaf | _beside(keys, leaf)
                 keys, leaf = keys[near], leaf[near]
-            if leaf.any() or len(levels) == 1:
-                layouts.append(
-                    cls(
-                        voxels[k],
-                        reaches[k],
-                        _MAX_SIGMA_VOXELS * voxel_m,
-                        keys,
-                        leaf,
-                        first,
-                        channels,
-                        stride,
-                    )
-                )
+            if len(keys) or (k == 0 and not layouts):
+                layout = cls(voxels[k], reaches[k], max_sigma, keys, leaf, first, channels, stride)
+                layouts.append(layout)
                 first += len(keys)
         return layouts
 
@@ -297,40 +284,40 @@ def _with_layer(owned: Int64, candidates: Int64, coordinates: Int32) -> Region:
     return Region(np.concatenate([owned, np.setdiff1d(in_box, owned)]), len(owned), low, high)
 
 
+class _SurfaceBlocks(NamedTuple):
+    """Keys, ascending, of the blocks of a level near surfaces, and of those with finer pixels."""
+
+    keys: Int64
+    finer: Int64
+
+
 def _surface_blocks(
     views: Views,
     poses: Float64,
     voxel_m: float,
-    levels: Sequence[int],
+    levels: range,
     reaches: Sequence[float],
     free_space_stride: int,
-) -> list[tuple[Int64, Int64]]:
-    """Return for each level the keys of the blocks near surfaces, ascending.
-
-    The first are those of pixels of lower levels, the second of all.
-    """
+) -> list[_SurfaceBlocks]:
+    """Return the blocks of each level near the surfaces of views."""
     stride = min(free_space_stride, 2)
+    # Pixels below these limits need a finer level. Up to a factor of 2 voxels remain as they are.
+    limits = [voxel_m * 2.0 ** (level if level > 0 else level - 1) for level in levels]
+    limits[0] = 0.0
 
     def touched(start: int, stop: int) -> list[Int64]:
         tables = [(np.full(1 << 12, EMPTY, np.int64), 0) for _ in range(2 * len(levels))]
         for k in range(start, stop):
-            view = views[k]
-            pixels, first = view.stored, first_pixel(k, stride)
-            pixel_level = view.level(voxel_m) if len(levels) > 1 else None
-            for n, (level, reach) in enumerate(zip(levels, reaches, strict=True)):
-                parts = [(2 * n + 1, pixels)]
-                if pixel_level is not None:
-                    finer = (pixel_level < level) & (n > 0)
-                    parts = [
-                        (2 * n + part, pixels._replace(strength=pixels.strength * mask))
-                        for part, mask in enumerate((finer, ~finer))
-                    ]
-                for table, selected in parts:
+            view, first = views[k], first_pixel(k, stride)
+            resolution = view.resolution
+            for n, level in enumerate(levels):
+                finer = resolution < limits[n]
+                for table, selected in ((2 * n, ~finer), (2 * n + 1, finer)):
                     keys = near_cubes(
-                        selected,
+                        view.stored._replace(strength=view.strength * selected),
                         poses[k],
                         EDGE * voxel_m * 2.0**level,
-                        reach,
+                        reaches[n],
                         _BLOCK_SPACING,
                         first,
                         stride,
@@ -339,11 +326,15 @@ def _surface_blocks(
         return [table[table != EMPTY] for table, _ in tables]
 
     chunks = run_chunks(touched, len(views), _CHUNKS) if len(views) else []
-    empty = np.zeros(0, np.int64)
-    keys = [
-        np.unique(np.concatenate([empty, *(c[k] for c in chunks)])) for k in range(2 * len(levels))
-    ]
-    return [(keys[k], np.union1d(keys[k], keys[k + 1])) for k in range(0, 2 * len(levels), 2)]
+    none = np.zeros(0, np.int64)
+    coarse, fine = (
+        [
+            np.unique(np.concatenate([none, *(c[k] for c in chunks)]))
+            for k in range(part, 2 * len(levels), 2)
+        ]
+        for part in range(2)
+    )
+    return [_SurfaceBlocks(np.union1d(a, b), b) for a, b in zip(coarse, fine, strict=True)]
 
 
 def is_among(values: Int64, ascending: Int64) -> Bool:

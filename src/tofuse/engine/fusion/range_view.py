@@ -41,7 +41,7 @@ _JUMP_SIGMAS = 4.0
 _JUMP_WEIGHT = 0.1
 _QUANTILES = (np.arange(17) + 0.5) / 17  # of depths in a summary
 # Relief of smaller extent, as a fraction of the depth, is lost in the noise.
-_MIN_PITCH = 0.004
+_MIN_DETAIL = 0.004
 # A pixel within this many sigmas is on the plane of its neighbours. Next to valid pixels it is
 # restored if a filter removed it from a noisy surface.
 _ON_PLANE_SIGMAS = 3.0
@@ -179,23 +179,18 @@ class RangeView:
         return np.zeros(0)
 
     @property
-    def pitch(self) -> float:
+    def detail(self) -> float:
         """Extent of the smallest visible detail relative to its z.
 
         It is the typical difference of x/z between neighbouring pixels, unless that is finer than
         the noise, which grows with depth.
         """
-        return max(self.projection.pitch, _MIN_PITCH)
+        return max(self.projection.pitch, _MIN_DETAIL)
 
-    def level(self, voxel_m: float) -> Int8:
-        """Return how often a voxel may be doubled, or must be halved, at each pixel (H, W).
-
-        Then it is not larger than what a pixel resolves: the distance to its neighbours, or its
-        standard deviation if that is more. Up to a factor of 2 the voxel is left as it is.
-        """
-        resolution = np.maximum(np.float32(self.pitch * self.unit) * self.z, _SIGMAS[self.strength])
-        ratio = np.maximum(resolution / np.float32(voxel_m), np.float32(1e-6))
-        return np.trunc(np.log2(ratio)).astype(np.int8)
+    @property
+    def resolution(self) -> Float32:
+        """(H, W) what a pixel resolves, m: its distance to the next one, or its sigma if larger."""
+        return np.maximum(np.float32(self.detail * self.unit) * self.z, _SIGMAS[self.strength])
 
     @property
     def channels(self) -> int:
@@ -302,20 +297,20 @@ class ViewSummary:
 
     Attributes
     ----------
-    index, depths, pitch, sigma_m, channels
+    index, depths, detail, sigma_m, channels
         See `RangeView`.
     """
 
     index: int
     depths: Float64
-    pitch: float
+    detail: float
     sigma_m: float
     channels: int
 
     @classmethod
     def of(cls, view: RangeView) -> ViewSummary:
         """Return the summary of a view."""
-        return cls(view.index, view.depths, view.pitch, view.sigma_m, view.channels)
+        return cls(view.index, view.depths, view.detail, view.sigma_m, view.channels)
 
 
 class Views(Protocol):

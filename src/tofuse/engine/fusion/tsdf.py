@@ -237,13 +237,13 @@ def fitting_voxel(views: Views) -> float:
     if not nonempty:
         return 0.01
     depth = float(np.median([summary.depths[len(summary.depths) // 2] for summary in nonempty]))
-    size = float(np.median([summary.pitch for summary in nonempty])) * depth
+    size = float(np.median([summary.detail for summary in nonempty])) * depth
     return float(f"{np.clip(size, _MIN_VOXEL, _MAX_VOXEL):.2g}")
 
 
 def fitting_levels(views: Views, voxel_m: float) -> range:
     """Return the levels of `Layout.levels` that the near and the far surfaces of views need."""
-    sizes = [summary.pitch * summary.depths for summary in summaries(views)]
+    sizes = [summary.detail * summary.depths for summary in summaries(views)]
     if not any(map(len, sizes)):
         return range(1)
     finest, coarsest = np.percentile(np.concatenate(sizes), _EXTREMES)
