@@ -178,7 +178,7 @@ class Layout:
         """Lay out the leaves of an octree, and what surrounds them, the coarsest first.
 
         Voxels of level l have an edge of 2^l `voxel_m`. A block is divided if a pixel of a surface
-        in it resolves less than half a voxel: the best view of a place decides.
+        in it resolves more than its voxels: the best view of a place decides.
         """
         view_summaries = summaries(views)
         noise = [summary.sigma_m for summary in view_summaries if summary.sigma_m > 0]
@@ -309,10 +309,12 @@ def _surface_blocks(
         tables = [(np.full(1 << 12, EMPTY, np.int64), 0) for _ in range(2 * len(levels))]
         for k in range(start, stop):
             view, first = views[k], first_pixel(k, stride)
-            resolution = view.resolution
+            resolution = view.resolution if len(levels) > 1 else np.float32(np.inf)
             for n, level in enumerate(levels):
                 finer = resolution < limits[n]
                 for table, selected in ((2 * n, ~finer), (2 * n + 1, finer)):
+                    if not selected.any():
+                        continue
                     keys = near_cubes(
                         view.stored._replace(strength=view.strength * selected),
                         poses[k],

@@ -173,7 +173,7 @@ class RangeView:
         """
         for step in (2, 1):
             sampled = self.z[::step, ::step]
-            valid = np.sort(sampled[sampled > 0])
+            valid = np.sort(sampled[sampled > 0], kind="stable")  # by radix
             if len(valid):
                 return np.asarray(self.unit * valid[(_QUANTILES * len(valid)).astype(int)])
         return np.zeros(0)

@@ -228,7 +228,9 @@ _MAX_SECOND_DIFFERENCE = 1e-3
 # Number of nodes within which the lookup of any other camera counts as linear.
 _DISTORTED_LINEAR_NODES = 2.0
 _MIN_VOXEL, _MAX_VOXEL = 0.002, 0.1  # m
-_EXTREMES = (1.0, 99.0)  # percentiles: no level for stray pixels
+# Percentiles of the pixels, the nearest first, that need another level, which is another pass over
+# the views: near surfaces fill many pixels, far ones much space.
+_NEAR, _FAR = 25, 99
 
 
 def fitting_voxel(views: Views) -> float:
@@ -246,7 +248,7 @@ def fitting_levels(views: Views, voxel_m: float) -> range:
     sizes = [summary.detail * summary.depths for summary in summaries(views)]
     if not any(map(len, sizes)):
         return range(1)
-    finest, coarsest = np.percentile(np.concatenate(sizes), _EXTREMES)
+    finest, coarsest = np.percentile(np.concatenate(sizes), (_NEAR, _FAR))
     low, high = (int(np.log2(size / voxel_m)) for size in (max(finest, _MIN_VOXEL), coarsest))
     return range(min(low, 0), max(high, 0) + 1)
 
@@ -599,13 +601,18 @@ def _fuse_by_regions(
     coarser: list[tuple[Layout, Int64]] = []
     with closing(store) as pieces:
         for layout, boxes in zip(layouts, regions, strict=True):
-            frusta = Frusta.of(views, poses, _free_space_limits(layout.reach_m))
+            # A single region is touched by nearly all views.
+            frusta = (
+                Frusta.of(views, poses, _free_space_limits(layout.reach_m))
+                if len(boxes) > 1
+                else None
+            )
             block_m = EDGE * layout.voxel_m
             cells = []
             for region in boxes:
                 # With a margin of one block, as blocks are tested by their bounding spheres.
                 low, high = np.asarray(region.low - 1, float), np.asarray(region.high + 1, float)
-                touching = frusta.touching(block_m * low, block_m * high)
+                touching = frusta and frusta.touching(block_m * low, block_m * high)
                 volume = Volume.of(layout, region)
                 volume.add(views, poses, step, touching)
                 piece = volume.piece(options.min_views)
