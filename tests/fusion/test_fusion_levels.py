@@ -10,7 +10,7 @@ import pytest
 from ball_views import EYE, frame_of, look, plane_range, sphere_range
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.fusion.layout import Layout
+from tofuse.engine.fusion import tsdf
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import DECODED, RangeView
 from tofuse.engine.fusion.tsdf import fitting_levels, fitting_voxel, fuse_surface
@@ -115,17 +115,24 @@ def test_size_is_bounded_by_what_the_pixels_resolve(scene, uniform) -> None:
     assert len(mesh) < 4 * views[0].z.size
 
 
-def test_levels_meet_without_gaps(scene) -> None:
-    """A floor leads through all levels: it has no border but where the views end."""
+def test_levels_meet_without_gaps(monkeypatch) -> None:
+    """A floor leads from one level to the next: it has no border but where the views end."""
+    monkeypatch.setattr(tsdf, "fitting_levels", lambda *_: range(-1, 1))
     views, poses = recorded(ball=False)
     mesh = fuse_surface(views, poses)
-    voxel = fitting_voxel(views)
-    levels = fitting_levels(views, voxel)
-    assert len(Layout.levels(views, poses, voxel, levels)) > 1
+    assert edge_at(mesh, 2.2, 2.6) > 1.7 * edge_at(mesh, 1.4, 1.6)
     x, _, z = borders_of(mesh).T
     assert not ((np.abs(x) < 0.3 * z) & (z > 1.4) & (z < 2.6)).any()
     x, _, z = mesh.vertices.T
     assert ((np.abs(x) < 0.3 * z) & (z > 1.4) & (z < 2.6)).sum() > 1000
+
+
+def test_finer_levels_do_not_make_the_model_larger() -> None:
+    """A near object in few views of a far scene adds no level: no coarser one pays for it."""
+    views, poses = recorded(ball=False)
+    voxel = fitting_voxel(views)
+    near = [seen(T, k, np.random.default_rng(k)) for k, T in enumerate(poses[:2])]
+    assert fitting_levels([*views, *near], voxel) == range(1)
 
 
 def test_regions_and_threads_give_the_same_bytes(scene) -> None:

@@ -228,9 +228,7 @@ _MAX_SECOND_DIFFERENCE = 1e-3
 # Number of nodes within which the lookup of any other camera counts as linear.
 _DISTORTED_LINEAR_NODES = 2.0
 _MIN_VOXEL, _MAX_VOXEL = 0.002, 0.1  # m
-# Percentiles of the pixels, the nearest first, that need another level, which is another pass over
-# the views: near surfaces fill many pixels, far ones much space.
-_NEAR, _FAR = 25, 99
+_EXTREMES = (1, 99)  # percentiles: there is no level for fewer pixels
 
 
 def fitting_voxel(views: Views) -> float:
@@ -244,12 +242,24 @@ def fitting_voxel(views: Views) -> float:
 
 
 def fitting_levels(views: Views, voxel_m: float) -> range:
-    """Return the levels of `Layout.levels` that the near and the far surfaces of views need."""
-    sizes = [summary.detail * summary.depths for summary in summaries(views)]
-    if not any(map(len, sizes)):
+    """Return the levels of `Layout.levels` that the near and the far surfaces of views need.
+
+    Coarser ones save voxels. Finer ones are added as long as there are no more voxels in total
+    than in a grid of `voxel_m`, so that neither time nor size depends on them.
+    """
+    pixels = [summary.detail * summary.depths for summary in summaries(views)]
+    if not any(map(len, pixels)):
         return range(1)
-    finest, coarsest = np.percentile(np.concatenate(sizes), (_NEAR, _FAR))
-    low, high = (int(np.log2(size / voxel_m)) for size in (max(finest, _MIN_VOXEL), coarsest))
+    size = np.concatenate(pixels) / voxel_m
+    levels = np.trunc(np.log2(np.maximum(size, _MIN_VOXEL / voxel_m))).astype(int)
+    low, high = (int(level) for level in np.percentile(levels, _EXTREMES, method="nearest"))
+
+    def voxels(lowest: int) -> float:
+        """Voxels of the surfaces of all pixels, each as large as a pixel is wide."""
+        return float(np.square(size / 2.0 ** levels.clip(lowest, max(high, 0))).sum())
+
+    while low < 0 and voxels(low) > np.square(size).sum():
+        low += 1
     return range(min(low, 0), max(high, 0) + 1)
 
 
