@@ -611,18 +611,15 @@ def _fuse_by_regions(
     coarser: list[tuple[Layout, Int64]] = []
     with closing(store) as pieces:
         for layout, boxes in zip(layouts, regions, strict=True):
+            limits = _free_space_limits(layout.reach_m)
             # A single region is touched by nearly all views.
-            frusta = (
-                Frusta.of(views, poses, _free_space_limits(layout.reach_m))
-                if len(boxes) > 1
-                else None
-            )
+            frusta = Frusta.of(views, poses, limits) if len(boxes) > 1 else None
             block_m = EDGE * layout.voxel_m
             cells = []
             for region in boxes:
                 # With a margin of one block, as blocks are tested by their bounding spheres.
                 low, high = np.asarray(region.low - 1, float), np.asarray(region.high + 1, float)
-                touching = frusta and frusta.touching(block_m * low, block_m * high)
+                touching = frusta.touching(block_m * low, block_m * high) if frusta else None
                 volume = Volume.of(layout, region)
                 volume.add(views, poses, step, touching)
                 piece = volume.piece(options.min_views)
