@@ -228,6 +228,7 @@ _MAX_SECOND_DIFFERENCE = 1e-3
 # Number of nodes within which the lookup of any other camera counts as linear.
 _DISTORTED_LINEAR_NODES = 2.0
 _MIN_VOXEL, _MAX_VOXEL = 0.002, 0.1  # m
+_MAX_VOXELS_LEFT = 0.5  # of a grid, by levels: they cost less time in any case then
 _EXTREMES = (1, 99)  # percentiles: there is no level for fewer pixels
 
 
@@ -244,8 +245,8 @@ def fitting_voxel(views: Views) -> float:
 def fitting_levels(views: Views, voxel_m: float) -> range:
     """Return the levels of `Layout.levels` that the near and the far surfaces of views need.
 
-    Coarser ones save voxels. Finer ones are added as long as there are no more voxels in total
-    than in a grid of `voxel_m`, so that neither time nor size depends on them.
+    Coarser ones save voxels, finer ones add some. There is one level, unless more of them halve the
+    number of voxels: each is another pass over the views.
     """
     pixels = [summary.detail * summary.depths for summary in summaries(views)]
     if not any(map(len, pixels)):
@@ -258,9 +259,9 @@ def fitting_levels(views: Views, voxel_m: float) -> range:
         """Voxels of the surfaces of all pixels, each as large as a pixel is wide."""
         return float(np.square(size / 2.0 ** levels.clip(lowest, max(high, 0))).sum())
 
-    while low < 0 and voxels(low) > np.square(size).sum():
-        low += 1
-    return range(min(low, 0), max(high, 0) + 1)
+    most = _MAX_VOXELS_LEFT * np.square(size).sum()
+    lowest = next((level for level in range(min(low, 0), 1) if voxels(level) <= most), None)
+    return range(1) if lowest is None else range(lowest, max(high, 0) + 1)
 
 
 @dataclass(eq=False)
