@@ -16,7 +16,8 @@ class Fusion(Bounded):
     ----------
     voxel_m
         Edge of a voxel, m; None chooses the distance between neighbouring pixels at the median
-        depth, which keeps the resolution of the sensor, or 0.4 % of that depth if that is more.
+        depth, which keeps the resolution of the sensor, or 0.4 % of that depth if that is more,
+        and doubles or halves it for much farther or nearer surfaces if that saves half of them.
     min_views
         Minimum number of frames that observed a point of the model.
     island

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Bool, Float32, Int8, UInt8, UInt16
+from tofuse.engine.arrays import Bool, Float32, Float64, Int8, UInt8, UInt16
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.compute import Spill, median
 from tofuse.engine.frames import CloudFrame, RangeFrame
@@ -30,6 +30,7 @@ from tofuse.engine.views import (
 # Weights, in 1/m^2, are stored as logarithms: six steps per octave, from 2^-14 on.
 _STEPS_PER_OCTAVE, _MIN_LOG2 = 6.0, -14.0
 DECODED = np.r_[0.0, 2.0 ** (np.arange(255) / _STEPS_PER_OCTAVE + _MIN_LOG2)].astype(np.float32)
+_SIGMAS = 1 / np.sqrt(np.maximum(DECODED, DECODED[1]))
 # Minimum cosine of the incidence: beyond, the footprint of a pixel is too large.
 _MIN_COSINE = 0.1
 # Expected relief of surfaces within a window of a few pixels, as a fraction of the depth.
@@ -38,6 +39,9 @@ _RELIEF = 0.002
 _JUMP_SIGMAS = 4.0
 # Weight factor of pixels near a jump: they matter only where nothing else was measured.
 _JUMP_WEIGHT = 0.1
+_QUANTILES = (np.arange(17) + 0.5) / 17  # of depths in a summary
+# Relief of smaller extent, as a fraction of the depth, is lost in the noise.
+_MIN_DETAIL = 0.004
 # A pixel within this many sigmas is on the plane of its neighbours. Next to valid pixels it is
 # restored if a filter removed it from a noisy surface.
 _ON_PLANE_SIGMAS = 3.0
@@ -162,19 +166,31 @@ class RangeView:
         return self.z.nbytes + self.normals.nbytes + self.strength.nbytes + intensity
 
     @property
-    def depth(self) -> float:
-        """Median z in m, of every fourth pixel if any of these is valid; 0 without valid ones."""
+    def depths(self) -> Float64:
+        """Evenly spaced quantiles of z in m, the median in the middle; none without valid pixels.
+
+        They are those of every fourth pixel if any of these is valid.
+        """
         for step in (2, 1):
             sampled = self.z[::step, ::step]
-            valid = sampled[sampled > 0]
+            valid = np.sort(sampled[sampled > 0], kind="stable")  # by radix
             if len(valid):
-                return float(median(valid.astype(np.float32))) * self.unit
-        return 0.0
+                return np.asarray(self.unit * valid[(_QUANTILES * len(valid)).astype(int)])
+        return np.zeros(0)
 
     @property
-    def pitch(self) -> float:
-        """Typical difference of x/z between neighbouring pixels."""
-        return self.projection.pitch
+    def detail(self) -> float:
+        """Extent of the smallest visible detail relative to its z.
+
+        It is the typical difference of x/z between neighbouring pixels, unless that is finer than
+        the noise, which grows with depth.
+        """
+        return max(self.projection.pitch, _MIN_DETAIL)
+
+    @property
+    def resolution(self) -> Float32:
+        """(H, W) what a pixel resolves, m: its distance to the next one, or its sigma if larger."""
+        return np.maximum(np.float32(self.detail * self.unit) * self.z, _SIGMAS[self.strength])
 
     @property
     def channels(self) -> int:
@@ -275,26 +291,26 @@ def _area_mean(image: Float32, shape: tuple[int, ...]) -> Float32:
     return np.asarray(means, np.float32)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ViewSummary:
     """Properties of a view that are needed without its images.
 
     Attributes
     ----------
-    index, depth, pitch, sigma_m, channels
+    index, depths, detail, sigma_m, channels
         See `RangeView`.
     """
 
     index: int
-    depth: float
-    pitch: float
+    depths: Float64
+    detail: float
     sigma_m: float
     channels: int
 
     @classmethod
     def of(cls, view: RangeView) -> ViewSummary:
         """Return the summary of a view."""
-        return cls(view.index, view.depth, view.pitch, view.sigma_m, view.channels)
+        return cls(view.index, view.depths, view.detail, view.sigma_m, view.channels)
 
 
 class Views(Protocol):

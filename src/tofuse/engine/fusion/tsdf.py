@@ -35,6 +35,7 @@ from tofuse.engine.fusion.layout import (
     Layout,
     Region,
     first_pixel,
+    is_among,
 )
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.options import Fusion
@@ -85,6 +86,58 @@ class Piece:
     def owned_ids(self) -> Int64:
         """Ids of the owned vertices."""
         return self.ids[: len(self)]
+
+    def joined(
+        self, layout: Layout, coarser: Sequence[tuple[Layout, Int64]]
+    ) -> tuple[Piece, Int64]:
+        """Return the surface of the leaves of a layout, joined to that of coarser ones.
+
+        A vertex is replaced by that of the coarser cell around it, if the surface of the coarser
+        leaves has it. This concerns the cells along the border, on both sides, so there is neither
+        a gap nor an overlap.
+
+        Parameters
+        ----------
+        layout
+            Of this surface.
+        coarser
+            The layouts before, the coarsest first, and the ids of the vertices of their leaves
+            in ascending order.
+
+        Returns
+        -------
+        The surface, and the ids (K,) of the vertices of the leaves' surface before it was joined.
+        """
+        block = np.repeat(self.blocks, self.counts)
+        of_leaves = layout.leaf[block - layout.first]
+        used = np.zeros(len(self.ids), bool)
+        used[self.faces[of_leaves]] = True
+        ids = self.ids.copy()
+        own = np.arange(len(ids)) < len(self)
+        for other, vertices in coarser:
+            rows = np.flatnonzero(ids == self.ids)
+            around = other.cells_around(layout, ids[rows])
+            found = is_among(around, vertices)
+            ids[rows[found]] = around[found]
+            own[rows[found]] = False
+        others = np.unique(ids[used & ~own])
+        new_row = np.cumsum(own, dtype=np.int32) - np.int32(1)
+        new_row[~own] = own.sum() + np.searchsorted(others, ids[~own])
+        a, b, c = new_row[self.faces].T
+        kept = of_leaves & (a != b) & (b != c) & (c != a)
+        owned = own[: len(self)]
+        piece = Piece(
+            np.concatenate([self.ids[own], others]),
+            self.points[owned],
+            self.normals[owned],
+            self.intensity[owned],
+            self.sigma[owned],
+            self.views[owned],
+            new_row[self.faces[kept]],
+            self.blocks,
+            np.bincount(np.searchsorted(self.blocks, block[kept]), minlength=len(self.blocks)),
+        )
+        return piece, self.ids[used]
 
 
 def stitch(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
@@ -174,18 +227,41 @@ _BATCH = 16  # views
 _MAX_SECOND_DIFFERENCE = 1e-3
 # Number of nodes within which the lookup of any other camera counts as linear.
 _DISTORTED_LINEAR_NODES = 2.0
-_MAX_SIGMA_VOXELS = 2.0  # maximum standard deviation of a surface, voxels
+_MIN_VOXEL, _MAX_VOXEL = 0.002, 0.1  # m
+_MAX_VOXELS_LEFT = 0.5  # of a grid, by levels: they cost less time in any case then
+_EXTREMES = (1, 99)  # percentiles: there is no level for fewer pixels
 
 
 def fitting_voxel(views: Views) -> float:
     """Return a voxel edge in m for the sensor and the scene: 2 mm to 10 cm."""
-    nonempty = [summary for summary in summaries(views) if summary.depth > 0]
+    nonempty = [summary for summary in summaries(views) if len(summary.depths)]
     if not nonempty:
         return 0.01
-    depth = float(np.median([summary.depth for summary in nonempty]))
-    # Depth noise grows with depth: finer voxels would represent mostly noise.
-    size = max(float(np.median([summary.pitch for summary in nonempty])), 0.004) * depth
-    return float(f"{np.clip(size, 0.002, 0.1):.2g}")
+    depth = float(np.median([summary.depths[len(summary.depths) // 2] for summary in nonempty]))
+    size = float(np.median([summary.detail for summary in nonempty])) * depth
+    return float(f"{np.clip(size, _MIN_VOXEL, _MAX_VOXEL):.2g}")
+
+
+def fitting_levels(views: Views, voxel_m: float) -> range:
+    """Return the levels of `Layout.levels` that the near and the far surfaces of views need.
+
+    Coarser ones save voxels, finer ones add some. There is one level, unless more of them halve the
+    number of voxels: each is another pass over the views.
+    """
+    pixels = [summary.detail * summary.depths for summary in summaries(views)]
+    if not any(map(len, pixels)):
+        return range(1)
+    size = np.concatenate(pixels) / voxel_m
+    levels = np.trunc(np.log2(np.maximum(size, _MIN_VOXEL / voxel_m))).astype(int)
+    low, high = (int(level) for level in np.percentile(levels, _EXTREMES, method="nearest"))
+
+    def voxels(lowest: int) -> float:
+        """Voxels of the surfaces of all pixels, each as large as a pixel is wide."""
+        return float(np.square(size / 2.0 ** levels.clip(lowest, max(high, 0))).sum())
+
+    most = _MAX_VOXELS_LEFT * np.square(size).sum()
+    lowest = next((level for level in range(min(low, 0), 1) if voxels(level) <= most), None)
+    return range(1) if lowest is None else range(lowest, max(high, 0) + 1)
 
 
 @dataclass(eq=False)
@@ -198,8 +274,8 @@ class Volume:
 
     Attributes
     ----------
-    voxel_m, reach_m
-        Edge of a voxel, and the truncation distance.
+    voxel_m, reach_m, max_sigma_m
+        Edge of a voxel, the truncation distance, and the largest sigma of a surface.
     keys
         (B,) of the blocks: those the region owns, ascending, then the layer around them.
     numbers, owned
@@ -212,6 +288,7 @@ class Volume:
 
     voxel_m: float
     reach_m: float
+    max_sigma_m: float
     keys: Int64
     numbers: Int64
     owned: int
@@ -242,8 +319,9 @@ class Volume:
         return cls(
             layout.voxel_m,
             layout.reach_m,
+            layout.max_sigma_m,
             layout.keys[region.rows],
-            region.rows,
+            layout.first + region.rows,
             region.owned,
             np.zeros((blocks, VOXELS), np.float32),
             np.zeros((blocks, VOXELS), np.float32),
@@ -339,7 +417,7 @@ class Volume:
     def surface(self, min_views: int = 1) -> Mesh:
         """Return the zero surface of the distances, between observed voxels.
 
-        Vertices with a standard deviation above a few voxels are left out, as there the surface is
+        Vertices with a standard deviation above `max_sigma_m` are left out, as there the surface is
         noise. The surface of the blocks that a region owns is a `piece`.
         """
         net = self._extract(min_views)
@@ -384,7 +462,7 @@ class Volume:
         neighbours_of(self.keys, neighbours)
         cells = np.empty((count, VOXELS), np.int32)
         counts = np.zeros(count, np.int64)
-        min_weight = 1 / (_MAX_SIGMA_VOXELS * self.voxel_m) ** 2
+        min_weight = 1 / self.max_sigma_m**2
         run_chunks(
             lambda a, b: mark_cells(blocks, neighbours, min_weight, min_views, cells, counts, a, b),
             count,
@@ -499,44 +577,58 @@ def fuse_surface(
     memory of the options, it is fused region by region, with the same result.
     """
     options = options or Fusion()
-    layout = Layout.of(views, poses, options.voxel_m or fitting_voxel(views))
-    regions = layout.regions(options.memory_mb * 1_000_000 // layout.block_bytes)
-    if len(regions) == 1:
-        volume = Volume.of(layout, regions[0])
+    voxel = options.voxel_m or fitting_voxel(views)
+    levels = range(1) if options.voxel_m else fitting_levels(views, voxel)
+    layouts = Layout.levels(views, poses, voxel, levels)
+    max_bytes = options.memory_mb * 1_000_000
+    regions = [layout.regions(max_bytes // layout.block_bytes) for layout in layouts]
+    if sum(map(len, regions)) == 1:
+        volume = Volume.of(layouts[0], regions[0][0])
         volume.add(views, poses, advance)
         mesh = volume.surface(options.min_views)
         del volume
         return mesh.without_islands(options.island)
-    return _fuse_by_regions(layout, regions, views, poses, options, advance)
+    return _fuse_by_regions(layouts, regions, views, poses, options, advance)
 
 
 def _fuse_by_regions(
-    layout: Layout,
-    regions: Sequence[Region],
+    layouts: Sequence[Layout],
+    regions: Sequence[Sequence[Region]],
     views: Views,
     poses: Float64,
     options: Fusion,
     advance: Callable[[], None] | None,
 ) -> Mesh:
-    """Fuse the surface region by region, byte-identical to that of a single region."""
-    frusta = Frusta.of(views, poses, _free_space_limits(layout.reach_m))
-    block_m = EDGE * layout.voxel_m
-    done = 0
+    """Fuse the surface region by region, byte-identical to that of one region for each layout."""
+    steps, done = sum(map(len, regions)), 0
 
     def step() -> None:
         nonlocal done
         done += 1
-        if advance is not None and done % len(regions) == 0:
+        if advance is not None and done % steps == 0:
             advance()
 
     store: Spill[Piece] = Spill(0)
+    coarser: list[tuple[Layout, Int64]] = []
     with closing(store) as pieces:
-        for region in regions:
-            # With a margin of one block, as blocks are tested by their bounding spheres.
-            low, high = np.asarray(region.low - 1, float), np.asarray(region.high + 1, float)
-            touching = frusta.touching(block_m * low, block_m * high)
-            volume = Volume.of(layout, region)
-            volume.add(views, poses, step, touching)
-            pieces.put(volume.piece(options.min_views))
-            del volume
-        return stitch(pieces, len(layout.keys), options.island)
+        for layout, boxes in zip(layouts, regions, strict=True):
+            limits = _free_space_limits(layout.reach_m)
+            # A single region is touched by nearly all views.
+            frusta = Frusta.of(views, poses, limits) if len(boxes) > 1 else None
+            block_m = EDGE * layout.voxel_m
+            cells = []
+            for region in boxes:
+                # With a margin of one block, as blocks are tested by their bounding spheres.
+                low, high = np.asarray(region.low - 1, float), np.asarray(region.high + 1, float)
+                touching = frusta.touching(block_m * low, block_m * high) if frusta else None
+                volume = Volume.of(layout, region)
+                volume.add(views, poses, step, touching)
+                piece = volume.piece(options.min_views)
+                del volume
+                if len(layouts) > 1:
+                    piece, vertices = piece.joined(layout, coarser)
+                    cells.append(vertices)
+                pieces.put(piece)
+            if cells:
+                coarser.append((layout, np.sort(np.concatenate(cells))))
+        return stitch(pieces, sum(len(layout.keys) for layout in layouts), options.island)
