@@ -50,6 +50,7 @@ from tofuse.engine.fusion.tsdf_kernels import (
     unpack_view,
 )
 from tofuse.engine.geometry import se3
+from tofuse.engine.stopwatch import timing
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +88,7 @@ class Piece:
         return self.ids[: len(self)]
 
 
+@timing("meshing")
 def stitch(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
     """Stitch the pieces of all blocks, without islands.
 
@@ -504,9 +506,10 @@ def fuse_surface(
     if len(regions) == 1:
         volume = Volume.of(layout, regions[0])
         volume.add(views, poses, advance)
-        mesh = volume.surface(options.min_views)
-        del volume
-        return mesh.without_islands(options.island)
+        with timing("meshing"):
+            mesh = volume.surface(options.min_views)
+            del volume
+            return mesh.without_islands(options.island)
     return _fuse_by_regions(layout, regions, views, poses, options, advance)
 
 
@@ -537,6 +540,7 @@ def _fuse_by_regions(
             touching = frusta.touching(block_m * low, block_m * high)
             volume = Volume.of(layout, region)
             volume.add(views, poses, step, touching)
-            pieces.put(volume.piece(options.min_views))
+            with timing("meshing"):
+                pieces.put(volume.piece(options.min_views))
             del volume
         return stitch(pieces, len(layout.keys), options.island)
