@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import get_ident
+from typing import Any, cast
 
-from numba.core import event
+from numba.core import event as numba_event
 from rich.console import Console
 from rich.table import Table
 
@@ -20,7 +21,7 @@ from tofuse.engine.stopwatch import Stopwatch
 _KERNELS = "numba:compiler_lock"  # an event of each kernel that is compiled or loaded
 
 
-class _KernelTimes(event.Listener):  # type: ignore[misc]
+class _KernelTimes(numba_event.Listener):
     """Counts compiling and loading kernels, and waiting for threads that do, as a stage."""
 
     def __init__(self, watch: Stopwatch) -> None:
@@ -42,13 +43,13 @@ def process_watch() -> Iterator[Stopwatch]:
     """Run a stopwatch of this process; what is in no stage of its own is "other"."""
     watch = Stopwatch({"starting": _age_s()}, {"starting": time.process_time()})
     watch.begin("other")
-    listener = _KernelTimes(watch)
-    event.register(_KERNELS, listener)
+    listener, events = _KernelTimes(watch), cast(Any, numba_event)
+    events.register(_KERNELS, listener)
     try:
         with watch.running():
             yield watch
     finally:
-        event.unregister(_KERNELS, listener)
+        events.unregister(_KERNELS, listener)
 
 
 def _age_s() -> float:
