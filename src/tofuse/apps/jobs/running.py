@@ -117,6 +117,7 @@ class _Job:
 @timing("opening")
 def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) -> _Job:
     """Open and inspect the recording, and resolve its configuration."""
+    progress.stage("opening")
     seed = seed_of(options)
     opening = Opening.of(inputs, options)
     recording = opening.open()
