@@ -184,4 +184,5 @@ def _type_of(text: str) -> Any:
 
 if __name__ == "__main__":
     with rare_garbage_collection():
-        compile_listed(*map(int, sys.argv[1:]))
+        numbers = [int(word) for word in sys.argv[1:]]
+        compile_listed(*numbers[:2], all_commands=any(numbers[2:]))
