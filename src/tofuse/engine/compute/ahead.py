@@ -141,7 +141,7 @@ def signatures(all_commands: bool = False) -> list[tuple[str, tuple[Any, ...]]]:
     return kernels
 
 
-def compile_listed(helper: int = 0, helpers: int = 1, all_commands: bool = False) -> None:
+def compile_listed(helper: int = 0, helpers: int = 1, *, all_commands: bool = False) -> None:
     """Compile `signatures` in reverse order, or load them from the cache.
 
     Each of several `helpers` starts at a different position in the list, and wraps around at its
