@@ -12,6 +12,8 @@ help:                       ## this list
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/dev.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@echo "compiling the numerical kernels on all cores, once: half a minute on two"
+	-$(BIN)/python -c "from tofuse.engine.compute import ahead; ahead.compile_now()"
 	@touch $@
 
 demo: .venv/.ready          ## simulate a recording, reconstruct it, leave a model and a report in demo/

@@ -138,7 +138,7 @@ def table(rows: Sequence[tuple[str, Sequence[Usage]]]) -> Iterator[str]:
             f"{max(run.peak_mb for run in runs):>9.0f}"
         )
         rest = median_run.wall_s - sum(median_run.stages.values())
-        for part, s in {**median_run.stages, "start, writing": max(0.0, rest)}.items():
+        for part, s in {**median_run.stages, "run.json, exit": max(0.0, rest)}.items():
             if s >= 0.05:
                 fraction = s / max(median_run.wall_s, 1e-9)
                 each = 1e3 * s / max(1, median_run.frames)

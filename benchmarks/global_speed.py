@@ -20,8 +20,7 @@ import argparse
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +32,6 @@ from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.loops.revisits import Revisits
 from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.methods import from_method
-from tofuse.engine.progress import Stopwatch
 from tofuse.engine.results.types import Reconstruction
 from tofuse.engine.search.search import Search
 from tofuse.engine.stored_views.view_store import SampledView, Spacing, ViewStore, overlaps
@@ -48,30 +46,13 @@ def there_and_back(frames: list[RangeFrame], count: int) -> Iterator[RangeFrame]
         yield replace(frames[order[k % len(order)]], index=k, timestamp=k / 30)
 
 
-@dataclass
-class BothTimes(Stopwatch):
-    """Stopwatch that also records CPU time."""
-
-    cpu: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def timing(self, stage: str) -> Iterator[None]:
-        start = time.process_time()
-        try:
-            with super().timing(stage):
-                yield
-        finally:
-            self.cpu[stage] = self.cpu.get(stage, 0.0) + time.process_time() - start
-
-
-def mapped(frames: list[RangeFrame], count: int) -> tuple[Reconstruction, BothTimes]:
+def mapped(frames: list[RangeFrame], count: int) -> Reconstruction:
     """Run the default method with a minimal model: coarse voxels, no filters."""
     config = replace(from_method("default"), model_filters=(), fusion=Fusion(voxel_m=0.1))
     mapper = Mapper(config)
-    mapper.watch = BothTimes()
     for frame in there_and_back(frames, count):
         mapper.push(frame)
-    return mapper.finish(), mapper.watch
+    return mapper.finish()
 
 
 def pairs(frames: list[RangeFrame], result: Reconstruction, max_pairs: int) -> str:
@@ -111,10 +92,10 @@ def pairs(frames: list[RangeFrame], result: Reconstruction, max_pairs: int) -> s
 PARTS = ("loops", "optimisation", "refinement")
 
 
-def row(result: Reconstruction, watch: BothTimes) -> str:
+def row(result: Reconstruction) -> str:
     """One line of the table: wall / CPU seconds."""
     d = result.diagnostics
-    wall, cpu = ([of.get(part, 0.0) for part in PARTS] for of in (watch.seconds, watch.cpu))
+    wall, cpu = ([of.get(part, 0.0) for part in PARTS] for of in (d.seconds, d.cpu_seconds))
     count = d.refinement.pairs
     both = [f"{a:.1f} / {b:.1f}" for a, b in zip(wall, cpu, strict=True)]
     return (
@@ -150,8 +131,8 @@ def main(arguments: list[str] | None = None) -> int:
         assert search is not None
         search.exhaustive()
         for count in options.frames:
-            result, watch = mapped(frames, count)
-            print(row(result, watch), flush=True)
+            result = mapped(frames, count)
+            print(row(result), flush=True)
         print(pairs(frames, result, options.pairs))
     return 0
 

@@ -252,6 +252,32 @@ def walk(rooms: int, frames: int, seed: int) -> Float64:
     return np.stack(poses)
 
 
+def image_of(
+    scene: Scene, camera: Pinhole, T: Float64, k: int, rng: np.random.Generator
+) -> RangeFrame:
+    """Image `k` of a camera with noise, at a pose (4, 4)."""
+    rays = np.concatenate(
+        [camera.rays().astype(float), np.ones((camera.height, camera.width, 1))], -1
+    )
+    rays = rays.reshape(-1, 3)
+    lengths = np.linalg.norm(rays, axis=1)
+    directions = rays / lengths[:, None] @ T[:3, :3].T
+    hits = scene.cast(T[:3, 3], directions)
+    distance = hits.distance.astype(float)
+    cosine = np.abs(np.einsum("ni,ni->n", hits.normal, directions))
+    amplitude = 3e4 * hits.albedo * cosine / distance**2
+    amplitude = amplitude + (0.5 + 0.01 * amplitude) * rng.standard_normal(len(amplitude))
+    # Noise of a phase camera grows as the signal falls.
+    sigma = 0.03 / np.sqrt(np.maximum(amplitude, 1.0))
+    measured = distance + sigma * rng.standard_normal(len(amplitude))
+    seen = np.isfinite(distance) & (distance < 9.0) & (amplitude > 20)
+    z, amplitude = (
+        np.where(seen, values, 0).reshape(camera.height, camera.width).astype(np.float32)
+        for values in (measured / lengths, amplitude)
+    )
+    return RangeFrame(k, k / RATE_HZ, camera, z, amplitude_image=amplitude)
+
+
 def record(rooms: int, frames: int, count: int, seed: int) -> Path:
     """Write the first images of the walk, unless they exist."""
     folder = OUT / f"building-{rooms}-{frames}-{count}-{seed}"
@@ -260,25 +286,9 @@ def record(rooms: int, frames: int, count: int, seed: int) -> Path:
     scene, poses = building(rooms, seed), walk(rooms, frames, seed)[:count]
     print(f"{scene.triangles} triangles; rendering {count} images", flush=True)
     camera = Pinhole(COLUMNS, ROWS, FOCAL, FOCAL, COLUMNS / 2 - 0.5, ROWS / 2 - 0.5)
-    rays = np.concatenate([camera.rays().astype(float), np.ones((ROWS, COLUMNS, 1))], -1)
-    rays = rays.reshape(-1, 3)
-    lengths = np.linalg.norm(rays, axis=1)
     writer = RecordingWriter(folder, camera, frame_rate_hz=RATE_HZ, amplitude_kind="raw")
     for k, T in enumerate(poses):
-        rng = np.random.default_rng([seed, 2000, k])
-        directions = rays / lengths[:, None] @ T[:3, :3].T
-        hits = scene.cast(T[:3, 3], directions)
-        distance = hits.distance.astype(float)
-        cosine = np.abs(np.einsum("ni,ni->n", hits.normal, directions))
-        amplitude = 3e4 * hits.albedo * cosine / distance**2
-        amplitude = amplitude + (0.5 + 0.01 * amplitude) * rng.standard_normal(len(amplitude))
-        # Noise of a phase camera grows as the signal falls.
-        sigma = 0.03 / np.sqrt(np.maximum(amplitude, 1.0))
-        measured = distance + sigma * rng.standard_normal(len(amplitude))
-        seen = np.isfinite(distance) & (distance < 9.0) & (amplitude > 20)
-        z = np.where(seen, measured / lengths, 0).reshape(ROWS, COLUMNS).astype(np.float32)
-        amplitude = np.where(seen, amplitude, 0).reshape(ROWS, COLUMNS).astype(np.float32)
-        writer.add(RangeFrame(k, k / RATE_HZ, camera, z, amplitude_image=amplitude))
+        writer.add(image_of(scene, camera, T, k, np.random.default_rng([seed, 2000, k])))
     writer.finish(groundtruth=se3.inverse(poses[0]) @ poses)
     return folder
 

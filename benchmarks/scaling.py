@@ -1,19 +1,30 @@
-"""Scaling of the tracker's time and memory, and its kernels compared with memory bandwidth.
+"""How time and memory of whole runs grow; and the tracker's kernels beside memory bandwidth.
 
-Four tables: time per frame over resolution; time and memory over the number of frames, with the
-sequence played forwards and backwards; compilation in a new process with an empty cache; and the
-CPU time of each kernel on one thread, with the lower bound from memory bandwidth, if each of its
-arrays is moved once. The frames are those of a synthetic room, or of a recording. All but the
-compilation is measured warm.
+Each row of a table is a run in a process of its own, without reading: a camera walks through a
+simulated building (`hours.py`), whose images are made when they are asked for. Three quantities are
+varied, one at a time:
 
-With `--whole` the memory of whole runs is printed instead, without reading and writing.
+- frames: 64 x 48 pixels, two rooms walked through in 1000 frames, again and again, with fresh
+  noise;
+- pixels: 64 x 48 to 1152 x 864 (1 megapixel), 60 frames of one room;
+- rooms: 64 x 48 pixels, 300 frames a room.
 
-    python benchmarks/scaling.py [RECORDING] [--columns 160 320 640] [--counts 500 1000 5000]
+Printed are wall time, CPU time in all and by stage, without that of making the images, peak memory,
+and at the end of a table the exponent of each column: the slope of its logarithm against that of
+what is varied, over the upper half of the rows. 1 is linear; fixed costs make it less.
+
+    python benchmarks/scaling.py [frames pixels rooms] [--full] [--values 500 1000 ...]
+
+The defaults end in about ten minutes; `--full` goes to 100,000 frames, 1 megapixel and 20 rooms,
+which takes hours. `kernels` prints instead the CPU time of each kernel of the tracker on one
+thread, with the lower bound from memory bandwidth, if each of its arrays is moved once; of a
+synthetic room, or of a `--recording`.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import platform
 import subprocess
@@ -22,21 +33,24 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+import hours
+import tofuse
+from stages import grouped
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.cameras.cameras import Pinhole, scaled
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import run_chunks
 from tofuse.engine.compute.thread_pool import threads as using_threads
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.stopwatch import Stopwatch
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.formats.recordings.open import open_recording
 
@@ -100,31 +114,6 @@ def recorded_frames(path: str, count: int) -> list[RangeFrame]:
     return [f for f in frames if isinstance(f, RangeFrame)]
 
 
-def reduced(frames: Sequence[RangeFrame], columns: int) -> list[RangeFrame]:
-    """Return the frames subsampled to a number of columns."""
-    step = max(1, frames[0].camera.width // columns)
-    part = (slice(step // 2, None, step), slice(step // 2, None, step))
-    found = []
-    for frame in frames:
-        depth = np.ascontiguousarray(frame.depth[part])
-        amplitude = frame.amplitude_image
-        assert isinstance(frame.camera, Pinhole)
-        found.append(
-            RangeFrame(
-                frame.index,
-                frame.timestamp,
-                scaled(frame.camera, depth.shape[1], depth.shape[0]),
-                depth,
-                frame.depth_kind,
-                amplitude_image=None
-                if amplitude is None
-                else np.ascontiguousarray(amplitude[part]),
-                amplitude_kind=frame.amplitude_kind,
-            )
-        )
-    return found
-
-
 def tracker(columns: int) -> Any:
     """Return the default tracker, working at a number of columns."""
     options = Keyframes()
@@ -149,84 +138,95 @@ def timed(tracker: Any, frames: Iterator[RangeFrame]) -> tuple[Float64, int]:
     return np.array(seconds), posed
 
 
-def over_resolution(frames: Sequence[RangeFrame], columns: Sequence[int]) -> Iterator[str]:
-    yield f"{'columns':>8}{'rows':>6}{'worked on':>11}{'ms: median':>12}{'95 %':>8}{'posed':>7}"
-    default = Keyframes().views.columns
-    for wanted in columns:
-        images = reduced(frames, wanted)
-        width, height = images[0].camera.width, images[0].camera.height
-        for worked in sorted({min(default, width), width}):
-            timed(tracker(worked), iter(images[:3]))
-            seconds, posed = timed(tracker(worked), forth_and_back(images, 2 * len(images)))
-            ms = 1e3 * seconds[1:]
-            yield (
-                f"{width:>8}{height:>6}{worked:>11}{np.median(ms):>12.1f}"
-                f"{np.percentile(ms, 95):>8.1f}{posed / len(seconds):>7.0%}"
-            )
+@dataclass
+class Walk:
+    """A source of images of a walk through a building, forwards, backwards and so on.
+
+    `making_s` is the CPU time of making images.
+    """
+
+    rooms: int
+    columns: int
+    count: int
+    per_room: int = 300
+    reference: None = None
+    odometry: None = None
+    gravity: None = None
+    warnings: list[str] = field(default_factory=list)
+    metadata: dict[str, Any] = field(default_factory=dict)
+    making_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.timestamps = np.arange(self.count) / hours.RATE_HZ
+        rows, focal = 3 * self.columns // 4, 0.65 * self.columns
+        centre = self.columns / 2 - 0.5, rows / 2 - 0.5
+        self._camera = Pinhole(self.columns, rows, focal, focal, *centre)
+        self._scene = hours.building(self.rooms, 0)
+        self._poses = hours.walk(self.rooms, self.per_room * self.rooms, 0)
+
+    def read(self, index: int) -> RangeFrame:
+        """Return image `index`."""
+        start = time.thread_time()
+        last = len(self._poses) - 1
+        pose = self._poses[last - abs(last - index % (2 * last))]
+        rng = np.random.default_rng([0, 2000, index])
+        image = hours.image_of(self._scene, self._camera, pose, index, rng)
+        self.making_s += time.thread_time() - start
+        return image
 
 
-def over_count(frames: Sequence[RangeFrame], counts: Sequence[int]) -> Iterator[str]:
-    columns = Keyframes().views.columns
-    at_work = tracker(columns)
-    source = forth_and_back(frames, max(counts))
-    yield f"{'frames':>8}{'ms: median':>12}{'95 %':>8}{'posed':>7}{'memory, MB':>12}"
-    done = 0
-    for count in sorted(counts):
-        seconds, posed = timed(at_work, (next(source) for _ in range(count - done)))
-        ms = 1e3 * seconds[1:]
-        fraction = posed / max(1, len(seconds))
-        done = count
-        yield (
-            f"{count:>8}{np.median(ms):>12.1f}{np.percentile(ms, 95):>8.1f}"
-            f"{fraction:>7.0%}{resident_bytes() / 1e6:>12.0f}"
-        )
+# Of a value: what is walked through; and the values.
+AXES = {
+    "frames": (lambda n: Walk(2, 64, n, 500), (250, 500, 1000, 2000)),
+    "pixels": (lambda n: Walk(1, n, 60), (64, 128, 256, 512)),
+    "rooms": (lambda n: Walk(n, 64, 300 * n), (1, 2, 4)),
+}
+FULL = {
+    "frames": (1000, 3000, 10_000, 30_000, 100_000),
+    "pixels": (64, 128, 256, 512, 1152),
+    "rooms": (1, 2, 5, 10, 20),
+}
 
 
-def whole_run(frames: Sequence[RangeFrame], counts: Sequence[int]) -> Iterator[str]:
-    """Memory during a whole run, including loops, refinement and model."""
-    mapper = Mapper()
-    source = forth_and_back(frames, max(counts))
-    yield f"{'frames':>8}{'CPU, s':>9}{'memory, MB':>12}"
-    done = 0
-    for count in sorted(counts):
-        start = time.process_time()
-        for _ in range(count - done):
-            mapper.push(next(source))
-        done = count
-        cpu_s = time.process_time() - start
-        yield f"{count:>8}{cpu_s:>9.1f}{resident_bytes() / 1e6:>12.0f}"
-    start = time.process_time()
-    result = mapper.finish()
-    cpu_s = time.process_time() - start
-    yield f"{'finished':>8}{cpu_s:>9.1f}{resident_bytes() / 1e6:>12.0f}"
-    yield f"{result.has_pose.mean():.0%} posed, {len(result.diagnostics.loops)} loops considered"
+def whole_run(source: Walk, threads: int) -> None:
+    """Reconstruct and write a result in this process, and print its figures for `growth`."""
+    watch = Stopwatch()
+    recording = Recording.of(source, "walk", "made")
+    with watch.running(), tempfile.TemporaryDirectory() as folder:
+        result = tofuse.reconstruct(recording, threads=threads)
+        result.save(folder)
+    stages = grouped(watch.cpu_seconds)
+    # Images are made on other threads while the tracker works or waits.
+    stages["tracking"] -= source.making_s
+    figures = {"s": sum(watch.seconds.values()), "CPU s": sum(stages.values()), **stages}
+    posed, loops = result.has_pose.mean(), sum(p.accepted for p in result.diagnostics.loops)
+    print(json.dumps({"posed %": 100 * posed, "closed": loops, **figures}))
 
 
-def resident_bytes() -> int:
-    """Resident memory now, or at its peak if the system reports only that."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:
-        import resource
-
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else 1024 * peak
-    return pages * os.sysconf("SC_PAGE_SIZE")
-
-
-def compilation() -> Iterator[str]:
-    """Track two small frames in a new process, with an empty and with a full cache."""
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
-        for name in ("first ever", "from the cache"):
-            start = time.perf_counter()
-            command = [sys.executable, __file__, "--compile-only"]
-            done = subprocess.run(command, env=environment, capture_output=True, text=True)
-            if done.returncode:
-                yield f"{name}: failed: {done.stderr.strip().splitlines()[-1]}"
-                return
-            whole = time.perf_counter() - start
-            yield f"{name:<16}{float(done.stdout):>8.1f} s for two frames,{whole:>7.1f} s in all"
+def growth(axis: str, values: Sequence[int], threads: int) -> Iterator[str]:
+    """Lines of a table: a run for each value."""
+    sizes, rows = [], []
+    for value in values:
+        command = [sys.executable, __file__, axis, "--values", str(value), "--run"]
+        child = subprocess.Popen([*command, "--threads", str(threads)], stdout=subprocess.PIPE)
+        assert child.stdout is not None
+        printed = child.stdout.read()
+        _, status, usage = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        if child.returncode:
+            yield f"{value}: failed with status {child.returncode}"
+            continue
+        figures = json.loads(printed.splitlines()[-1]) | {"peak MB": usage.ru_maxrss / 1e3}
+        if not rows:
+            yield f"{axis:>8}" + "".join(f"{name:>11}" for name in figures)
+        sizes.append(3 * value * value // 4 if axis == "pixels" else value)
+        rows.append(list(figures.values()))
+        yield f"{sizes[-1]:>8}" + "".join(f"{x:>11.{0 if x >= 100 else 2}f}" for x in rows[-1])
+    upper = len(rows) // 2 - (len(rows) == 2)
+    if len(rows) > 1:
+        logs = np.log(np.maximum(rows[upper:], 1e-3))
+        slopes = np.polyfit(np.log(sizes[upper:]), logs, 1)[0]
+        yield f"{'exponent':>8}" + "".join(f"{slope:>11.2f}" for slope in slopes)
 
 
 @dataclass
@@ -340,47 +340,32 @@ def over_kernels(frames: Sequence[RangeFrame]) -> Iterator[str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "recording", nargs="?", help="recording to use instead of the synthetic room"
-    )
-    parser.add_argument("--columns", type=int, nargs="+", default=[160, 320, 640])
-    parser.add_argument("--counts", type=int, nargs="+", default=[500, 1000, 5000])
-    parser.add_argument("--length", type=int, default=LENGTH, help="frames of the sequence")
+    parser.add_argument("tables", nargs="*", choices=[*AXES, "kernels"])
+    parser.add_argument("--values", type=int, nargs="+", help="frames, columns, or rooms")
+    parser.add_argument("--full", action="store_true", help="to the largest sizes: hours")
+    parser.add_argument("--recording", help="for kernels: instead of the synthetic room")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--whole", action="store_true", help="print only the memory of a whole run")
-    parser.add_argument("--compile-only", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--run", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
-    if options.compile_only:
-        start = time.perf_counter()
-        timed(Keyframes().start(0), iter(made_frames(160, 2)))
-        print(time.perf_counter() - start)
+    if options.run:
+        whole_run(AXES[options.tables[0]][0](options.values[0]), options.threads)
         return
-
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     print(
         f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; "
-        f"{options.threads} threads{load}; {options.recording or 'synthetic room'}"
+        f"{options.threads} threads{load}"
     )
-    widest = max(options.columns)
-    frames = (
-        recorded_frames(options.recording, options.length)
-        if options.recording
-        else made_frames(widest, options.length)
-    )
-    if options.whole:
-        _print("Whole run", whole_run(frames, options.counts))
-        return
-    with using_threads(options.threads):
-        _print("Resolution", over_resolution(frames, options.columns))
-        _print("Number of frames", over_count(frames, options.counts))
-    _print("Compilation", compilation())
-    _print("Kernels, on one thread", over_kernels(frames))
-
-
-def _print(title: str, lines: Iterator[str]) -> None:
-    print(f"\n{title}", flush=True)
-    for line in lines:
-        print(f"  {line}", flush=True)
+    for table in options.tables or AXES:
+        if table == "kernels":
+            path = options.recording
+            frames = recorded_frames(path, LENGTH) if path else made_frames(640, LENGTH)
+            lines = over_kernels(frames)
+        else:
+            values = options.values or (FULL[table] if options.full else AXES[table][1])
+            lines = growth(table, values, options.threads)
+        print(f"\n{table}", flush=True)
+        for line in lines:
+            print(f"  {line}", flush=True)
 
 
 if __name__ == "__main__":

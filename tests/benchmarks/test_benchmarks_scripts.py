@@ -25,6 +25,21 @@ def test_script_prints_help(script: str, capsys) -> None:
     assert "--threads" in capsys.readouterr().out
 
 
+def test_picture_of_speed_finds_peers_in_the_evidence() -> None:
+    picture = importlib.import_module("speed_picture")
+    peers = dict(picture.peers(picture.EVIDENCE.read_text()))
+    assert list(peers) == list(picture.PEERS.values())
+    assert all(5 < ms < 500 for ms in peers.values())
+    assert peers["Open3D dense SLAM and mesh"] > peers["small_gicp, tracking only"]
+
+
+def test_groups_of_stages_have_all_time() -> None:
+    grouped = importlib.import_module("stages").grouped
+    groups = grouped({"imports": 1.0, "kernels": 2.0, "tracking": 4.0, "unknown": 8.0})
+    assert (groups["start"], groups["tracking"], groups["other"]) == (3, 4, 8)
+    assert sum(groups.values()) == 15
+
+
 def test_listed_signatures_round_trip() -> None:
     compilation = importlib.import_module("compilation")
     listed = ahead.signatures(all_commands=True)

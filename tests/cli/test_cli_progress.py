@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 
+import numba
 import pytest
 
 from tofuse.apps.cli.progress import (
@@ -44,6 +45,21 @@ def test_json_progress_reports_events(capsys) -> None:
     assert (first["done"], first["total"], last["done"]) == (1, 2, 2)
     assert last["per_second"] > 0
     assert (last["seconds_left"], last["inlier_share"], last["reason"]) == (0, None, "why")
+
+
+def test_terminal_says_that_kernels_are_compiled() -> None:
+    shown = []
+
+    class Recording(TerminalProgress):
+        def notify(self, event) -> None:
+            super().notify(event)
+            shown.extend(task.fields["health"] for task in self._bar.tasks)
+
+    with Recording(io.StringIO()) as progress:
+        progress.stage("opening")
+        numba.njit(lambda x: x + 1)(1)
+    numba.njit(lambda x: x + 2)(1)
+    assert shown == ["compiling kernels", ""]
 
 
 _SHOW = """

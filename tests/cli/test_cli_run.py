@@ -30,8 +30,8 @@ SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
 FILES = {*SAME, "report.html", "run.json"}
 # Fields of run.json, of its frames and of its loops.
 RUN_KEYS = """
-schema version input seed threads config seconds verdict self_calibration accuracy reasons
-frames loops optimiser priors refinement filters findings warnings components sessions
+schema version input seed threads config seconds cpu_seconds verdict self_calibration accuracy
+reasons frames loops optimiser priors refinement filters findings warnings components sessions
 session_pairs changes T_up_world rig shift_m sha256
 """
 FRAME_KEYS = """

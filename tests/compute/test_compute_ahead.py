@@ -6,11 +6,12 @@ import os
 import subprocess
 import sys
 import textwrap
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
-from tofuse.engine.compute import ahead, jit
+from tofuse.engine.compute import ahead, jit, kernel_cache
 
 
 def test_listed_kernels_exist() -> None:
@@ -67,6 +68,28 @@ def test_failed_process_start_is_ignored(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(subprocess, "Popen", refused)
     with ahead.compiling_in_background() as is_first_run:
         assert is_first_run
+
+
+def test_compile_now_waits_for_all_processes(monkeypatch) -> None:
+    waited = []
+
+    class Helper:
+        def __init__(self, status: int) -> None:
+            self.status = status
+
+        def wait(self) -> int:
+            waited.append(self.status)
+            return self.status
+
+    monkeypatch.setenv("NUMBA_CPU_NAME", "")
+    monkeypatch.setenv("NUMBA_CPU_FEATURES", "")
+    processor = kernel_cache.Processor("generic", "+avx")
+    for statuses, succeeds in (((0, 0), True), ((1, 0), False), ((), False)):
+        monkeypatch.setattr(ahead, "_start", lambda *_, s=statuses: map(Helper, s))
+        with nullcontext() if succeeds else pytest.raises(RuntimeError, match="compiled"):
+            ahead.compile_now(processor=processor)
+    assert waited == [0, 0, 1, 0]
+    assert (os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"]) == processor
 
 
 def test_nothing_is_compiled_ahead_that_package_contains(tmp_path, monkeypatch) -> None:

@@ -14,7 +14,6 @@ from tofuse.engine.loops.loops import ClosedLoop
 from tofuse.engine.loops.revisits import degraded_neighbours
 from tofuse.engine.mapping.backend import BackEnd, Job
 from tofuse.engine.mapping.methods import from_method
-from tofuse.engine.progress import Stopwatch
 from tofuse.engine.tracking.base import Step
 
 SIGMA = np.array([0.003] * 3 + [0.002] * 3)
@@ -58,7 +57,7 @@ def chain(posed, truth, inflation, wrong):
     log = SimpleNamespace(posed=entries, entries=entries)
     kept = SimpleNamespace(views=SimpleNamespace(of=lambda row: posed))
     progress = SimpleNamespace(stage=lambda *_: None)
-    job = Job(from_method("default"), kept, (), progress, Stopwatch())
+    job = Job(from_method("default"), kept, (), progress)
     return BackEnd(job, log, poses, ())
 
 

@@ -1,4 +1,4 @@
-"""A wheel contains compiled kernels, so that a first run compiles nothing."""
+"""Wheels, and installations from source, contain compiled kernels: a first run compiles nothing."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ import sys
 import sysconfig
 import venv
 import zipfile
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from hatchling.bridge.app import Application
 
 from paths import ROOT
 
@@ -24,6 +28,56 @@ from tofuse.engine.geometry import rigid_motion_kernels
 import numpy as np
 assert rigid_motion_kernels.distance_and_angle(np.eye(4), np.eye(4)) == (0, 0)
 """
+
+
+@pytest.fixture
+def build(tmp_path, monkeypatch) -> Any:
+    """Call the hook in an empty folder, with a compiler that writes no or one kernel."""
+    spec = spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    def call(version: str = "standard", *, compiles: bool = True) -> dict[str, Any]:
+        def run(words: list[str], env: dict[str, str], check: bool) -> None:
+            if compiles:
+                folder = Path(env["NUMBA_CACHE_DIR"], "kernels-1")
+                folder.mkdir(parents=True)
+                (folder / f"all-{words[-1]}.kernel").touch()
+            elif check:
+                raise subprocess.CalledProcessError(1, words)
+
+        monkeypatch.setattr(module, "subprocess", SimpleNamespace(run=run))
+        hook = module.CompiledKernels(str(tmp_path), {}, None, None, "", "wheel", Application())
+        data: dict[str, Any] = {"force_include": {}, "pure_python": True}
+        hook.initialize(version, data)
+        return data
+
+    return call
+
+
+def test_installation_from_source_compiles_what_runs_call(build) -> None:
+    data = build()
+    assert list(data["force_include"].values()) == [
+        "tofuse/engine/compute/compiled/kernels-1/all-0.kernel"
+    ]
+    assert (data["pure_python"], data["infer_tag"]) == (False, True)
+
+
+def test_installation_from_source_needs_no_compiled_kernels(build) -> None:
+    untouched = {"force_include": {}, "pure_python": True}
+    assert build(compiles=False) == untouched
+    assert build("editable") == untouched
+
+
+def test_wheel_of_release_has_all_kernels(build, monkeypatch) -> None:
+    monkeypatch.setenv("HATCH_BUILD_HOOK_ENABLE_CUSTOM", "true")
+    data = build()
+    assert [Path(name).name for name in data["force_include"]] == ["all-1.kernel"]
+    assert data["tag"].startswith(f"cp{sys.version_info.major}{sys.version_info.minor}-")
+    with pytest.raises(subprocess.CalledProcessError):
+        build(compiles=False)
 
 
 @pytest.fixture(scope="module")

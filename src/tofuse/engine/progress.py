@@ -1,11 +1,8 @@
-"""Progress of long jobs: stages, steps, notes, and wall times."""
+"""Progress of long jobs: stages, steps and notes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from time import perf_counter
+from dataclasses import dataclass
 from typing import Protocol
 
 from tofuse.engine.arrays import Float64
@@ -63,19 +60,3 @@ class CombinedProgress:
         """See `Progress`."""
         self.first.placed(frame, T_world_camera)
         self.second.placed(frame, T_world_camera)
-
-
-@dataclass
-class Stopwatch:
-    """Wall time of each stage in s, summed over its blocks."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def timing(self, stage: str) -> Iterator[None]:
-        """Add the time of the block to the stage."""
-        start = perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + perf_counter() - start

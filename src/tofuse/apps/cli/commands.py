@@ -26,6 +26,7 @@ from tofuse.apps.cli.progress import (
 )
 from tofuse.engine.errors import InputError
 from tofuse.engine.results import Reason, Reconstruction
+from tofuse.engine.stopwatch import timing
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -40,7 +41,7 @@ _NAME_WIDTH = 14  # width of the column of names
 _STATUS_COLORS = {True: "green", False: "red", None: "yellow"}
 _NOT_WITH_RIG = (
     *("view", "loops", "guess", "object"),
-    *("average_still", "camera", "topic", "no_report"),
+    *("average_still", "camera", "topic", "no_report", "profile"),
 )
 VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
 
@@ -93,24 +94,31 @@ def progress_unless_json(
 
 def run(arguments: cli.Run) -> int:
     """``tofuse run``."""
-    from tofuse.apps.jobs import run as run_pipeline
+    from tofuse.apps.cli import stage_times
     from tofuse.formats.rigs import recordings_of, rig_file_in
 
-    options = run_options(arguments)
     if arguments.rig is None and len(arguments.inputs) == 1:
         arguments.rig = rig_file_in(arguments.inputs[0])
         if arguments.rig is not None:
             arguments.inputs = [str(path) for path in recordings_of(arguments.rig).values()]
     if arguments.rig is not None:
-        return _run_rig(arguments.rig, arguments, options)
+        return _run_rig(arguments.rig, arguments)
     if arguments.view:
-        return _run_live(arguments, options)
+        return _run_live(arguments)
     for is_set, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
         if is_set:
             raise InputError("requires --view", where=name, remedy="pass --view as well")
-    with progress_for(as_json=arguments.json) as progress:
-        result = run_pipeline(arguments.inputs, options, progress)
-    return _finished(result, arguments.out, arguments)
+    with stage_times.process_watch() as watch:
+        with timing("imports"):
+            from tofuse.apps.jobs import run as run_pipeline
+
+            options = run_options(arguments)
+        with progress_for(as_json=arguments.json) as progress:
+            result = run_pipeline(arguments.inputs, options, progress)
+        status = _finished(result, arguments.out, arguments)
+    if arguments.profile:
+        stage_times.print_at_exit(watch, len(result.diagnostics.frames), result.threads)
+    return status
 
 
 def _finished(result: Reconstruction, out: Path, arguments: cli.JsonLines) -> int:
@@ -128,10 +136,11 @@ def run_options(arguments: cli.Run) -> Options:
     return from_arguments(Options, arguments)
 
 
-def _run_rig(rig: Path, arguments: cli.Run, options: Options) -> int:
+def _run_rig(rig: Path, arguments: cli.Run) -> int:
     """``tofuse run --rig``."""
     from tofuse.apps.rigs import run_rig
 
+    options = run_options(arguments)
     for name in _NOT_WITH_RIG:
         if getattr(arguments, name):
             option = f"--{name.replace('_', '-')}"
@@ -141,13 +150,16 @@ def _run_rig(rig: Path, arguments: cli.Run, options: Options) -> int:
     return _finished(rig_result.result, arguments.out, arguments)
 
 
-def _run_live(arguments: cli.Run, options: Options) -> int:
+def _run_live(arguments: cli.Run) -> int:
     """Run and show the reconstruction live; then show the result until Ctrl-C."""
     from tofuse.apps.jobs import exit_status
     from tofuse.apps.jobs import run as run_pipeline
     from tofuse.apps.viewer import LiveView, address, serve, stop
     from tofuse.engine.progress import CombinedProgress
 
+    if arguments.profile:
+        raise InputError("can't be used with --view", where="--profile", remedy="leave one out")
+    options = run_options(arguments)
     server = serve(arguments.port)
     try:
         _show(address(server), arguments)

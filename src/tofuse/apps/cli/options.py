@@ -173,6 +173,8 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
         approximate memory limit, e.g. 4GB; the rest goes to disk (2GB)
     rig : FILE
         a rig.json; each INPUT is one of its cameras, in the same order
+    profile
+        print how long each stage took, from the start of the process to its end
 
     Reconstruction
     --------------
@@ -226,6 +228,7 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     voxel: Length | None = None
     memory: Size | None = None
     rig: Path | None = None
+    profile: bool = False
     method: str | None = None
     config: Path | None = None
     guess: Literal["identity", "previous", "odometry"] | None = None

@@ -141,7 +141,10 @@ def _function(cls: type[Command], name: str) -> Callable[[argparse.Namespace], i
 
         with compiling_in_background() as is_first_run:
             if is_first_run and sys.stderr.isatty():
-                sys.stderr.write("tofuse: compiling the numerical kernels, in the first run only\n")
+                sys.stderr.write(
+                    "tofuse: the first run compiles the numerical kernels, each when it is needed: "
+                    "half a minute longer on two cores\n"
+                )
             return function(options)
 
     return call

@@ -82,12 +82,20 @@ class TerminalProgress(Silent):
 
     def __enter__(self) -> Self:
         self._bar.start()
+        _listen("register", self)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
     ) -> None:
+        _listen("unregister", self)
         self._bar.stop()
+
+    def notify(self, event: Any) -> None:
+        """Show that a kernel is being compiled; called by Numba when it begins and ends."""
+        for task in self._bar.tasks[-1:]:
+            health = "compiling kernels" if event.is_start else ""
+            self._bar.update(task.id, health=health)
 
     def stage(self, name: str, total: int | None = None) -> None:
         """Begin a stage."""
@@ -168,6 +176,13 @@ class QuietProgress(_Context):
     def note(self, text: str) -> None:
         """Keep the note for the end."""
         self._notes.append(text)
+
+
+def _listen(action: str, listener: TerminalProgress) -> None:
+    """Register or unregister for the compilation of kernels, where Numba is in use."""
+    if numba_event := sys.modules.get("numba.core.event"):
+        numba_event.Listener.register(TerminalProgress)
+        getattr(numba_event, action)("numba:compile", listener)
 
 
 def progress_for(*, as_json: bool) -> TerminalProgress | JsonProgress | QuietProgress:

@@ -17,17 +17,20 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Config, changed, reconstructing
 from tofuse.engine.parts import name_of
 from tofuse.engine.results import Reconstruction
+from tofuse.engine.stopwatch import timing
 from tofuse.formats.geometry import read_ply
 
 _DRAWN_CLOUDS = 12  # views in the report, if they are clouds
 _TRUTH_POINTS = 100_000
 
 
+@timing("report")
 def write_report_files(
     recording: Recording, config: Config, result: Reconstruction, folder: Path
 ) -> None:
     """Write `report.html` into a folder."""
-    from tofuse.apps.report import ReportExtras, write_report
+    with timing("imports"):
+        from tofuse.apps.report import ReportExtras, write_report
 
     title = _title(Path(recording.path)) or recording.path
     truth = truth_points(recording)

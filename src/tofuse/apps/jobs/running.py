@@ -27,7 +27,7 @@ from tofuse.engine.fusion import texture
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import Config, adaptation, reconstructing, texturing
 from tofuse.engine.normal import OF_99_PERCENT
-from tofuse.engine.progress import Progress, Silent, Stopwatch
+from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import (
     Reason,
     Reconstruction,
@@ -36,6 +36,7 @@ from tofuse.engine.results import (
     verdicts,
 )
 from tofuse.engine.sensor import Unwrap
+from tofuse.engine.stopwatch import timing
 from tofuse.formats.files import stamps
 from tofuse.formats.poses import read_loops
 from tofuse.formats.recordings import Opening
@@ -60,9 +61,7 @@ def run(
     progress = progress or Silent()
     if folder is None:
         folders.check_output(options.out, overwrite=options.overwrite)
-    watch = Stopwatch()
-    with watch.timing("opening"):
-        job = _open(inputs, options, progress)
+    job = _open(inputs, options, progress)
     tracked_file = _tracked_file(inputs, options, job, progress) if folder is None else None
     with (
         folders.OutputFolder(options.out, overwrite=options.overwrite)
@@ -79,20 +78,16 @@ def run(
                 progress=progress,
                 tracked_frames=tracked_file,
             )
-            texture = _texture(job, result, options, progress, watch)
+            texture = _texture(job, result, options, progress)
             result = with_findings(result, job.findings, turning=options.object)
-            seconds = {**watch.seconds, **result.diagnostics.seconds}
-            result = replace(
-                result,
-                recording={**result.recording, "opening": job.opening.to_dict()},
-                diagnostics=replace(result.diagnostics, seconds=seconds),
-            )
+            opening = job.opening.to_dict()
+            result = replace(result, recording={**result.recording, "opening": opening})
             if device := device_sentence(job.recording, result):
                 progress.note(device)
             progress.stage("writing")
-            trim_memory()
             # BLAS results depend on its number of threads, and idle threads busy-wait.
-            with threadpool_limits(1):
+            with threadpool_limits(1), timing("writing"):
+                trim_memory()
                 report = partial(write_report_files, job.recording, job.config)
                 write_result(result, out, None if options.no_report else report, texture)
         except BaseException as error:
@@ -119,8 +114,10 @@ class _Job:
     findings: tuple[Finding, ...]
 
 
+@timing("opening")
 def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) -> _Job:
     """Open and inspect the recording, and resolve its configuration."""
+    progress.stage("opening")
     seed = seed_of(options)
     opening = Opening.of(inputs, options)
     recording = opening.open()
@@ -142,20 +139,21 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
     return _Job(opening, recording, config, seed, loops, findings)
 
 
+@timing("texture")
 def _texture(
-    job: _Job, result: Reconstruction, options: Options, progress: Progress, watch: Stopwatch
+    job: _Job, result: Reconstruction, options: Options, progress: Progress
 ) -> texture.Textured | None:
     """Make the texture if one is configured; with a note if that is impossible."""
     size = job.config.fusion.texture
     if not size:
         return None
-    with watch.timing("texture"):
-        texture = texturing.make_texture(job.recording, result, size, options.threads, progress)
+    texture = texturing.make_texture(job.recording, result, size, options.threads, progress)
     if texture is None:
         progress.note("no texture: there is no surface, or neither colour nor amplitude")
     return texture
 
 
+@timing("opening")
 def _tracked_file(
     inputs: Sequence[str | Path], options: Options, job: _Job, progress: Progress
 ) -> TrackedFile:
@@ -173,6 +171,7 @@ def _tracked_file(
     return TrackedFile(out / folders.TRACKED, key, progress.note)
 
 
+@timing("inspection")
 def quick_findings(
     recording: Recording, config: Config, *, turning: bool = False
 ) -> tuple[Finding, ...]:

@@ -22,6 +22,7 @@ from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.mapping import FrameLog
+from tofuse.engine.stopwatch import timing
 from tofuse.engine.tracking import FrameTime, Step, Tracker, moving_objects
 from tofuse.engine.views import PreparedView
 from tofuse.formats.files import atomic, npz
@@ -69,6 +70,7 @@ class TrackedFile:
         self._tracker = self._replaying(tracker) or LoggingTracker(tracker)
         return self._tracker
 
+    @timing("writing")
     def finish(self, log: FrameLog) -> None:
         """Store the steps of all frames after tracking.
 

@@ -71,6 +71,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         (),
         {name: each["removed"] for name, each in run["filters"].items()},
         run["seconds"],
+        run.get("cpu_seconds", {}),
         parts=tuple(_part(each) for each in run["optimiser"]),
         priors=tuple(external_sensors.SensorRecord(**s) for s in run["priors"]),
         accuracy=_accuracy(run["accuracy"]),

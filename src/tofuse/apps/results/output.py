@@ -16,6 +16,7 @@ from tofuse.engine.compute import job_pool
 from tofuse.engine.fusion import GeometryRecord, Mesh, display_colors, texture
 from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
+from tofuse.engine.stopwatch import timing
 from tofuse.formats.export import exchange
 from tofuse.formats.geometry import write_glb, write_obj, write_ply
 from tofuse.formats.images import png_bytes
@@ -82,7 +83,8 @@ def _write_files(
         # Last, since it shares the report's overview of the surface.
         if result.mesh is not None:
             _write_scene(result.mesh, result.T_up_world, folder, texture)
-        write_run_json(folder / "run.json", result)
+        with timing("writing"):  # its times are those until here
+            write_run_json(folder / "run.json", result)
 
 
 def _write_model(result: Reconstruction, folder: Path) -> None:

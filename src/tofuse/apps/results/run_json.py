@@ -80,6 +80,7 @@ def _content(result: Reconstruction) -> dict[str, Any]:
         "threads": result.threads,
         "config": result.config,
         "seconds": {k: round(v, 4) for k, v in d.seconds.items()},
+        "cpu_seconds": {k: round(v, 4) for k, v in d.cpu_seconds.items()},
         "verdict": d.verdict,
         "accuracy": accuracy_json(d.accuracy),
         "self_calibration": _calibration(d.calibrated),

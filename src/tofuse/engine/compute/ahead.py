@@ -1,6 +1,7 @@
-"""Compilation of kernels ahead of their first call, by other processes during the first run.
+"""Compilation of kernels ahead of their first call, by other processes.
 
-The first run on a machine compiles every kernel that it calls. Meanwhile, helper processes compile
+Installation from source compiles them, if it can (`compile_now`). Else the first run on a machine
+compiles every kernel that it calls. Meanwhile, helper processes compile
 the same kernels in reverse order into the same cache, each starting at a different position in the
 list, and load those that are already cached. The list of kernels and argument types was recorded in
 runs of the default method; `python benchmarks/compilation.py --list` records it again.
@@ -9,6 +10,7 @@ runs of the default method; `python benchmarks/compilation.py --list` records it
 from __future__ import annotations
 
 import gc
+import os
 import re
 import subprocess
 import sys
@@ -21,7 +23,7 @@ from typing import Any
 import numba
 from llvmlite.binding import get_host_cpu_name
 
-from tofuse.engine.compute import jit
+from tofuse.engine.compute import jit, kernel_cache
 from tofuse.engine.compute.thread_pool import usable_cores
 
 # Helper processes, each of which takes about 0.5 GB of memory; at most half of the cores.
@@ -59,7 +61,7 @@ def compiling_in_background() -> Iterator[bool]:
         return
     with ExitStack() as stack:
         stack.enter_context(rare_garbage_collection())
-        for helper in _start_helpers():
+        for helper in _start(min(usable_cores() // 2, _MAX_HELPERS), False):
             stack.callback(helper.wait)
             stack.callback(helper.terminate)
         yield True
@@ -84,14 +86,35 @@ def _are_compiled() -> bool:
     return marker is not None and marker.exists()
 
 
-def _start_helpers() -> Iterator[subprocess.Popen[bytes]]:
+def compile_now(
+    all_commands: bool = False, processor: kernel_cache.Processor | None = None
+) -> None:
+    """Compile kernels into the cache, on all cores, and wait until they are there.
+
+    Parameters
+    ----------
+    all_commands
+        As for `signatures`.
+    processor
+        What they are for; None: the one of this machine.
+    """
+    if processor is not None:  # names that Numba reads
+        os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = processor
+    helpers = list(_start(min(usable_cores(), _MAX_HELPERS + 1), all_commands))
+    statuses = [helper.wait() for helper in helpers]
+    if not statuses or any(statuses):
+        raise RuntimeError("the kernels could not be compiled")
+
+
+def _start(count: int, all_commands: bool) -> Iterator[subprocess.Popen[bytes]]:
+    """Start processes that compile the listed kernels."""
     if jit.cache_folder() is None:
         return
-    count = min(usable_cores() // 2, _MAX_HELPERS)
     for k in range(count):
+        numbers = map(str, (k, count, int(all_commands)))
         try:
             yield subprocess.Popen(
-                [sys.executable, "-m", "tofuse.engine.compute.ahead", str(k), str(count)],
+                [sys.executable, "-m", "tofuse.engine.compute.ahead", *numbers],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
@@ -118,13 +141,13 @@ def signatures(all_commands: bool = False) -> list[tuple[str, tuple[Any, ...]]]:
     return kernels
 
 
-def compile_listed(helper: int = 0, helpers: int = 1) -> None:
+def compile_listed(helper: int = 0, helpers: int = 1, *, all_commands: bool = False) -> None:
     """Compile `signatures` in reverse order, or load them from the cache.
 
     Each of several `helpers` starts at a different position in the list, and wraps around at its
     end.
     """
-    listed = signatures()[::-1]
+    listed = signatures(all_commands)[::-1]
     first = len(listed) * helper // helpers
     compile_all(listed[first:] + listed[:first])
     if marker := compiled_marker():
@@ -161,4 +184,5 @@ def _type_of(text: str) -> Any:
 
 if __name__ == "__main__":
     with rare_garbage_collection():
-        compile_listed(*map(int, sys.argv[1:]))
+        numbers = [int(word) for word in sys.argv[1:]]
+        compile_listed(*numbers[:2], all_commands=any(numbers[2:]))

@@ -18,6 +18,7 @@ from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import RangeView, StoredViews
 from tofuse.engine.fusion.tsdf import fitting_voxel, fuse_surface
 from tofuse.engine.refinement import without_errors
+from tofuse.engine.stopwatch import timing
 from tofuse.engine.views import PreparedView
 
 _SKETCH_VIEWS, _SKETCH_PIXELS = 60, 6000  # views in a sketch, and approximate pixels of each
@@ -115,7 +116,8 @@ class ModelBuilder:
         mesh = fuse_surface(views, T_world_camera, self._options, advance)
         if len(mesh):
             faces = self._options.faces
-            model = Model(mesh.cloud(), mesh.decimated(faces) if faces else mesh)
+            with timing("meshing"):
+                model = Model(mesh.cloud(), mesh.decimated(faces) if faces else mesh)
         else:
             clouds = (view.as_cloud() for view in views)
             model = Model(self._average(clouds, poses, self._range_voxel), mesh)

@@ -51,6 +51,7 @@ from tofuse.engine.fusion.tsdf_kernels import (
     unpack_view,
 )
 from tofuse.engine.geometry import se3
+from tofuse.engine.stopwatch import timing
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +141,7 @@ class Piece:
         return piece, self.ids[used]
 
 
+@timing("meshing")
 def stitch(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
     """Stitch the pieces of all blocks, without islands.
 
@@ -585,9 +587,10 @@ def fuse_surface(
     if sum(map(len, regions)) == 1:
         volume = Volume.of(layouts[0], regions[0][0])
         volume.add(views, poses, advance)
-        mesh = volume.surface(options.min_views)
-        del volume
-        return mesh.without_islands(options.island)
+        with timing("meshing"):
+            mesh = volume.surface(options.min_views)
+            del volume
+            return mesh.without_islands(options.island)
     return _fuse_by_regions(layouts, regions, views, poses, options, advance)
 
 
@@ -623,12 +626,13 @@ def _fuse_by_regions(
                 touching = frusta.touching(block_m * low, block_m * high) if frusta else None
                 volume = Volume.of(layout, region)
                 volume.add(views, poses, step, touching)
-                piece = volume.piece(options.min_views)
-                del volume
-                if len(layouts) > 1:
-                    piece, vertices = piece.joined(layout, coarser)
-                    cells.append(vertices)
-                pieces.put(piece)
+                with timing("meshing"):
+                    piece = volume.piece(options.min_views)
+                    del volume
+                    if len(layouts) > 1:
+                        piece, vertices = piece.joined(layout, coarser)
+                        cells.append(vertices)
+                    pieces.put(piece)
             if cells:
                 coarser.append((layout, np.sort(np.concatenate(cells))))
         return stitch(pieces, sum(len(layout.keys) for layout in layouts), options.island)

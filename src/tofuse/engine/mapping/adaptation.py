@@ -23,6 +23,7 @@ from tofuse.engine.noise import NOISE, NoiseModel, noise_model_for
 from tofuse.engine.parts import name_of
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.sensor import Correction, Noise
+from tofuse.engine.stopwatch import timing
 from tofuse.engine.tracking import Keyframes, given
 from tofuse.engine.views import RAW_RANGE_FALLOFF
 
@@ -65,7 +66,7 @@ def adapted(
     initial = config
     filters_learn = any(f.needs_fit for f in (*config.filters, *config.model_filters))
     # BLAS results depend on its number of threads; those of our kernels don't.
-    with use_threads(threads), threadpool_limits(1):
+    with use_threads(threads), threadpool_limits(1), timing("fitting"):
         if filters_learn or any(c.needs_fit for c in config.corrections):
             config = _fitted(config, recording)
         for item in config.corrections:
@@ -151,6 +152,7 @@ def _fitted(config: Config, recording: Recording) -> Config:
     return replace(config, corrections=corrections, filters=filters, model_filters=model_filters)
 
 
+@timing("trials")
 def _after_trial(
     config: Config, item: Correction, recording: Recording, progress: Progress
 ) -> Config:

@@ -13,6 +13,7 @@ from tofuse.engine.loops import Group, JoinKind
 from tofuse.engine.mapping.backend import BackEnd, Job
 from tofuse.engine.mapping.frame_log import FrameLog, poses_in_world
 from tofuse.engine.results import Component, Reconstruction
+from tofuse.engine.stopwatch import timing
 
 # An unconnected component gets its own model if it has more frames than this.
 _MAX_WITHOUT_MODEL = 5
@@ -51,14 +52,14 @@ class Assembly:
             result = BackEnd(self.job, log, poses, groups[0].joins).run(components)
         return replace(result, seed=self.seed, threads=self.threads)
 
+    @timing("joining")
     def _join(self, log: FrameLog) -> list[Group]:
         """Decide from all views which components are connected, and how."""
         components = log.tracked_components(self.job.observations.views)
         if len(components) > 1:
             self.job.progress.stage("joining components")
-        with self.job.watch.timing("joining"):
-            config = self.job.config
-            return config.joining.join(components, log.links, config.search)
+        config = self.job.config
+        return config.joining.join(components, log.links, config.search)
 
     def _components(
         self, log: FrameLog, groups: Sequence[Group]

@@ -23,8 +23,9 @@ from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph, VisualEvidence
-from tofuse.engine.progress import Progress, Stopwatch
+from tofuse.engine.progress import Progress
 from tofuse.engine.results import Component, Diagnostics, Reconstruction
+from tofuse.engine.stopwatch import current, timing
 
 # Maximum number of repeated loop searches along a long trajectory.
 _MAX_SEARCHES = 2
@@ -42,15 +43,14 @@ class Job:
         Stored observations.
     prior_loops
         Given loops.
-    progress, watch
-        Receive stages and times.
+    progress
+        Receives stages.
     """
 
     config: Config
     observations: Observations
     prior_loops: Sequence[PriorLoop]
     progress: Progress
-    watch: Stopwatch
 
 
 class BackEnd:
@@ -72,7 +72,7 @@ class BackEnd:
         self, job: Job, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]
     ) -> None:
         self._config, self._log, self._prior_loops = job.config, log, job.prior_loops
-        self._observations, self._progress, self._watch = job.observations, job.progress, job.watch
+        self._observations, self._progress = job.observations, job.progress
         posed = [e for e in log.posed if e.record.index in poses]
         self._tracked = TrackedGraph(posed, poses, joins)
 
@@ -86,20 +86,18 @@ class BackEnd:
         trim_memory()
         return self._result(closed, refined, model, cloud_before, components)
 
+    @timing("loops")
     def _close_loops(self) -> Optimised:
         self._progress.stage("closing loops")
-        with self._watch.timing("loops"):
-            tracked = self._tracked.build(())
-            # For the search, assume that motion in degenerate directions may differ from the rest.
-            degenerate = bool(self._tracked.unobservable)
-            conservative = self._tracked.build((), conservative=True) if degenerate else tracked
-            detected = self._observations.loops.finish(
-                self._tracked.poses, _covariances(conservative)
-            )
-            loops = with_joins(detected, self._tracked.joins)
-            del conservative
-            loops = self._repeat_loop_search(loops)
-            graph = self._tracked.build(loops)
+        tracked = self._tracked.build(())
+        # For the search, assume that motion in degenerate directions may differ from the rest.
+        degenerate = bool(self._tracked.unobservable)
+        conservative = self._tracked.build((), conservative=True) if degenerate else tracked
+        detected = self._observations.loops.finish(self._tracked.poses, _covariances(conservative))
+        loops = with_joins(detected, self._tracked.joins)
+        del conservative
+        loops = self._repeat_loop_search(loops)
+        graph = self._tracked.build(loops)
         # Poses before loop closure, without and with external sensors.
         sequential = aided = graph.poses
         sensors = external_sensors.SensorPriors()
@@ -111,7 +109,7 @@ class BackEnd:
         confirmed: frozenset[int] = frozenset()
         if graph.loop.any() or sensors:
             self._progress.stage("optimising")
-            with self._watch.timing("optimisation"):
+            with timing("optimisation"):
                 optimisation, confirmed = self._optimise(graph, loops, sensors)
                 if sensors and graph.loop.any():  # loops are compared with these poses
                     without_loops = external_sensors.with_sensors(tracked, sensors)
@@ -173,31 +171,32 @@ class BackEnd:
             loops = with_joins(detected, self._tracked.joins)
         return loops
 
+    @timing("refinement")
     def _refine(self, closed: Optimised) -> Refined:
         graph = closed.optimisation.graph
         self._progress.stage("refining")
-        with self._watch.timing("refinement"):
-            refinement = self._observations.refiner.finish(graph, closed.sensors)
-            if refinement.kept:
-                graph = self._tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
-                graph = external_sensors.with_sensors(graph, closed.sensors)
+        refinement = self._observations.refiner.finish(graph, closed.sensors)
+        if refinement.kept:
+            graph = self._tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
+            graph = external_sensors.with_sensors(graph, closed.sensors)
         return Refined(graph, refinement)
 
+    @timing("fusion")
     def _fuse(self, closed: Optimised, refined: Refined) -> tuple[Model, Cloud | None]:
         """Return the model, and a cloud at the poses before optimisation if that changed any."""
         graph, refinement, model = refined.graph, refined.refinement, self._observations.model
         poses_changed = bool(graph.loop.any()) or refinement.kept or bool(closed.sensors)
         self._progress.stage("fusing", model.views)
-        with self._watch.timing("fusion"):
-            ids = graph.ids.tolist()
-            fused = model.fuse(
-                dict(zip(ids, graph.poses, strict=True)),
-                self._progress.advance,
-                refinement.errors,
-            )
-            initial_poses = dict(zip(ids, closed.sequential, strict=True))
-            return fused, model.sketch(initial_poses) if poses_changed else None
+        ids = graph.ids.tolist()
+        fused = model.fuse(
+            dict(zip(ids, graph.poses, strict=True)),
+            self._progress.advance,
+            refinement.errors,
+        )
+        initial_poses = dict(zip(ids, closed.sequential, strict=True))
+        return fused, model.sketch(initial_poses) if poses_changed else None
 
+    @timing("checking")
     def _result(
         self,
         closed: Optimised,
@@ -207,12 +206,11 @@ class BackEnd:
         components: tuple[Component, ...],
     ) -> Reconstruction:
         self._progress.stage("checking")
-        with self._watch.timing("checking"):
-            assessment = Assessment(
-                self._config, self._log, self._tracked, self._observations, self._prior_loops
-            )
-            assessed = assessment.run(closed, refined, model, components)
-        model, entries = assessed.model, self._log.entries
+        assessment = Assessment(
+            self._config, self._log, self._tracked, self._observations, self._prior_loops
+        )
+        assessed = assessment.run(closed, refined, model, components)
+        model, entries, watch = assessed.model, self._log.entries, current()
         return Reconstruction(
             trajectory=self._scatter(refined.graph.poses),
             timestamps=np.array([e.record.timestamp for e in entries]),
@@ -227,7 +225,8 @@ class BackEnd:
                 sequential=self._scatter(closed.sequential),
                 objective=closed.optimisation.objective,
                 removed={},
-                seconds=dict(self._watch.seconds),
+                seconds=watch.seconds,
+                cpu_seconds=watch.cpu_seconds,
                 cloud_before=cloud_before,
                 refinement=refined.refinement,
                 parts=closed.optimisation.parts,

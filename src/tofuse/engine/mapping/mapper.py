@@ -23,8 +23,9 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.preparation import FilteredFrame, Preparation, Prepared
 from tofuse.engine.parts import check_number
-from tofuse.engine.progress import Progress, Silent, Stopwatch
+from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import FrameRecord, Reconstruction
+from tofuse.engine.stopwatch import current, timing
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import FrameTime, Step, Tracker
 from tofuse.engine.views import PreparedView
@@ -69,7 +70,7 @@ class Mapper:
         self._method = config if isinstance(config, str) else None
         self.seed = seed
         self.threads = threads if threads is not None else thread_count()
-        self.watch = Stopwatch()
+        self.watch = current()
         self._prior_loops = tuple(loops)
         self._progress = progress or Silent()
         self._sequence = FrameSequence()
@@ -130,28 +131,27 @@ class Mapper:
             self._log.repeated.append(frame.index)
         # Chunks run serially while other threads prepare frames; else relocalization uses all.
         busy = prepared is not None and prepared.filtered is not None
-        with threads(self.threads, serial=busy):
+        with threads(self.threads, serial=busy), self.watch.running(), timing("tracking"):
             filtered = self._prepare(frame, history, prepared)
             step = self._track(filtered, T_odometry, repeated)
             record = record_of(filtered.corrected, step, frame.mean_depth)
             self._log.add(record, step, T_odometry, gravity)
             self._store(filtered, step)
-            with self.watch.timing("loops"):
+            with timing("loops"):
                 self._live_poses.update(step, self._log)
             return self._report(filtered, step)
 
+    @timing("filters")
     def _prepare(
         self, frame: Frame, history: Sequence[Frame] | None, prepared: Prepared | None
     ) -> FilteredFrame:
-        with self.watch.timing("filters"):
-            T_expected = None
-            if self._log.entries and self._log.entries[-1].has_pose:
-                T_expected = self._tracker.predicted_pose(FrameTime(frame.index, frame.timestamp))
-            return self._preparation.process(frame, T_expected, history, prepared)
+        T_expected = None
+        if self._log.entries and self._log.entries[-1].has_pose:
+            T_expected = self._tracker.predicted_pose(FrameTime(frame.index, frame.timestamp))
+        return self._preparation.process(frame, T_expected, history, prepared)
 
     def _track(self, filtered: FilteredFrame, T_odometry: Float64 | None, repeated: bool) -> Step:
-        with self.watch.timing("tracking"):
-            step = self._tracker.push(filtered.for_tracking, T_odometry, filtered.surface)
+        step = self._tracker.push(filtered.for_tracking, T_odometry, filtered.surface)
         if repeated and step.status == "tracked":
             reason = f"the same image as frame {self._log.entries[-1].record.index}"
             step = replace(step, status="predicted", reason=reason)
@@ -167,9 +167,9 @@ class Mapper:
         if step.moving is not None:
             filtered = replace(filtered, for_model=filtered.for_model.keep(~step.moving))
         if not lost:
-            with self.watch.timing("loops"):
+            with timing("loops"):
                 self._observations.add(filtered, step)
-            with self.watch.timing("fusion"):
+            with timing("fusion"):
                 self._observations.add_to_model(filtered, step)
         self._observations.sample(filtered, lost=lost)
 
@@ -241,17 +241,18 @@ class Mapper:
         self._check_open()
         self._finished = True
         self._log.check_posed()
-        self._live_poses.finish()
-        with self.watch.timing("fusion"):
-            self._observations.finish()
-        del self._sequence, self._tracker, self._given_tracker  # the last frame, and keyframes
-        trim_memory()
-        job = Job(self.config, self._observations, self._prior_loops, self._progress, self.watch)
-        result = Assembly(job, self.seed, self.threads).run(self._log)
+        with self.watch.running():
+            with timing("loops"):
+                self._live_poses.finish()
+            with timing("fusion"):
+                self._observations.finish()
+            del self._sequence, self._tracker, self._given_tracker  # the last frame, and keyframes
+            trim_memory()
+            job = Job(self.config, self._observations, self._prior_loops, self._progress)
+            result = Assembly(job, self.seed, self.threads).run(self._log)
         diagnostics = replace(
             result.diagnostics,
             removed=self._preparation.counts.fractions,
-            seconds=dict(self.watch.seconds),
             samples=self._observations.samples.all,
         )
         return replace(result, diagnostics=diagnostics, shift=self._shift)

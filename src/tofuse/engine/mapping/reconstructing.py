@@ -23,6 +23,7 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.self_calibration import self_calibrated
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
+from tofuse.engine.stopwatch import current, timing
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import Tracker
 from tofuse.engine.views import PreparedView
@@ -84,8 +85,6 @@ def reconstruct(
         learn from the recording.
     """
     progress = progress or Silent()
-    config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
-    config = adapted(config, recording, threads, progress)
 
     def reconstruct_with(config: Config, tracked_frames: TrackedFrames | None) -> Reconstruction:
         # BLAS results depend on its number of threads; those of our kernels don't.
@@ -94,10 +93,13 @@ def reconstruct(
             result = mapper.finish()
         return _with_facts(result, recording, config)
 
-    result = reconstruct_with(config, tracked_frames)
-    if not config.self_calibration:
-        return result
-    return self_calibrated(result, config, lambda config: reconstruct_with(config, None), progress)
+    with current().running():
+        config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
+        config = adapted(config, recording, threads, progress)
+        result = reconstruct_with(config, tracked_frames)
+        if not config.self_calibration:
+            return result
+        return self_calibrated(result, config, lambda c: reconstruct_with(c, None), progress)
 
 
 def reconstruct_with_views(
@@ -131,7 +133,8 @@ def _track(
     mapper = Mapper(
         config, seed=seed, threads=threads, loops=loops, progress=progress, tracker=tracker
     )
-    unreadable = push_frames(mapper, recording, config.window)
+    with mapper.watch.running(), timing("reading"):
+        unreadable = push_frames(mapper, recording, config.window)
     if len(unreadable) == len(recording):
         raise InputError(
             f"none of the {len(recording)} frames can be read (first: {unreadable[0]})",
@@ -178,8 +181,7 @@ def push_frames(mapper: Mapper, recording: Recording, window: int) -> list[str]:
     else:
         frames = ((item, None) for item in recording.read_all(_PREFETCHED_FRAMES))
     for k in range(len(recording)):
-        with mapper.watch.timing("reading"):
-            item, prepared = next(frames)
+        item, prepared = next(frames)
         index, time = int(recording.indices[k]), float(recording.timestamps[k])
         if k and part_start(recording, index) != part_start(
             recording, int(recording.indices[k - 1])

@@ -134,8 +134,8 @@ class Diagnostics:
         Value of the optimiser's objective at every iteration (figure 5.3).
     removed
         Fraction of the points that each filter removed, by name.
-    seconds
-        Wall time of each stage, by name.
+    seconds, cpu_seconds
+        Wall time of each stage by name, and the CPU time of all threads.
     cloud_before
         The model under the sequential poses; None where optimisation changed none of them.
     refinement
@@ -162,6 +162,7 @@ class Diagnostics:
     objective: tuple[float, ...]
     removed: dict[str, float]
     seconds: dict[str, float]
+    cpu_seconds: dict[str, float] = field(default_factory=dict)
     cloud_before: Cloud | None = None
     refinement: Refinement | None = None
     parts: tuple[GraphPart, ...] = ()

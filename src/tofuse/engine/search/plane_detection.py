@@ -164,7 +164,8 @@ def find_floor(view: PreparedView, down: Float64) -> Floor | None:
     facing = np.flatnonzero(n @ down > _MIN_COSINE)
     if len(facing) < _MIN_INLIERS * len(p):
         return None
-    hypotheses = facing[:: max(1, len(facing) // _FLOOR_HYPOTHESES)]
+    # Contiguous for any step, so that the kernel is compiled once.
+    hypotheses = np.ascontiguousarray(facing[:: max(1, len(facing) // _FLOOR_HYPOTHESES)])
     weight = 1 / np.maximum(sampled.sigma.astype(float), 1e-4) ** 2
     band = _BAND_M + _BAND_FRACTION * p[:, 2]
     # A table may be larger than the visible floor, but has points below it.
