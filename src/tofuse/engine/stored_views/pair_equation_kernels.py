@@ -328,9 +328,9 @@ def _respond_to_errors(
         focal_q = n0 * qx + n1 * qy - lateral_q * kept_q
         rho2_p = lateral_p / max(pz * pz, tiny)
         rho2_q = lateral_q / max(qz * qz, tiny)
-        block[(_RESPONSE + OFFSET) * residual.LANES + k] = (
-            along_p / np.sqrt(p2) - range_q * along_q / np.sqrt(q2)
-        )
+        block[(_RESPONSE + OFFSET) * residual.LANES + k] = along_p / np.sqrt(
+            p2
+        ) - range_q * along_q / np.sqrt(q2)
         block[(_RESPONSE + SCALE) * residual.LANES + k] = along_p - range_q * along_q
         block[(_RESPONSE + FOCAL) * residual.LANES + k] = focal_p - focal_q
         block[(_RESPONSE + CENTER_X) * residual.LANES + k] = pz * (m0 - px * kept_p) - qz * (
