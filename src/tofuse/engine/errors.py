@@ -50,6 +50,10 @@ class RegistrationError(TofuseError):
     """Two views can't be registered (no points, no overlap)."""
 
 
+class InputWarning(UserWarning):
+    """A file is read, but not exactly as it is."""
+
+
 class KernelCacheWarning(RuntimeWarning):
     """Compiled kernels can't be kept, so that each run takes half a minute longer."""
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from tofuse.apps.jobs import Options
     from tofuse.apps.viewer import ReportServer
+    from tofuse.engine.graph import Optimisation, PoseGraph, certificate
 
 _Options = TypeVar("_Options", bound="DataclassInstance")
 
@@ -503,38 +504,78 @@ def evaluate(arguments: cli.Evaluate) -> int:
 def optimize(arguments: cli.Optimize) -> int:
     """``tofuse optimize``."""
     from tofuse.apps.calibration import check_new
+    from tofuse.engine.graph import certificate, graph_covariances
     from tofuse.engine.mapping import changed, from_method
     from tofuse.formats.poses import read_g2o, write_g2o
 
     check_new(arguments.out, overwrite=arguments.overwrite)
-    config = from_method("default", "range")
-    if arguments.optimiser is not None:
-        part = {"part": arguments.optimiser}
-        config = changed(config, {"optimiser": part}, where="--optimiser")
+    default = "levenberg-marquardt"
+    part = {"part": arguments.optimiser or default}
+    if part["part"] == default:
+        part |= {"robust": arguments.robust or "none", "start": "best"}
+    elif arguments.robust is not None:
+        raise InputError(f"needs the optimiser {default}", where="--robust")
+    where = "--robust" if arguments.robust is not None else "--optimiser"
+    config = changed(from_method("default", "range"), {"optimiser": part}, where=where)
     graph = read_g2o(arguments.input)
     solution = config.optimiser.optimise(graph)
     write_g2o(arguments.out, solution.graph)
-    print(
+    certified = certificate.certify(graph_covariances.accepted_only(solution).graph)
+    data = {
+        "out": str(arguments.out),
+        "poses": len(graph.ids),
+        "edges": len(graph.edges),
+        "before": graph.chi2(),
+        "after": solution.graph.chi2(),
+        "iterations": max(len(solution.objective) - 1, 0),
+        "converged": solution.converged,
+        "improved": solution.improved,
+        "rejected": _rejected(solution),
+        "certificate": certified and certified.to_dict(),
+    }
+    return show(arguments, data, *_optimised(graph, solution), *_certified(certified))
+
+
+def _rejected(solution: Optimisation) -> list[tuple[int, int]]:
+    """Return the ids of the ends of rejected edges."""
+    if solution.weights is None:
+        return []
+    rejected = solution.graph.edges[solution.weights < 0.5]
+    return [(int(i), int(j)) for i, j in solution.graph.ids[rejected]]
+
+
+def _optimised(graph: PoseGraph, solution: Optimisation) -> Iterator[str]:
+    yield (
         f"{len(graph.ids)} poses, {len(graph.edges)} edges: squared error {graph.chi2():.6g} "
         f"to {solution.graph.chi2():.6g} in {max(len(solution.objective) - 1, 0)} iterations"
         + ("" if solution.converged else " (not converged)")
     )
-    if solution.weights is not None and (solution.weights < 0.5).any():
-        left_out = solution.weights < 0.5
-        count = int(left_out.sum())
-        before, after = graph.chi2(~left_out), solution.graph.chi2(~left_out)
-        print(
-            f"{count} edge{'' if count == 1 else 's'} rejected as inconsistent with "
-            f"the others; squared error of the others {before:.6g} to {after:.6g}"
+    count = len(_rejected(solution))
+    if solution.weights is not None and count:
+        kept = solution.weights >= 0.5
+        yield (
+            f"{count} edge{'' if count == 1 else 's'} rejected as inconsistent with the others; "
+            f"squared error of the others {graph.chi2(kept):.6g} to {solution.graph.chi2(kept):.6g}"
         )
     for piece in solution.parts if len(solution.parts) > 1 else ():
-        print(
+        yield (
             f"part from vertex {piece.first}: {piece.vertices} poses, {piece.edges} edges, "
             f"objective {piece.before:.6g} to {piece.after:.6g}"
         )
     if not solution.improved:
-        print("no improvement: the poses are those of the input")
-    return 0
+        yield "no improvement: the poses are those of the input"
+
+
+def _certified(certified: certificate.Certificate | None) -> Iterator[str]:
+    if certified is None:
+        yield "Whether other poses fit better is not known: the graph is too large."
+    elif certified.text:
+        yield certified.text
+    if certified is not None and not certified.optimal:
+        yield (
+            "That no other poses fit better is not shown: their squared error is above "
+            f"{certified.lower_bound:.6g}."
+        )
 
 
 def export(arguments: cli.Export) -> int:

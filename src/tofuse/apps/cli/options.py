@@ -728,7 +728,7 @@ class Evaluate(Json, Edited):
     reference_error: Length | None = None
 
 
-class Optimize(Command):
+class Optimize(Json):
     """Optimise a pose graph.
 
     Attributes
@@ -739,6 +739,9 @@ class Optimize(Command):
         the optimised pose graph
     optimiser : NAME
         levenberg-marquardt (the default), castellani, lu-milios, elch or stochastic
+    robust : KERNEL
+        reject false loops, of levenberg-marquardt: truncated, huber, cauchy, geman-mcclure, dcs or
+        switchable (default: none, plain least squares)
     overwrite
         replace an existing OUT.g2o
     """
@@ -746,6 +749,7 @@ class Optimize(Command):
     input: Path
     out: Path = REQUIRED
     optimiser: str | None = None
+    robust: str | None = None
     overwrite: bool = False
 
 

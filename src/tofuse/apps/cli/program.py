@@ -61,9 +61,9 @@ def _format_warning(
     line: str | None = None,
 ) -> str:
     """Format a warning of this package like its other messages, and others as Python does."""
-    from tofuse.engine.errors import KernelCacheWarning
+    from tofuse.engine.errors import InputWarning, KernelCacheWarning
 
-    if issubclass(category, KernelCacheWarning):
+    if issubclass(category, (InputWarning, KernelCacheWarning)):
         return f"tofuse: {message}\n"
     return f"{filename}:{lineno}: {category.__name__}: {message}\n"
 

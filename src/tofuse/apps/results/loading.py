@@ -17,7 +17,7 @@ from tofuse.apps.results.run_json import (
 )
 from tofuse.engine.arrays import Float64
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
-from tofuse.engine.graph import GraphPart, LoopRecord, external_sensors
+from tofuse.engine.graph import GraphPart, LoopRecord, certificate, external_sensors
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.results import (
     Component,
@@ -73,6 +73,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         run["seconds"],
         run.get("cpu_seconds", {}),
         parts=tuple(_part(each) for each in run["optimiser"]),
+        certified=_certificate(run.get("certificate")),
         priors=tuple(external_sensors.SensorRecord(**s) for s in run["priors"]),
         accuracy=_accuracy(run["accuracy"]),
         calibrated=_calibration(run.get("self_calibration")),
@@ -111,6 +112,13 @@ def _frame(data: dict[str, Any]) -> FrameRecord:
 def _session(data: dict[str, Any]) -> SessionRecord:
     T = data["T_main_session"]
     return SessionRecord(**{**data, "T_main_session": None if T is None else np.array(T, float)})
+
+
+def _certificate(data: dict[str, Any] | None) -> certificate.Certificate | None:
+    if data is None:
+        return None
+    names = ("squared_error", "lower_bound", "eigenvalue", "isotropic")
+    return certificate.Certificate(**{name: data[name] for name in names})
 
 
 def _part(data: dict[str, Any]) -> GraphPart:

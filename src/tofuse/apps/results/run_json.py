@@ -109,6 +109,7 @@ def _content(result: Reconstruction) -> dict[str, Any]:
             _fields(p, "first", "vertices", "edges", "before", "after", "improved", "converged")
             for p in d.parts
         ],
+        "certificate": d.certified and d.certified.to_dict(),
         "priors": [_fields(s, "sensor", "measured", "used", "scale", "text") for s in d.priors],
         "refinement": _refinement(d.refinement),
         "filters": {name: {"removed": fraction} for name, fraction in d.removed.items()},

@@ -13,10 +13,10 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.graph import (
         castellani,
+        certificate,
         external_sensors,
         graph_covariances,
         levenberg,
-        minimisation,
         robust,
         solver,
         sparse,

@@ -18,13 +18,13 @@ from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import Gravity, Measured, PoseGraph
+from tofuse.engine.graph.robust import MEDIAN
 from tofuse.engine.parts import part
 
 # With fewer measured frames, a moving accelerometer can't be detected.
 _MIN_FRAMES = 3
 # Odometry that fewer fully constrained registrations were compared with is not verified.
 _MIN_COMPARED = 10
-_MEDIAN = 5.3481  # of a chi-square variable with six degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,14 +336,14 @@ class _Comparison:
             added = scale**2 * self.variances[:, :, None] * np.eye(6)
             return float(np.median(_squared(misfit, self.covariances + added)))
 
-        if median(1.0) <= _MEDIAN:
+        if median(1.0) <= MEDIAN:
             return 1.0
-        if median(limit) > _MEDIAN:
+        if median(limit) > MEDIAN:
             return None
         low, high = 1.0, limit
         for _ in range(30):
             mid = 0.5 * (low + high)
-            low, high = (mid, high) if median(mid) > _MEDIAN else (low, mid)
+            low, high = (mid, high) if median(mid) > MEDIAN else (low, mid)
         return high
 
     def lengths_agree(self, scale: float) -> bool:

@@ -158,10 +158,14 @@ class PoseGraph:
         T_i_j = se3.inverse(self.poses[i]) @ self.poses[j]
         return se3.log(se3.inverse(self.measurements) @ T_i_j)
 
-    def chi2(self, edges: Bool | None = None) -> float:
-        """Return the sum of squared errors, weighted by the information, of all edges or some."""
+    def squared_errors(self) -> Float64:
+        """Return the (M,) squared errors of the edges, weighted by their information."""
         r = self.residuals()
-        squared_errors = np.einsum("mi,mij,mj->m", r, self.information, r)
+        return np.asarray(np.einsum("mi,mij,mj->m", r, self.information, r), np.float64)
+
+    def chi2(self, edges: Bool | None = None) -> float:
+        """Return the sum of the squared errors of all edges or some."""
+        squared_errors = self.squared_errors()
         return float(squared_errors.sum() if edges is None else squared_errors[edges].sum())
 
 

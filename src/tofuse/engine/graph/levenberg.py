@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import GraphPart, Optimisation, Optimiser, PoseGraph
 from tofuse.engine.graph.graph_covariances import Branches
-from tofuse.engine.graph.robust import Robust, Settings
+from tofuse.engine.graph.robust import MEDIAN, Robust, Settings
 from tofuse.engine.graph.solver import Solution, solve
 from tofuse.engine.graph.sparse import parts_of, sparsify
 from tofuse.engine.parts import part
@@ -29,8 +29,9 @@ class LevenbergMarquardt(Bounded, Optimiser):
     """Weighted least squares on SE(3), robust against false loops.
 
     Edges of odometry and gravity have their full weight; loop edges that of the robust kernel. The
-    iteration starts from the poses in the graph. Connected parts are solved separately; the first
-    vertex of each stays where it is. If a part can't be improved, its poses stay.
+    iteration starts from the poses in the graph, unless `start` is "best". Connected parts are
+    solved separately; the first vertex of each stays where it is. If a part can't be improved, its
+    poses stay.
 
     Attributes
     ----------
@@ -41,10 +42,16 @@ class LevenbergMarquardt(Bounded, Optimiser):
     gate
         Threshold on a loop edge's squared error, in units of its information: 100 is ten standard
         deviations.
+    start
+        "given": from the poses in the graph. "best": from them or from chordal initialisation
+        (Carlone et al. 2015), whichever fits better; and where a kernel would reject most loops,
+        the stated information is taken for too large, and the threshold scaled by the median of
+        their errors at the least squares.
     """
 
     robust: Robust = "truncated"
     gate: Annotated[float, Bounds(0, exclusive=True)] = 100.0
+    start: Literal["given", "best"] = "given"
 
     def optimise(self, graph: PoseGraph) -> Optimisation:
         """See `Optimiser.optimise`.
@@ -54,7 +61,13 @@ class LevenbergMarquardt(Bounded, Optimiser):
         InputError
             If a pose or a measurement is not finite, or information not positive semidefinite.
         """
-        return minimise(graph, Settings(self.robust, self.gate))
+        settings = Settings(self.robust, self.gate, best_start=self.start == "best")
+        done = minimise(graph, settings)
+        if not settings.best_start or not _rejects_most(done):
+            return done
+        fitted = minimise(graph, replace(settings, robust="none")).graph
+        scale = float(np.median(fitted.squared_errors()[graph.loop])) / MEDIAN
+        return minimise(graph, replace(settings, gate=self.gate * max(scale, 1.0)))
 
 
 def minimise(graph: PoseGraph, settings: Settings) -> Optimisation:
@@ -102,6 +115,12 @@ def minimise(graph: PoseGraph, settings: Settings) -> Optimisation:
     )
 
 
+def _rejects_most(done: Optimisation) -> bool:
+    """Whether most loops have less than half of their weight."""
+    weights = np.ones(0) if done.weights is None else done.weights[done.graph.loop]
+    return bool(2 * (weights < 0.5).sum() > len(weights))
+
+
 def _solve(graph: PoseGraph, settings: Settings) -> Solution:
     """Solve a connected graph, of which the first vertex is fixed."""
     fixed = np.zeros(len(graph.ids), bool)
@@ -122,8 +141,7 @@ def _weights_of(
     left_out = edges[~used]
     if not len(left_out):
         return np.ones(0)
-    e = graph.residuals()
-    chi2 = np.einsum("mi,mij,mj->m", e, graph.information, e)
+    chi2 = graph.squared_errors()
     accepted = edges[used & graph.loop[edges] & (weights[edges] > 0)]
     limit = max(settings.gate, float(chi2[accepted].max(initial=0.0)))
     return np.where(graph.loop[left_out] & (chi2[left_out] > limit), 0.0, 1.0)

@@ -168,7 +168,7 @@ class Descent:
         problem = self.problem
         if problem.fixed.all():
             return True
-        value = self._value(total)
+        value = self.value(total)
         for _ in range(iterations):
             if value <= ROUNDING * len(problem.pairs):
                 return True
@@ -201,11 +201,12 @@ class Descent:
         stepped = self.problem.retract(self.poses, step)
         self.poses = np.where(fixed[:, None, None], self.poses, stepped)
         self._evaluate()
-        new_value = self._value(total)
+        new_value = self.value(total)
         if new_value < value:
             return new_value
         self.poses, self.e, self.down, self.chi2 = previous
         return None
 
-    def _value(self, total: Cost) -> float:
+    def value(self, total: Cost) -> float:
+        """Return the objective."""
         return float(total(self.chi2).sum()) + self.problem.gravity_cost(self.down)

@@ -14,6 +14,8 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 
+MEDIAN = 5.3481  # of a chi-square variable with six degrees of freedom
+
 Robust = Literal["none", "huber", "cauchy", "geman-mcclure", "dcs", "switchable", "truncated"]
 
 
@@ -36,6 +38,9 @@ class Settings:
         Iterations stop when a step lowers the objective by a smaller fraction.
     max_iterations
         Maximum number of steps, in each of the stages of "truncated".
+    best_start
+        Whether to begin with chordal initialisation where it has a lower objective than the given
+        poses. "truncated" does so if it has to select.
     """
 
     robust: Robust = "truncated"
@@ -43,6 +48,7 @@ class Settings:
     max_inflation: float = 3.0
     tolerance: float = 1e-6
     max_iterations: int = 100
+    best_start: bool = False
 
 
 def cost(kernel: Robust, x: Float64, c: float) -> Float64:

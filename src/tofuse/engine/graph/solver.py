@@ -17,9 +17,11 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.graph import robust
-from tofuse.engine.graph.gnc import truncated_least_squares
+from tofuse.engine.graph.gnc import chordal_poses, truncated_least_squares
 from tofuse.engine.graph.graph import Gravity
-from tofuse.engine.graph.minimisation import Descent, Problem
+from tofuse.engine.graph.minimisation import Cost
+from tofuse.engine.graph.minimisation import Descent as Descent
+from tofuse.engine.graph.minimisation import Problem as Problem
 from tofuse.engine.graph.robust import Settings
 from tofuse.engine.graph.sparse import Factor, first_of_parts
 
@@ -112,7 +114,22 @@ def solve(
         return np.where(loop, robust.weight(kernel, x, settings.gate), 1.0)
 
     descent = Descent(problem, problem.start(poses))
+    if settings.best_start:
+        descent = _better(
+            descent, chordal_poses(poses, pairs, measurements, information, fixed), total
+        )
     converged = descent.run(total, weights, settings.tolerance, settings.max_iterations)
     history = tuple(float(total(x).sum()) + extra for x, extra in descent.log)
     solved_poses, chi2 = descent.poses[: len(fixed)], descent.chi2
     return Solution(solved_poses, chi2, weights(chi2), history, converged, problem)
+
+
+def _better(given: Descent, poses: Float64 | None, total: Cost) -> Descent:
+    """Return a descent from other poses if their objective is lower, with the given log first."""
+    if poses is None:
+        return given
+    other = Descent(given.problem, given.problem.start(poses))
+    if not other.value(total) < given.value(total):
+        return given
+    other.log[:0] = given.log
+    return other

@@ -218,6 +218,11 @@ class Factor:
                 raise RuntimeError("the system is singular")
         return values
 
+    @property
+    def positive_definite(self) -> bool:
+        """Whether the matrix is positive definite."""
+        return not (self._signs < 0).any()
+
     def step(self) -> Float64 | None:
         """Return the (n, k) solution of ``matrix x = -gradient``; None if not finite."""
         return self.solve(self.gradient)
@@ -295,7 +300,7 @@ class Factor:
 
     def _inverse(self) -> tuple[Float64, Float64]:
         """Return the blocks of the inverse: diagonal (free, 6, 6), and those of the pairs."""
-        if (self._signs < 0).any():
+        if not self.positive_definite:
             raise RuntimeError("the system is not positive definite")
         panels, places = self.system.panels
         values = self._factorised() if self._values is None else self._values

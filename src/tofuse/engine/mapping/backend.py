@@ -14,6 +14,7 @@ from tofuse.engine.graph import (
     LoopRecord,
     Optimisation,
     PoseGraph,
+    certificate,
     external_sensors,
     graph_covariances,
 )
@@ -27,6 +28,8 @@ from tofuse.engine.progress import Progress
 from tofuse.engine.results import Component, Diagnostics, Reconstruction
 from tofuse.engine.stopwatch import current, timing
 
+# Maximum size of a certificate's factor, in numbers: a few per cent of a run.
+_MAX_CERTIFIED = 1_000_000
 # Maximum number of repeated loop searches along a long trajectory.
 _MAX_SEARCHES = 2
 
@@ -230,6 +233,7 @@ class BackEnd:
                 cloud_before=cloud_before,
                 refinement=refined.refinement,
                 parts=closed.optimisation.parts,
+                certified=_certified(closed.optimisation),
                 priors=closed.sensors.records,
                 accuracy=assessed.accuracy,
                 joins=tuple(self._tracked.joins),
@@ -267,6 +271,15 @@ def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[Close
         record = LoopRecord.of((link.i, link.j), True, reason, link.registration)
         redundant.append(ClosedLoop.of(record, link.registration))
     return [*loops, *redundant]
+
+
+@timing("optimisation")
+def _certified(optimisation: Optimisation) -> certificate.Certificate | None:
+    """Return the certificate of optimised poses, if it certifies anything."""
+    if not optimisation.objective:
+        return None
+    certified = certificate.certify(optimisation.graph, _MAX_CERTIFIED)
+    return certified if certified and certified.text else None
 
 
 def _without_rejected(loops: Sequence[ClosedLoop], optimisation: Optimisation) -> list[ClosedLoop]:

@@ -12,7 +12,7 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.frames import frame_ranges
 from tofuse.engine.fusion import Cloud, Mesh, T_up_world
-from tofuse.engine.graph import GraphPart, LoopRecord, PoseGraph, external_sensors
+from tofuse.engine.graph import GraphPart, LoopRecord, PoseGraph, certificate, external_sensors
 from tofuse.engine.loops import Join
 from tofuse.engine.quality import Change, frame_samples, pose_accuracy
 from tofuse.engine.refinement import Refinement
@@ -142,6 +142,8 @@ class Diagnostics:
         Outcome of the global refinement; None where there was none.
     parts
         The connected parts of the pose graph, where the optimiser treats them separately.
+    certified
+        What is certified of the optimised poses, None where nothing is.
     priors
         Outcome of the external sensors.
     samples
@@ -166,6 +168,7 @@ class Diagnostics:
     cloud_before: Cloud | None = None
     refinement: Refinement | None = None
     parts: tuple[GraphPart, ...] = ()
+    certified: certificate.Certificate | None = None
     priors: tuple[external_sensors.SensorRecord, ...] = ()
     samples: tuple[frame_samples.FrameSample, ...] = ()
     accuracy: pose_accuracy.Accuracy = pose_accuracy.Accuracy()  # noqa: RUF009 - immutable

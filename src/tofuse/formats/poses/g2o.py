@@ -8,12 +8,13 @@ does (g2o itself refers to the quaternion's vector part, half as large).
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, InputWarning
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.graph import PoseGraph
 from tofuse.formats.files import atomic, reading
@@ -24,6 +25,9 @@ EDGE = "EDGE_SE3:QUAT"
 IGNORED = ("FIX", "PARAMS_SE3OFFSET")
 
 _UPPER = np.triu_indices(6)
+# Negative eigenvalue, relative to the largest: of computed information, and of information in files
+# with few digits.
+_ROUNDING, _MAX_NEGATIVE = 1e-9, 1e-2
 _UNIT = 1e-2  # tolerance of a quaternion's length, for files with few digits
 
 
@@ -40,6 +44,12 @@ def read_g2o(path: str | Path) -> PoseGraph:
         tag, a wrong count of numbers, a number that is not finite, a quaternion that is not a
         unit, information that is not positive semidefinite (or is all zero), a duplicate vertex,
         an edge to a missing vertex or from a vertex to itself.
+
+    Warns
+    -----
+    InputWarning
+        If information is not positive semidefinite as its numbers were rounded. The nearest matrix
+        that is replaces it; the warning says how many there are.
     """
     lines = reading.read_text(path).splitlines()
     position: dict[int, int] = {}
@@ -80,7 +90,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
     information = np.zeros((len(rows), 6, 6))
     information[:, _UPPER[0], _UPPER[1]] = rows[:, 7:]
     information[:, _UPPER[1], _UPPER[0]] = rows[:, 7:]
-    _check_information(information, path, edge_lines)
+    information = _projected(information, path, edge_lines)
     pairs = np.array([(position[i], position[j]) for i, j in ends], np.intp).reshape(-1, 2)
     return PoseGraph(
         ids=np.array(list(position), np.intp),
@@ -105,7 +115,7 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
     for name in ("poses", "measurements", "information"):
         if not np.isfinite(getattr(graph, name)).all():
             raise InputError(f"{name} are not all finite", where="pose graph")
-    _check_information(graph.information, None, None)
+    _check_information(graph.information, _ROUNDING, None, None)
     upper = graph.information[:, _UPPER[0], _UPPER[1]]
     values = np.concatenate([_vectors(graph.measurements), upper], axis=1)
     vertices = zip(graph.ids, _vectors(graph.poses), strict=True)
@@ -137,12 +147,40 @@ def _numbers(words: list[str], ids: int, count: int) -> tuple[list[int], list[fl
     return vertices, values
 
 
+def _projected(information: Float64, path: str | Path, line_numbers: list[int]) -> Float64:
+    """Replace matrices (m, 6, 6) that are indefinite by rounding by the nearest that are not."""
+    _check_information(information, _MAX_NEGATIVE, path, line_numbers)
+    values, vectors = np.linalg.eigh(information)
+    rounded = values[:, 0] < -_ROUNDING * values[:, -1]
+    count = int(rounded.sum())
+    if count:
+        V = vectors[rounded]
+        positive = np.maximum(values[rounded], 0)[:, None, :]
+        information[rounded] = (V * positive) @ np.swapaxes(V, 1, 2)
+        warnings.warn(
+            f"{path}: {count} of {len(information)} information matrices "
+            f"{'is' if count == 1 else 'are'} slightly indefinite, as if rounded; the nearest "
+            f"positive semidefinite ones are used",
+            InputWarning,
+            stacklevel=3,
+        )
+    return information
+
+
 def _check_information(
-    information: Float64, path: str | Path | None, line_numbers: list[int] | None
+    information: Float64, tolerance: float, path: str | Path | None, line_numbers: list[int] | None
 ) -> None:
+    """Raise InputError for a matrix that is zero or has a negative eigenvalue.
+
+    Eigenvalues may be negative by the tolerance times the largest one; the diagonal may not.
+    """
     eigenvalues = np.linalg.eigvalsh(information)
     largest = np.abs(eigenvalues).max(axis=1, initial=0)
-    bad = np.flatnonzero((eigenvalues.min(axis=1, initial=0) < -1e-9 * largest) | (largest == 0))
+    smallest = eigenvalues.min(axis=1, initial=0)
+    diagonal = np.diagonal(information, axis1=1, axis2=2).min(axis=1, initial=0)
+    bad = np.flatnonzero(
+        (smallest < -tolerance * largest) | (diagonal < -_ROUNDING * largest) | (largest == 0)
+    )
     if len(bad):
         place = f"edge {bad[0]}" if line_numbers is None else f"{path}, line {line_numbers[bad[0]]}"
         raise InputError(

@@ -13,7 +13,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.engine.graph import PoseGraph, minimisation, sparse
+from tofuse.engine.graph import PoseGraph, solver, sparse
 
 
 class Chart(Protocol):
@@ -96,7 +96,7 @@ def _retracted(poses: Float64, slide: Float64, R: Float64) -> Float64:
     return out
 
 
-class ChartProblem(minimisation.Problem):
+class ChartProblem(solver.Problem):
     """The least squares problem of a pose graph, in the parameters of a chart.
 
     The first vertex of each connected part is fixed.
@@ -135,7 +135,7 @@ class ChartProblem(minimisation.Problem):
 
 def descend(
     graph: PoseGraph, chart: Chart, tolerance: float, iterations: int = 100
-) -> minimisation.Descent:
+) -> solver.Descent:
     """Minimise the squared errors of all edges and of gravity in the parameters of a chart.
 
     Parameters
@@ -148,6 +148,6 @@ def descend(
         Stopping rule, see `Descent.run`.
     """
     problem = ChartProblem(graph, chart)
-    descent = minimisation.Descent(problem, problem.start(graph.poses))
+    descent = solver.Descent(problem, problem.start(graph.poses))
     descent.run(lambda x: x, np.ones_like, tolerance, iterations)
     return descent
