@@ -144,16 +144,17 @@ def simulated(kind: str) -> PoseGraph:
             [np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], 1
         )
     loops = [(m - each, m) for m in range(each, len(k))]
-    if kind == "sphere":
+    if kind != "torus":
         loops += [(m - each - 1, m) for m in range(each + 1, len(k))]
     sigma_m, sigma_rad = (0.05, 0.03) if kind == "torus" else (0.5, 0.1)
+    true = 3.0 if kind == "big noise" else 1.0  # noise, in units of the stated one
     n = len(position)
     truth = np.asarray(se3.exp(np.concatenate([np.zeros((n, 3)), rng.normal(size=(n, 3))], 1)))
     truth[:, :3, 3] = position
     edges = np.concatenate([np.stack([np.arange(n - 1), np.arange(1, n)], 1), loops])
     i, j = edges.T
     sigma = np.array([sigma_m] * 3 + [sigma_rad] * 3)
-    noise = se3.exp(rng.normal(size=(len(edges), 6)) * sigma)
+    noise = se3.exp(true * rng.normal(size=(len(edges), 6)) * sigma)
     measured = se3.inverse(truth[i]) @ truth[j] @ noise
     start = np.empty_like(truth)
     start[0] = truth[0]
