@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tofuse.apps.cli.program import main
-from tofuse.engine.errors import TofuseError
+from tofuse.engine.errors import InputWarning, TofuseError
 from tofuse.engine.results.verdicts import REASONS
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.formats.images.images import read_image, write_png
@@ -31,8 +31,8 @@ FILES = {*SAME, "report.html", "run.json"}
 # Fields of run.json, of its frames and of its loops.
 RUN_KEYS = """
 schema version input seed threads config seconds cpu_seconds verdict self_calibration accuracy
-reasons frames loops optimiser priors refinement filters findings warnings components sessions
-session_pairs changes T_up_world rig shift_m sha256
+reasons frames loops optimiser certificate priors refinement filters findings warnings components
+sessions session_pairs changes T_up_world rig shift_m sha256
 """
 FRAME_KEYS = """
 index timestamp status reason valid_share inlier_share rms_m covariance unobservable
@@ -433,9 +433,36 @@ def test_optimize_reports_false_loops_and_components(tmp_path, capsys) -> None:
     lines += [f"EDGE_SE3:QUAT {i} {j} {x} 0 0 0 0 0 1 {unit}" for i, j, x in edges]
     (tmp_path / "in.g2o").write_text("\n".join(lines) + "\n")
     words = ["optimize", str(tmp_path / "in.g2o"), "--out", str(tmp_path / "out.g2o")]
-    assert main(words) == 0
+    assert main([*words, "--robust", "truncated"]) == 0
     output = capsys.readouterr().out
     assert "1 edge rejected as inconsistent with the others" in output
     assert re.search(r"part from vertex 0: 5 poses, 8 edges", output)
     assert re.search(r"part from vertex 9: 1 poses, 0 edges", output)
+    assert "No other poses fit these measurements better" in output
     assert read_g2o(tmp_path / "out.g2o").poses[4, 0, 3] == pytest.approx(4.0, abs=0.02)
+    # By default it is least squares of what is in the file.
+    assert main([*words, "--overwrite", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["rejected"] == []
+    assert found["poses"] == 6
+    assert found["after"] < 0.9 * found["before"]
+    # With so false a loop the relaxation is not tight, and nothing is claimed.
+    assert not found["certificate"]["optimal"]
+    assert found["certificate"]["lower_bound"] < 0.95 * found["after"]
+    assert read_g2o(tmp_path / "out.g2o").poses[4, 0, 3] < 2
+    assert main([*words, "--overwrite", "--robust", "huber", "--optimiser", "elch"]) == 2
+    assert "--robust: needs the optimiser levenberg-marquardt" in capsys.readouterr().err
+
+
+def test_optimize_says_what_it_cannot_show(tmp_path, capsys) -> None:
+    """Rounded information is projected, with a warning; anisotropic information certifies less."""
+    rows = [f"VERTEX_SE3:QUAT {k} {k} 0 0 0 0 0 1" for k in range(3)]
+    information = np.diag([1.0, 1.0, 1e4, 1.0, 1.0, 1.0])
+    information[0, 1] = information[1, 0] = 1.0001
+    upper = " ".join(str(v) for v in information[np.triu_indices(6)])
+    for i, j, z in ((0, 1, 0.1), (1, 2, 0.1), (0, 2, 0.0)):
+        rows.append(f"EDGE_SE3:QUAT {i} {j} {j - i} 0 {z} 0 0 0 1 {upper}")
+    (tmp_path / "in.g2o").write_text("\n".join(rows) + "\n")
+    with pytest.warns(InputWarning, match="3 of 3 information matrices are slightly indefinite"):
+        main(["optimize", str(tmp_path / "in.g2o"), "--out", str(tmp_path / "out.g2o")])
+    assert "no other poses fit better is not shown" in capsys.readouterr().out

@@ -162,6 +162,34 @@ def test_without_false_loops_result_is_least_squares():
     assert (LevenbergMarquardt().optimise(boast).weights == 1).all()
 
 
+def test_best_start_does_not_depend_on_given_poses():
+    graph, _, _ = walk()
+    least = LevenbergMarquardt(robust="none").optimise(graph).graph.chi2()
+    rng = np.random.default_rng(0)
+    lost = graph.poses @ se3.exp(rng.normal(size=(len(graph.ids), 6)) * 2)
+    lost[0] = graph.poses[0]
+    for robust_kernel in ("none", "huber"):
+        optimiser = LevenbergMarquardt(robust=robust_kernel, start="best")
+        done = optimiser.optimise(graph.with_poses(lost))
+        assert done.graph.chi2() == pytest.approx(least, rel=1e-5)
+        assert (np.diff(done.objective) <= 0).all()
+    # Good poses are not left for worse ones.
+    solved = LevenbergMarquardt(robust="none").optimise(graph).graph
+    again = LevenbergMarquardt(robust="none", start="best").optimise(solved)
+    assert len(again.objective) <= 2
+    np.testing.assert_allclose(again.graph.poses, solved.poses, atol=1e-5)
+
+
+def test_overstated_information_does_not_reject_the_majority():
+    graph, truth, bad = walk(false=3, seed=4)
+    boast = replace(graph, information=1e4 * graph.information)
+    assert (LevenbergMarquardt().optimise(boast).weights[graph.loop] == 0).mean() > 0.5
+    done = LevenbergMarquardt(start="best").optimise(boast)
+    assert (done.weights[graph.loop & ~bad] == 1).all()
+    assert done.improved
+    assert ate(done.graph.poses, truth) < ate(graph.poses, truth)
+
+
 @pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman-mcclure", "dcs", "switchable"])
 def test_robust_kernels(kernel):
     """Weights are the slope of the cost; small errors have full weight, large ones less."""

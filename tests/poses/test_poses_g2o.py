@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
-from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.errors import InputError, InputWarning, OutputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import Measured, PoseGraph, build_graph
 from tofuse.formats.poses.g2o import read_g2o, write_g2o
@@ -110,6 +112,26 @@ def test_invalid_files_give_one_line_errors(tmp_path, text, line, problem):
     assert problem in message
     assert message.startswith(f"{file}, line {line}: " if line else f"{file}: ")
     assert "\n" not in message
+
+
+def test_information_indefinite_by_rounding_is_projected(tmp_path):
+    """The nearest positive matrix is used, and the number of such matrices is told."""
+    information = np.diag([1e4, 1e4, 1e4, 4e4, 4e4, 4e4])
+    information[0, 4] = information[4, 0] = 20000.1  # rounded to six digits; the limit is 2e4
+    upper = " ".join(str(v) for v in information[np.triu_indices(6)])
+    file = tmp_path / "rounded.g2o"
+    start = EDGE.split("0.8")[0] + "0.8 "
+    file.write_text(f"{VERTICES}{EDGE}{start}{upper}\n")
+    with pytest.warns(InputWarning, match=r"rounded\.g2o: 1 of 2 information matrices is slightly"):
+        graph = read_g2o(file)
+    values = np.linalg.eigvalsh(graph.information)
+    assert values[1, 0] == pytest.approx(0, abs=1e-9)
+    assert np.abs(graph.information[1] - information).max() < 0.1
+    write_g2o(tmp_path / "again.g2o", graph)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = read_g2o(tmp_path / "again.g2o")
+    np.testing.assert_array_equal(again.information, graph.information)
 
 
 def test_invalid_graphs_are_not_written(tmp_path):

@@ -154,7 +154,7 @@ def test_run_json_matches_contract(tmp_path) -> None:
     assert " ".join(data) == (
         "schema version input warnings findings seed threads config seconds verdict "
         "accuracy self_calibration reasons frames T_up_world shift_m rig components sessions "
-        "session_pairs changes loops optimiser priors refinement filters sha256"
+        "session_pairs changes loops optimiser certificate priors refinement filters sha256"
     )
     assert data["schema"] == 1
     assert data["input"] == {

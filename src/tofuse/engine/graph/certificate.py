@@ -38,7 +38,7 @@ from tofuse.engine.graph.sparse import MAX_FACTOR, Factor, PairSystem, factor_si
 
 # Largest fraction by which other poses could lower the squared error of certified ones; and f at a
 # certified minimum.
-_MAX_GAP, _MAX_ISOTROPIC_GAP = 0.05, 1e-3
+_MAX_GAP, _MAX_ISOTROPIC_GAP = 0.05, 2e-3
 # Largest difference of two objectives, as a fraction, at the same minimum.
 _SAME = 1e-4
 # What the first shift of S costs of the bound, as a fraction of f.
@@ -118,7 +118,7 @@ def certify(graph: PoseGraph, max_factor: int = MAX_FACTOR) -> Certificate | Non
         return None
     problem = _Isotropic(graph)
     descent = Descent(problem, graph.poses)
-    descent.run(_unchanged, np.ones_like, 1e-12, 50)
+    descent.run(_unchanged, np.ones_like, 1e-8, 50)
     dual, least = Dual(problem, descent.poses), float(descent.chi2.sum())
     eigenvalue, shift = dual.smallest_eigenvalue(_SHIFT * least)
     bound = float(np.trace(dual.multipliers, axis1=1, axis2=2).sum()) - 3 * len(graph.ids) * shift

@@ -155,8 +155,9 @@ def _projected(information: Float64, path: str | Path, line_numbers: list[int]) 
     count = int(rounded.sum())
     if count:
         V = vectors[rounded]
-        positive = np.maximum(values[rounded], 0)[:, None, :]
-        information[rounded] = (V * positive) @ np.swapaxes(V, 1, 2)
+        root = V * np.sqrt(np.maximum(values[rounded], 0))[:, None, :]
+        projected = root @ np.swapaxes(root, 1, 2)
+        information[rounded] = (projected + np.swapaxes(projected, 1, 2)) / 2
         warnings.warn(
             f"{path}: {count} of {len(information)} information matrices "
             f"{'is' if count == 1 else 'are'} slightly indefinite, as if rounded; the nearest "
