@@ -18,7 +18,7 @@ eliminated. At a minimum of f Lambda follows from the poses, and tr(Lambda) is f
 the minimum is global and the noise moderate. What remains between F and the bound is due to
 anisotropic information and large angles: the bound is then true, but says less. Where it says too
 little, there is a weaker statement: the minimum of f is global (that is what SE-Sync certifies),
-and the descent of F from there ends at the given poses.
+and the descent of F from there ends in the same minimum as from the given poses.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Certificate:
     Attributes
     ----------
     squared_error
-        Of the poses that were found.
+        Of the given poses.
     lower_bound
         No poses have a smaller squared error.
     eigenvalue
@@ -61,8 +61,8 @@ class Certificate:
         zero if that is not the global one, or if the noise is too large; None if the weights leave
         poses undetermined.
     isotropic
-        Whether this minimum is proven to be the global one of the isotropic problem, and descent
-        from there ends at the poses that were found.
+        Whether this minimum is proven to be the global one of the isotropic problem, and descents
+        of the squared error from there and from the given poses end in the same minimum.
     """
 
     squared_error: float
@@ -95,7 +95,7 @@ class Certificate:
         if self.isotropic:
             return (
                 "If every measurement counts alike in all directions, no other poses fit better "
-                "(certified), and the optimisation from there ends at these poses."
+                "(certified), and from there the optimisation ends in the same minimum."
             )
         return ""
 
@@ -122,19 +122,21 @@ def certify(graph: PoseGraph, max_factor: int = MAX_FACTOR) -> Certificate | Non
     dual, least = Dual(problem, descent.poses), float(descent.chi2.sum())
     eigenvalue, shift = dual.smallest_eigenvalue(_SHIFT * least)
     bound = float(np.trace(dual.multipliers, axis1=1, axis2=2).sum()) - 3 * len(graph.ids) * shift
-    isotropic = bound >= (1 - _MAX_ISOTROPIC_GAP) * least and _leads_to(descent.poses, graph)
+    isotropic = bound >= (1 - _MAX_ISOTROPIC_GAP) * least and _same_minimum(graph, descent.poses)
     bound = float(np.clip(bound, 0, squared_error))
     return Certificate(squared_error, bound, eigenvalue, isotropic)
 
 
-def _leads_to(start: Float64, graph: PoseGraph) -> bool:
-    """Whether the descent from other poses ends where the graph's poses are."""
+def _same_minimum(graph: PoseGraph, other: Float64) -> bool:
+    """Whether descents from the graph's poses and from others end in the same minimum of F."""
     fixed = first_of_parts(len(graph.ids), graph.edges)
     problem = Problem(graph.edges, graph.measurements, graph.information, fixed, graph.gravity)
-    descent = Descent(problem, problem.start(start))
-    descent.run(_unchanged, np.ones_like, _SAME / 100, 50)
-    here = Descent(problem, problem.start(graph.poses)).value(_unchanged)
-    return abs(descent.value(_unchanged) - here) <= _SAME * here
+    ends = []
+    for poses in (graph.poses, other):
+        descent = Descent(problem, problem.start(poses))
+        descent.run(_unchanged, np.ones_like, _SAME / 100, 50)
+        ends.append(descent.value(_unchanged))
+    return abs(ends[1] - ends[0]) <= _SAME * ends[0]
 
 
 def _unchanged(x: Float64) -> Float64:

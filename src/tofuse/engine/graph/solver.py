@@ -19,9 +19,7 @@ from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.graph import robust
 from tofuse.engine.graph.gnc import chordal_poses, truncated_least_squares
 from tofuse.engine.graph.graph import Gravity
-from tofuse.engine.graph.minimisation import Cost
-from tofuse.engine.graph.minimisation import Descent as Descent
-from tofuse.engine.graph.minimisation import Problem as Problem
+from tofuse.engine.graph.minimisation import Cost, Descent, Problem
 from tofuse.engine.graph.robust import Settings
 from tofuse.engine.graph.sparse import Factor, first_of_parts
 

@@ -29,7 +29,7 @@ from tofuse.engine.results import Component, Diagnostics, Reconstruction
 from tofuse.engine.stopwatch import current, timing
 
 # Maximum size of a certificate's factor, in numbers: a few per cent of a run.
-_MAX_CERTIFIED = 1_000_000
+_MAX_CERTIFIED = 3_000_000
 # Maximum number of repeated loop searches along a long trajectory.
 _MAX_SEARCHES = 2
 
@@ -233,7 +233,7 @@ class BackEnd:
                 cloud_before=cloud_before,
                 refinement=refined.refinement,
                 parts=closed.optimisation.parts,
-                certified=_certified(closed.optimisation),
+                certified=_certified(refined.graph),
                 priors=closed.sensors.records,
                 accuracy=assessed.accuracy,
                 joins=tuple(self._tracked.joins),
@@ -274,11 +274,11 @@ def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[Close
 
 
 @timing("optimisation")
-def _certified(optimisation: Optimisation) -> certificate.Certificate | None:
-    """Return the certificate of optimised poses, if it certifies anything."""
-    if not optimisation.objective:
-        return None
-    certified = certificate.certify(optimisation.graph, _MAX_CERTIFIED)
+def _certified(graph: PoseGraph) -> certificate.Certificate | None:
+    """Return the certificate of the final poses, if it certifies anything."""
+    if len(graph.edges) < len(graph.ids):
+        return None  # a tree has no other solution
+    certified = certificate.certify(graph, _MAX_CERTIFIED)
     return certified if certified and certified.text else None
 
 

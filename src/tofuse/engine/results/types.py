@@ -143,7 +143,7 @@ class Diagnostics:
     parts
         The connected parts of the pose graph, where the optimiser treats them separately.
     certified
-        What is certified of the optimised poses, None where nothing is.
+        What is certified of the final poses, None where nothing is.
     priors
         Outcome of the external sensors.
     samples
