@@ -152,7 +152,7 @@ def test_run_json_matches_contract(tmp_path) -> None:
     assert text == json.dumps(data, indent=1) + "\n"
     assert data["shift_m"] == [0.0, 0.0, 0.0]
     assert " ".join(data) == (
-        "schema version input warnings findings seed threads config seconds verdict "
+        "schema version input warnings findings seed threads config seconds cpu_seconds verdict "
         "accuracy self_calibration reasons frames T_up_world shift_m rig components sessions "
         "session_pairs changes loops optimiser certificate priors refinement filters sha256"
     )
