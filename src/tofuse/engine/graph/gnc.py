@@ -110,11 +110,11 @@ def _solved(
     system: PairSystem, blocks: tuple[Float64, Float64, Float64], g_i: Float64, g_j: Float64
 ) -> Float64 | None:
     """Return the (n, 3, q) solutions for gradients (m, 3, q); zero for fixed poses."""
-    gradients = [system.assemble(*blocks, g_i[..., k], g_j[..., k]) for k in range(g_i.shape[-1])]
-    factor = system.factor(*gradients[0])
+    factor = system.factor(*system.assemble(*blocks, g_i[..., 0], g_j[..., 0]))
     if factor is None:
         return None
-    solutions = [factor.solve(gradient) for _, gradient in gradients]
+    columns = range(g_i.shape[-1])
+    solutions = [factor.solve(system.summed(g_i[..., k], g_j[..., k])) for k in columns]
     finite = [x for x in solutions if x is not None]
     return np.stack(finite, -1) if len(finite) == len(solutions) else None
 

@@ -125,7 +125,7 @@ class PairSystem:
         n, k = len(self.free), self.size
         diagonal = self._sum_i @ ii.reshape(-1, k * k) + self._sum_j @ jj.reshape(-1, k * k)
         diagonal = diagonal.reshape(n, k, k)
-        gradient = self._sum_i @ g_i + self._sum_j @ g_j
+        gradient = self.summed(g_i, g_j)
         if unary is not None:
             diagonal = diagonal + unary[0][self.free]
             gradient = gradient + unary[1][self.free]
@@ -152,7 +152,11 @@ class PairSystem:
         """Return only the gradient (free poses x 6) of (m, 6) g, as in `relative`."""
         At = np.swapaxes(se3.adjoint(se3.inverse(T_i_j)), 1, 2)
         g_i = -(At @ g[..., None])[..., 0]
-        return np.asarray(self._sum_i @ g_i + self._sum_j @ g, np.float64)
+        return self.summed(g_i, g)
+
+    def summed(self, g_i: Float64, g_j: Float64) -> Float64:
+        """Return only the gradient (free poses x k) of (m, k) g_i and g_j, as in `assemble`."""
+        return np.asarray(self._sum_i @ g_i + self._sum_j @ g_j, np.float64)
 
     def solve(
         self,
