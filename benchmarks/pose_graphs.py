@@ -128,7 +128,11 @@ def compare_with_gtsam(files: list[Path], repeats: int = 3) -> None:
         # Evaluated by GTSAM, from the written file.
         mine = score(gtsam, graph, done.graph)
         a, b, c = (statistics.median(seconds) for seconds in times.values())
-        gap = "" if certified is None else f"{certified.gap:>8.2%} {certified.eigenvalue:>10.1e}"
+        gap = (
+            ""
+            if certified is None
+            else f"{certified.gap:>8.2%} {certified.eigenvalue or np.nan:>10.1e}"
+        )
         print(
             f"{file.stem:<26} {len(ours.ids):>6} {len(ours.edges):>6} {graph.error(start):>11.4g} "
             f"{theirs:>14.8g} {mine:>14.8g} {mine / theirs - 1:>10.1e} {a:>8.3f} {b:>7.3f} "
