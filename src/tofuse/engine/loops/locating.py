@@ -19,7 +19,7 @@ from tofuse.engine.alignment import covariance, projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.join_checks import JoinChecks
-from tofuse.engine.loops.merged_components import MergedComponents, TrackedComponent, View
+from tofuse.engine.loops.merged_components import DRIFT, MergedComponents, TrackedComponent, View
 from tofuse.engine.search import (
     DISTINCT_M,
     SearchOptions,
@@ -79,6 +79,23 @@ class Location:
         """Whether the pose is accepted."""
         return not self.reason
 
+    def carried(self, T_view_other: Float64, depth: float) -> Location:
+        """Return the location of another view of the clip, given its relative pose (4, 4).
+
+        Its covariance includes the drift of tracking between views of this depth, m.
+        """
+        A = se3.adjoint(se3.inverse(T_view_other))
+        shift, angle = se3.lengths(T_view_other[None])[0] * DRIFT
+        sigma = np.repeat([shift + angle * depth, angle + shift / depth], 3)
+        rival = self.runner_up
+        return replace(
+            self,
+            T_map_camera=self.T_map_camera @ T_view_other,
+            covariance=A @ self.covariance @ A.T + np.diag(sigma**2),
+            unobservable=self.unobservable @ A.T,
+            runner_up=None if rival is None else rival @ T_view_other,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
@@ -124,9 +141,9 @@ class Locator:
         self._poses = np.stack([v.T_component_camera for v in views])
         self._depths = np.array([v.depth for v in views])
         self._descriptors = np.stack([view_descriptors.view_descriptor(v.view) for v in views])
-        rows = np.arange(len(views))
+        rows, times = np.arange(len(views)), np.arange(len(views), dtype=np.float64)
         checks = JoinChecks(
-            MergedComponents([TrackedComponent(0, rows, rows * 1.0, self._poses, tuple(views))])
+            MergedComponents([TrackedComponent(0, rows, times, self._poses, tuple(views))])
         )
         self._fit_statistics = checks.fit_statistics
         self._max_contradiction = checks.max_contradiction
