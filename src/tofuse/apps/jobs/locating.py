@@ -158,13 +158,13 @@ class ResultMap:
 
     def locate_frame(self, frame: Frame) -> LocatedFrame:
         """Locate a single frame."""
-        view = clips.prepared_view(frame, self._config_of(frame))
-        if view is None:
+        if not isinstance(frame, RangeFrame):
             raise InputError(
                 "is a cloud",
                 where=f"frame {frame.index}",
                 remedy="register it with the points of the map: tofuse.register",
             )
+        view = clips.prepared_view(frame, self._config_of(frame))
         found = self.locator.locate([PosedView(view, np.eye(4))])
         return _located(frame.index, frame.timestamp, found.get(view.index))
 
@@ -202,9 +202,9 @@ class ResultMap:
 
     def _config_of(self, frame: Frame | None, recording: Recording | None = None) -> Config:
         """Return how a frame is corrected: as those of the map if it is of the same camera."""
-        mine = self.camera
-        if isinstance(frame, RangeFrame) and mine is not None:
-            if np.array_equal(frame.camera.rays(), mine.rays()):
+        if isinstance(frame, RangeFrame) and self.camera is not None:
+            same = np.array_equal(frame.camera.rays(), self.camera.rays())
+            if same:
                 return self.config
         config = replace(from_method("default"), odometry=self.config.odometry)
         return config if recording is None else adaptation.adapted(config, recording)

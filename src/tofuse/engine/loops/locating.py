@@ -33,8 +33,9 @@ from tofuse.engine.views import PreparedView, view_descriptors
 
 # Largest shift of similar views, as a fraction of the width of their images.
 _MAX_SHIFT = 0.5
-# Places in which a pose is searched, and those in which rivals of an accepted one are.
-_SEARCHED, _RIVALS = 8, 2
+# Places in which the pose of one view is searched, and further ones for each other view of a clip;
+# and those in which rivals of an accepted pose are.
+_SEARCHED, _PER_VIEW, _RIVALS = 8, 2, 2
 # Candidates and compared map views differ by more: fraction of the depth plus rad.
 _SPACING = 0.25
 # Map views that a pose is compared with, and their smallest overlap.
@@ -161,9 +162,12 @@ class Locator:
         located: dict[int, Location] = {}
         tried = rivals = 0
         # The most similar place of each view first.
+        budget = _SEARCHED + _PER_VIEW * (len(views) - 1)
         for rank, view in itertools.product(range(_SEARCHED), views):
             if rank >= len(similar[view.index]):
                 continue
+            if tried == budget:
+                break
             k = similar[view.index][rank]
             if any(location.accepted for location in located.values()):
                 if rivals == _RIVALS:

@@ -44,25 +44,25 @@ def map_views(
     return [
         PosedView(view, poses[view.index])
         for unread in selected.views
-        if (view := _prepared(recording, config, unread.index)) is not None
+        if (view := _read(recording, config, unread.index)) is not None
     ]
 
 
-def _prepared(recording: Recording, config: Config, index: int) -> PreparedView | None:
+def _read(recording: Recording, config: Config, index: int) -> PreparedView | None:
     try:
         frame = recording.source.read(index)
     except UnreadableFrameError:
         return None
-    past = past_frames(recording, index, config.window - 1)
-    return prepared_view(frame, config, past)
+    if not isinstance(frame, RangeFrame):
+        return None
+    return prepared_view(frame, config, past_frames(recording, index, config.window - 1))
 
 
-def prepared_view(frame: Frame, config: Config, past: Sequence[Frame] = ()) -> PreparedView | None:
-    """Correct, filter and prepare a frame; None if it is a cloud."""
+def prepared_view(frame: RangeFrame, config: Config, past: Sequence[Frame] = ()) -> PreparedView:
+    """Correct, filter and prepare an image, as those of a map."""
     filtered = Preparation(config).process(frame, None, past, None).for_tracking
     assert isinstance(config.odometry, given.GivenPoses)
-    if not isinstance(filtered, RangeFrame):
-        return None
+    assert isinstance(filtered, RangeFrame)
     view = prepare_view(filtered, config.odometry.views.surface)
     return view.subsampled(_COLUMNS).without_caches()
 
