@@ -18,9 +18,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import hours
 import numpy as np
 
+import hours
 import tofuse
 from tofuse.apps.jobs import locating
 from tofuse.engine.arrays import Float64
@@ -116,12 +116,12 @@ def main() -> None:
         known = seed == 0
         print(scored(name, list(zip(located, true, strict=True)), seconds, known=known), flush=True)
     for name, seed in buildings.items():
-        scene, pairs, seconds = hours.building(options.rooms, seed), [], 0.0
+        scene, seconds = hours.building(options.rooms, seed), 0.0
+        pairs: list[tuple[locating.LocatedFrame, Float64]] = []
         for first in rng.choice(len(walk) - CLIP, options.clips):
             poses = walk[first : first + CLIP]
             frames = images(scene, poses, int(first))
-            times = np.arange(CLIP) / hours.RATE_HZ
-            clip = Recording.of(ArraySource(tuple(frames), times), "clip", "arrays")
+            clip = Recording.of(ArraySource(frames), "clip", "arrays")
             start = time.perf_counter()
             located = index.locate_clip(clip, Silent())
             seconds += time.perf_counter() - start
