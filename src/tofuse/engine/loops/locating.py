@@ -3,7 +3,7 @@
 The pose of a view is searched relative to the map views of different places that look most
 similar, until it is accepted, and then in further places for rivals. All poses found compete: each
 is aligned with the map views that overlap it, and its probability is that of a search whose rivals
-are those poses everywhere in the map, reduced by the number of tried places (multiple testing).
+are all other poses found, reduced by the number of tried places (multiple testing).
 Several views of one clip, whose relative poses are known, share this evidence.
 """
 
@@ -36,6 +36,8 @@ _MAX_SHIFT = 0.5
 # Places in which the pose of one view is searched, and further ones for each other view of a clip;
 # and those in which rivals of an accepted pose are.
 _SEARCHED, _PER_VIEW, _RIVALS = 8, 2, 2
+# Most similar places that are considered.
+_CONSIDERED = 64
 # Candidates and compared map views differ by more: fraction of the depth plus rad.
 _SPACING = 0.25
 # Map views that a pose is compared with, and their smallest overlap.
@@ -163,11 +165,9 @@ class Locator:
         tried = rivals = 0
         # The most similar place of each view first.
         budget = _SEARCHED + _PER_VIEW * (len(views) - 1)
-        for rank, view in itertools.product(range(_SEARCHED), views):
+        for rank, view in itertools.product(range(_CONSIDERED), views):
             if rank >= len(similar[view.index]):
                 continue
-            if tried == budget:
-                break
             k = similar[view.index][rank]
             if any(location.accepted for location in located.values()):
                 if rivals == _RIVALS:
@@ -175,6 +175,8 @@ class Locator:
                 if view.index in located and self._is_near(located[view.index].T_map_camera, k):
                     continue
                 rivals += 1
+            elif tried >= budget:
+                break
             tried += 1
             for T_map_view in self._searched(view.view, k):
                 T = T_map_view @ se3.inverse(view.T_component_camera)
@@ -195,7 +197,7 @@ class Locator:
                 continue
             if not chosen or self._distances(self._poses[k], chosen).min() > _SPACING:
                 chosen.append(k)
-            if len(chosen) == _SEARCHED:
+            if len(chosen) == _CONSIDERED:
                 break
         return chosen
 
