@@ -8,7 +8,8 @@ import tempfile
 import webbrowser
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -20,6 +21,7 @@ from tofuse.apps.cli import TerminalProgress
 from tofuse.apps.jobs import (
     Evaluation,
     evaluate,
+    locating,
     merging,
     quick_findings,
     with_findings,
@@ -28,11 +30,11 @@ from tofuse.apps.jobs import (
 from tofuse.apps.results import folders, integrity, load_result, write_result
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Foreground
-from tofuse.engine.frames import Recording
+from tofuse.engine.frames import Frame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import Config, adaptation, changed, from_method, reconstructing
-from tofuse.engine.progress import Progress
+from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction, accuracy_card
 
 if TYPE_CHECKING:
@@ -52,10 +54,13 @@ class Result(Reconstruction):
         The recording; None for a result that was loaded.
     fitted
         The configuration after its parts were fitted to the recording, if known.
+    folder
+        The folder that it was loaded from.
     """
 
     source: Recording | None = None
     fitted: Config | None = None
+    folder: Path | None = None
 
     @classmethod
     def of(
@@ -158,6 +163,34 @@ class Result(Reconstruction):
             reference_error_m=reference_error_m,
             config=self.config,
         )
+
+    def locate(self, frame: Frame) -> locating.LocatedFrame:
+        """Find where an image was taken: its pose in this map, as ``tofuse locate`` does.
+
+        The first call makes the index of the map, from the images of its recording.
+
+        Parameters
+        ----------
+        frame
+            A frame of `tofuse.open` or `tofuse.from_arrays`.
+
+        Raises
+        ------
+        InputError
+            If the frame is a cloud, or the recording of a loaded result is missing or has changed.
+        """
+        with threadpool_limits(1):
+            return self._map.locate_frame(frame)
+
+    @cached_property
+    def _map(self) -> locating.ResultMap:
+        if self.source is None or self.fitted is None:
+            if self.folder is None:
+                raise InputError(
+                    "has no recording", where="the result", remedy="load it: tofuse.load(folder)"
+                )
+            return locating.ResultMap.read(self.folder, None, Silent())
+        return locating.ResultMap.of_result(self.source, self.fitted, self)
 
     def view(self, *, port: int | None = None, open_browser: bool = True) -> ReportServer:
         """Show the report in the browser, as ``tofuse view`` does, and return the server.
@@ -320,4 +353,4 @@ def load(folder: str | Path, *, edited: bool = False) -> Result:
         If it is not an output folder, or its files are damaged, edited or of different runs.
     """
     with integrity.accepting_edits() if edited else nullcontext():
-        return Result.of(load_result(folder))
+        return replace(Result.of(load_result(folder)), folder=Path(folder))

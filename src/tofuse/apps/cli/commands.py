@@ -295,7 +295,31 @@ def merge(arguments: cli.Merge) -> int:
     return _finished(result, arguments.out, arguments)
 
 
-def _check_overwrite(arguments: cli.Register | cli.Judge) -> None:
+def locate(arguments: cli.Locate) -> int:
+    """``tofuse locate``."""
+    from tofuse.apps.jobs import locating
+
+    _check_overwrite(arguments)
+    options = from_arguments(locating.LocateOptions, arguments)
+    with progress_unless_json(arguments) as progress:
+        located = locating.locate_files(arguments.result, arguments.input, options, progress)
+    data = locating.locations_json(located, arguments.result, arguments.input)
+    lines = []
+    for frame in located:
+        head, color = ("accepted", "green") if frame.accepted else ("rejected", "red")
+        lines.append(f"[bold {color}]{head}[/] {escaped(locating.sentence(frame))}")
+    lines.append(f"{data['accepted']} of {len(located)} frames located")
+    if options.out is not None:
+        lines.append(escaped(f"see {options.out}"))
+    return show(
+        arguments,
+        {**data, "out": _out_json(options.out)},
+        *lines,
+        status=0 if data["accepted"] == len(located) else 3,
+    )
+
+
+def _check_overwrite(arguments: cli.Register | cli.Judge | cli.Locate) -> None:
     """Refuse --overwrite without --out, where that is optional."""
 
     if arguments.overwrite and arguments.out is None:

@@ -404,6 +404,38 @@ class Merge(JsonLines, Seed, Threads, Edited):
     voxel: Length | None = None
 
 
+class Locate(Json, Threads, Edited, Selection):
+    """Locate a frame, a clip or a cloud in a finished result.
+
+    RESULT is the --out of `tofuse run` or `tofuse merge`; its recording must still be where it was.
+    INPUT is a recording, one frame of it (REC#12), or a cloud.
+
+    Attributes
+    ----------
+    result : RESULT
+        the map
+    input : INPUT
+        what is to be located
+    out : DIR
+        folder for the poses (none)
+    overwrite
+        replace an existing one in --out
+
+    Exit status
+    -----------
+    0  every frame has an accepted pose in the map
+    3  the pose of some frame is not accepted; poses are still printed and written
+    2  nothing was written: one line on stderr states the reason
+    """
+
+    reconstructs = True
+
+    result: Path
+    input: str
+    out: Path | None = None
+    overwrite: bool = False
+
+
 class RigOptions(Json, Threads):
     """Options of the commands of rigs.
 
@@ -819,6 +851,6 @@ class View(Page, Edited):
 
 
 COMMANDS: tuple[type[Command], ...] = (
-    *(Run, Batch, Register, Judge, Merge, Rig, Demo, Simulate, Inspect, Convert, Record),
+    *(Run, Batch, Register, Judge, Merge, Locate, Rig, Demo, Simulate, Inspect, Convert, Record),
     *(Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
 )

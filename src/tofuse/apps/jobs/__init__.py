@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.apps.jobs import judging, merging
+    from tofuse.apps.jobs import judging, locating, merging
     from tofuse.apps.jobs.evaluating import Evaluation, evaluate
     from tofuse.apps.jobs.report_files import write_report_files
     from tofuse.apps.jobs.run_options import Options, resolve

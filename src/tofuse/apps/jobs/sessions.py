@@ -190,13 +190,17 @@ def _config(
     """Return the stored configuration of a result, with `GivenPoses` as odometry."""
     where = f"{folder / 'run.json'}: config"
     config = changed(from_method("default"), stored, where=where)
+    return adaptation.adapted(with_given_poses(config), recording, threads, progress)
+
+
+def with_given_poses(config: Config) -> Config:
+    """Return a configuration that adopts given poses, and prepares images as before."""
     given_poses = given.GivenPoses()
     if isinstance(odometry := config.odometry, Keyframes | given.GivenPoses):
         given_poses = given.GivenPoses(
             odometry.views, odometry.keyframe_angle, odometry.keyframe_distance
         )
-    config = replace(config, odometry=given_poses)
-    return adaptation.adapted(config, recording, threads, progress)
+    return replace(config, odometry=given_poses)
 
 
 def _check_different(first: Session, second: Session) -> None:

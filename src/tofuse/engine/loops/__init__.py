@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
+    from tofuse.engine.loops import locating
     from tofuse.engine.loops.joining import Group, Joining
     from tofuse.engine.loops.loops import ClosedLoop, Confirmation, LoopDetector, Loops, PriorLoop
     from tofuse.engine.loops.merged_components import Join, JoinKind, TrackedComponent, cut_edges

@@ -68,7 +68,7 @@ class JoinChecks:
     def __init__(self, merged: MergedComponents) -> None:
         self._merged = merged
         self.fit_statistics = verification.FitStatistics()
-        self._contradiction = pose_probability.CONTRADICTION
+        self.max_contradiction = pose_probability.CONTRADICTION
         tracked = list(merged.tracked.values())
         measured = np.concatenate([end_speeds(s, end=True) for s in tracked])
         # Motions during which tracking failed may have been faster than all others.
@@ -102,7 +102,7 @@ class JoinChecks:
             median = float(np.median(contradictions))
             spread = 1.48 * float(np.median(np.abs(np.array(contradictions) - median)))
             limit = median + _SIGMAS * max(spread, _MIN_SPREAD)
-            self._contradiction = max(self._contradiction, min(limit, _MAX_CONTRADICTION))
+            self.max_contradiction = max(self.max_contradiction, min(limit, _MAX_CONTRADICTION))
 
     def _overlapping(
         self, a: MergedComponent, b: MergedComponent, T_a_b: Float64
@@ -149,7 +149,7 @@ class JoinChecks:
             if drift > CONVERGENCE:
                 continue
             agreed = at_implied
-            if agreed.contradiction > self._contradiction:
+            if agreed.contradiction > self.max_contradiction:
                 target = [projective.Target(first.view, np.eye(4))]
                 scale = self.fit_statistics.noise_scale
                 aligned = projective.align(second.view, target, T, _ALIGNMENT, usual_scale=scale)
@@ -163,7 +163,7 @@ class JoinChecks:
                     agreed = min(agreed, realigned, key=lambda result: result.contradiction)
             overlap += agreed.overlap
             contradicting += agreed.violation + agreed.clash
-        limit = self._contradiction
+        limit = self.max_contradiction
         if self.is_near(a, b, T_a_b, _SMALL_MOTION):
             # Contradictions come from moving objects or errors of the pose.
             limit = max(limit, _MAX_CONTRADICTION_NEAR)

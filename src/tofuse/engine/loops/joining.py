@@ -94,9 +94,6 @@ _MAX_RIVAL = 0.5
 _MAX_SHIFT = 0.35
 # Up to this many views, all pairs of descriptors are compared.
 _MAX_EXHAUSTIVE = 512
-# Probabilities are not extrapolated beyond the data that their model was fitted to, a few hundred
-# poses.
-_MAX_PROBABILITY = 0.998
 
 
 @dataclass(frozen=True, eq=False)
@@ -416,7 +413,7 @@ class _Joiner:
         counted: list[Link] = []
         log_odds = 0.0
         for link in sorted(links, key=lambda link: -(link.registration.probability or 0.0)):
-            p = min(link.registration.probability or 0.0, _MAX_PROBABILITY)
+            p = min(link.registration.probability or 0.0, pose_probability.MAX_PROBABILITY)
             if p <= 0:
                 continue
             independence = min(

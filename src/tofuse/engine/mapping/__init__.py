@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.mapping import adaptation, reconstructing, texturing
+    from tofuse.engine.mapping import adaptation, clips, reconstructing, texturing
     from tofuse.engine.mapping.config import (
         MIN_MEMORY_MB,
         Config,

@@ -24,6 +24,9 @@ ACCEPTED = 0.9
 # Minimum probability at which a pose aligned from a guess is accepted without a search, as it was
 # not compared with rivals.
 CERTAIN = 0.98
+# Probabilities are not extrapolated beyond the data that their model was fitted to, a few hundred
+# poses.
+MAX_PROBABILITY = 0.998
 # Usual limits of right poses: minimum support, minimum lead and maximum contradiction.
 _MIN_SUPPORT, _MIN_LEAD, CONTRADICTION = 0.25, 0.1, 0.08
 

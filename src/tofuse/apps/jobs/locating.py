@@ -1,0 +1,346 @@
+"""Frames, clips and clouds located in a finished map: `tofuse locate`.
+
+The index of a map is made of its own images, corrected and filtered as in its run, at its final
+poses. The frames of a clip are tracked, and a few of them located together.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from tofuse._version import __version__
+from tofuse.apps.jobs.sessions import sessions_of, with_given_poses
+from tofuse.apps.pairs import PairOptions, pair_words, register_files
+from tofuse.apps.results import folders, run_json
+from tofuse.engine.arrays import Float64
+from tofuse.engine.cameras import Camera
+from tofuse.engine.compute import threads
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames import Frame, RangeFrame, Recording, evenly_spaced
+from tofuse.engine.geometry import se3
+from tofuse.engine.loops import locating
+from tofuse.engine.mapping import Config, adaptation, clips, from_method, kind_of
+from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.results import Reconstruction
+from tofuse.engine.stored_views import PosedView
+from tofuse.engine.tracking import Keyframes, given
+from tofuse.formats.files import atomic
+from tofuse.formats.poses import write_tum
+from tofuse.formats.recordings import Opening, OpeningOptions, open_view
+
+# Frames of a clip that are located.
+_LOCATED = 4
+_MAX_STATED = 0.999
+_NOWHERE = "no place in the map resembles it"
+MARKER, TRAJECTORY = "locations.json", "trajectory.txt"
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedFrame:
+    """A frame and its pose in a map.
+
+    Attributes
+    ----------
+    index, timestamp
+        Of the frame in its recording, and s.
+    location
+        Its pose; None if there is none.
+    reason
+        Why there is none, or it is not accepted; empty otherwise.
+    """
+
+    index: int
+    timestamp: float
+    location: locating.Location | None
+    reason: str
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the frame has an accepted pose."""
+        return self.location is not None and self.location.accepted
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data: SI units and radians."""
+        found: dict[str, Any] = {
+            "index": self.index,
+            "timestamp": self.timestamp,
+            "accepted": self.accepted,
+            "reason": self.reason,
+        }
+        location = self.location
+        if location is not None:
+            sigma_m, sigma_rad = se3.largest_sigmas(location.covariance).tolist()
+            found |= {
+                "T_world_camera": location.T_map_camera,
+                "covariance": location.covariance.ravel(),
+                "sigma_m": sigma_m,
+                "sigma_rad": sigma_rad,
+                "unobservable": location.unobservable,
+                "probability": location.probability,
+                "runner_up": location.runner_up,
+            }
+        plain: dict[str, Any] = run_json.plain(found)
+        return plain
+
+
+@dataclass(frozen=True, eq=False)
+class ResultMap:
+    """The index of a map.
+
+    Attributes
+    ----------
+    locator
+        Finds views in it.
+    config
+        How its images were corrected and filtered, with `GivenPoses`.
+    camera
+        Its camera.
+    """
+
+    locator: locating.Locator
+    config: Config
+    camera: Camera | None
+
+    @classmethod
+    def of(cls, sessions: Sequence[tuple[Recording, Config, dict[int, Float64]]]) -> ResultMap:
+        """Make the index from recordings, their configurations, and T_world_camera by index."""
+        views = [view for session in sessions for view in clips.map_views(*session)]
+        if not views:
+            raise InputError("has no image with a pose", where="the result")
+        recording, config, _ = sessions[0]
+        frame = recording.first_readable()
+        camera = frame.camera if isinstance(frame, RangeFrame) else None
+        return cls(locating.Locator(views), config, camera)
+
+    @classmethod
+    def of_result(cls, recording: Recording, config: Config, result: Reconstruction) -> ResultMap:
+        """Make the index of a result, and of the recording and configuration it was made with."""
+        indices = [frame.index for frame in result.diagnostics.frames]
+        poses = {
+            index: T
+            for index, T in zip(indices, result.trajectory, strict=True)
+            if np.isfinite(T).all()
+        }
+        return cls.of([(recording, with_given_poses(config), poses)])
+
+    @classmethod
+    def read(cls, folder: Path, threads: int | None, progress: Progress) -> ResultMap:
+        """Make the index of an output folder from its recordings.
+
+        Raises
+        ------
+        InputError
+            If it is not a result of images, or its recording is missing or has changed.
+        """
+        sessions = sessions_of(folder, 0, threads, progress)
+        return cls.of(
+            [
+                (
+                    session.recording,
+                    session.config,
+                    {
+                        k: s.T_component_camera
+                        for k, s in session.posed.items()
+                        if s.component == 0 and s.T_component_camera is not None
+                    },
+                )
+                for session in sessions
+            ]
+        )
+
+    def locate_frame(self, frame: Frame) -> LocatedFrame:
+        """Locate a single frame."""
+        if not isinstance(frame, RangeFrame):
+            raise InputError(
+                "is a cloud",
+                where=f"frame {frame.index}",
+                remedy="register it with the points of the map: tofuse.register",
+            )
+        view = clips.prepared_view(frame, self._config_of(frame))
+        found = self.locator.locate([PosedView(view, np.eye(4))])
+        return _located(frame.index, frame.timestamp, found.get(view.index))
+
+    def locate_clip(self, recording: Recording, progress: Progress) -> list[LocatedFrame]:
+        """Track the frames of a recording, and locate them together."""
+        config = self._config_of(recording.first_readable(), recording)
+        assert isinstance(config.odometry, given.GivenPoses)
+        tracking = replace(config, odometry=Keyframes(views=config.odometry.views))
+        tracked, lost = clips.tracked_clips(recording, tracking, progress)
+        found: dict[int, locating.Location] = {}
+        for clip in tracked:
+            found |= self._in_clip(clip)
+        return [
+            _located(index, time, found.get(index), lost.get(index))
+            for index, time in zip(
+                recording.indices.tolist(), recording.timestamps.tolist(), strict=True
+            )
+        ]
+
+    def _in_clip(self, clip: clips.Clip) -> dict[int, locating.Location]:
+        """Return the locations of the frames of a clip, each from the nearest located one."""
+        views = clip.store.views
+        chosen = [views[k] for k in evenly_spaced(np.arange(len(views)), _LOCATED)]
+        located = self.locator.locate(chosen)
+        accepted = {k: location for k, location in located.items() if location.accepted}
+        located = accepted or located
+        depths = {view.index: view.depth for view in chosen}
+        found = {}
+        for index, T in clip.poses.items():
+            if located:
+                k = min(located, key=lambda other: abs(other - index))
+                T_view_frame = se3.inverse(clip.poses[k]) @ T
+                found[index] = located[k].carried(T_view_frame, depths[k])
+        return found
+
+    def _config_of(self, frame: Frame | None, recording: Recording | None = None) -> Config:
+        """Return how a frame is corrected: as those of the map if it is of the same camera."""
+        if isinstance(frame, RangeFrame) and self.camera is not None:
+            same = np.array_equal(frame.camera.rays(), self.camera.rays())
+            if same:
+                return self.config
+        config = replace(from_method("default"), odometry=self.config.odometry)
+        return config if recording is None else adaptation.adapted(config, recording)
+
+
+def _located(
+    index: int, timestamp: float, location: locating.Location | None, lost: str | None = None
+) -> LocatedFrame:
+    reason = (lost or _NOWHERE) if location is None else location.reason
+    return LocatedFrame(index, timestamp, location, reason)
+
+
+@dataclass(frozen=True)
+class LocateOptions(OpeningOptions):
+    """The options of ``tofuse locate``; see its ``--help``."""
+
+    out: Path | None = None
+    overwrite: bool = False
+    threads: int | None = None
+
+
+def locate_files(
+    result: Path, name: str, options: LocateOptions | None = None, progress: Progress | None = None
+) -> list[LocatedFrame]:
+    """Locate a frame (REC#12), a clip or a cloud in a result, and write the poses.
+
+    Raises
+    ------
+    InputError
+        If the result or the input can't be used.
+    OutputError
+        If the poses can't be written; existing files are then unchanged.
+    """
+    options, progress = options or LocateOptions(), progress or Silent()
+    with threads(options.threads), threadpool_limits(1):
+        progress.stage("opening")
+        if options.out is None:
+            return _located_in(result, name, options, progress)
+        with folders.OutputFolder(
+            options.out, overwrite=options.overwrite, contract=CONTRACT
+        ) as folder:
+            located = _located_in(result, name, options, progress)
+            progress.stage("writing")
+            _write(located, result, name, folder)
+    return located
+
+
+def _located_in(
+    result: Path, name: str, options: LocateOptions, progress: Progress
+) -> list[LocatedFrame]:
+    folders.check_result(result)
+    recording = None if "#" in name else Opening.of([name], options).open()
+    if recording is None or len(recording) == 1:
+        view = open_view(name, format=options.format, camera=options.camera, topic=options.topic)
+        frame: Frame | None = view.frame
+    else:
+        frame = recording.first_readable()
+    if frame is not None and kind_of(frame) == "cloud":
+        return [_located_cloud(result, name, options, progress)]
+    progress.stage("reading the map")
+    index = ResultMap.read(result, options.threads, progress)
+    progress.stage("locating")
+    if recording is None or len(recording) == 1:
+        assert frame is not None
+        return [index.locate_frame(frame)]
+    return index.locate_clip(recording, progress)
+
+
+def _located_cloud(
+    result: Path, name: str, options: LocateOptions, progress: Progress
+) -> LocatedFrame:
+    """Register a cloud with the points of a result."""
+    cloud = next((p for p in (result / "cloud.ply", result / "cloud.laz") if p.exists()), None)
+    if cloud is None:
+        raise InputError("has no cloud.ply", where=result, remedy="run `tofuse run` again")
+    pair = register_files(name, str(cloud), PairOptions(threads=options.threads), progress)
+    registration, C = pair.in_files, pair.covariance
+    location = locating.Location(
+        registration.T_target_source,
+        np.full((6, 6), np.nan) if C is None else C,
+        registration.unobservable,
+        registration.probability or 0.0,
+        "" if registration.believed else registration.reason or "the pose can't be verified",
+        registration.runner_up,
+    )
+    return _located(pair.source.index, pair.source.frame.timestamp, location)
+
+
+def sentence(frame: LocatedFrame) -> str:
+    """Describe the pose of a frame: position, rotation, sigma and probability."""
+    words = [f"frame {frame.index}"]
+    location = frame.location
+    if location is not None:
+        T = location.T_map_camera
+        rotation = np.degrees(se3.so3_log(T[:3, :3]))
+        words.append(
+            f"at {pair_words.vector(T[:3, 3], 3)} m, rotation {pair_words.vector(rotation, 1)} deg"
+        )
+        sigma_m, sigma_rad = se3.largest_sigmas(location.covariance).tolist()
+        if np.isfinite(sigma_m):
+            words.append(f"sigma {1e3 * sigma_m:.0f} mm, {np.degrees(sigma_rad):.2f} deg")
+        words.append(f"probability {min(location.probability, _MAX_STATED):.1%}")
+        if location.runner_up is not None:
+            apart = np.linalg.norm(location.runner_up[:3, 3] - T[:3, 3])
+            words.append(f"runner-up {apart:.2f} m away")
+    return "; ".join([*words, *([frame.reason] if frame.reason else [])])
+
+
+def locations_json(located: Sequence[LocatedFrame], result: Path, name: str) -> dict[str, Any]:
+    """Return the content of `locations.json`."""
+    return {
+        "schema": 1,
+        "version": __version__,
+        "result": str(result.absolute()),
+        "input": name,
+        "accepted": sum(frame.accepted for frame in located),
+        "frames": [frame.to_dict() for frame in located],
+    }
+
+
+def _write(
+    located: Sequence[LocatedFrame], result: Path, name: str, folder: folders.OutputFolder
+) -> None:
+    accepted = [f for f in located if f.location is not None and f.accepted]
+    poses = np.array([f.location.T_map_camera for f in accepted if f.location]).reshape(-1, 4, 4)
+    with folder.staging() as staging:
+        write_tum(staging / TRAJECTORY, [f.timestamp for f in accepted], poses)
+        text = json.dumps(locations_json(located, result, name), indent=1, allow_nan=False)
+        atomic.write_text(staging / MARKER, text + "\n")
+
+
+def _is_ours(folder: Path) -> bool:
+    data = folders.read_json_object(folder / MARKER)
+    return data is not None and {"schema", "version", "frames"} <= set(data)
+
+
+CONTRACT = folders.Contract(
+    re.compile("|".join(map(re.escape, (MARKER, TRAJECTORY)))), MARKER, _is_ours
+)

@@ -1,0 +1,113 @@
+"""Prepared views without a model: of a recording with known poses, and of a clip as tracked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import UnreadableFrameError
+from tofuse.engine.frames import Frame, RangeFrame, Recording
+from tofuse.engine.mapping.config import Config
+from tofuse.engine.mapping.preparation import Preparation
+from tofuse.engine.mapping.reconstructing import past_frames
+from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.stored_views import PosedView, Spacing, ViewStore
+from tofuse.engine.tracking import given
+from tofuse.engine.views import PreparedView, prepare_view
+
+# Views of a map, of which a place needs few, and width of their images.
+_SPACING = Spacing(0.12, 0.06, max_views=4000, max_stretch=1.0, views_per_place=1)
+_COLUMNS = 200
+
+
+@dataclass(frozen=True)
+class _Unread:
+    """A frame that is not read yet: enough to select it by its pose."""
+
+    index: int
+    depth: float
+
+
+def map_views(
+    recording: Recording, config: Config, poses: Mapping[int, Float64]
+) -> list[PosedView[PreparedView]]:
+    """Prepare the views of a recording at T_map_camera (4, 4) by index, spaced by motion.
+
+    Only these are read. The odometry of the configuration must be `GivenPoses`.
+    """
+    first = recording.first_readable()
+    depth = 1.0 if first is None else first.mean_depth
+    selected: ViewStore[_Unread] = ViewStore(_SPACING)
+    for index, T in sorted(poses.items()):
+        selected.push(_Unread(index, depth), T)
+    return [
+        PosedView(view, poses[view.index])
+        for unread in selected.views
+        if (view := _read(recording, config, unread.index)) is not None
+    ]
+
+
+def _read(recording: Recording, config: Config, index: int) -> PreparedView | None:
+    try:
+        frame = recording.source.read(index)
+    except UnreadableFrameError:
+        return None
+    if not isinstance(frame, RangeFrame):
+        return None
+    return prepared_view(frame, config, past_frames(recording, index, config.window - 1))
+
+
+def prepared_view(frame: RangeFrame, config: Config, past: Sequence[Frame] = ()) -> PreparedView:
+    """Correct, filter and prepare an image, as those of a map."""
+    filtered = Preparation(config).process(frame, None, past, None).for_tracking
+    assert isinstance(config.odometry, given.GivenPoses)
+    assert isinstance(filtered, RangeFrame)
+    view = prepare_view(filtered, config.odometry.views.surface)
+    return view.subsampled(_COLUMNS).without_caches()
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """A part of a recording that was tracked without a gap.
+
+    Attributes
+    ----------
+    poses
+        (4, 4) T_clip_camera by frame index.
+    store
+        Views spaced by motion.
+    """
+
+    poses: dict[int, Float64] = field(default_factory=dict)
+    store: ViewStore[PreparedView] = field(default_factory=lambda: ViewStore(Spacing()))
+
+
+def tracked_clips(
+    recording: Recording, config: Config, progress: Progress | None = None
+) -> tuple[list[Clip], dict[int, str]]:
+    """Track a recording; return its clips, and for each frame without a pose the reason."""
+    progress = progress or Silent()
+    preparation, tracker = Preparation(config), config.odometry.start(0, config.search)
+    clips: dict[int, Clip] = {}
+    lost: dict[int, str] = {}
+    for index, frame in _frames(recording):
+        if isinstance(frame, UnreadableFrameError):
+            lost[index] = str(frame)
+            continue
+        past = past_frames(recording, index, config.window - 1)
+        filtered = preparation.process(frame, None, past, None)
+        step = tracker.push(filtered.for_tracking)
+        if step.T_component_camera is None or step.surface is None:
+            lost[index] = step.reason
+            continue
+        clip = clips.setdefault(step.component, Clip())
+        clip.poses[index] = step.T_component_camera
+        clip.store.push(
+            step.surface, step.T_component_camera, reduced=lambda v: v.subsampled(_COLUMNS)
+        )
+    return list(clips.values()), lost
+
+
+def _frames(recording: Recording) -> Iterator[tuple[int, Frame | UnreadableFrameError]]:
+    yield from zip(recording.indices.tolist(), recording.read_all(), strict=True)

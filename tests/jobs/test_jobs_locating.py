@@ -1,0 +1,171 @@
+"""Frames, clips and clouds located in a result: right where the map has the place, else refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tofuse
+from cli_calls import call, listing, refuses
+from made_rooms import CAMERA, OTHER, at, seen
+from made_sessions import HERE
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.geometry import se3
+from tofuse.formats.geometry.ply import write_ply
+from tofuse.formats.poses.trajectory import read_tum
+from tofuse.formats.recordings.native import RecordingWriter
+
+# A second pass, beside and above the first one.
+AGAIN = [at(0.1 + 0.02 * k, 0.1, 0.05 + 0.1 * k, 0.25, -0.05) for k in range(6)]
+T_WORLD_ROOM = se3.inverse(HERE[0])
+# The same walls with other furniture, and another room altogether.
+FOREIGN = (
+    {"boxes": OTHER, "scene": 8},
+    {"boxes": OTHER, "scene": 9, "half": (1.6, 1.3, 2.4)},
+)
+
+
+def recorded(folder: Path, poses, **scene) -> Path:
+    writer = RecordingWriter(
+        folder,
+        CAMERA,
+        depth_unit_m=0.0005,
+        depth_kind="z",
+        frame_rate_hz=10.0,
+        amplitude_kind="range_compensated",
+    )
+    for k, T in enumerate(poses):
+        writer.add(replace(seen(T, 900 + k, **scene), index=k, timestamp=k / 10))
+    writer.finish()
+    return folder
+
+
+def error_m(T_world_camera, T_room_camera) -> float:
+    off = se3.inverse(T_WORLD_ROOM @ T_room_camera) @ T_world_camera
+    return float(np.linalg.norm(off[:3, 3]))
+
+
+@pytest.fixture(scope="module")
+def here(session_results) -> tofuse.Result:
+    return tofuse.load(session_results["here"])
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> Path:
+    return recorded(tmp_path_factory.mktemp("clip") / "clip", AGAIN)
+
+
+def locate_json(capfd, *words: object) -> tuple[int, dict]:
+    capfd.readouterr()
+    status = call("locate", *words, "--json")
+    return status, json.loads(capfd.readouterr().out)
+
+
+@pytest.mark.parametrize("k", [1, 4])
+def test_frame_of_second_pass_is_located(here, k) -> None:
+    located = here.locate(seen(AGAIN[k], 500 + k))
+    assert located.accepted
+    assert located.reason == ""
+    location = located.location
+    assert location.probability > 0.9
+    assert error_m(location.T_map_camera, AGAIN[k]) < 0.02
+    off = se3.log(se3.inverse(T_WORLD_ROOM @ AGAIN[k]) @ location.T_map_camera)
+    assert off @ np.linalg.solve(location.covariance, off) < 30
+    assert np.linalg.eigvalsh(location.covariance)[-1] < 0.1**2
+
+
+@pytest.mark.parametrize("scene", FOREIGN)
+@pytest.mark.parametrize("k", [0, 3])
+def test_frame_of_another_room_is_not_accepted(here, scene, k) -> None:
+    located = here.locate(seen(AGAIN[k], 600 + k, **scene))
+    assert not located.accepted
+    assert located.reason
+
+
+def test_two_rooms_that_look_the_same_are_rivals(here) -> None:
+    """A map with the same room twice: either pose fits, so none is accepted."""
+    views = here._map.locator._views
+    apart = se3.exp([20, 0, 0, 0, 0, 0])
+    twice = [*views, *(type(v)(v.view, apart @ v.T_component_camera) for v in views)]
+    locator = type(here._map.locator)(twice)
+    doubled = replace(here._map, locator=locator)
+    located = doubled.locate_frame(seen(AGAIN[2], 502))
+    assert not located.accepted
+    between = se3.inverse(located.location.T_map_camera) @ located.location.runner_up
+    assert np.linalg.norm(between[:3, 3]) == pytest.approx(20, abs=0.3)
+
+
+def test_clip_is_located_as_a_whole(session_results, clip, tmp_path, capfd) -> None:
+    out = tmp_path / "out"
+    status, data = locate_json(capfd, session_results["here"], clip, "--out", out)
+    assert status == 0
+    assert data["accepted"] == len(AGAIN)
+    assert listing(out) == ["locations.json", "trajectory.txt"]
+    written = json.loads((out / "locations.json").read_text())
+    assert written == {k: v for k, v in data.items() if k != "out"}
+    times, poses = read_tum(out / "trajectory.txt")
+    assert times == pytest.approx(np.arange(len(AGAIN)) / 10)
+    assert max(error_m(T, true) for T, true in zip(poses, AGAIN, strict=True)) < 0.02
+    for frame, T in zip(data["frames"], poses, strict=True):
+        assert np.allclose(frame["T_world_camera"], T)
+        assert len(frame["covariance"]) == 36
+
+
+def test_one_frame_of_a_recording(session_results, clip, capsys) -> None:
+    assert call("locate", session_results["here"], f"{clip}#3") == 0
+    done = capsys.readouterr().out
+    assert done.startswith("accepted frame 3; at (")
+    assert "probability" in done
+    assert done.endswith("1 of 1 frames located\n")
+
+
+def test_clip_of_another_room_has_status_3(session_results, tmp_path, capfd) -> None:
+    foreign = recorded(tmp_path / "foreign", AGAIN[::2], **FOREIGN[1])
+    out = tmp_path / "out"
+    status, data = locate_json(capfd, session_results["here"], foreign, "--out", out)
+    assert status == 3
+    assert data["accepted"] == 0
+    assert all(frame["reason"] for frame in data["frames"])
+    assert (out / "trajectory.txt").read_text() == ""
+
+
+def test_cloud_is_registered_with_points_of_the_map(session_results, tmp_path, capfd) -> None:
+    cloud = seen(AGAIN[0], 700)
+    write_ply(tmp_path / "view.ply", GeometryRecord(cloud.points))
+    status, data = locate_json(capfd, session_results["here"], tmp_path / "view.ply")
+    (frame,) = data["frames"]
+    assert status == (0 if frame["accepted"] else 3)
+    if frame["accepted"]:
+        assert error_m(np.array(frame["T_world_camera"]), AGAIN[0]) < 0.05
+
+
+def test_python_refuses_cloud(here) -> None:
+    cloud = CloudFrame(0, 0.0, np.zeros((20, 3), np.float32))
+    with pytest.raises(InputError, match=r"is a cloud.*tofuse\.register"):
+        here.locate(cloud)
+
+
+def test_missing_recording_is_named(session_results, clip, tmp_path, capfd) -> None:
+    folder = tmp_path / "result"
+    shutil.copytree(session_results["here"], folder)
+    run = json.loads((folder / "run.json").read_text())
+    run["input"]["opening"]["paths"] = [str(tmp_path / "gone")]
+    (folder / "run.json").write_text(json.dumps(run))
+    says = (f"{tmp_path / 'gone'}, which doesn't exist", "put it back")
+    refuses(capfd, "locate", "--edited", folder, clip, says=says)
+
+
+def test_errors_are_one_line(session_results, clip, tmp_path, capfd) -> None:
+    refuses(capfd, "locate", tmp_path, clip, says=(str(tmp_path),))
+    refuses(capfd, "locate", session_results["here"], tmp_path / "no", says=("no",))
+    refuses(
+        capfd, "locate", session_results["here"], f"{clip}#77", says=("has no frame 77", "0 to 5")
+    )
+    refuses(capfd, "locate", session_results["here"], clip, "--overwrite", says=("requires --out",))
