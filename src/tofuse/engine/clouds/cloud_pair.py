@@ -37,7 +37,7 @@ from tofuse.engine.search import pair_agreement, pose_probability
 # Maximum number of points of each averaged view.
 _POINTS = 10_000
 # Number of proposals that are aligned at full resolution.
-_MAX_REFINED = 8
+_MAX_REFINED = 5
 # Poses that differ by more resolutions, or rad, are distinct hypotheses.
 _DISTINCT, _DISTINCT_RAD = 4.0, 0.0873
 # A pose near the guess is preferred to one with a lead below this fraction of the points.
@@ -214,7 +214,7 @@ def _registered(
         if image_registration is None
         else [local, views.evaluated(image_registration.T_target_source)]
     )
-    poses += _proposed(views, start)
+    poses += _proposed(views, start, guessed=guess is not None)
     if certain is not None:
         poses += _turned(views, local)
     poses.sort(key=lambda pose: -pose.agreement.score)
@@ -302,8 +302,9 @@ def follow_clouds(
     return views.with_information(_registration(views, local))
 
 
-def _proposed(views: _CloudViews, start: Float64) -> list[_Pose]:
-    """Return the poses of feature matching, and of coarse-to-fine ICP if they lack support.
+def _proposed(views: _CloudViews, start: Float64, *, guessed: bool) -> list[_Pose]:
+    """Return the poses of feature matching; without any, or if they don't support more than a
+    guess might, also that of coarse-to-fine ICP.
 
     Raises
     ------
@@ -316,7 +317,8 @@ def _proposed(views: _CloudViews, start: Float64) -> list[_Pose]:
         poses += [views.refined(c.T_target_source) for c in found.poses[:_MAX_REFINED]]
     except RegistrationError as error:
         failure = error
-    if any(pose.agreement.support > _MIN_SUPPORT for pose in poses):
+    supported = any(pose.agreement.support > _MIN_SUPPORT for pose in poses)
+    if supported or (poses and not guessed):
         return poses
     try:
         registration = CoarseToFine().register(views.source, views.target, start, views.rng)

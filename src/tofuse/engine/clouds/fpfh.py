@@ -255,20 +255,22 @@ def fpfh(
 def mutually_nearest(a: Float64, b: Float64, count: int = 1) -> tuple[Int64, Int64]:
     """Return the positions in a (n, d) and b (m, d) of rows among the `count` nearest of each."""
     rows, columns = (np.asarray(x, np.float32) for x in (a, b))
-    distance = (columns**2).sum(1) - 2 * (rows @ columns.T)
+    distance = (rows**2).sum(1)[:, None] + (columns**2).sum(1) - 2 * (rows @ columns.T)
+    backward = _smallest(np.ascontiguousarray(distance.T), count)
     forward = _smallest(distance, count)
-    # The squares of the rows don't change the order of the columns.
-    backward = _smallest((distance + (rows**2).sum(1)[:, None]).T, count)
     mutual = (backward[forward] == np.arange(len(a))[:, None, None]).any(2)
     i, k = np.nonzero(mutual)
     return i.astype(np.int64), forward[i, k].astype(np.int64)
 
 
 def _smallest(distance: Float32, count: int) -> Int64:
-    """Return the columns (n, count) of the smallest entries of each row (n, m)."""
-    if count == 1 or count >= distance.shape[1]:
-        return np.argsort(distance, axis=1)[:, :count] if count > 1 else distance.argmin(1)[:, None]
-    return np.argpartition(distance, count - 1, axis=1)[:, :count]
+    """Return the columns (n, count) of the smallest entries of each row (n, m), which are lost."""
+    count = min(count, distance.shape[1])
+    columns = np.empty((len(distance), count), np.int64)
+    for k in range(count):
+        columns[:, k] = distance.argmin(1)
+        np.put_along_axis(distance, columns[:, k : k + 1], np.inf, 1)
+    return columns
 
 
 def _fit(view: DescribedCloud, other: DescribedCloud, T: Float64, size: float) -> Float64:

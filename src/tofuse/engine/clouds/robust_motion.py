@@ -233,13 +233,16 @@ def distinct(
     points
         (n, 3) points that are moved, m.
     """
+    centre = np.median(points, 0)
+    moved = se3.transform(motions, centre[None])[:, 0]
+    rotations = motions[:, :3, :3].reshape(-1, 9)
+    alike = cdist(moved, moved) <= options.distinct_m
+    alike &= rotations @ rotations.T >= 1 + 2 * np.cos(options.distinct_rad)  # traces
     remaining, chosen = np.ones(len(motions), bool), list[int]()
     for k in np.argsort(-score, kind="stable"):
         if remaining[k] and len(chosen) < most:
             chosen.append(int(k))
-            remaining &= are_distinct(
-                motions, motions[k], points, metres=options.distinct_m, rad=options.distinct_rad
-            )
+            remaining &= ~alike[k]
     return np.array(chosen, np.int64)
 
 
