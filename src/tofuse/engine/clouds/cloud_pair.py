@@ -18,8 +18,9 @@ from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
-from tofuse.engine.clouds.fpfh import candidates
+from tofuse.engine.clouds.fpfh import MATCH_WEIGHT, Candidates, candidates, log_matches
 from tofuse.engine.clouds.robust_motion import are_distinct
+from tofuse.engine.clouds.viewpoint import viewpoint_of
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
@@ -35,11 +36,13 @@ from tofuse.engine.icp import (
 from tofuse.engine.search import pair_agreement, pose_probability
 
 # Maximum number of points of each averaged view.
-_POINTS = 10_000
+_POINTS = 7_000
 # Number of proposals that are aligned at full resolution.
-_MAX_REFINED = 5
+_MAX_REFINED = 3
 # Poses that differ by more resolutions, or rad, are distinct hypotheses.
 _DISTINCT, _DISTINCT_RAD = 4.0, 0.0873
+# Factor of these limits for poses that are not refined.
+_UNREFINED = 3.0
 # A pose near the guess is preferred to one with a lead below this fraction of the points.
 _MIN_LEAD = 0.02
 # Support below which the views are also aligned from the guess from coarse to fine.
@@ -62,6 +65,13 @@ class _Pose:
     agreement: pair_agreement.Agreement
     # Start of its alignment; None for proposals.
     guess: Float64 | None = None
+    # MSAC score of the feature matches at the pose.
+    matches: float = 0.0
+
+    @property
+    def score(self) -> float:
+        """Score of the agreement, and of the matches."""
+        return self.agreement.score + MATCH_WEIGHT * log_matches(self.matches)
 
 
 # Placeholder for the rival of a pose without one; it has no support.
@@ -94,6 +104,17 @@ class _CloudViews:
         """Whether the viewpoint, and so the free space, is known for both views."""
         return self.source_map.viewpoint is not None and self.target_map.viewpoint is not None
 
+    @property
+    def has_assumed_viewpoint(self) -> bool:
+        """Whether the viewpoint of a view is not certain."""
+        maps = (self.source, self.source_map), (self.target, self.target_map)
+        return any(m.viewpoint is not None and viewpoint_of(view) is None for view, m in maps)
+
+    def without_free_space(self) -> _CloudViews:
+        """Return the views without their viewpoints."""
+        maps = (replace(m, viewpoint=None, sphere=None) for m in (self.source_map, self.target_map))
+        return _CloudViews(self.source, self.target, *maps, self.rng)
+
     def evaluated(self, T: Float64) -> _Pose:
         return _Pose(T, cloud_agreement(self.source_map, self.target_map, T))
 
@@ -111,11 +132,27 @@ class _CloudViews:
         return aligned if aligned.agreement.score >= initial.agreement.score else initial
 
     def evidence(
-        self, pose: _Pose, lead: float | None = None, degenerate: int = 0
+        self,
+        pose: _Pose,
+        lead: float | None = None,
+        degenerate: int = 0,
+        found: Candidates | None = None,
     ) -> pose_probability.PoseEvidence:
-        return pose_probability.PoseEvidence.of(
+        """Return the evidence for a pose; that of the matches if proposals were `found`."""
+        evidence = pose_probability.PoseEvidence.of(
             pose.agreement, lead, degenerate, pose_probability.CLOUDS
         )
+        if found is None:
+            return evidence
+        T = np.array([c.T_target_source for c in found.poses])
+        points = self.source_map.view.points.astype(np.float64)
+        limits = {"metres": _UNREFINED * _DISTINCT * self.size, "rad": _UNREFINED * _DISTINCT_RAD}
+        others = are_distinct(T, pose.T_target_source, points, **limits)
+        scores = np.array([c.score for c in found.poses])
+        matches = np.array([c.consensus.score for c in found.poses])
+        own, rival = (scores[mask].max(initial=0.0) for mask in (~others, others))
+        consensus = log_matches(pose.matches) - log_matches(matches[others].max(initial=0.0))
+        return replace(evidence, consensus=float(consensus), proposal_lead=float(own - rival))
 
     def with_information(self, registration: Registration) -> Registration:
         """Return a registration with its information matrix."""
@@ -204,6 +241,22 @@ def _registered(
     always_search: bool = False,
 ) -> Registration:
     views = _CloudViews.of(source, target, rng)
+    options = {"always_search": always_search}
+    registration = _registered_views(views, guess, image_registration, **options)
+    if registration.believed or not views.has_assumed_viewpoint:
+        return registration
+    blind = views.without_free_space()
+    other = _registered_views(blind, guess, image_registration, **options)
+    return max(registration, other, key=lambda found: found.probability or 0.0)
+
+
+def _registered_views(
+    views: _CloudViews,
+    guess: Float64 | None,
+    image_registration: Registration | None,
+    *,
+    always_search: bool,
+) -> Registration:
     start = np.eye(4) if guess is None else guess
     local = replace(views.refined(start), guess=start)
     certain = None if always_search else _certain(views, local)
@@ -214,15 +267,17 @@ def _registered(
         if image_registration is None
         else [local, views.evaluated(image_registration.T_target_source)]
     )
-    poses += _proposed(views, start, guessed=guess is not None)
+    proposed, found = _proposed(views, start, guessed=guess is not None)
+    poses += proposed
     if certain is not None:
         poses += _turned(views, local)
-    poses.sort(key=lambda pose: -pose.agreement.score)
+    poses = _with_matches(poses, found)
+    poses.sort(key=lambda pose: -pose.score)
     best = poses[0]
     if guess is not None:
-        tied = [p for p in poses if p.agreement.score >= best.agreement.score - _MIN_LEAD]
+        tied = [p for p in poses if p.score >= best.score - _MIN_LEAD]
         best = min(tied, key=lambda p: _pose_distance(p.T_target_source, guess))
-    registration = _registration(views, best, poses)
+    registration = _registration(views, best, poses, found)
     if certain is not None and registration.believed:
         T = registration.T_target_source
         if not views.are_distinct_poses(T, certain.T_target_source):
@@ -236,7 +291,7 @@ def _registered(
     across = remapping.across(se3.inverse(local.T_target_source) @ registration.T_target_source)
     if views.are_distinct_poses(local.T_target_source, local.T_target_source @ across):
         return views.with_information(registration)
-    return views.with_information(_registration(views, local, [best]))
+    return views.with_information(_registration(views, local, [best], found))
 
 
 def _certain(views: _CloudViews, local: _Pose) -> Registration | None:
@@ -302,7 +357,9 @@ def follow_clouds(
     return views.with_information(_registration(views, local))
 
 
-def _proposed(views: _CloudViews, start: Float64, *, guessed: bool) -> list[_Pose]:
+def _proposed(
+    views: _CloudViews, start: Float64, *, guessed: bool
+) -> tuple[list[_Pose], Candidates | None]:
     """Return the poses of feature matching; without any, or if they don't support more than a
     guess might, also that of coarse-to-fine ICP.
 
@@ -311,7 +368,7 @@ def _proposed(views: _CloudViews, start: Float64, *, guessed: bool) -> list[_Pos
     RegistrationError
         If there is no pose.
     """
-    poses, failure = [], None
+    poses, found, failure = [], None, None
     try:
         found = candidates(views.source, views.target, signed=views.has_free_space)
         poses += [views.refined(c.T_target_source) for c in found.poses[:_MAX_REFINED]]
@@ -319,7 +376,7 @@ def _proposed(views: _CloudViews, start: Float64, *, guessed: bool) -> list[_Pos
         failure = error
     supported = any(pose.agreement.support > _MIN_SUPPORT for pose in poses)
     if supported or (poses and not guessed):
-        return poses
+        return poses, found
     try:
         registration = CoarseToFine().register(views.source, views.target, start, views.rng)
         poses.append(replace(views.evaluated(registration.T_target_source), guess=start))
@@ -327,7 +384,15 @@ def _proposed(views: _CloudViews, start: Float64, *, guessed: bool) -> list[_Pos
         failure = error
     if not poses and failure is not None:
         raise failure
-    return poses
+    return poses, found
+
+
+def _with_matches(poses: list[_Pose], found: Candidates | None) -> list[_Pose]:
+    """Return poses with the number of feature matches that agree with them."""
+    if found is None:
+        return poses
+    matches = found.matches_at(np.array([pose.T_target_source for pose in poses]))
+    return [replace(p, matches=float(count)) for p, count in zip(poses, matches, strict=True)]
 
 
 def _turned(views: _CloudViews, pose: _Pose) -> list[_Pose]:
@@ -383,11 +448,15 @@ def _rival(views: _CloudViews, poses: Sequence[_Pose], best: _Pose, T: Float64) 
 
 
 def _registration(
-    views: _CloudViews, best: _Pose, poses: Sequence[_Pose] | None = None
+    views: _CloudViews,
+    best: _Pose,
+    poses: Sequence[_Pose] | None = None,
+    found: Candidates | None = None,
 ) -> Registration:
     """Align all points from the best pose and evaluate its evidence.
 
-    The rival is one of `poses`, the best first; None if the pose is not compared with others.
+    The rival is one of `poses`, the best first; None if the pose is not compared with others. The
+    other poses that feature matches agree on are those `found`.
     """
     T = best.T_target_source
     averaged = views.source_map.view, views.target_map.view
@@ -403,6 +472,7 @@ def _registration(
     lead = None if rival is None else agreement.score - max(rival.agreement.score, 0.0)
     if lead is not None and len(registration.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well
-    evidence = views.evidence(pose, lead, len(registration.unobservable))
+    matched = replace(pose, matches=best.matches)
+    evidence = views.evidence(matched, lead, len(registration.unobservable), found)
     runner_up = None if rival is None or rival is _NO_RIVAL else rival.T_target_source
     return evidence.applied(registration, agreement, runner_up)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float32, Float64, Int64
 from tofuse.engine.clouds import fpfh_kernels as kernels
@@ -15,6 +16,7 @@ from tofuse.engine.clouds.robust_motion import (
     Motions,
     Pairs,
     consensus,
+    match_scores,
 )
 from tofuse.engine.clouds.viewpoint import RangeSphere, Viewpoint
 from tofuse.engine.compute import run_chunks
@@ -49,7 +51,9 @@ _FIT_POINTS, _MIN_NORMAL_COSINE = 500, 0.7
 # A point violates free space if it lies before the other view's surface by more resolutions, plus
 # this fraction of its range; weight of such points, and the fraction of them that counts.
 _IN_FRONT, _IN_FRONT_RANGE = 2.5, 0.03
-VIOLATION_WEIGHT, MAX_VIOLATION = 10.0, 0.1
+VIOLATION_WEIGHT, MAX_VIOLATION = 20.0, 0.05
+# Weight of the log of the matches that agree with a pose, and of those that do by chance.
+MATCH_WEIGHT, _CHANCE_MATCHES = 0.1, 5.0
 
 
 def candidates(
@@ -114,15 +118,15 @@ def candidates(
     T = np.array([c.T_target_source for c in found])
     fits = 0.5 * (_fit(*described, T, size) + _fit(*described[::-1], se3.inverse(T), size))
     score = fits[0] - VIOLATION_WEIGHT * np.minimum(fits[1], MAX_VIOLATION)
+    score += MATCH_WEIGHT * log_matches([c.score for c in found])
     best = np.argsort(-score, kind="stable")
-    return Candidates(
-        size, pairs, tuple(Candidate(T[k], float(fits[0, k]), found[k]) for k in best)
-    )
+    ranked = tuple(Candidate(T[k], float(fits[0, k]), found[k], float(score[k])) for k in best)
+    return Candidates(size, pairs, ranked, options.sigmas)
 
 
 @dataclass(frozen=True, eq=False)
 class DescribedCloud:
-    """Points (n, 3) of a view, their normals (n, 3), histograms (n, 66), and free space if known."""
+    """Points (n, 3) of a view, their normals and histograms (n, 66), and its free space."""
 
     points: Float64
     normals: Float64
@@ -137,11 +141,20 @@ class DescribedCloud:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose T_target_source (4, 4), the fraction of points that fit, and its matches."""
+    """A pose T_target_source (4, 4) of matches.
+
+    Attributes
+    ----------
+    inlier_ratio
+        Fraction of the points that fit.
+    score
+        The same, less violations of free space, plus the weighted log of the matches.
+    """
 
     T_target_source: Float64
     inlier_ratio: float
     consensus: Consensus
+    score: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,12 +168,24 @@ class Candidates:
     pairs
         All matches.
     poses
-        Distinct poses, in order of decreasing fit less violations of free space.
+        Distinct poses, in order of decreasing score.
+    sigmas
+        Maximum distance of a match that agrees, in its standard deviations.
     """
 
     size: float
     pairs: Pairs
     poses: tuple[Candidate, ...]
+    sigmas: float
+
+    def matches_at(self, motions: Float64) -> Float64:
+        """Return the MSAC scores (k,) of the matches at motions (k, 4, 4)."""
+        return match_scores(self.pairs, motions, self.sigmas)
+
+
+def log_matches(score: ArrayLike) -> Float64:
+    """Return the logs of MSAC scores of matches, of which some agree by chance."""
+    return np.log(np.asarray(score, np.float64) + _CHANCE_MATCHES)
 
 
 def _described(

@@ -25,9 +25,9 @@ from tofuse.engine.geometry import se3
 MIN_PAIRS = 3
 # Inlier threshold of each round of least squares, relative to the final one: wide at first, as the
 # motion of a minimal sample is inaccurate.
-_INLIER_GATES = (2.0, 1.5, 1.0, 1.0, 1.0)
+_INLIER_GATES = (2.0, 1.5, 1.0)
 # Maximum number of distinct motions that are refined before they are ranked.
-_MAX_REFINED = 200
+_MAX_REFINED = 120
 # Motions whose residuals are computed at once.
 _BATCH = 256
 # Size of the consensus set of a seed (SC2-PCR: its nearest neighbours in compatibility).
@@ -251,7 +251,8 @@ def _score(squared: Float64, sigmas: float) -> Float64:
     return np.asarray(np.maximum(1 - squared / sigmas**2, 0).sum(-1), np.float64)
 
 
-def _scores(pairs: Pairs, motions: Float64, sigmas: float) -> Float64:
+def match_scores(pairs: Pairs, motions: Float64, sigmas: float) -> Float64:
+    """Return the MSAC scores (k,) of motions (k, 4, 4)."""
     batches = [motions[k : k + _BATCH] for k in range(0, len(motions), _BATCH)]
     scores = [_score(squared_residuals(pairs, batch), sigmas) for batch in batches]
     return np.concatenate(scores) if scores else np.zeros(0)
@@ -260,10 +261,10 @@ def _scores(pairs: Pairs, motions: Float64, sigmas: float) -> Float64:
 def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[Consensus]:
     """Return the distinct motions, the best first, each refined on its inliers."""
     count, sigmas = len(motions), options.sigmas
-    score = _scores(pairs, motions, sigmas)
+    score = match_scores(pairs, motions, sigmas)
     motions = motions[distinct(motions, score, pairs.source, options, _MAX_REFINED)]
     motions = _refined(pairs, motions, sigmas)
-    score = _scores(pairs, motions, sigmas)
+    score = match_scores(pairs, motions, sigmas)
     return [
         Consensus(
             motions[k],
@@ -277,7 +278,7 @@ def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[C
 
 def _refined(pairs: Pairs, motions: Float64, sigmas: float) -> Float64:
     """Refine motions (k, 4, 4) by iterated least squares over their inliers."""
-    best, best_score = motions.copy(), _scores(pairs, motions, sigmas)
+    best, best_score = motions.copy(), match_scores(pairs, motions, sigmas)
     for gate in _INLIER_GATES:
         inliers = squared_residuals(pairs, motions) < (gate * sigmas) ** 2
         motions = np.where(
@@ -285,7 +286,7 @@ def _refined(pairs: Pairs, motions: Float64, sigmas: float) -> Float64:
             _weighted_motions(pairs, inliers / pairs.variance),
             motions,
         )
-        score = _scores(pairs, motions, sigmas)
+        score = match_scores(pairs, motions, sigmas)
         better = score > best_score
         best[better], best_score[better] = motions[better], score[better]
     return best

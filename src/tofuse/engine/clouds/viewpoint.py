@@ -38,11 +38,10 @@ _PIXEL, _MAX_PIXELS = 1.25, 640
 # Relative depth difference of points on the same surface; half the baseline in pixels of the
 # slopes, and number of their iterations.
 _SAME_SURFACE, _HALF_BASELINE, _SLOPE_ITERATIONS = 0.03, 2, 3
-# Of a cloud that is fused from several views: maximum number of averaged points, and fraction of them
-# that may be hidden from the viewpoint; other places, within this margin of the extent, and the
-# percentile of what is hidden from them.
-_HIDING_POINTS, _MAX_HIDDEN = 4000, 0.3
-_PLACES, _PLACES_MARGIN, _PLACES_PERCENTILE = 40, 0.1, 25
+# Of a cloud that is fused from several views: maximum number of averaged points; maximum fraction
+# of them that are hidden from the viewpoint; number of other places among the points, and the
+# percentile of what is hidden from these.
+_HIDING_POINTS, _MAX_HIDDEN, _PLACES, _PLACES_PERCENTILE = 3000, 0.3, 30, 33
 # A point is hidden behind another in its cell, in spacings, by more spacings and this fraction of
 # its range.
 _HIDING_CELL, _BEHIND, _BEHIND_RANGE = 1.5, 3.0, 0.05
@@ -123,8 +122,7 @@ def _fused(view: CloudFrame) -> Viewpoint | None:
     spread, thin, _ = reduced(view, view, spread, _HIDING_POINTS)
     points, origin = thin.points.astype(np.float64), np.asarray(view.origin, np.float64)
     low, high = np.percentile(points, [2, 98], axis=0)
-    margin = _PLACES_MARGIN * (high - low)
-    places = np.random.default_rng(0).uniform(low - margin, high + margin, (_PLACES, 3))
+    places = np.random.default_rng(0).uniform(low, high, (_PLACES, 3))
     hidden = _hidden_fraction(points - origin, spread)
     others = [_hidden_fraction(points - place, spread) for place in places]
     if hidden > min(_MAX_HIDDEN, float(np.percentile(others, _PLACES_PERCENTILE))):

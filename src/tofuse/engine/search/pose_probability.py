@@ -59,6 +59,11 @@ class PoseEvidence:
         Number of degenerate directions.
     model
         Model of the kind of views.
+    consensus
+        Log of the ratio of the feature matches that agree with the pose to those that agree with
+        another; 0 if there are none.
+    proposal_lead
+        Lead over the best rival among the proposals of feature matching, before their alignment.
     """
 
     support: float
@@ -66,6 +71,8 @@ class PoseEvidence:
     margin: float | None = None
     degenerate: int = 0
     model: ProbabilityModel = IMAGES
+    consensus: float = 0.0
+    proposal_lead: float = 0.0
 
     @classmethod
     def of(
@@ -108,7 +115,7 @@ class PoseEvidence:
 
     @property
     def search_regressors(self) -> Float64:
-        """Regressors (4,) of a pose that was compared with rivals.
+        """Regressors of a pose that was compared with rivals: (4,) of images, (6,) of clouds.
 
         Square roots of margin and contradiction, as the step from 0 to 2 % is more informative than
         that from 20 to 40 %. Degenerate directions count less with a larger lead, as poses along
@@ -116,7 +123,8 @@ class PoseEvidence:
         """
         lead = max(self.margin or 0.0, 0.0)
         degeneracy = max(1 - lead / _MIN_LEAD, 0.0) if self.degenerate else 0.0
-        return np.array([1, np.sqrt(lead), np.sqrt(self.contradiction), degeneracy])
+        regressors = [1, np.sqrt(lead), np.sqrt(self.contradiction), degeneracy]
+        return np.array([*regressors, self.consensus, self.proposal_lead][: len(self.model.search)])
 
     @property
     def local_regressors(self) -> Float64:
