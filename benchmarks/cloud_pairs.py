@@ -457,7 +457,7 @@ def print_fit(data: Path, max_pairs: int) -> None:
     fitted = [kind.name for kind in KINDS.values() if kind.fitted]
     others = [kind.name for kind in KINDS.values() if kind.shown and not kind.fitted]
     titles = (
-        "Searched: constant, sqrt of margin, sqrt of contradiction, degenerate, matches, proposals",
+        "Searched: constant, margin / support, contradiction, matches, unknown free space",
         "Followed: constant, support, sqrt of contradiction",
     )
     mine, theirs = (samples(names, data, max_pairs) for names in (fitted, others))

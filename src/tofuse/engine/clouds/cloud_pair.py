@@ -47,6 +47,9 @@ _UNREFINED = 3.0
 _MIN_LEAD = 0.02
 # Support below which the views are also aligned from the guess from coarse to fine.
 _MIN_SUPPORT = 1 / 3
+# Overlap of a turned pose before its alignment, relative to that of the pose, below which it is no
+# rival.
+_MIN_TURNED_OVERLAP = 0.5
 # Loss of score by noise when a pose is aligned again.
 _MAX_SCORE_LOSS = 0.02
 # Points used to test whether a rival converges to the best pose.
@@ -142,17 +145,16 @@ class _CloudViews:
         evidence = pose_probability.PoseEvidence.of(
             pose.agreement, lead, degenerate, pose_probability.CLOUDS
         )
+        evidence = replace(evidence, free_space=self.has_free_space)
         if found is None:
             return evidence
         T = np.array([c.T_target_source for c in found.poses])
         points = self.source_map.view.points.astype(np.float64)
         limits = {"metres": _UNREFINED * _DISTINCT * self.size, "rad": _UNREFINED * _DISTINCT_RAD}
         others = are_distinct(T, pose.T_target_source, points, **limits)
-        scores = np.array([c.score for c in found.poses])
-        matches = np.array([c.consensus.score for c in found.poses])
-        own, rival = (scores[mask].max(initial=0.0) for mask in (~others, others))
-        consensus = log_matches(pose.matches) - log_matches(matches[others].max(initial=0.0))
-        return replace(evidence, consensus=float(consensus), proposal_lead=float(own - rival))
+        matches = np.array([c.consensus.score for c in found.poses])[others]
+        consensus = log_matches(pose.matches) - log_matches(matches.max(initial=0.0))
+        return replace(evidence, consensus=float(consensus))
 
     def with_information(self, registration: Registration) -> Registration:
         """Return a registration with its information matrix."""
@@ -269,10 +271,9 @@ def _registered_views(
     )
     proposed, found = _proposed(views, start, guessed=guess is not None)
     poses += proposed
-    if certain is not None:
-        poses += _turned(views, local)
-    poses = _with_matches(poses, found)
-    poses.sort(key=lambda pose: -pose.score)
+    poses = _ranked(poses, found)
+    if guess is None:
+        poses = _ranked([*poses, *_turned(views, poses[0])], found)
     best = poses[0]
     if guess is not None:
         tied = [p for p in poses if p.score >= best.score - _MIN_LEAD]
@@ -387,24 +388,26 @@ def _proposed(
     return poses, found
 
 
-def _with_matches(poses: list[_Pose], found: Candidates | None) -> list[_Pose]:
-    """Return poses with the number of feature matches that agree with them."""
-    if found is None:
-        return poses
-    matches = found.matches_at(np.array([pose.T_target_source for pose in poses]))
-    return [replace(p, matches=float(count)) for p, count in zip(poses, matches, strict=True)]
+def _ranked(poses: list[_Pose], found: Candidates | None) -> list[_Pose]:
+    """Return poses with the feature matches that agree with them, the highest score first."""
+    if found is not None:
+        matches = found.matches_at(np.array([pose.T_target_source for pose in poses]))
+        poses = [replace(p, matches=float(count)) for p, count in zip(poses, matches, strict=True)]
+    return sorted(poses, key=lambda pose: -pose.score)
 
 
 def _turned(views: _CloudViews, pose: _Pose) -> list[_Pose]:
     """Return a pose after half and quarter turns about the principal axes of the source.
 
-    A symmetric body fits in some of them, also one without distinct features.
+    A symmetric body fits in some of them, also one without distinct features; others are left out.
     """
     points = views.source_map.view.points.astype(np.float64)
     _, axes = np.linalg.eigh(np.cov(points.T))
     turns = [[0.0, 0.0, 0.0, *(angle * axis)] for axis in axes.T for angle in (np.pi / 2, np.pi)]
     centre = points.mean(0)
-    return [views.refined(pose.T_target_source @ se3.about(centre, se3.exp(w))) for w in turns]
+    turned = [views.evaluated(pose.T_target_source @ se3.about(centre, se3.exp(w))) for w in turns]
+    least = _MIN_TURNED_OVERLAP * pose.agreement.overlap
+    return [views.refined(p.T_target_source) for p in turned if p.agreement.overlap > least]
 
 
 def _pose_distance(a: Float64, b: Float64) -> float:

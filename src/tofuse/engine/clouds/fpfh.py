@@ -120,7 +120,7 @@ def candidates(
     score = fits[0] - VIOLATION_WEIGHT * np.minimum(fits[1], MAX_VIOLATION)
     score += MATCH_WEIGHT * log_matches([c.score for c in found])
     best = np.argsort(-score, kind="stable")
-    ranked = tuple(Candidate(T[k], float(fits[0, k]), found[k], float(score[k])) for k in best)
+    ranked = tuple(Candidate(T[k], float(fits[0, k]), found[k]) for k in best)
     return Candidates(size, pairs, ranked, options.sigmas)
 
 
@@ -141,20 +141,11 @@ class DescribedCloud:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose T_target_source (4, 4) of matches.
-
-    Attributes
-    ----------
-    inlier_ratio
-        Fraction of the points that fit.
-    score
-        The same, less violations of free space, plus the weighted log of the matches.
-    """
+    """A pose T_target_source (4, 4), the fraction of points that fit, and its matches."""
 
     T_target_source: Float64
     inlier_ratio: float
     consensus: Consensus
-    score: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +159,7 @@ class Candidates:
     pairs
         All matches.
     poses
-        Distinct poses, in order of decreasing score.
+        Distinct poses, in order of decreasing fit and matches, less violations of free space.
     sigmas
         Maximum distance of a match that agrees, in its standard deviations.
     """
