@@ -74,7 +74,7 @@ class _Pose:
     @property
     def score(self) -> float:
         """Score of the agreement, and of the matches."""
-        return self.agreement.score + MATCH_WEIGHT * log_matches(self.matches)
+        return self.agreement.score + MATCH_WEIGHT * float(log_matches(self.matches))
 
 
 # Placeholder for the rival of a pose without one; it has no support.
@@ -115,8 +115,10 @@ class _CloudViews:
 
     def without_free_space(self) -> _CloudViews:
         """Return the views without their viewpoints."""
-        maps = (replace(m, viewpoint=None, sphere=None) for m in (self.source_map, self.target_map))
-        return _CloudViews(self.source, self.target, *maps, self.rng)
+        source, target = (
+            replace(m, viewpoint=None, sphere=None) for m in (self.source_map, self.target_map)
+        )
+        return replace(self, source_map=source, target_map=target)
 
     def evaluated(self, T: Float64) -> _Pose:
         return _Pose(T, cloud_agreement(self.source_map, self.target_map, T))

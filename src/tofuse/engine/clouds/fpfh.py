@@ -116,7 +116,8 @@ def candidates(
     pairs = Pairs(described[0].points[i], described[1].points[j], variance)
     found = consensus(pairs, options, motions)
     T = np.array([c.T_target_source for c in found])
-    fits = 0.5 * (_fit(*described, T, size) + _fit(*described[::-1], se3.inverse(T), size))
+    first, second = described
+    fits = 0.5 * (_fit(first, second, T, size) + _fit(second, first, se3.inverse(T), size))
     score = fits[0] - VIOLATION_WEIGHT * np.minimum(fits[1], MAX_VIOLATION)
     score += MATCH_WEIGHT * log_matches([c.score for c in found])
     best = np.argsort(-score, kind="stable")

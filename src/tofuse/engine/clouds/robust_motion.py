@@ -25,7 +25,7 @@ from tofuse.engine.geometry import se3
 MIN_PAIRS = 3
 # Inlier threshold of each round of least squares, relative to the final one: wide at first, as the
 # motion of a minimal sample is inaccurate.
-_INLIER_GATES = (2.0, 1.5, 1.0)
+_INLIER_GATES = (2.0, 1.5, 1.0, 1.0, 1.0)
 # Maximum number of distinct motions that are refined before they are ranked.
 _MAX_REFINED = 120
 # Motions whose residuals are computed at once.
