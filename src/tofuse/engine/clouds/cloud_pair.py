@@ -20,7 +20,6 @@ from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agr
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
 from tofuse.engine.clouds.fpfh import MATCH_WEIGHT, Candidates, candidates, log_matches
 from tofuse.engine.clouds.robust_motion import are_distinct
-from tofuse.engine.clouds.viewpoint import viewpoint_of
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
@@ -109,9 +108,9 @@ class _CloudViews:
 
     @property
     def has_assumed_viewpoint(self) -> bool:
-        """Whether the viewpoint of a view is not certain."""
+        """Whether the free space of a view is that of a cloud whose viewpoint was detected."""
         maps = (self.source, self.source_map), (self.target, self.target_map)
-        return any(m.viewpoint is not None and viewpoint_of(view) is None for view, m in maps)
+        return any(m.viewpoint is not None and isinstance(v, CloudFrame) for v, m in maps)
 
     def without_free_space(self) -> _CloudViews:
         """Return the views without their viewpoints."""
