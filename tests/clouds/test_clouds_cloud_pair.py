@@ -319,7 +319,7 @@ def test_clouds_of_different_density(scans):
 def test_views_without_overlap_are_rejected(scans):
     _, elsewhere = scanned([2.5, -2.5, 1.3], 1.0, seed=3)
     for source, target, reason in (
-        (elsewhere, scans[1], "probability"),
+        (elsewhere, scans[1], "another pose"),
         (np.random.default_rng(0).normal(size=(3000, 3)), scans[1], "points of both views"),
     ):
         found = tofuse.register(source, target)

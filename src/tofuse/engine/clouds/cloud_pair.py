@@ -49,6 +49,8 @@ _MIN_SUPPORT = 1 / 3
 # Overlap of a turned pose before its alignment, relative to that of the pose, below which it is no
 # rival.
 _MIN_TURNED_OVERLAP = 0.5
+# Probability above which a pose is not searched again without free space.
+_LIKELY = 0.5
 # Loss of score by noise when a pose is aligned again.
 _MAX_SCORE_LOSS = 0.02
 # Points used to test whether a rival converges to the best pose.
@@ -246,7 +248,8 @@ def _registered(
     views = _CloudViews.of(source, target, rng)
     options = {"always_search": always_search}
     registration = _registered_views(views, guess, image_registration, **options)
-    if registration.believed or not views.has_assumed_viewpoint:
+    likely = (registration.probability or 0.0) > _LIKELY
+    if registration.believed or likely or not views.has_assumed_viewpoint:
         return registration
     blind = views.without_free_space()
     other = _registered_views(blind, guess, image_registration, **options)
