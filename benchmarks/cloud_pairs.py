@@ -206,8 +206,9 @@ def scanned(name: str, max_scans: int, points: int, seed: int) -> Iterator[tuple
 def clips(name: str, *, seed: int, fused: bool) -> Maker:
     """Clips of a walk through a scene, fused to one cloud, or their first frames; some are moved.
 
-    The pairs overlap by any amount: half of them by less than 30 %, some not at all. A fused clip
-    of 3 s drifts, and is thinned to 25 mm, as the fragments that a reconstruction is made from.
+    The pairs overlap by any amount: a third of them by less than 30 %, a third not at all, as poses
+    of different places of one scene are most often confused. A fused clip of 3 s drifts, and is
+    thinned to 25 mm, as the fragments that a reconstruction is made from.
     """
 
     def make(_data: Path, max_pairs: int, rng: np.random.Generator) -> Iterator[Pair]:
@@ -223,7 +224,7 @@ def clips(name: str, *, seed: int, fused: bool) -> Maker:
             for T_b, b in taken[k + 1 :]
         ]
         overlaps = np.array([_overlap(pair) for pair in pairs_of])
-        for low, high, share in ((0.08, 0.3, 2), (0.3, 0.7, 4), (0.7, 1.01, 8), (0.0, 0.01, 8)):
+        for low, high, share in ((0.08, 0.3, 2), (0.3, 0.7, 4), (0.7, 1.01, 4), (0.0, 0.01, 2)):
             fitting = np.flatnonzero((overlaps >= low) & (overlaps < high))
             for k in rng.permutation(fitting)[: -(-2 * max_pairs // share)]:
                 pair = pairs_of[k]
@@ -457,16 +458,17 @@ def print_fit(data: Path, max_pairs: int) -> None:
     fitted = [kind.name for kind in KINDS.values() if kind.fitted]
     others = [kind.name for kind in KINDS.values() if kind.shown and not kind.fitted]
     titles = (
-        "Searched: constant, margin / support, contradiction, matches, unknown free space",
+        "Searched: constant, margin / support, contradiction, log of matches, misfit",
         "Followed: constant, support, sqrt of contradiction",
     )
-    mine, theirs = (samples(names, data, max_pairs) for names in (fitted, others))
-    for title, rows, held_out in zip(titles, mine, theirs, strict=True):
+    for title, rows in zip(titles, samples(fitted, data, max_pairs), strict=True):
         pairs.print_fit(title, pairs.stacked([row[:3] for row in rows]))
+    for title, held_out in zip(titles, samples(others, data, max_pairs), strict=True):
         p = np.array([row[3] for row in held_out])
         right = np.array([row[1] for row in held_out], bool)
         accepted = p >= pairs.ACCEPTED
-        print(f"\ncoefficients in use, on {len(p)} poses of {', '.join(others)}:")
+        print(f"\n{title.partition(':')[0]}, coefficients in use, on {len(p)} poses of", end=" ")
+        print(f"{', '.join(others)}:")
         print(f"area under the ROC curve {pairs.roc_area(p, right):.3f}, accepted", end=" ")
         print(f"{accepted.sum()}, of these wrong {(accepted & ~right).sum()}")
 
@@ -514,17 +516,18 @@ def samples(names: list[str], data: Path, max_pairs: int) -> tuple[list[Row], li
             try:
                 with decisions() as made, one_blas_thread():
                     if guess is None:
-                        register_clouds(*views, None, rng_pair, always_search=True)
+                        result = register_clouds(*views, None, rng_pair, always_search=True)
                     else:
-                        follow_clouds(*views, guess, rng_pair)
+                        result = follow_clouds(*views, guess, rng_pair)
             except RegistrationError:
                 continue
-            for evidence, found in made:
-                right, p = pair.is_right(found.T_target_source), evidence.probability
-                if evidence.margin is not None:
-                    searched.append((evidence.search_regressors, right, family, p))
-                elif guess is not None and not evidence.degenerate:
-                    followed.append((evidence.local_regressors, right, family, p))
+            T = result.T_target_source
+            evidence = next(e for e, found in reversed(made) if found.T_target_source is T)
+            right, p = pair.is_right(T), evidence.probability
+            if evidence.margin is not None:
+                searched.append((evidence.search_regressors, right, family, p))
+            elif guess is not None and not evidence.degenerate:
+                followed.append((evidence.local_regressors, right, family, p))
     return searched, followed
 
 

@@ -264,15 +264,14 @@ def test_agreement_is_symmetric(scans):
 
 
 def test_evidence_of_clouds_is_lead_contradiction_and_matches():
-    """A small overlap is no evidence against a pose, matches that agree with another are."""
-    right = PoseEvidence(0.6, 0, 0.6, 0, CLOUDS, consensus=2.0)
+    """A small overlap is no evidence against a pose, few matches for its overlap are."""
+    right = PoseEvidence(0.6, 0, 0.6, 0, CLOUDS, misfit=0.03, match_share=0.4)
     assert right.probability > 0.9
     assert replace(right, support=0.2, margin=0.2).probability == pytest.approx(right.probability)
-    for change in ({"margin": 0.0}, {"contradiction": 0.1}, {"consensus": -0.5}):
-        assert replace(right, **change).probability < 0.9
-    assert replace(right, free_space=False).probability < right.probability
-    slides = replace(right, margin=0.0, degenerate=1, consensus=0.0)
-    assert slides.probability < 0.75
+    walls = {"match_share": 0.1, "misfit": 0.17}  # of different rooms, without any rival
+    for change in ({"margin": 0.0}, {"contradiction": 0.1}, walls):
+        assert replace(right, **change).probability < 0.85
+    slides = replace(right, margin=0.0, degenerate=1)
     assert "degenerate" in slides.rejection_reason()
 
 

@@ -40,8 +40,6 @@ _POINTS = 7_000
 _MAX_REFINED = 3
 # Poses that differ by more resolutions, or rad, are distinct hypotheses.
 _DISTINCT, _DISTINCT_RAD = 4.0, 0.0873
-# Factor of these limits for poses that are not refined.
-_UNREFINED = 3.0
 # A pose near the guess is preferred to one with a lead below this fraction of the points.
 _MIN_LEAD = 0.02
 # Support below which the views are also aligned from the guess from coarse to fine.
@@ -148,16 +146,13 @@ class _CloudViews:
         evidence = pose_probability.PoseEvidence.of(
             pose.agreement, lead, degenerate, pose_probability.CLOUDS
         )
-        evidence = replace(evidence, free_space=self.has_free_space)
+        agreement = pose.agreement
+        beside = agreement.overlap - agreement.support - agreement.violation
+        evidence = replace(evidence, misfit=beside / max(agreement.overlap, 1e-9))
         if found is None:
             return evidence
-        T = np.array([c.T_target_source for c in found.poses])
-        points = self.source_map.view.points.astype(np.float64)
-        limits = {"metres": _UNREFINED * _DISTINCT * self.size, "rad": _UNREFINED * _DISTINCT_RAD}
-        others = are_distinct(T, pose.T_target_source, points, **limits)
-        matches = np.array([c.consensus.score for c in found.poses])[others]
-        consensus = log_matches(pose.matches) - log_matches(matches.max(initial=0.0))
-        return replace(evidence, consensus=float(consensus))
+        matches = pose.matches / max(len(found.pairs), 1)
+        return replace(evidence, match_share=matches / max(agreement.support, 1e-9))
 
     def with_information(self, registration: Registration) -> Registration:
         """Return a registration with its information matrix."""
@@ -479,7 +474,7 @@ def _registration(
     lead = None if rival is None else agreement.score - max(rival.agreement.score, 0.0)
     if lead is not None and len(registration.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well
-    matched = replace(pose, matches=best.matches)
+    matched = pose if found is None else _ranked([pose], found)[0]
     evidence = views.evidence(matched, lead, len(registration.unobservable), found)
     runner_up = None if rival is None or rival is _NO_RIVAL else rival.T_target_source
     return evidence.applied(registration, agreement, runner_up)

@@ -39,13 +39,13 @@ class ProbabilityModel:
 # Fitted to images: 351 searched poses, 370 poses aligned from a guess. On held-out scenes the area
 # under the ROC curve is 0.99 and 0.91.
 IMAGES = ProbabilityModel(search=(0.34, 6.17, -6.40, -4.21), local=(0.55, 7.01, -6.02))
-# Contradiction of clouds beyond which more is no stronger evidence; range of the consensus, and
-# relative leads between which it begins to count for a pose.
-_MUCH_CONTRADICTION, _CONSENSUS_RANGE, _TRUSTED_LEADS = 0.05, (-1.0, 2.0), (0.2, 0.4)
+# Contradiction and misfit of clouds beyond which more is no stronger evidence, and the range of the
+# share of the matches that tells right from wrong poses.
+_MUCH_CONTRADICTION, _MUCH_MISFIT, _MATCH_SHARES = 0.05, 0.3, (0.03, 0.5)
 # Fitted to clouds: 201 searched poses, of which 92 are right, of clips of simulated walks, single
 # views and spherical scans, and of different places. Leaving one kind out the area is 0.80: rooms
 # that look alike, or have the same shape, are confused where they are not among the kinds.
-CLOUDS = ProbabilityModel(search=(0.73, 1.44, -13.56, 2.11, -1.25), local=(-2.29, 9.96, -5.5))
+CLOUDS = ProbabilityModel(search=(2.73, 2.41, -5.79, 1.46, -1.0), local=(-2.29, 9.96, -5.5))
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,12 @@ class PoseEvidence:
         Number of degenerate directions.
     model
         Model of the kind of views.
-    consensus
-        Log of the ratio of the feature matches that agree with the pose to those that agree with
-        another; of clouds only.
-    free_space
-        Whether the free space of both views is known.
+    misfit
+        Fraction of the overlap that is near the other view's surface, but not on it; of clouds
+        only.
+    match_share
+        Fraction of the feature matches that agree with the pose, relative to the support; of clouds
+        only.
     """
 
     support: float
@@ -74,8 +75,8 @@ class PoseEvidence:
     margin: float | None = None
     degenerate: int = 0
     model: ProbabilityModel = IMAGES
-    consensus: float = 0.0
-    free_space: bool = True
+    misfit: float = 0.0
+    match_share: float = 0.0
 
     @classmethod
     def of(
@@ -125,17 +126,17 @@ class PoseEvidence:
         them would fit as well. Support enters by the lead.
 
         Clouds overlap by any amount, so that their lead is relative to the support. Degenerate
-        directions leave them none. Free space of fused clouds is inaccurate, so that a small
-        contradiction says little.
+        directions leave them none. Walls fit in many poses, without any rival that fits as well:
+        matches and the misfit tell those apart. Matches with rivals don't, as repeated shapes of
+        one place agree with many poses.
         """
         lead = max(self.margin or 0.0, 0.0)
         if self.model is CLOUDS:
             relative_lead = min(lead / max(self.support, 1e-9), 1.0)
             contradiction = min(self.contradiction / _MUCH_CONTRADICTION, 1.0)
-            consensus = np.clip(self.consensus, *_CONSENSUS_RANGE)
-            if consensus > 0:  # where another pose fits as well, it may just have fewer features
-                consensus *= np.interp(relative_lead, _TRUSTED_LEADS, (0.0, 1.0))
-            return np.array([1, relative_lead, contradiction, consensus, not self.free_space])
+            matches = np.log(np.clip(self.match_share, *_MATCH_SHARES))
+            misfit = min(self.misfit / _MUCH_MISFIT, 1.0)
+            return np.array([1, relative_lead, contradiction, matches, misfit])
         degeneracy = max(1 - lead / _MIN_LEAD, 0.0) if self.degenerate else 0.0
         return np.array([1, np.sqrt(lead), np.sqrt(self.contradiction), degeneracy])
 
