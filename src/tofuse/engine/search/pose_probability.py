@@ -43,9 +43,9 @@ IMAGES = ProbabilityModel(search=(0.34, 6.17, -6.40, -4.21), local=(0.55, 7.01, 
 # share of the matches that tells right from wrong poses.
 _MUCH_CONTRADICTION, _MUCH_MISFIT, _MATCH_SHARES = 0.05, 0.3, (0.03, 0.5)
 # Fitted to clouds: 169 decisions on 138 pairs, of which 76 are right, of clips of simulated walks,
-# single views and spherical scans, and of different places. Leaving one kind out the area is 0.80, and of
-# the right poses 23 are accepted, of the wrong ones none; the most probable wrong one (0.88) lays
-# two similar rooms over each other.
+# single views and spherical scans, and of different places. Leaving one kind out the area is 0.80;
+# of the right poses 23 are accepted, of the wrong ones none: the most probable one (0.88) lays two
+# similar rooms over each other.
 CLOUDS = ProbabilityModel(search=(2.73, 2.41, -5.79, 1.46, -1.0), local=(-2.29, 9.96, -5.5))
 
 
