@@ -22,8 +22,11 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -38,15 +41,21 @@ from sequences import DATA
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.clouds.cloud_pair import follow_clouds, register_clouds
 from tofuse.engine.clouds.viewpoint import viewpoint_of
+from tofuse.engine.compute import one_blas_thread
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame, Frame
-from tofuse.engine.geometry import se3
-from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
+from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.icp import averaged
+from tofuse.engine.search.pose_probability import PoseEvidence
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.world import scene as scenes
 
 POINTS = 20_000
 RIGHT_M, RIGHT_FRACTION, RIGHT_DEG = 0.1, 0.05, 4.0
+# Clips: noise and largest range, drift from frame to frame, edge of the voxels, and the fraction of
+# pairs that are moved to another frame.
+_NOISE_M, _RANGE_M, _THINNED_M, _MOVED = 0.003, 5.0, 0.025, 0.3
+_DRIFT = np.array([0.002] * 3 + [0.001] * 3)
 # A rotating object stands in front of a static background.
 OBJECT_M = 1.6
 
@@ -194,6 +203,72 @@ def scanned(name: str, max_scans: int, points: int, seed: int) -> Iterator[tuple
             return
 
 
+def clips(name: str, *, seed: int, fused: bool) -> Maker:
+    """Clips of a walk through a scene, fused to one cloud, or their first frames; some are moved.
+
+    The pairs overlap by any amount: a third of them by less than 30 %, a third not at all, as poses
+    of different places of one scene are most often confused. A fused clip of 3 s drifts, and is
+    thinned to 25 mm, as the fragments that a reconstruction is made from.
+    """
+
+    def make(_data: Path, max_pairs: int, rng: np.random.Generator) -> Iterator[Pair]:
+        built, sequence = scenes.build(name, seed=seed)
+        last = max(sequence.frames / sequence.frame_rate_hz - 3.2, 0.1)
+        taken = []
+        for start in np.linspace(0, last, 18):
+            times = start + (np.linspace(0, 3, 12) if fused else np.zeros(1))
+            taken.append((sequence.T_room_camera(start), _clip(built, sequence, times, rng)))
+        pairs_of = [
+            Pair(b, a, se3.inverse(T_a) @ T_b)
+            for k, (T_a, a) in enumerate(taken)
+            for T_b, b in taken[k + 1 :]
+        ]
+        overlaps = np.array([_overlap(pair) for pair in pairs_of])
+        for low, high, share in ((0.08, 0.3, 2), (0.3, 0.7, 4), (0.7, 1.01, 4), (0.0, 0.01, 2)):
+            fitting = np.flatnonzero((overlaps >= low) & (overlaps < high))
+            for k in rng.permutation(fitting)[: -(-2 * max_pairs // share)]:
+                pair = pairs_of[k]
+                moved = _elsewhere(pair, rng) if rng.random() < _MOVED else pair
+                yield Pair(moved.source, moved.target, moved.true if low else None)
+
+    return make
+
+
+def _clip(
+    built: scenes.Scene, sequence: scenes.Sequence, times: Float64, rng: np.random.Generator
+) -> Float64:
+    """Points (n, 3) of some instants of a sequence in the frame of the first."""
+    size = (160, 120) if len(times) == 1 else (96, 72)
+    u, v = np.meshgrid(*(np.linspace(-0.5, 0.5, k) * k / size[0] for k in size))
+    rays = np.stack([1.1 * u, 1.1 * v, np.ones_like(u)], -1).reshape(-1, 3)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    T_camera_room, drift = se3.inverse(sequence.T_room_camera(times[0])), np.eye(4)
+    points = []
+    for t in times:
+        T = sequence.T_room_camera(t)
+        distance = built.cast(T[:3, 3], rays @ T[:3, :3].T).distance
+        seen = distance < _RANGE_M  # inf where nothing is hit
+        noise = _NOISE_M * (1 + 0.3 * distance[seen] ** 2) * rng.standard_normal(int(seen.sum()))
+        drift = drift @ se3.exp(_DRIFT * rng.standard_normal(6))
+        hit = rays[seen] * (distance[seen] + noise)[:, None]
+        points.append(se3.transform(drift @ T_camera_room @ T, hit))
+    joined = np.concatenate(points)
+    if len(times) == 1:
+        return joined
+    return averaged(CloudFrame.of(joined), _THINNED_M).points.astype(np.float64)
+
+
+def _overlap(pair: Pair) -> float:
+    """Smaller one of the fractions of both clouds that lie near the other."""
+    assert pair.true is not None
+    T = pair.true
+    shares = []
+    for a, b, motion in ((pair.source, pair.target, T), (pair.target, pair.source, se3.inverse(T))):
+        nearest, _ = KdTree(b).nearest(se3.transform(motion, a[::7]), 0.06)
+        shares.append(float(np.mean(nearest >= 0)))
+    return min(shares)
+
+
 def _lidar_pair(data: Path, _max_pairs: int, _rng: np.random.Generator) -> Iterator[Pair]:
     folder = data / "lidar_pair_gt"
     if not folder.is_dir():
@@ -204,11 +279,11 @@ def _lidar_pair(data: Path, _max_pairs: int, _rng: np.random.Generator) -> Itera
 
 
 _FRAMES = (
-    ("room", "Furnished room, SR4000", (1, 2, 3), "room", True),
-    ("empty-room", "Empty room, SR4000", (1, 3), "room", True),
-    ("flat", "Flat of four rooms, SR4000", (1, 2, 3), "flat", True),
-    ("flat-alike", "Flat with similar rooms, SR4000", (1, 2), "flat", True),
-    ("torso", "Torso alone, SR4000", (1, 2, 4), "torso", True),
+    ("room", "Furnished room, SR4000", (1, 2, 3), "room", False),
+    ("empty-room", "Empty room, SR4000", (1, 3), "room", False),
+    ("flat", "Flat of four rooms, SR4000", (1, 2, 3), "flat", False),
+    ("flat-alike", "Flat with similar rooms, SR4000", (1, 2), "flat", False),
+    ("torso", "Torso alone, SR4000", (1, 2, 4), "torso", False),
     ("rail", "Rail, pico flexx", (1, 2), "rail", False),
     ("hall", "Hall, ifm O3R", (1, 2), "hall", False),
     ("box", "Box alone, SR4000", (1, 2, 4), "box", False),
@@ -242,17 +317,37 @@ KINDS = {
         Kind("scans-moved", "Scans of the flat, moved", scans("flat", moved=True), "flat"),
         Kind("scans-2", "Scans of another flat", scans("flat", seed=3), "flat", False),
         Kind("lidar", "LiDAR outdoors", _lidar_pair, "lidar", False),
-        # Flats that are not in the table.
+        # Scenes that are not in the table.
+        *(
+            Kind(
+                f"{'clips' if fused else 'views'}-of-{name}-{seed}",
+                f"{'Clips' if fused else 'Views'} of {name} {seed}",
+                clips(name, seed=seed, fused=fused),
+                name.removesuffix("-alike") + ("" if fused else "-views"),
+                fitted=True,
+                shown=False,
+            )
+            for name, seed, fused in (
+                ("flat", 1, True),
+                ("flat", 2, True),
+                ("flat-alike", 2, True),
+                ("room", 1, True),
+                ("rail", 1, True),
+                ("flat", 4, False),
+                ("hall", 3, False),
+                ("room", 3, False),
+            )
+        ),
         *(
             Kind(
                 f"scans-of-{seed}{name}",
                 f"Scans of flat {seed}{name}",
-                scans("flat", moved=bool(name), seed=seed),
-                "flat",
+                scans("flat", moved=bool(name), seed=seed, points=POINTS),
+                "scans",
                 fitted=True,
                 shown=False,
             )
-            for seed in (1, 2, 5)
+            for seed in (1, 2)
             for name in ("", "-moved")
         ),
     )
@@ -363,18 +458,33 @@ def print_fit(data: Path, max_pairs: int) -> None:
     fitted = [kind.name for kind in KINDS.values() if kind.fitted]
     others = [kind.name for kind in KINDS.values() if kind.shown and not kind.fitted]
     titles = (
-        "Searched: constant, sqrt of margin, sqrt of contradiction, degenerate",
+        "Searched: constant, margin / support, contradiction, log of matches, misfit",
         "Followed: constant, support, sqrt of contradiction",
     )
-    mine, theirs = (samples(names, data, max_pairs) for names in (fitted, others))
-    for title, rows, held_out in zip(titles, mine, theirs, strict=True):
+    for title, rows in zip(titles, samples(fitted, data, max_pairs), strict=True):
         pairs.print_fit(title, pairs.stacked([row[:3] for row in rows]))
+    for title, held_out in zip(titles, samples(others, data, max_pairs), strict=True):
         p = np.array([row[3] for row in held_out])
         right = np.array([row[1] for row in held_out], bool)
         accepted = p >= pairs.ACCEPTED
-        print(f"\ncoefficients in use, on {len(p)} poses of {', '.join(others)}:")
+        print(f"\n{title.partition(':')[0]}, coefficients in use, on {len(p)} poses of", end=" ")
+        print(f"{', '.join(others)}:")
         print(f"area under the ROC curve {pairs.roc_area(p, right):.3f}, accepted", end=" ")
         print(f"{accepted.sum()}, of these wrong {(accepted & ~right).sum()}")
+
+
+@contextmanager
+def decisions() -> Iterator[list[tuple[PoseEvidence, Registration]]]:
+    """Record the evidence of each pose that is decided on."""
+    made: list[tuple[PoseEvidence, Registration]] = []
+    decide = PoseEvidence.applied
+
+    def recorded(evidence: PoseEvidence, *given: Any) -> Registration:
+        made.append((evidence, decide(evidence, *given)))
+        return made[-1][1]
+
+    with mock.patch.object(PoseEvidence, "applied", recorded):
+        yield made
 
 
 # Regressors, whether the pose is right, index of the family, and the probability in use.
@@ -400,26 +510,24 @@ def samples(names: list[str], data: Path, max_pairs: int) -> tuple[list[Row], li
     for pair, name in todo:
         views = CloudFrame.of(pair.source, index=1), CloudFrame.of(pair.target)
         start = np.eye(4) if pair.true is None else pair.true
+        family = families.index(KINDS[name].family)
         for guess in (None, *(start @ _off_by(m, d, rng) for m, d in pairs.GUESSES)):
             rng_pair = np.random.default_rng(0)
             try:
-                if guess is None:
-                    found = register_clouds(*views, None, rng_pair, always_search=True)
-                else:
-                    found = follow_clouds(*views, guess, rng_pair)
+                with decisions() as made, one_blas_thread():
+                    if guess is None:
+                        result = register_clouds(*views, None, rng_pair, always_search=True)
+                    else:
+                        result = follow_clouds(*views, guess, rng_pair)
             except RegistrationError:
                 continue
-            assert found.support is not None
-            assert found.contradiction is not None
-            degenerate = len(found.unobservable)
-            evidence = PoseEvidence(
-                found.support, found.contradiction, found.margin, degenerate, CLOUDS
-            )
-            right, family = pair.is_right(found.T_target_source), families.index(KINDS[name].family)
-            if guess is None:
-                searched.append((evidence.search_regressors, right, family, evidence.probability))
-            elif not degenerate:
-                followed.append((evidence.local_regressors, right, family, evidence.probability))
+            T = result.T_target_source
+            evidence = next(e for e, found in reversed(made) if found.T_target_source is T)
+            right, p = pair.is_right(T), evidence.probability
+            if evidence.margin is not None:
+                searched.append((evidence.search_regressors, right, family, p))
+            elif guess is not None and not evidence.degenerate:
+                followed.append((evidence.local_regressors, right, family, p))
     return searched, followed
 
 

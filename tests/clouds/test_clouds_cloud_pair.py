@@ -12,9 +12,16 @@ from registration_scenes import box_walls, bumpy_ball, turn
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.clouds import cloud_pair
+from tofuse.engine.clouds import pair as any_pair
 from tofuse.engine.clouds.cloud_agreement import CloudMap, cloud_agreement
 from tofuse.engine.clouds.cloud_pair import register_clouds
-from tofuse.engine.clouds.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
+from tofuse.engine.clouds.viewpoint import (
+    RangeSphere,
+    as_image,
+    free_space_viewpoint,
+    rendered,
+    viewpoint_of,
+)
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame
@@ -64,6 +71,31 @@ def frames():
     return rendered[0], rendered[1], se3.inverse(made.poses[0]) @ made.poses[1]
 
 
+@pytest.fixture(scope="module")
+def clips():
+    """Two fused clips of a turn in a furnished room that share a third of what they see."""
+    built, sequence = scenes.build("room", seed=1)
+    rng = np.random.default_rng(3)
+    u, v = np.meshgrid(np.linspace(-0.55, 0.55, 96), np.linspace(-0.4, 0.4, 72))
+    rays = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    fused = []
+    for start in (0.0, 2.0):
+        T_first = sequence.T_room_camera(start)
+        points = []
+        for t in np.linspace(start, start + 1, 6):
+            T = sequence.T_room_camera(t)
+            distance = built.cast(T[:3, 3], rays @ T[:3, :3].T).distance.astype(float)
+            distance += rng.normal(0, 0.004, len(distance))
+            seen = distance < 5
+            hits = rays[seen] * distance[seen, None]
+            points.append(se3.transform(se3.inverse(T_first) @ T, hits))
+        thin = averaged(CloudFrame.of(np.concatenate(points)), 0.025)
+        fused.append((T_first, thin.points.astype(float)))
+    (T_a, a), (T_b, b) = fused
+    return b, a, se3.inverse(T_a) @ T_b
+
+
 def off(T, true, points):
     """Error in m at the median of the source, and in degrees."""
     middle = np.median(points, 0)[None].astype(float)
@@ -103,6 +135,15 @@ def test_evenly_sampled_surfaces_have_no_viewpoint(frames):
     assert viewpoint_of(even) is None
     assert viewpoint_of(CloudFrame.of(np.zeros((100, 3)))) is None
     assert viewpoint_of(CloudFrame.of(frames[0].points[:20])) is None
+
+
+def test_fused_cloud_is_seen_from_its_origin(scans):
+    """Evenly sampled surfaces have no viewpoint, but hide little from where they were seen."""
+    even = averaged(CloudFrame.of(scans[0]), 0.08)
+    assert viewpoint_of(even) is None
+    assert free_space_viewpoint(even) is not None
+    for place in ([4, 0, 0], [-4, 0, 0], [0, 0, 2]):  # behind walls, and under the floor
+        assert free_space_viewpoint(CloudFrame.of(even.points + np.float32(place))) is None
 
 
 def test_image_of_cloud_matches_original_image(frames):
@@ -183,11 +224,8 @@ def test_wrong_pose_is_contradicted_by_free_space(scans):
         assert agreement.violation > 0.02
         assert agreement.score < right.score - 0.2
     # Without viewpoints, free space is unknown.
-    without_viewpoint = maps(se3.transform(ANYWHERE, source.astype(float)), target)
-    assert without_viewpoint[0].sphere is None
-    agreement = cloud_agreement(
-        without_viewpoint[0], replace(without_viewpoint[1], sphere=None), turn([0, 0, 1], 180)
-    )
+    without_viewpoint = [replace(view, sphere=None) for view in views]
+    agreement = cloud_agreement(*without_viewpoint, turn([0, 0, 1], 180))
     assert agreement.violation == 0
 
 
@@ -225,14 +263,16 @@ def test_agreement_is_symmetric(scans):
     assert there.support == pytest.approx(back.support, abs=1e-9)
 
 
-def test_evidence_without_free_space_depends_on_margin():
-    """Images and clouds have their own models of evidence."""
-    cases = [
-        PoseEvidence(0.6, c, m, k, CLOUDS) for c, m, k in ((0, 0.6, 0), (0.03, 0.25, 0), (0, 0, 1))
-    ]
-    right, other_room, slides = (case.probability for case in cases)
-    assert right > 0.9 > 0.7 > other_room > slides
-    assert "degenerate" in cases[2].rejection_reason()
+def test_evidence_of_clouds_is_lead_contradiction_and_matches():
+    """A small overlap is no evidence against a pose, few matches for its overlap are."""
+    right = PoseEvidence(0.6, 0, 0.6, 0, CLOUDS, misfit=0.03, match_share=0.4)
+    assert right.probability > 0.9
+    assert replace(right, support=0.2, margin=0.2).probability == pytest.approx(right.probability)
+    walls = {"match_share": 0.1, "misfit": 0.17}  # of different rooms, without any rival
+    for change in ({"margin": 0.0}, {"contradiction": 0.1}, walls):
+        assert replace(right, **change).probability < 0.85
+    slides = replace(right, margin=0.0, degenerate=1)
+    assert "degenerate" in slides.rejection_reason()
 
 
 # Registration
@@ -278,12 +318,30 @@ def test_clouds_of_different_density(scans):
 def test_views_without_overlap_are_rejected(scans):
     _, elsewhere = scanned([2.5, -2.5, 1.3], 1.0, seed=3)
     for source, target, reason in (
-        (elsewhere, scans[1], "probability"),
+        (elsewhere, scans[1], "another pose"),
         (np.random.default_rng(0).normal(size=(3000, 3)), scans[1], "points of both views"),
     ):
         found = tofuse.register(source, target)
         assert found.believed is False
         assert reason in found.reason
+
+
+def test_large_clouds_are_registered_by_a_part_of_their_points(scans, registered, monkeypatch):
+    monkeypatch.setattr(any_pair, "_MAX_POINTS", 10_000)
+    found = tofuse.register(*scans[:2])
+    assert off(found.T_target_source, registered.T_target_source, scans[0])[0] < 0.01
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_fused_clips_that_overlap_little_are_registered(clips, moved):
+    """Without a guess, wherever their origin is."""
+    source, target, true = clips
+    if moved:
+        source, true = se3.transform(ANYWHERE, source), true @ se3.inverse(ANYWHERE)
+    found = tofuse.register(source, target)
+    shift, angle = off(found.T_target_source, true, source)
+    assert shift < 0.05
+    assert angle < 2
 
 
 def test_wrong_unit_is_found_with_few_points(scans, monkeypatch):

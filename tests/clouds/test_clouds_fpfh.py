@@ -112,3 +112,23 @@ def test_rows_are_matched_mutually():
         (k, int(apart[k].argmin())) for k in range(300) if apart[:, apart[k].argmin()].argmin() == k
     ]
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == expected
+
+
+def test_several_nearest_rows_are_matched_mutually():
+    a, b = rng(0).normal(size=(90, 5)), rng(1).normal(size=(80, 5))
+    apart = ((a[:, None] - b) ** 2).sum(2)
+    near_a = apart <= np.sort(apart, axis=1)[:, 1:2]
+    near_b = apart <= np.sort(apart, axis=0)[1:2]
+    i, j = mutually_nearest(a, b, 2)
+    assert set(zip(i.tolist(), j.tolist(), strict=True)) == set(
+        zip(*(k.tolist() for k in np.nonzero(near_a & near_b)), strict=True)
+    )
+
+
+def test_histograms_of_surroundings_are_those_of_all_points():
+    points, normals = surface()
+    np.testing.assert_allclose(
+        fpfh(points, normals, 0.9, True, (points, normals)),
+        fpfh(points, normals, 0.9, True),
+        atol=1e-12,
+    )

@@ -13,7 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.clouds.viewpoint import RangeSphere, Viewpoint, viewpoint_of
+from tofuse.engine.clouds.fpfh import MAX_VIOLATION, VIOLATION_WEIGHT
+from tofuse.engine.clouds.viewpoint import RangeSphere, Viewpoint, free_space_viewpoint
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.icp import surface_shape
@@ -35,9 +36,6 @@ _MIN_NORMAL_COSINE = 0.75
 # A point is in free space if it lies in front of the surface by more than this fraction of the
 # range plus the tolerance.
 _IN_FRONT = 0.02
-# Weight of a point in free space relative to a supporting one: at a wrong pose most points may lie
-# on surfaces, as walls are similar, but at the right pose hardly any lies in free space.
-_VIOLATION_WEIGHT = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +74,7 @@ class CloudMap:
         shape = surface_shape.shape_at(view, np.arange(len(view)), NEIGHBOURS)
         roughness = shape.roughness[np.isfinite(shape.roughness)]
         sigma = float(np.median(roughness)) * size if len(roughness) else size
-        viewpoint = viewpoint_of(full_view)
+        viewpoint = free_space_viewpoint(full_view)
         sphere = None if viewpoint is None else RangeSphere.of(full_view, viewpoint)
         tested = (
             np.zeros((0, 3)) if viewpoint is None else _tested_points(view, shape, viewpoint.origin)
@@ -132,7 +130,7 @@ def cloud_agreement(
         clash=0.0,
         rms_m=float(np.sqrt(squares / on_surface)) if on_surface else np.inf,
         points=sum(len(view.compared[0]) for view in (source, target)),
-        score=float(on_surface - _VIOLATION_WEIGHT * violation),
+        score=float(on_surface - VIOLATION_WEIGHT * min(violation, MAX_VIOLATION)),
     )
 
 

@@ -18,7 +18,7 @@ from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
-from tofuse.engine.clouds.fpfh import candidates
+from tofuse.engine.clouds.fpfh import MATCH_WEIGHT, Candidates, candidates, log_matches
 from tofuse.engine.clouds.robust_motion import are_distinct
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
@@ -35,15 +35,20 @@ from tofuse.engine.icp import (
 from tofuse.engine.search import pair_agreement, pose_probability
 
 # Maximum number of points of each averaged view.
-_POINTS = 10_000
+_POINTS = 7_000
 # Number of proposals that are aligned at full resolution.
-_MAX_REFINED = 8
+_MAX_REFINED = 3
 # Poses that differ by more resolutions, or rad, are distinct hypotheses.
 _DISTINCT, _DISTINCT_RAD = 4.0, 0.0873
 # A pose near the guess is preferred to one with a lead below this fraction of the points.
 _MIN_LEAD = 0.02
 # Support below which the views are also aligned from the guess from coarse to fine.
 _MIN_SUPPORT = 1 / 3
+# Overlap of a turned pose before its alignment, relative to that of the pose, below which it is no
+# rival.
+_MIN_TURNED_OVERLAP = 0.5
+# Probability above which a pose is not searched again without free space.
+_LIKELY = 0.5
 # Loss of score by noise when a pose is aligned again.
 _MAX_SCORE_LOSS = 0.02
 # Points used to test whether a rival converges to the best pose.
@@ -62,6 +67,13 @@ class _Pose:
     agreement: pair_agreement.Agreement
     # Start of its alignment; None for proposals.
     guess: Float64 | None = None
+    # MSAC score of the feature matches at the pose.
+    matches: float = 0.0
+
+    @property
+    def score(self) -> float:
+        """Score of the agreement, and of the matches."""
+        return self.agreement.score + MATCH_WEIGHT * float(log_matches(self.matches))
 
 
 # Placeholder for the rival of a pose without one; it has no support.
@@ -94,6 +106,19 @@ class _CloudViews:
         """Whether the viewpoint, and so the free space, is known for both views."""
         return self.source_map.viewpoint is not None and self.target_map.viewpoint is not None
 
+    @property
+    def has_assumed_viewpoint(self) -> bool:
+        """Whether the free space of a view is that of a cloud whose viewpoint was detected."""
+        maps = (self.source, self.source_map), (self.target, self.target_map)
+        return any(m.viewpoint is not None and isinstance(v, CloudFrame) for v, m in maps)
+
+    def without_free_space(self) -> _CloudViews:
+        """Return the views without their viewpoints."""
+        source, target = (
+            replace(m, viewpoint=None, sphere=None) for m in (self.source_map, self.target_map)
+        )
+        return replace(self, source_map=source, target_map=target)
+
     def evaluated(self, T: Float64) -> _Pose:
         return _Pose(T, cloud_agreement(self.source_map, self.target_map, T))
 
@@ -111,11 +136,23 @@ class _CloudViews:
         return aligned if aligned.agreement.score >= initial.agreement.score else initial
 
     def evidence(
-        self, pose: _Pose, lead: float | None = None, degenerate: int = 0
+        self,
+        pose: _Pose,
+        lead: float | None = None,
+        degenerate: int = 0,
+        found: Candidates | None = None,
     ) -> pose_probability.PoseEvidence:
-        return pose_probability.PoseEvidence.of(
+        """Return the evidence for a pose; that of the matches if proposals were `found`."""
+        evidence = pose_probability.PoseEvidence.of(
             pose.agreement, lead, degenerate, pose_probability.CLOUDS
         )
+        agreement = pose.agreement
+        beside = agreement.overlap - agreement.support - agreement.violation
+        evidence = replace(evidence, misfit=beside / max(agreement.overlap, 1e-9))
+        if found is None:
+            return evidence
+        matches = pose.matches / max(len(found.pairs), 1)
+        return replace(evidence, match_share=matches / max(agreement.support, 1e-9))
 
     def with_information(self, registration: Registration) -> Registration:
         """Return a registration with its information matrix."""
@@ -204,6 +241,23 @@ def _registered(
     always_search: bool = False,
 ) -> Registration:
     views = _CloudViews.of(source, target, rng)
+    options = {"always_search": always_search}
+    registration = _registered_views(views, guess, image_registration, **options)
+    likely = (registration.probability or 0.0) > _LIKELY
+    if registration.believed or likely or not views.has_assumed_viewpoint:
+        return registration
+    blind = views.without_free_space()
+    other = _registered_views(blind, guess, image_registration, **options)
+    return max(registration, other, key=lambda found: found.probability or 0.0)
+
+
+def _registered_views(
+    views: _CloudViews,
+    guess: Float64 | None,
+    image_registration: Registration | None,
+    *,
+    always_search: bool,
+) -> Registration:
     start = np.eye(4) if guess is None else guess
     local = replace(views.refined(start), guess=start)
     certain = None if always_search else _certain(views, local)
@@ -214,15 +268,16 @@ def _registered(
         if image_registration is None
         else [local, views.evaluated(image_registration.T_target_source)]
     )
-    poses += _proposed(views, start)
-    if certain is not None:
-        poses += _turned(views, local)
-    poses.sort(key=lambda pose: -pose.agreement.score)
+    proposed, found = _proposed(views, start, guessed=guess is not None)
+    poses += proposed
+    poses = _ranked(poses, found)
+    if guess is None:
+        poses = _ranked([*poses, *_turned(views, poses[0])], found)
     best = poses[0]
     if guess is not None:
-        tied = [p for p in poses if p.agreement.score >= best.agreement.score - _MIN_LEAD]
+        tied = [p for p in poses if p.score >= best.score - _MIN_LEAD]
         best = min(tied, key=lambda p: _pose_distance(p.T_target_source, guess))
-    registration = _registration(views, best, poses)
+    registration = _registration(views, best, poses, found)
     if certain is not None and registration.believed:
         T = registration.T_target_source
         if not views.are_distinct_poses(T, certain.T_target_source):
@@ -236,7 +291,7 @@ def _registered(
     across = remapping.across(se3.inverse(local.T_target_source) @ registration.T_target_source)
     if views.are_distinct_poses(local.T_target_source, local.T_target_source @ across):
         return views.with_information(registration)
-    return views.with_information(_registration(views, local, [best]))
+    return views.with_information(_registration(views, local, [best], found))
 
 
 def _certain(views: _CloudViews, local: _Pose) -> Registration | None:
@@ -302,22 +357,26 @@ def follow_clouds(
     return views.with_information(_registration(views, local))
 
 
-def _proposed(views: _CloudViews, start: Float64) -> list[_Pose]:
-    """Return the poses of feature matching, and of coarse-to-fine ICP if they lack support.
+def _proposed(
+    views: _CloudViews, start: Float64, *, guessed: bool
+) -> tuple[list[_Pose], Candidates | None]:
+    """Return the poses of feature matching; without any, or if they don't support more than a
+    guess might, also that of coarse-to-fine ICP.
 
     Raises
     ------
     RegistrationError
         If there is no pose.
     """
-    poses, failure = [], None
+    poses, found, failure = [], None, None
     try:
         found = candidates(views.source, views.target, signed=views.has_free_space)
         poses += [views.refined(c.T_target_source) for c in found.poses[:_MAX_REFINED]]
     except RegistrationError as error:
         failure = error
-    if any(pose.agreement.support > _MIN_SUPPORT for pose in poses):
-        return poses
+    supported = any(pose.agreement.support > _MIN_SUPPORT for pose in poses)
+    if supported or (poses and not guessed):
+        return poses, found
     try:
         registration = CoarseToFine().register(views.source, views.target, start, views.rng)
         poses.append(replace(views.evaluated(registration.T_target_source), guess=start))
@@ -325,19 +384,29 @@ def _proposed(views: _CloudViews, start: Float64) -> list[_Pose]:
         failure = error
     if not poses and failure is not None:
         raise failure
-    return poses
+    return poses, found
+
+
+def _ranked(poses: list[_Pose], found: Candidates | None) -> list[_Pose]:
+    """Return poses with the feature matches that agree with them, the highest score first."""
+    if found is not None:
+        matches = found.matches_at(np.array([pose.T_target_source for pose in poses]))
+        poses = [replace(p, matches=float(count)) for p, count in zip(poses, matches, strict=True)]
+    return sorted(poses, key=lambda pose: -pose.score)
 
 
 def _turned(views: _CloudViews, pose: _Pose) -> list[_Pose]:
     """Return a pose after half and quarter turns about the principal axes of the source.
 
-    A symmetric body fits in some of them, also one without distinct features.
+    A symmetric body fits in some of them, also one without distinct features; others are left out.
     """
     points = views.source_map.view.points.astype(np.float64)
     _, axes = np.linalg.eigh(np.cov(points.T))
     turns = [[0.0, 0.0, 0.0, *(angle * axis)] for axis in axes.T for angle in (np.pi / 2, np.pi)]
     centre = points.mean(0)
-    return [views.refined(pose.T_target_source @ se3.about(centre, se3.exp(w))) for w in turns]
+    turned = [views.evaluated(pose.T_target_source @ se3.about(centre, se3.exp(w))) for w in turns]
+    least = _MIN_TURNED_OVERLAP * pose.agreement.overlap
+    return [views.refined(p.T_target_source) for p in turned if p.agreement.overlap > least]
 
 
 def _pose_distance(a: Float64, b: Float64) -> float:
@@ -381,11 +450,15 @@ def _rival(views: _CloudViews, poses: Sequence[_Pose], best: _Pose, T: Float64) 
 
 
 def _registration(
-    views: _CloudViews, best: _Pose, poses: Sequence[_Pose] | None = None
+    views: _CloudViews,
+    best: _Pose,
+    poses: Sequence[_Pose] | None = None,
+    found: Candidates | None = None,
 ) -> Registration:
     """Align all points from the best pose and evaluate its evidence.
 
-    The rival is one of `poses`, the best first; None if the pose is not compared with others.
+    The rival is one of `poses`, the best first; None if the pose is not compared with others. The
+    other poses that feature matches agree on are those `found`.
     """
     T = best.T_target_source
     averaged = views.source_map.view, views.target_map.view
@@ -401,6 +474,7 @@ def _registration(
     lead = None if rival is None else agreement.score - max(rival.agreement.score, 0.0)
     if lead is not None and len(registration.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well
-    evidence = views.evidence(pose, lead, len(registration.unobservable))
+    matched = pose if found is None else _ranked([pose], found)[0]
+    evidence = views.evidence(matched, lead, len(registration.unobservable), found)
     runner_up = None if rival is None or rival is _NO_RIVAL else rival.T_target_source
     return evidence.applied(registration, agreement, runner_up)

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from tofuse.engine.arrays import Bool, Float64, Int64
+from tofuse.engine.arrays import Float32, Float64, Int64
 from tofuse.engine.clouds import fpfh_kernels as kernels
 from tofuse.engine.clouds.robust_motion import (
     Consensus,
     ConsensusOptions,
     Motions,
     Pairs,
-    are_distinct,
     consensus,
-    motion_of,
+    match_scores,
 )
+from tofuse.engine.clouds.viewpoint import RangeSphere, Viewpoint
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
-from tofuse.engine.icp import reduced, spacing, surface_shape
+from tofuse.engine.icp import averaged, reduced, spacing, surface_shape
 
 # Defaults of `candidates`.
 POINTS, REACH, FPFH_NEIGHBOURS = 4000, 5.0, 12
@@ -29,19 +31,29 @@ _BINS = 11
 # Resolution of the averaged views in spacings of the points: averages are less noisy than samples.
 _COARSER = 2.0
 # Maximum number of neighbours within reach.
-_MAX_NEIGHBOURS = 60
+_MAX_NEIGHBOURS = 85
+# Resolution of the surroundings, in resolutions of the points, and their radius in its resolutions.
+_SURROUNDINGS, _SURROUNDINGS_REACH = 2.0, 6.0
+# Each point is matched with this many, if it is among as many nearest of theirs.
+_MATCHES = 2
+# Sets of compatible matches that propose motions.
+_SEEDS = 1000
 # Sampling noise of an averaged point along each axis, and maximum distance of points that fit, in
 # resolutions.
-_SAMPLING_SIGMA, _FIT_DISTANCE = 0.4, 1.5
+_SAMPLING_SIGMA, _FIT_DISTANCE = 0.4, 2.0
 # Maximum extent of a surface across relative to that along it.
 _MAX_ROUGHNESS = 0.6
 # Motions that differ by more are distinct: resolutions, and rad (rotations from matches are
 # inaccurate).
-_DISTINCT, _DISTINCT_RAD = 4.0, 0.3
-# Reach of ICP per iteration, resolutions, and minimum number of correspondences.
-_REACHES, _MIN_PAIRS = (4.0, 3.0, 3.0, 2.0, 2.0, 2.0), 6
-# Minimum cosine of the angle between normals that fit.
-_MIN_NORMAL_COSINE = 0.8
+_DISTINCT, _DISTINCT_RAD = 4.0, 0.15
+# Points of each view that evaluate a motion, and minimum cosine between normals that fit.
+_FIT_POINTS, _MIN_NORMAL_COSINE = 500, 0.7
+# A point violates free space if it lies before the other view's surface by more resolutions, plus
+# this fraction of its range; weight of such points, and the fraction of them that counts.
+_IN_FRONT, _IN_FRONT_RANGE = 2.5, 0.03
+VIOLATION_WEIGHT, MAX_VIOLATION = 20.0, 0.05
+# Weight of the log of the matches that agree with a pose, and of those that do by chance.
+MATCH_WEIGHT, _CHANCE_MATCHES = 0.1, 5.0
 
 
 def candidates(
@@ -87,46 +99,50 @@ def candidates(
     size = _COARSER * max(spacing(source), spacing(target))
     size, data, model = reduced(source, target, size, points)
     options = replace(
-        options or ConsensusOptions(), distinct_m=_DISTINCT * size, distinct_rad=_DISTINCT_RAD
+        options or ConsensusOptions(seeds=_SEEDS),
+        distinct_m=_DISTINCT * size,
+        distinct_rad=_DISTINCT_RAD,
     )
-    described_source, described_target = (
-        _described(view, reach * size, neighbours, signed, options.inliers)
-        for view in (data, model)
-    )
-    i, j = mutually_nearest(described_source.histograms, described_target.histograms)
-    variance = np.full(len(i), 2 * (_SAMPLING_SIGMA * size) ** 2)
-    pairs = Pairs(described_source.points[i], described_target.points[j], variance)
-    tree = KdTree(described_target.points)
-    refined = [
-        Candidate(*_refined(described_source, described_target, tree, c.T_target_source, size), c)
-        for c in consensus(pairs, options, motions)
+    described = [
+        _described(view, size, reach, neighbours, signed, options.inliers) for view in (data, model)
     ]
-    distinct: list[Candidate] = []
-    for candidate in sorted(refined, key=lambda c: -c.inlier_ratio):
-        # Discard poses that converge to a better one.
-        if are_distinct(
-            np.array([c.T_target_source for c in distinct]).reshape(-1, 4, 4),
-            candidate.T_target_source,
-            described_source.points,
-            metres=options.distinct_m,
-            rad=options.distinct_rad,
-        ).all():
-            distinct.append(candidate)
-    return Candidates(size, pairs, tuple(distinct))
+    if signed:
+        described = [
+            replace(cloud, sphere=_sphere(view, cloud, size))
+            for view, cloud in zip((source, target), described, strict=True)
+        ]
+    i, j = mutually_nearest(described[0].histograms, described[1].histograms, _MATCHES)
+    variance = np.full(len(i), 2 * (_SAMPLING_SIGMA * size) ** 2)
+    pairs = Pairs(described[0].points[i], described[1].points[j], variance)
+    found = consensus(pairs, options, motions)
+    T = np.array([c.T_target_source for c in found])
+    first, second = described
+    fits = 0.5 * (_fit(first, second, T, size) + _fit(second, first, se3.inverse(T), size))
+    score = fits[0] - VIOLATION_WEIGHT * np.minimum(fits[1], MAX_VIOLATION)
+    score += MATCH_WEIGHT * log_matches([c.score for c in found])
+    best = np.argsort(-score, kind="stable")
+    ranked = tuple(Candidate(T[k], float(fits[0, k]), found[k]) for k in best)
+    return Candidates(size, pairs, ranked, options.sigmas)
 
 
 @dataclass(frozen=True, eq=False)
 class DescribedCloud:
-    """Points (n, 3) of a view, their normals (n, 3), and histograms (n, 33)."""
+    """Points (n, 3) of a view, their normals and histograms (n, 66), and its free space."""
 
     points: Float64
     normals: Float64
     histograms: Float64
+    sphere: RangeSphere | None = None
+
+    @cached_property
+    def tree(self) -> KdTree:
+        """kd-tree over the points."""
+        return KdTree(self.points)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose T_target_source (4, 4), the fraction of averaged points that fit, and its matches."""
+    """A pose T_target_source (4, 4), the fraction of points that fit, and its matches."""
 
     T_target_source: Float64
     inlier_ratio: float
@@ -144,33 +160,70 @@ class Candidates:
     pairs
         All matches.
     poses
-        Distinct poses, in order of decreasing fit.
+        Distinct poses, in order of decreasing fit and matches, less violations of free space.
+    sigmas
+        Maximum distance of a match that agrees, in its standard deviations.
     """
 
     size: float
     pairs: Pairs
     poses: tuple[Candidate, ...]
+    sigmas: float
+
+    def matches_at(self, motions: Float64) -> Float64:
+        """Return the MSAC scores (k,) of the matches at motions (k, 4, 4)."""
+        return match_scores(self.pairs, motions, self.sigmas)
+
+
+def log_matches(score: ArrayLike) -> Float64:
+    """Return the logs of MSAC scores of matches, of which some agree by chance."""
+    return np.log(np.asarray(score, np.float64) + _CHANCE_MATCHES)
 
 
 def _described(
-    view: CloudFrame, reach: float, neighbours: int, signed: bool, min_points: int
+    view: CloudFrame, size: float, reach: float, neighbours: int, signed: bool, min_points: int
 ) -> DescribedCloud:
-    """Describe the points of a view that are on surfaces; `reach` in m.
+    """Describe the points of a view that are on surfaces, by their neighbours and surroundings.
 
     Other points have no descriptor, and corrupt those of their neighbours.
     """
-    shape = surface_shape.shape_at(view, np.arange(len(view)), neighbours)
-    valid = np.isfinite(shape.normals).all(1) & (shape.roughness < _MAX_ROUGHNESS)
-    points, normals = view.points[valid].astype(np.float64), shape.normals[valid]
+    points, normals = _on_surfaces(view, neighbours)
     if len(points) < min_points:
         raise RegistrationError(
             f"has {len(points)} points on surfaces, too few to be matched",
             where=f"frame {view.index}",
         )
-    return DescribedCloud(points, normals, fpfh(points, normals, reach, signed))
+    near = fpfh(points, normals, reach * size, signed)
+    coarse = averaged(view, _SURROUNDINGS * size)
+    surroundings = _on_surfaces(coarse, neighbours)
+    if len(surroundings[0]) < min_points:
+        surroundings = points, normals
+    far_reach = _SURROUNDINGS_REACH * _SURROUNDINGS * size
+    far = fpfh(points, normals, far_reach, signed, surroundings)
+    return DescribedCloud(points, normals, np.hstack([near, far]))
 
 
-def fpfh(points: Float64, normals: Float64, reach: float, signed: bool) -> Float64:
+def _on_surfaces(view: CloudFrame, neighbours: int) -> tuple[Float64, Float64]:
+    shape = surface_shape.shape_at(view, np.arange(len(view)), neighbours)
+    valid = np.isfinite(shape.normals).all(1) & (shape.roughness < _MAX_ROUGHNESS)
+    return view.points[valid].astype(np.float64), shape.normals[valid]
+
+
+def _sphere(view: Frame, cloud: DescribedCloud, size: float) -> RangeSphere:
+    """Return the free space of a view seen from its origin, m."""
+    origin = np.asarray(view.origin, np.float64)
+    ranges = np.linalg.norm(cloud.points - origin, axis=1)
+    spacing_rad = size / _COARSER / max(float(np.median(ranges)), size)
+    return RangeSphere.of(view, Viewpoint(origin, spacing_rad))
+
+
+def fpfh(
+    points: Float64,
+    normals: Float64,
+    reach: float,
+    signed: bool,
+    surroundings: tuple[Float64, Float64] | None = None,
+) -> Float64:
     """Return fast point feature histograms (n, 33).
 
     With p and q a point and a neighbour, d the unit vector from p to q, and u, v, w the axes
@@ -187,63 +240,73 @@ def fpfh(points: Float64, normals: Float64, reach: float, signed: bool) -> Float
     signed
         Whether normals are oriented. If not, the angles are folded so that a normal and its
         opposite give the same histogram.
+    surroundings
+        Points and normals (m, 3) that are the neighbours; the points themselves unless given.
     """
-    n = len(points)
-    neighbours, squared = KdTree(points).neighbours(points, min(_MAX_NEIGHBOURS + 1, n))
-    spfh, neighbour_mean = np.empty((n, 3, _BINS)), np.empty((n, 3 * _BINS))
+    n, first = len(points), 0
+    tree = KdTree(points if surroundings is None else surroundings[0])
+    if surroundings is not None:
+        points, normals = (
+            np.vstack(both) for both in zip((points, normals), surroundings, strict=True)
+        )
+        first = n
+    neighbours, squared = tree.neighbours(points, min(_MAX_NEIGHBOURS + 1, len(tree)))
+    neighbours += first
+    spfh, neighbour_mean = np.empty((len(points), 3, _BINS)), np.empty((n, 3 * _BINS))
     run_chunks(
         lambda a, b: kernels.histograms(
             points, normals, neighbours, squared, reach, signed, spfh, a, b
         ),
-        n,
+        len(points),
     )
-    spfh_flat = spfh.reshape(n, 3 * _BINS)
+    spfh_flat = spfh.reshape(-1, 3 * _BINS)
     run_chunks(
         lambda a, b: kernels.weighted_means(
             spfh_flat, neighbours, squared, reach, neighbour_mean, a, b
         ),
         n,
     )
-    return spfh_flat + neighbour_mean
+    return spfh_flat[:n] + neighbour_mean
 
 
-def mutually_nearest(a: Float64, b: Float64) -> tuple[Int64, Int64]:
-    """Return the positions in a (n, d) and b (m, d) of mutual nearest neighbours."""
-    forward = _nearest(a, b)
-    backward = _nearest(b, a)
-    i = np.flatnonzero(backward[forward] == np.arange(len(a)))
-    return i.astype(np.int64), forward[i]
+def mutually_nearest(a: Float64, b: Float64, count: int = 1) -> tuple[Int64, Int64]:
+    """Return the positions in a (n, d) and b (m, d) of rows among the `count` nearest of each."""
+    rows, columns = (np.asarray(x, np.float32) for x in (a, b))
+    distance = (rows**2).sum(1)[:, None] + (columns**2).sum(1) - 2 * (rows @ columns.T)
+    backward = _smallest(np.ascontiguousarray(distance.T), count)
+    forward = _smallest(distance, count)
+    mutual = (backward[forward] == np.arange(len(a))[:, None, None]).any(2)
+    i, k = np.nonzero(mutual)
+    return i.astype(np.int64), forward[i, k].astype(np.int64)
 
 
-def _nearest(a: Float64, b: Float64) -> Int64:
-    """Return the position (n,) in b (m, d) of the nearest neighbour of each row of a (n, d)."""
-    rows = np.ascontiguousarray(a, np.float32)
-    columns = np.ascontiguousarray(b.T, np.float32)
-    nearest = np.empty(len(a), np.int64)
-    run_chunks(lambda i, j: kernels.nearest_rows(rows, columns, nearest, i, j), len(a))
-    return nearest
+def _smallest(distance: Float32, count: int) -> Int64:
+    """Return the columns (n, count) of the smallest entries of each row (n, m), which are lost."""
+    count = min(count, distance.shape[1])
+    columns = np.empty((len(distance), count), np.int64)
+    for k in range(count):
+        columns[:, k] = distance.argmin(1)
+        np.put_along_axis(distance, columns[:, k : k + 1], np.inf, 1)
+    return columns
 
 
-def _refined(
-    source: DescribedCloud, target: DescribedCloud, tree: KdTree, T: Float64, size: float
-) -> tuple[Float64, float]:
-    """Refine T (4, 4) by ICP over the averaged points; return it and the fraction that fits."""
-    for reach in _REACHES:
-        fits, nearest = _fitting(source, target, tree, T, reach * size)
-        if np.count_nonzero(fits) < _MIN_PAIRS:
-            break
-        p, q = source.points[fits], target.points[nearest[fits]]
-        T = motion_of(Pairs(p, q, np.ones(len(p))))
-    fits, _ = _fitting(source, target, tree, T, _FIT_DISTANCE * size)
-    return T, float(np.mean(fits))
+def _fit(view: DescribedCloud, other: DescribedCloud, T: Float64, size: float) -> Float64:
+    """Return how well a view fits the other at poses T (k, 4, 4) that map it there, (2, k).
 
-
-def _fitting(
-    source: DescribedCloud, target: DescribedCloud, tree: KdTree, T: Float64, max_distance: float
-) -> tuple[Bool, Int64]:
-    """Return which source points fit a target point with a similar normal (n,), and its index."""
-    nearest, squared = tree.nearest(se3.transform(T, source.points), max_distance)
-    rotated_normals = source.normals @ T[:3, :3].T
-    # Without a neighbour the squared distance is infinite and the normals are irrelevant.
-    same_normal = np.abs((rotated_normals * target.normals[nearest]).sum(1)) > _MIN_NORMAL_COSINE
-    return (squared < max_distance * max_distance) & same_normal, nearest
+    The first row is the mean over its points of 1 - (distance / limit)^2 where the normals agree,
+    the second the fraction of them in the other's free space.
+    """
+    chosen = slice(None, None, max(1, len(view.points) // _FIT_POINTS))
+    points = se3.transform(T, view.points[chosen])
+    normals = view.normals[chosen] @ T[:, :3, :3].transpose(0, 2, 1)
+    nearest, squared = other.tree.nearest(points.reshape(-1, 3), _FIT_DISTANCE * size)
+    nearest, squared = nearest.reshape(points.shape[:2]), squared.reshape(points.shape[:2])
+    cosine = (normals * other.normals[nearest]).sum(2)
+    same_normal = (cosine if other.sphere is not None else np.abs(cosine)) > _MIN_NORMAL_COSINE
+    fits = np.where(same_normal, np.maximum(1 - squared / (_FIT_DISTANCE * size) ** 2, 0), 0)
+    violation = np.zeros(len(T))
+    if other.sphere is not None:
+        ranges = np.linalg.norm(points - other.sphere.origin, axis=2)
+        front = other.sphere.distance_in_front(points.reshape(-1, 3)).reshape(ranges.shape)
+        violation = (front > _IN_FRONT * size + _IN_FRONT_RANGE * ranges).mean(1)
+    return np.stack([fits.mean(1), violation])

@@ -1,33 +1,11 @@
-"""Fast point feature histograms, and search for the nearest of them."""
+"""Fast point feature histograms."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.arrays import Float32, Float64, Int64
+from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.compute import kernel
-
-
-@kernel
-def nearest_rows(rows: Float32, columns: Float32, out: Int64, start: int, stop: int) -> None:
-    """Write to `out` (n,) the index of the column (d, m) that is nearest to each row (n, d).
-
-    For the rows `start` to `stop`; ties go to the first column. The columns are transposed
-    features, so that the inner loop runs over independent sums.
-    """
-    distance2 = np.empty(columns.shape[1], np.float32)
-    for i in range(start, stop):
-        distance2[:] = 0
-        for k in range(rows.shape[1]):
-            value = rows[i, k]
-            for j in range(columns.shape[1]):
-                difference = value - columns[k, j]
-                distance2[j] += difference * difference
-        nearest = 0
-        for j in range(1, columns.shape[1]):
-            if distance2[j] < distance2[nearest]:
-                nearest = j
-        out[i] = nearest
 
 
 @kernel

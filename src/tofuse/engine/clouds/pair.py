@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +30,10 @@ MIN_POINTS = 10
 # For recorded views with a wide baseline, which multipath distorts individually.
 # docs/uncertainty.md describes the calibration.
 _RECORDED_VIEWS = UncertaintyOptions(hidden=0.01, offset=0.5, floor=0.006)
+# Maximum number of points of a cloud.
+_MAX_POINTS = 320_000
+# Cache: a view is registered to several others.
+_thinned_views: WeakKeyDictionary[Frame, Frame] = WeakKeyDictionary()
 # Maximum number of poses proposed by feature matching, and of described points of a view.
 _PROPOSALS, _DESCRIBED_POINTS = 8, 1500
 
@@ -62,6 +67,7 @@ class AnyPair(Registrar):
         for view in (source, target):
             if len(view) < MIN_POINTS:
                 raise RegistrationError(f"has {len(view)} points", where=f"frame {view.index}")
+        source, target = _thinned(source), _thinned(target)
         searches = self.search or guess is None
         are_images = isinstance(source, RangeFrame) and isinstance(target, RangeFrame)
         # Other clouds are matched by features below.
@@ -76,6 +82,16 @@ class AnyPair(Registrar):
         if not searches and guess is not None:
             return follow_clouds(source, target, guess, rng)
         return register_clouds(source, target, guess, rng, image_registration)
+
+
+def _thinned(view: Frame) -> Frame:
+    """Return a view with enough points for its registration; of larger clouds a random subset."""
+    if not isinstance(view, CloudFrame) or len(view) <= _MAX_POINTS:
+        return view
+    if view not in _thinned_views:
+        chosen = np.random.default_rng(0).choice(len(view), _MAX_POINTS, replace=False)
+        _thinned_views[view] = view.keep(np.isin(np.arange(len(view)), chosen))
+    return _thinned_views[view]
 
 
 def _feature_proposals(source: Frame, target: Frame) -> Float64:

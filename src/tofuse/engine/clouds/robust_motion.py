@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -27,8 +26,10 @@ MIN_PAIRS = 3
 # Inlier threshold of each round of least squares, relative to the final one: wide at first, as the
 # motion of a minimal sample is inaccurate.
 _INLIER_GATES = (2.0, 1.5, 1.0, 1.0, 1.0)
-# Maximum number of distinct motions that are refined before the best is selected.
-_MAX_REFINED = 20
+# Maximum number of distinct motions that are refined before they are ranked.
+_MAX_REFINED = 120
+# Motions whose residuals are computed at once.
+_BATCH = 256
 # Size of the consensus set of a seed (SC2-PCR: its nearest neighbours in compatibility).
 _CONSENSUS_SIZE = 20
 # Maximum number of pairs in the compatibility matrix, whose memory is quadratic.
@@ -186,16 +187,14 @@ def _compatible_motions(pairs: Pairs, options: ConsensusOptions) -> Float64:
     ).astype(np.float32)
     second_order = compatible * (compatible @ compatible)
     seeds = np.argsort(-second_order.sum(1), kind="stable")[: options.seeds]
-    set_size = min(_CONSENSUS_SIZE, len(pairs))
-    motions = []
-    for seed in seeds:
-        row = second_order[seed]
-        nearest = np.argsort(-row, kind="stable")[: set_size - 1]
-        members = np.concatenate([[seed], nearest[row[nearest] > 0]])
-        if len(members) < MIN_PAIRS:
-            continue
-        motions.append(motion_of(pairs.select(members)))
-    return np.stack(motions) if motions else np.zeros((0, 4, 4))
+    rows = second_order[seeds]
+    size = min(_CONSENSUS_SIZE, len(pairs)) - 1
+    members = np.argpartition(-rows, size - 1, axis=1)[:, :size]
+    weight = (np.take_along_axis(rows, members, 1) > 0).astype(float)
+    enough = weight.sum(1) >= MIN_PAIRS - 1
+    members = np.column_stack([seeds, members])[enough]
+    weight = np.column_stack([np.ones(len(seeds)), weight])[enough] / pairs.variance[members]
+    return motions_of(p[members], q[members], weight)
 
 
 def motions_of(p: Float64, q: Float64, weight: Float64) -> Float64:
@@ -203,11 +202,16 @@ def motions_of(p: Float64, q: Float64, weight: Float64) -> Float64:
     relative = (weight / weight.sum(1, keepdims=True))[..., None]
     p0, q0 = (relative * p).sum(1), (relative * q).sum(1)
     H = np.einsum("kni,knj->kij", relative * (p - p0[:, None]), q - q0[:, None])
+    return _motions_from(H, p0, q0)
+
+
+def _motions_from(H: Float64, p0: Float64, q0: Float64) -> Float64:
+    """Return motions (k, 4, 4) from covariances (k, 3, 3) and centroids (k, 3) of the pairs."""
     U, _, Vt = np.linalg.svd(H)
     mirrored = np.linalg.det(U) * np.linalg.det(Vt) < 0
     Vt[mirrored, 2] *= -1
     R = np.einsum("kji,klj->kil", Vt, U)
-    T = np.tile(np.eye(4), (len(p), 1, 1))
+    T = np.tile(np.eye(4), (len(H), 1, 1))
     T[:, :3, :3] = R
     T[:, :3, 3] = q0 - np.einsum("kij,kj->ki", R, p0)
     return T
@@ -215,10 +219,31 @@ def motions_of(p: Float64, q: Float64, weight: Float64) -> Float64:
 
 def squared_residuals(pairs: Pairs, motions: Float64) -> Float64:
     """Return the normalised squared residuals (k, m) of motions (k, 4, 4)."""
-    transformed = (
-        np.einsum("kij,mj->kmi", motions[:, :3, :3], pairs.source) + motions[:, None, :3, 3]
-    )
-    return np.asarray(((transformed - pairs.target) ** 2).sum(2) / pairs.variance, np.float64)
+    residual = se3.transform(motions, pairs.source) - pairs.target
+    return np.asarray((residual**2).sum(2) / pairs.variance, np.float64)
+
+
+def distinct(
+    motions: Float64, score: Float64, points: Float64, options: ConsensusOptions, most: int
+) -> Int64:
+    """Return the positions of at most `most` distinct motions (k, 4, 4), highest scores (k,) first.
+
+    Parameters
+    ----------
+    points
+        (n, 3) points that are moved, m.
+    """
+    centre = np.median(points, 0)
+    moved = se3.transform(motions, centre[None])[:, 0]
+    rotations = motions[:, :3, :3].reshape(-1, 9)
+    alike = cdist(moved, moved) <= options.distinct_m
+    alike &= rotations @ rotations.T >= 1 + 2 * np.cos(options.distinct_rad)  # traces
+    remaining, chosen = np.ones(len(motions), bool), list[int]()
+    for k in np.argsort(-score, kind="stable"):
+        if remaining[k] and len(chosen) < most:
+            chosen.append(int(k))
+            remaining &= ~alike[k]
+    return np.array(chosen, np.int64)
 
 
 def _score(squared: Float64, sigmas: float) -> Float64:
@@ -226,46 +251,53 @@ def _score(squared: Float64, sigmas: float) -> Float64:
     return np.asarray(np.maximum(1 - squared / sigmas**2, 0).sum(-1), np.float64)
 
 
+def match_scores(pairs: Pairs, motions: Float64, sigmas: float) -> Float64:
+    """Return the MSAC scores (k,) of motions (k, 4, 4)."""
+    batches = [motions[k : k + _BATCH] for k in range(0, len(motions), _BATCH)]
+    scores = [_score(squared_residuals(pairs, batch), sigmas) for batch in batches]
+    return np.concatenate(scores) if scores else np.zeros(0)
+
+
 def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[Consensus]:
     """Return the distinct motions, the best first, each refined on its inliers."""
-    remaining = np.ones(len(motions), bool)
-    score = (
-        _score(squared_residuals(pairs, motions), options.sigmas) if len(motions) else np.zeros(0)
-    )
-    differ = partial(
-        are_distinct, points=pairs.source, metres=options.distinct_m, rad=options.distinct_rad
-    )
-    refined: list[Consensus] = []
-    order = np.argsort(-score, kind="stable")
-    for k in order:
-        if not remaining[k]:
-            continue
-        remaining &= differ(motions, motions[k])
-        T, inliers = _refined(pairs, motions[k], options.sigmas)
-        refined_score = float(_score(squared_residuals(pairs, T[None]), options.sigmas)[0])
-        refined.append(Consensus(T, inliers, refined_score, len(motions)))
-        if len(refined) == _MAX_REFINED:
-            break
-    distinct: list[Consensus] = []
-    for candidate in sorted(refined, key=lambda c: -c.score):
-        accepted = np.array([c.T_target_source for c in distinct]).reshape(-1, 4, 4)
-        if differ(accepted, candidate.T_target_source).all():
-            distinct.append(candidate)
-    return distinct
+    count, sigmas = len(motions), options.sigmas
+    score = match_scores(pairs, motions, sigmas)
+    motions = motions[distinct(motions, score, pairs.source, options, _MAX_REFINED)]
+    motions = _refined(pairs, motions, sigmas)
+    score = match_scores(pairs, motions, sigmas)
+    return [
+        Consensus(
+            motions[k],
+            squared_residuals(pairs, motions[k : k + 1])[0] < sigmas**2,
+            float(score[k]),
+            count,
+        )
+        for k in distinct(motions, score, pairs.source, options, _MAX_REFINED)
+    ]
 
 
-def _refined(pairs: Pairs, T: Float64, sigmas: float) -> tuple[Float64, Bool]:
-    """Refine T by iterated least squares over its inliers; return the best motion and its mask."""
-    best, best_score = T, -1.0
+def _refined(pairs: Pairs, motions: Float64, sigmas: float) -> Float64:
+    """Refine motions (k, 4, 4) by iterated least squares over their inliers."""
+    best, best_score = motions.copy(), match_scores(pairs, motions, sigmas)
     for gate in _INLIER_GATES:
-        squared = squared_residuals(pairs, T[None])[0]
-        score = float(_score(squared, sigmas))
-        if score > best_score:
-            best, best_score = T, score
-        inliers = squared < (gate * sigmas) ** 2
-        if np.count_nonzero(inliers) < MIN_PAIRS:
-            break
-        T = motion_of(pairs.select(inliers))
-    if float(_score(squared_residuals(pairs, T[None])[0], sigmas)) > best_score:
-        best = T
-    return best, squared_residuals(pairs, best[None])[0] < sigmas**2
+        inliers = squared_residuals(pairs, motions) < (gate * sigmas) ** 2
+        motions = np.where(
+            (np.count_nonzero(inliers, axis=1) >= MIN_PAIRS)[:, None, None],
+            _weighted_motions(pairs, inliers / pairs.variance),
+            motions,
+        )
+        score = match_scores(pairs, motions, sigmas)
+        better = score > best_score
+        best[better], best_score[better] = motions[better], score[better]
+    return best
+
+
+def _weighted_motions(pairs: Pairs, weight: Float64) -> Float64:
+    """Return least squares motions (k, 4, 4) of all pairs with different weights (k, m)."""
+    relative = weight / np.maximum(weight.sum(1, keepdims=True), 1e-300)
+    p0, q0 = pairs.source.mean(0), pairs.target.mean(0)
+    p, q = pairs.source - p0, pairs.target - q0
+    p_mean, q_mean = relative @ p, relative @ q
+    products = relative @ (p[:, :, None] * q[:, None]).reshape(-1, 9)
+    H = products.reshape(-1, 3, 3) - p_mean[:, :, None] * q_mean[:, None]
+    return _motions_from(H, p_mean + p0, q_mean + q0)

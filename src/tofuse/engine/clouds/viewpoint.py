@@ -17,6 +17,7 @@ from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import KdTree
+from tofuse.engine.icp import reduced, spacing
 
 # Maximum number of points, of samples among them, and of neighbours for the local density.
 _MAX_POINTS, _SAMPLES, _NEIGHBOURS = 50_000, 2000, 8
@@ -37,6 +38,13 @@ _PIXEL, _MAX_PIXELS = 1.25, 640
 # Relative depth difference of points on the same surface; half the baseline in pixels of the
 # slopes, and number of their iterations.
 _SAME_SURFACE, _HALF_BASELINE, _SLOPE_ITERATIONS = 0.03, 2, 3
+# Of a cloud that is fused from several views: maximum number of averaged points; maximum fraction
+# of them that are hidden from the viewpoint; number of other places among the points, and the
+# percentile of what is hidden from these.
+_HIDING_POINTS, _MAX_HIDDEN, _PLACES, _PLACES_PERCENTILE = 3000, 0.3, 30, 33
+# A point is hidden behind another in its cell, in spacings, by more spacings and this fraction of
+# its range.
+_HIDING_CELL, _BEHIND, _BEHIND_RANGE = 1.5, 3.0, 0.05
 # Cell size of a range sphere in spacings of the points, and its minimum, rad.
 _CELL, _MIN_CELL = 2.0, 0.006
 _NEIGHBOURHOOD = np.ones((3, 3), np.uint8)
@@ -52,6 +60,7 @@ class Viewpoint:
 
 # Cache: a view is registered to several others, as an image and as a cloud.
 _viewpoints: WeakKeyDictionary[Frame, Viewpoint | None] = WeakKeyDictionary()
+_fused_viewpoints: WeakKeyDictionary[Frame, Viewpoint | None] = WeakKeyDictionary()
 
 
 def viewpoint_of(view: Frame) -> Viewpoint | None:
@@ -91,6 +100,47 @@ def _detected(view: CloudFrame) -> Viewpoint | None:
     subsampling = np.sqrt(len(points) / max(len(view), 1))
     spacing = float(np.median(angles)) * np.sqrt(np.pi / _NEIGHBOURS) * subsampling
     return Viewpoint(origin, spacing) if spacing > 0 else None
+
+
+def free_space_viewpoint(view: Frame) -> Viewpoint | None:
+    """Return the viewpoint of a view, also of one that is fused from several nearby.
+
+    Such a cloud hides few of its points from its origin, fewer than from most other places.
+    """
+    detected = viewpoint_of(view)
+    if detected is not None or not isinstance(view, CloudFrame):
+        return detected
+    if view not in _fused_viewpoints:
+        _fused_viewpoints[view] = _fused(view)
+    return _fused_viewpoints[view]
+
+
+def _fused(view: CloudFrame) -> Viewpoint | None:
+    spread = 2 * spacing(view)
+    if len(view) < 4 * _NEIGHBOURS:
+        return None
+    spread, thin, _ = reduced(view, view, spread, _HIDING_POINTS)
+    points, origin = thin.points.astype(np.float64), np.asarray(view.origin, np.float64)
+    low, high = np.percentile(points, [2, 98], axis=0)
+    places = np.random.default_rng(0).uniform(low, high, (_PLACES, 3))
+    hidden = _hidden_fraction(points - origin, spread)
+    others = [_hidden_fraction(points - place, spread) for place in places]
+    if hidden > min(_MAX_HIDDEN, float(np.percentile(others, _PLACES_PERCENTILE))):
+        return None
+    ranges = np.linalg.norm(points - origin, axis=1)
+    return Viewpoint(origin, spread / 2 / max(float(np.median(ranges)), spread))
+
+
+def _hidden_fraction(points: Float64, size: float) -> float:
+    """Return the fraction of points (n, 3), `size` m apart, that others hide from the origin."""
+    ranges = np.linalg.norm(points, axis=1)
+    cell = max(_HIDING_CELL * size / max(float(np.median(ranges)), size), _MIN_CELL)
+    shape = int(np.ceil(np.pi / cell)), int(np.ceil(2 * np.pi / cell))
+    index = _cells(points, np.maximum(ranges, 1e-12), cell, shape)
+    nearest = np.full(shape[0] * shape[1], np.inf)
+    np.minimum.at(nearest, index, ranges)
+    behind = ranges - nearest[index]
+    return float(np.mean(behind > _BEHIND * size + _BEHIND_RANGE * ranges))
 
 
 def _angle_of_pixel(camera: Camera) -> float:
