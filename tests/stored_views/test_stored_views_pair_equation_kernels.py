@@ -61,6 +61,21 @@ def test_camera_error_changes_gradient_as_predicted_by_hessian(
     assert np.abs((slope - column)[chosen] / scale).max() < tolerance
 
 
+@pytest.mark.parametrize("error", range(kernels.ERRORS))
+def test_large_error_has_no_effect_between_equal_views(error):
+    """Its displacements cancel: else the estimate of an error would run away from a large one."""
+    view = corner(np.eye(4))
+    known = KNOWN.copy()
+    known[error] = 0
+    errors = np.zeros(kernels.ERRORS)
+    errors[error] = 0.05
+    wide = (0.0, 1.0, 0.0, 0.3, 50.0, 0.5)
+    same, _ = unpack(evaluate(view, view, np.eye(4), errors, known, wide))
+    apart = se3.exp(np.array([0.2, -0.1, 0.1, 0.3, -0.4, 0.2]))
+    turned, _ = unpack(evaluate(corner(apart), view, apart, errors, known, wide))
+    assert same[7 + error, 7 + error] < 0.01 * turned[7 + error, 7 + error]
+
+
 @pytest.mark.parametrize("kind", ["z", "range"])
 @pytest.mark.parametrize(
     "error", [kernels.FOCAL, kernels.CENTER_X, kernels.CENTER_Y, kernels.DISTORTION]
