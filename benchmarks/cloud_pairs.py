@@ -458,7 +458,7 @@ def print_fit(data: Path, max_pairs: int) -> None:
     fitted = [kind.name for kind in KINDS.values() if kind.fitted]
     others = [kind.name for kind in KINDS.values() if kind.shown and not kind.fitted]
     titles = (
-        "Searched: constant, margin / support, contradiction, log of matches, misfit",
+        "Searched: constant, sqrt of margin, sqrt of contradiction, degenerate",
         "Followed: constant, support, sqrt of contradiction",
     )
     for title, rows in zip(titles, samples(fitted, data, max_pairs), strict=True):

@@ -136,23 +136,12 @@ class _CloudViews:
         return aligned if aligned.agreement.score >= initial.agreement.score else initial
 
     def evidence(
-        self,
-        pose: _Pose,
-        lead: float | None = None,
-        degenerate: int = 0,
-        found: Candidates | None = None,
+        self, pose: _Pose, lead: float | None = None, degenerate: int = 0
     ) -> pose_probability.PoseEvidence:
-        """Return the evidence for a pose; that of the matches if proposals were `found`."""
-        evidence = pose_probability.PoseEvidence.of(
+        """Return the evidence for a pose."""
+        return pose_probability.PoseEvidence.of(
             pose.agreement, lead, degenerate, pose_probability.CLOUDS
         )
-        agreement = pose.agreement
-        beside = agreement.overlap - agreement.support - agreement.violation
-        evidence = replace(evidence, misfit=beside / max(agreement.overlap, 1e-9))
-        if found is None:
-            return evidence
-        matches = pose.matches / max(len(found.pairs), 1)
-        return replace(evidence, match_share=matches / max(agreement.support, 1e-9))
 
     def with_information(self, registration: Registration) -> Registration:
         """Return a registration with its information matrix."""
@@ -277,7 +266,7 @@ def _registered_views(
     if guess is not None:
         tied = [p for p in poses if p.score >= best.score - _MIN_LEAD]
         best = min(tied, key=lambda p: _pose_distance(p.T_target_source, guess))
-    registration = _registration(views, best, poses, found)
+    registration = _registration(views, best, poses)
     if certain is not None and registration.believed:
         T = registration.T_target_source
         if not views.are_distinct_poses(T, certain.T_target_source):
@@ -291,7 +280,7 @@ def _registered_views(
     across = remapping.across(se3.inverse(local.T_target_source) @ registration.T_target_source)
     if views.are_distinct_poses(local.T_target_source, local.T_target_source @ across):
         return views.with_information(registration)
-    return views.with_information(_registration(views, local, [best], found))
+    return views.with_information(_registration(views, local, [best]))
 
 
 def _certain(views: _CloudViews, local: _Pose) -> Registration | None:
@@ -453,12 +442,10 @@ def _registration(
     views: _CloudViews,
     best: _Pose,
     poses: Sequence[_Pose] | None = None,
-    found: Candidates | None = None,
 ) -> Registration:
     """Align all points from the best pose and evaluate its evidence.
 
-    The rival is one of `poses`, the best first; None if the pose is not compared with others. The
-    other poses that feature matches agree on are those `found`.
+    The rival is one of `poses`, the best first; None if the pose is not compared with others.
     """
     T = best.T_target_source
     averaged = views.source_map.view, views.target_map.view
@@ -474,7 +461,6 @@ def _registration(
     lead = None if rival is None else agreement.score - max(rival.agreement.score, 0.0)
     if lead is not None and len(registration.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well
-    matched = pose if found is None else _ranked([pose], found)[0]
-    evidence = views.evidence(matched, lead, len(registration.unobservable), found)
+    evidence = views.evidence(pose, lead, len(registration.unobservable))
     runner_up = None if rival is None or rival is _NO_RIVAL else rival.T_target_source
     return evidence.applied(registration, agreement, runner_up)
