@@ -257,9 +257,12 @@ def _located_in(
 ) -> list[LocatedFrame]:
     folders.check_result(result)
     recording = None if "#" in name else Opening.of([name], options).open()
-    if recording is None or len(recording) == 1:
+    if recording is not None and len(recording) == 1:
+        recording = None  # its frame is located like one that is named
+    frame: Frame | None
+    if recording is None:
         view = open_view(name, format=options.format, camera=options.camera, topic=options.topic)
-        frame: Frame | None = view.frame
+        frame = view.frame
     else:
         frame = recording.first_readable()
     if frame is not None and kind_of(frame) == "cloud":
@@ -267,7 +270,7 @@ def _located_in(
     progress.stage("reading the map")
     index = ResultMap.read(result, options.threads, progress)
     progress.stage("locating")
-    if recording is None or len(recording) == 1:
+    if recording is None:
         assert frame is not None
         return [index.locate_frame(frame)]
     return index.locate_clip(recording, progress)

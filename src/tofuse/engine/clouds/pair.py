@@ -90,7 +90,9 @@ def _thinned(view: Frame) -> Frame:
         return view
     if view not in _thinned_views:
         chosen = np.random.default_rng(0).choice(len(view), _MAX_POINTS, replace=False)
-        _thinned_views[view] = view.keep(np.isin(np.arange(len(view)), chosen))
+        kept = np.zeros(len(view), bool)
+        kept[chosen] = True
+        _thinned_views[view] = view.keep(kept)
     return _thinned_views[view]
 
 

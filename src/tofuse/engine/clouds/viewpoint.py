@@ -135,7 +135,7 @@ def _hidden_fraction(points: Float64, size: float) -> float:
     """Return the fraction of points (n, 3), `size` m apart, that others hide from the origin."""
     ranges = np.linalg.norm(points, axis=1)
     cell = max(_HIDING_CELL * size / max(float(np.median(ranges)), size), _MIN_CELL)
-    shape = int(np.ceil(np.pi / cell)), int(np.ceil(2 * np.pi / cell))
+    shape = _shape_of(cell)
     index = _cells(points, np.maximum(ranges, 1e-12), cell, shape)
     nearest = np.full(shape[0] * shape[1], np.inf)
     np.minimum.at(nearest, index, ranges)
@@ -174,7 +174,7 @@ class RangeSphere:
     def of(cls, view: Frame, viewpoint: Viewpoint) -> RangeSphere:
         """Take the nearest range in each cell and its neighbours."""
         cell = max(_CELL * viewpoint.spacing, _MIN_CELL)
-        shape = int(np.ceil(np.pi / cell)), int(np.ceil(2 * np.pi / cell))
+        shape = _shape_of(cell)
         points = view.points.astype(np.float64) - viewpoint.origin
         ranges = np.linalg.norm(points, axis=1)
         valid = ranges > 0
@@ -194,6 +194,11 @@ class RangeSphere:
         ranges = np.linalg.norm(points, axis=1)
         cell_index = _cells(points, np.maximum(ranges, 1e-12), self.cell, self.ranges.shape)
         return np.asarray(self.ranges.reshape(-1)[cell_index] - ranges, np.float64)
+
+
+def _shape_of(cell: float) -> tuple[int, int]:
+    """Return the numbers of elevations and azimuths of a sphere of cells of this size, rad."""
+    return int(np.ceil(np.pi / cell)), int(np.ceil(2 * np.pi / cell))
 
 
 def _cells(points: Float64, ranges: Float64, cell: float, shape: tuple[int, ...]) -> Intp:

@@ -243,19 +243,17 @@ def _pair_equations(
             ]
             for k in range(residual.LANES):
                 column[k] += row[k]
-    _sum_columns(total)
-    q, index = 0, PRODUCTS
+    residual.sum_columns(total)
+    q = 0
     for p in range(8):
         for o in range(p, 8):
-            if p < 7 and o < 7:
-                out[index] = total[q, 0]
-                index += 1
+            if o < 7:
+                out[_product(p, o)] = total[q, 0]
             elif p < 7:
                 out[GRADIENT + p] = total[q, 0]
             q += 1
-        index += ERRORS
     for k in range(len(estimated)):
-        _sum_columns(error_total[k])
+        residual.sum_columns(error_total[k])
         unknown = 7 + estimated[k]
         for p in range(7):
             out[_product(p, unknown)] = error_total[k, p, 0]
@@ -273,18 +271,6 @@ def _pair_equations(
 def _product(p: int, o: int) -> int:
     """Return the position in `out` of the product of two unknowns, p <= o."""
     return PRODUCTS + p * UNKNOWNS - p * (p - 1) // 2 + o - p
-
-
-@kernel
-def _sum_columns(total: Float64) -> None:
-    """Add the columns of each row to its first one, in pairs."""
-    width = residual.LANES
-    while width > 1:
-        width //= 2
-        for q in range(len(total)):
-            low, high = total[q, :width], total[q, width:]
-            for k in range(width):
-                low[k] += high[k]
 
 
 @kernel
@@ -577,7 +563,7 @@ def _marginalise(sums: Float64, correlation: Float64, variance: float, row: Floa
     for p in range(6):
         for k in range(count):
             row[GRADIENT + p] -= R[k, 0] * R[k, 1 + p] - Z[k, 0] * Z[k, 1 + p]
-        index = PRODUCTS + p * UNKNOWNS - p * (p - 1) // 2
+        index = _product(p, p)
         for o in range(p, 6):
             for k in range(count):
                 row[index + o - p] -= R[k, 1 + p] * R[k, 1 + o] - Z[k, 1 + p] * Z[k, 1 + o]

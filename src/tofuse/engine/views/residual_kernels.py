@@ -178,6 +178,17 @@ def accumulate(points: Float32, target: TargetImage, T: Float64, residuals: Resi
             if block[HAS_PLANE * LANES + k] > 0:
                 out[COMPARED] += 1
                 out[HISTOGRAM + histogram_bin(block[CHI2 * LANES + k])] += 1
+    sum_columns(sums)
+    for q in range(PROJECTED):
+        out[q] = sums[q, 0]
+    for q in range(_STATS):
+        out[INLIERS + q] = sums[PROJECTED + q, 0]
+    return out
+
+
+@kernel
+def sum_columns(sums: Float64) -> None:
+    """Add the columns (n, LANES) of each row to its first one, in pairs."""
     width = LANES
     while width > 1:
         width //= 2
@@ -185,11 +196,6 @@ def accumulate(points: Float32, target: TargetImage, T: Float64, residuals: Resi
             low, high = sums[q, :width], sums[q, width:]
             for k in range(width):
                 low[k] += high[k]
-    for q in range(PROJECTED):
-        out[q] = sums[q, 0]
-    for q in range(_STATS):
-        out[INLIERS + q] = sums[PROJECTED + q, 0]
-    return out
 
 
 @kernel
