@@ -394,20 +394,19 @@ def _check_by_loop(
     loop = Loop.longest(views, refined, options)
     if loop is None:
         return without_error
-    poses = refined.start
-    uncorrected = loop.closure_error(poses, np.zeros(kernels.ERRORS))
+    uncorrected = loop.aligned(loop.steps(refined.start), np.zeros(kernels.ERRORS))
     if not loop.gap(uncorrected, uncorrected).significant:
         return without_error
     candidates: dict[str, tuple[float, Gap]] = {}
     sigmas = first.sigmas
     for name in (name for name in _REVEALED_BY_LOOP if name in first.determined):
         step = _LOOP_FACTOR * TOLERANCES[name]
-        error, corrected = loop.closing_error(poses, uncorrected, _INDEX[name], step)
+        error, corrected = loop.closing_error(uncorrected, _INDEX[name], step)
         gap = loop.gap(uncorrected, corrected)
         limit = without_error.significance * sigmas[name]
         if not (gap.closes and _large(name, error, limit, _LOOP_FACTOR)):
             continue
-        confirmed = loop.error_by_views(poses, _INDEX[name], error)
+        confirmed = loop.error_by_views(corrected, _INDEX[name], error)
         if _large(name, confirmed, limit, _LOOP_FACTOR) and confirmed / error > _MIN_CONFIRMED:
             candidates[name] = error, gap
     if not candidates:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 
@@ -104,8 +105,8 @@ def loop_gap(
     loop = Loop.longest(views, refined, options)
     if loop is None:
         return None
-    without = loop.closure_error(refined.poses, np.zeros(kernels.ERRORS))
-    return loop.gap(without, loop.closure_error(poses, errors))
+    without = loop.aligned(loop.steps(refined.poses), np.zeros(kernels.ERRORS))
+    return loop.gap(without, loop.aligned(loop.steps(poses), errors))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,31 +131,22 @@ class Loop:
         """Median depth of the two ends, m."""
         return 0.5 * (self.views[self.i].depth + self.views[self.j].depth)
 
-    def closure_error(self, poses: Float64, errors: Float64) -> Float64:
-        """Return the motion (4, 4) by which chained pairwise alignments fail to close the loop.
+    def steps(self, poses: Float64) -> Float64:
+        """Return the relative poses (M, 4, 4) of consecutive views, and last that of the ends."""
+        first, second = self._pairs.T
+        return np.asarray(se3.inverse(poses[first]) @ poses[second], np.float64)
 
-        Parameters
-        ----------
-        poses
-            (N, 4, 4) T_world_camera, where the alignments start.
-        errors
-            (ERRORS,) assumed errors of the camera.
-        """
-        return self.align_chain(poses, errors)[0]
+    def aligned(self, steps: Float64, errors: Float64) -> Float64:
+        """Return the `steps`, each aligned separately with assumed (ERRORS,) of the camera."""
+        return align_pairs(self.views, self._pairs, steps, self.options, errors)
 
-    def align_chain(self, poses: Float64, errors: Float64) -> tuple[Float64, Float64]:
-        """Return `closure_error`, and the chain's poses (j - i + 1, 4, 4) relative to its first."""
+    @property
+    def _pairs(self) -> Intp:
         i, j = self.i, self.j
         chain = np.stack([np.arange(i, j), np.arange(i + 1, j + 1)], 1)
-        pairs = np.concatenate([chain, [[i, j]]])
-        T = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
-        T = align_pairs(self.views, pairs, T, self.options, errors)
-        chained = [np.eye(4)]
-        for step in T[:-1]:
-            chained.append(chained[-1] @ step)
-        return np.asarray(se3.inverse(T[-1]) @ chained[-1], np.float64), np.array(chained)
+        return np.concatenate([chain, [[i, j]]])
 
-    def error_by_views(self, poses: Float64, error_index: int, error: float) -> float:
+    def error_by_views(self, steps: Float64, error_index: int, error: float) -> float:
         """Return an error of the camera as all views of the loop estimate it, starting from one.
 
         A true error is confirmed, even if residuals at a wrong one are small. An error that only
@@ -162,38 +154,37 @@ class Loop:
 
         Parameters
         ----------
-        poses
-            As for `closure_error`.
+        steps
+            Aligned with the error.
         error_index, error
             Index of the error, and its initial value.
         """
         errors = np.zeros(kernels.ERRORS)
         errors[error_index] = error
-        chain = self.align_chain(poses, errors)[1]
         options = replace(self.options, rounds=COARSE_TO_FINE)
         views = self.views[self.i : self.j + 1]
+        chain = np.array(_chained(steps))
         aligned = align_views(views, chain, options, calibrate=[error_index], errors=errors)
         return float(aligned.errors[error_index])
 
     def gap(self, before: Float64, after: Float64) -> Gap:
-        """Return the gap, given `closure_error` without and with errors of the camera."""
+        """Return the gap, given steps aligned without and with errors of the camera."""
         first, last = (self.views[k].index for k in (self.i, self.j))
-        change = se3.inverse(before) @ after
-        return Gap(first, last, _norms(before), _norms(after), self.depth, _norms(change))
+        closures = _closure_error(before), _closure_error(after)
+        change = se3.inverse(closures[0]) @ closures[1]
+        return Gap(first, last, *map(_norms, closures), self.depth, _norms(change))
 
     def closing_error(
-        self, poses: Float64, uncorrected: Float64, error_index: int, step: float
+        self, uncorrected: Float64, error_index: int, step: float
     ) -> tuple[float, Float64]:
-        """Return the error of the camera that closes the loop best, and `closure_error` with it.
+        """Return the error of the camera that closes the loop best, and steps aligned with it.
 
         Gauss-Newton on the gap at the views' depth, with derivatives by secants.
 
         Parameters
         ----------
-        poses
-            As for `closure_error`.
         uncorrected
-            (4, 4) `closure_error` without errors of the camera.
+            Steps aligned without errors of the camera.
         error_index
             Index of the error.
         step
@@ -201,12 +192,12 @@ class Loop:
         """
         scale = np.r_[np.full(3, 1 / self.depth), np.ones(3)]
         errors = np.zeros(kernels.ERRORS)
-        previous_error, residual = 0.0, se3.log(uncorrected) * scale
-        error = step
+        previous_error, residual = 0.0, se3.log(_closure_error(uncorrected)) * scale
+        error, steps = step, uncorrected
         for _ in range(_MAX_SECANT_STEPS):
             errors[error_index] = error
-            closure = self.closure_error(poses, errors)
-            previous_residual, residual = residual, se3.log(closure) * scale
+            steps = self.aligned(steps, errors)
+            previous_residual, residual = residual, se3.log(_closure_error(steps)) * scale
             slope = (residual - previous_residual) / (error - previous_error)
             previous_error = error
             error -= float(slope @ residual) / max(float(slope @ slope), 1e-12)
@@ -215,7 +206,17 @@ class Loop:
                 or abs(error) > _IMPLAUSIBLE * step
             ):
                 break
-        return previous_error, closure
+        return previous_error, steps
+
+
+def _chained(steps: Float64) -> list[Float64]:
+    """Return the poses (4, 4) of the chain's views, relative to its first."""
+    return list(accumulate(steps[:-1], np.matmul, initial=np.eye(4)))
+
+
+def _closure_error(steps: Float64) -> Float64:
+    """Return the motion (4, 4) by which the chain fails to reach its end."""
+    return np.asarray(se3.inverse(steps[-1]) @ _chained(steps)[-1], np.float64)
 
 
 def _norms(T: Float64) -> tuple[float, float]:

@@ -121,11 +121,13 @@ class Selection:
 
         The structure that constrains a view may be outside the convergence basin of a wrong start,
         where a wall fits anywhere along itself. So other starts along the degenerate directions are
-        tried, and a search if the previous view was better constrained.
+        tried, and a search if the previous view was better constrained and no external odometry
+        measured the motion since.
         """
         best, best_score = hypothesis, self._explanation_score(hypothesis)
         degenerate = len(hypothesis.aligned.unobservable)
-        searched = self._by_search() if degenerate > self._state.degenerate else None
+        needs_search = degenerate > self._state.degenerate and self._motion.odometry_pose() is None
+        searched = self._by_search() if needs_search else None
         rivals = [(searched, 0.0)] if searched is not None else []
         rivals += [(rival, pair_agreement.MIN_LEAD) for rival in self._displaced(hypothesis)]
         for rival, min_lead in rivals:
