@@ -31,7 +31,7 @@ from tofuse.engine.refinement.joint_alignment import (
     mean_support,
     spread_evenly,
 )
-from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap
+from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap, thinned
 from tofuse.engine.refinement.split_half import aligned_motion
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
@@ -68,12 +68,8 @@ _INDEX = {
     "center_y": kernels.CENTER_Y,
     "distortion": kernels.DISTORTION,
 }
-# This many points of pairs determine errors that all views share: of more, up to every n-th point
-# is used, and then fewer pairs.
-_MAX_POINTS, _MAX_STRIDE = 250_000, 3
-# Iterations that realign the views without errors; and the change of an error, in units of 1 % and
-# 1 cm, below which its estimate has converged.
-_REALIGNMENT, _CONVERGED = (pair_equations.Round(6, 0.0, 0.0),), 0.05
+# Iterations that realign the views without errors.
+_REALIGNMENT = (pair_equations.Round(6, 0.0, 0.0),)
 # Larger first estimates, as multiples of the tolerance, are sought from coarse to fine.
 _MAX_DIRECT = 3.0
 
@@ -311,17 +307,14 @@ class _Estimator:
         priors: Priors,
         first: _FirstEstimates,
     ) -> None:
-        pairs, count = refined.pairs, len(refined.pairs) * options.points
-        stride = min(-(-count // _MAX_POINTS), _MAX_STRIDE)
-        views = [v.with_points(np.s_[::stride]) for v in views]
-        if count > stride * _MAX_POINTS:
-            pairs = spread_evenly(pairs, -(-options.neighbours * stride * _MAX_POINTS // count))
+        pairs = refined.pairs
+        views, thinned_options = thinned(views, len(pairs), options)
+        if thinned_options.neighbours < options.neighbours:
+            pairs = spread_evenly(pairs, thinned_options.neighbours)
         # An estimate of camera errors does not model errors that patches share, so it can't be
         # compared with the refined poses.
         self._views, self._first = views, first
-        self._options = replace(
-            options, rounds=COARSE_TO_FINE[-1:], shared=0.0, error_convergence=_CONVERGED
-        )
+        self._options = replace(thinned_options, rounds=COARSE_TO_FINE[-1:])
         self._align = partial(align_views, views, priors=priors, pairs=pairs)
         self._poses = self._align(refined.poses, replace(self._options, rounds=_REALIGNMENT)).poses
 

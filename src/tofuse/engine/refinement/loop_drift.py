@@ -20,11 +20,37 @@ COARSE_TO_FINE = (
     pair_equations.Round(2, 0.005, 0.03),
     pair_equations.Round(12, 0.0, 0.0),
 )
+# This many points of pairs determine errors that all views share: of more, up to every n-th point
+# is used, and then fewer pairs.
+_MAX_POINTS, _MAX_STRIDE = 250_000, 3
+# Change of an error, in units of 1 % and 1 cm, below which its estimate has converged.
+_CONVERGED = 0.05
 # A loop is closed if its error is below this, m and rad.
 _MAX_CLOSURE_ERROR = (0.01, np.radians(0.5))
 # Secant steps to the error that closes a loop: their maximum number; and the change at convergence,
 # and an implausible error, relative to the first one.
 _MAX_SECANT_STEPS, _CONVERGENCE, _IMPLAUSIBLE = 4, 0.05, 10.0
+
+
+def thinned(
+    views: Sequence[SampledView], pair_count: int, options: pair_equations.RefineOptions
+) -> tuple[list[SampledView], pair_equations.RefineOptions]:
+    """Return as many points, and options for as many pairs, as estimates of shared errors need.
+
+    The errors of patches are not modelled, and `rounds` are coarse to fine.
+    """
+    count = pair_count * options.points
+    stride = min(-(-count // _MAX_POINTS), _MAX_STRIDE)
+    neighbours = options.neighbours
+    if count > stride * _MAX_POINTS:
+        neighbours = -(-neighbours * stride * _MAX_POINTS // count)
+    return [v.with_points(np.s_[::stride]) for v in views], replace(
+        options,
+        rounds=COARSE_TO_FINE,
+        neighbours=neighbours,
+        shared=0.0,
+        error_convergence=_CONVERGED,
+    )
 
 
 @dataclass(frozen=True)
@@ -161,8 +187,8 @@ class Loop:
         """
         errors = np.zeros(kernels.ERRORS)
         errors[error_index] = error
-        options = replace(self.options, rounds=COARSE_TO_FINE)
         views = self.views[self.i : self.j + 1]
+        views, options = thinned(views, len(views) * self.options.neighbours, self.options)
         chain = np.array(_chained(steps))
         aligned = align_views(views, chain, options, calibrate=[error_index], errors=errors)
         return float(aligned.errors[error_index])
