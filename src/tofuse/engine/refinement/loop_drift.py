@@ -196,9 +196,9 @@ class Loop:
     def gap(self, before: Float64, after: Float64) -> Gap:
         """Return the gap, given steps aligned without and with errors of the camera."""
         first, last = (self.views[k].index for k in (self.i, self.j))
-        closures = _closure_error(before), _closure_error(after)
-        change = se3.inverse(closures[0]) @ closures[1]
-        return Gap(first, last, *map(_norms, closures), self.depth, _norms(change))
+        without, corrected = _closure_error(before), _closure_error(after)
+        change = _norms(se3.inverse(without) @ corrected)
+        return Gap(first, last, _norms(without), _norms(corrected), self.depth, change)
 
     def closing_error(
         self, uncorrected: Float64, error_index: int, step: float
