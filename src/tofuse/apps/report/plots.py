@@ -190,9 +190,12 @@ def _outlines(flat: Float64) -> list[Float64]:
     extent = np.maximum(high - low, 1e-3)
     # Cells wide enough for a few samples in each, so that surfaces have no holes.
     cell = max(extent.max() / 160, 1.5 * np.sqrt(extent[0] * extent[1] / len(flat)))
-    edges = [a + cell * np.arange(-4, int(n) + 6) for a, n in zip(low, extent / cell, strict=True)]
+    edges = [
+        a + cell * (np.arange(-4, int(n) + 7) - 0.5)
+        for a, n in zip(low, extent / cell, strict=True)
+    ]
     counts, _, _ = np.histogram2d(flat[:, 0], flat[:, 1], bins=edges)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     mask = cv2.morphologyEx((counts.T > 0).astype(np.uint8), cv2.MORPH_CLOSE, cross, iterations=3)
     rings, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    return [low + cell * (ring[:, 0] - 3.5) for ring in rings]
+    return [low + cell * (ring[:, 0] - 4) for ring in rings]

@@ -56,7 +56,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         ("timings", "Time", lambda _: {}),
         ("settings", "Settings", _settings),
     )
-    # Simplifying the surface takes as long as the other sections, and releases the interpreter lock.
+    # Simplifying the surface takes as long as the rest, and releases the interpreter lock.
     with job_pool(1, "tofuse-report") as background:
         model = background.submit(section_model.model, subject)
         contents = {name: content(subject) for name, _, content in listed}

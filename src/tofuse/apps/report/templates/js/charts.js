@@ -1,8 +1,8 @@
 // Line charts by uPlot, of the data that `report/plots.py` puts into the page, in the page's colours.
 (function () {
-  const root = getComputedStyle(document.documentElement);
-  const color = (name) => () => root.getPropertyValue(`--${name}`);
-  const text = (value) => (value === null ? "" : String(Number(value.toPrecision(5))).replace("-", "−"));
+  const style = getComputedStyle(document.body);
+  const color = (name) => () => style.getPropertyValue(`--${name}`);
+  const text = (value, digits = 6) => (value === null ? "" : String(Number(value.toPrecision(digits))).replace("-", "−"));
   const drawn = new Map();
 
   // From 0, with 0, or around the values; of a logarithmic axis as uPlot chooses.
@@ -44,21 +44,22 @@
     const c = JSON.parse(box.dataset.chart), names = Object.keys(c.series);
     const readout = box.parentNode.querySelector("span");
     const tell = ({ cursor: { idx } }) => {
-      const at = (name) => text(c.series[name][idx]) || "–";
+      const at = (name) => text(c.series[name][idx], 4) || "–";
       readout.textContent = idx === null || idx === undefined
         ? ""
         : `${c.xlabel} ${c.x[idx]}: ${names.map((name) => (names.length > 1 ? `${name} ${at(name)}` : at(name))).join(", ")}`;
     };
     const axis = {
-      font: `11px ${root.fontFamily}`, labelFont: `11px ${root.fontFamily}`, stroke: color("ink"),
+      font: `11px ${style.fontFamily}`, labelFont: `11px ${style.fontFamily}`, stroke: color("ink"),
       grid: { stroke: color("grid"), width: 0.8 }, ticks: { stroke: color("muted"), width: 0.8, size: 3 },
-      values: (chart, splits) => splits.map(text),
+      values: (chart, splits) => splits.map((value) => text(value)),
     };
     const lines = names.map((name) => (
-      { stroke: color(name), width: 1.6, dash: name === "before" ? [6, 3] : undefined, points: { size: 4 } }
+      { stroke: color(name), width: 1.6, dash: name === "before" ? [6, 3] : undefined, points: { size: 4, fill: color(name) } }
     ));
     return new uPlot({
       width: box.clientWidth, height: box.clientHeight,
+      padding: [8, 10, 0, 0],
       legend: { show: false },
       cursor: { y: false, sync: { key: c.xlabel } },
       scales: {
@@ -67,7 +68,7 @@
       },
       axes: [
         { ...axis, label: c.xlabel, labelSize: 16, size: 22, gap: 3, incrs: [1, 2, 5].flatMap((k) => [k, 10 * k, 100 * k, 1e3 * k, 1e4 * k]).sort((a, b) => a - b) },
-        { ...axis, size: 52, gap: 3, space: 34 },
+        { ...axis, size: 48, gap: 3, space: 34 },
       ],
       series: [{}, ...lines],
       hooks: { draw: [(chart) => marks(chart, c)], setCursor: [tell] },
