@@ -42,6 +42,18 @@ def test_help_loads_no_heavy_packages(words) -> None:
     assert not loaded & (HEAVY | {"numpy"})
 
 
+def test_run_with_report_does_not_load_matplotlib(room_recording, tmp_path) -> None:
+    words = ["run", str(room_recording), "--out", str(tmp_path / "result")]
+    done = _python(
+        "import sys\n"
+        "from tofuse.apps.cli.program import main\n"
+        f"status = main({words!r})\n"
+        "print('STATUS', status, 'matplotlib' in sys.modules)"
+    )
+    assert "STATUS 0 False" in done.stdout, done.stderr
+    assert "data-chart=" in (tmp_path / "result" / "report.html").read_text(encoding="utf-8")
+
+
 def test_public_names_exist() -> None:
     for name in tofuse.__all__:
         assert getattr(tofuse, name) is not None, name

@@ -178,3 +178,49 @@ def test_layout_follows_scheme_and_screen_size(browser, report, scheme, size):
         assert not columns[[0, -1]].any()
         assert max(rows.mean(), columns.mean()) > 0.7
         seen.check()
+
+
+def test_charts_are_drawn_when_seen_and_follow_pointer_and_theme(browser, report):
+    with opened(browser, report, viewport=DESK, color_scheme="light") as seen:
+        page = seen.page
+        charts = page.locator("#error [data-chart]")
+        assert page.locator("[data-chart] canvas").count() < page.locator("[data-chart]").count()
+        charts.first.scroll_into_view_if_needed()
+        charts.first.locator("canvas").wait_for()
+        light = seen.pixels("#error [data-chart] >> nth=0")
+        orange = light[..., 2] - light[..., 0] > 60  # BGR: the line before optimisation
+        assert orange.sum() > 100
+        box = charts.first.bounding_box()
+        page.mouse.move(box["x"] + 0.9 * box["width"], box["y"] + 60)
+        readout = page.locator("#error .chart span").first
+        assert re.fullmatch(r"frame 2\d: before 0\.\d+, after 0\.\d+", readout.inner_text())
+        page.mouse.move(1, 1)
+        assert readout.inner_text() == ""
+        page.emulate_media(color_scheme="dark")
+        seen.rest()
+        dark = seen.pixels("#error [data-chart] >> nth=0")
+        assert light[:4, :4].min() > 200 > 60 > dark[:4, :4].max()
+        # Redrawn with the lighter orange.
+        assert ((dark[..., 2] > 225) & (dark[..., 0] < 120)).sum() > 50
+        page.set_viewport_size(PHONE)
+        seen.rest()
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert charts.first.locator("canvas").bounding_box()["width"] > 300
+        seen.check()
+
+
+def test_chart_in_closed_details_is_drawn_on_opening(browser, report, tmp_path):
+    text = report.read_text(encoding="utf-8")
+    before, section, rest = text.partition('<section id="objective">')
+    folded = rest.replace("</section>", "</details></section>", 1)
+    path = tmp_path / "folded.html"
+    path.write_text(f"{before}{section}<details><summary>more</summary>{folded}", encoding="utf-8")
+    with opened(browser, path, viewport=DESK) as seen:
+        details = seen.page.locator("#objective details")
+        details.scroll_into_view_if_needed()
+        seen.rest()
+        assert details.locator("canvas").count() == 0
+        details.locator("summary").click()
+        details.locator("canvas").wait_for()
+        assert details.locator("canvas").bounding_box()["width"] > 300
+        seen.check()

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from report_results import lonely, make_room
+from tofuse.apps.report import plots
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.fields import fields
 from tofuse.apps.report.packing import pack
@@ -49,7 +50,7 @@ class Page(HTMLParser):
     def __init__(self, text):
         super().__init__(convert_charrefs=True)
         self.open, self.sections, self.links, self.ids, self.scripts = [], {}, [], [], []
-        self.rows, self.images, self.titles = [], [], []
+        self.rows, self.images, self.titles, self.charts = [], [], [], []
         self.section, self.text = None, text
         self.feed(text)
         self.close()
@@ -66,6 +67,9 @@ class Page(HTMLParser):
             self.rows.append([])
         if tag in ("td", "th"):
             self.rows[-1].append("")
+        if "data-chart" in attrs:
+            self.charts.append(json.loads(attrs["data-chart"]))
+            assert attrs["aria-label"] == self.charts[-1]["label"]
         if tag == "img":
             assert attrs["alt"]
             self.images.append(attrs["src"])
@@ -140,7 +144,7 @@ def test_sections_are_ordered_with_model_first(shown):
 def test_page_has_no_external_resources(shown):
     assert shown.links
     assert all(link.startswith(("#", "data:")) for link in shown.links)
-    text = shown.text
+    text = shown.text.replace("/*! https://github.com/leeoniya/uPlot ", "")  # its only address
     assert "://" not in text
     assert "@import" not in text
     assert "default-src 'none'" in text
@@ -319,6 +323,57 @@ def test_viewer_contains_model_cameras_and_loops(shown):
         known = np.isfinite(poses[:, 0, 0])
         np.testing.assert_allclose(found[known], R @ poses[known, :3], atol=1e-6)
         assert not found[~known].any()
+
+
+def test_charts_have_values_gaps_and_text(shown):
+    inliers, residual, x, _, _, rotation, objective = shown.charts
+    result, _ = room()
+    expected = [
+        100 * r.inlier_share for r in result.diagnostics.frames if r.inlier_share is not None
+    ]
+    values = [v for v in inliers["series"]["after"] if v is not None]
+    np.testing.assert_allclose(values, expected, rtol=1e-4)
+    assert inliers["series"]["after"][15] is None
+    assert inliers["bad"] == [9, 10, 15]
+    assert (inliers["floor"], residual["ylabel"]) == (True, "rms residual, mm")
+    assert list(x["series"]) == ["before", "after"]
+    assert (x["x"], x["zero"]) == (list(range(24)), True)
+    high = max(v for v in rotation["series"]["before"] if v is not None)
+    assert rotation["label"].endswith(f"rotation, degrees: from 0 to {high:.3g}")
+    assert (objective["xlabel"], objective["scale"]["distr"]) == ("iteration", 3)
+
+
+@pytest.mark.parametrize(
+    ("values", "scale"),
+    [
+        ([2, 1, np.nan], {"distr": 3, "asinh": 1.0}),
+        ([2, 0, np.inf], {"distr": 4, "asinh": 2.0}),
+        ([0, 0, 0], {}),
+    ],
+)
+def test_logarithmic_axis_is_linear_near_zero(values, scale):
+    y = np.array(values, float)
+    chart = plots.lines(np.arange(3.0), {"after": y}, label="a", ylabel="b", log=True)
+    assert chart["scale"] == scale
+    assert chart["series"]["after"][2] == (0.0 if values[2] == 0 else None)
+
+
+def test_plan_shows_outline_extents_and_path_in_pixels():
+    rng = np.random.default_rng(1)
+    points = rng.uniform(0, 1, (20_000, 3)) * [4, 1, 2]
+    cameras = np.array([[1.0, 0, 0.5], [2.0, 0, 0.5], [3.0, 0, 0.5]])
+    corners = np.array([[0, 0, 0], [4.0, 1, 2]])
+    p = plots.model(points, cameras, points, "above", measured=corners, label="a")
+    at = {text: pixel for pixel, text in p["x"]}
+    scale = at["2"] - at["1"]
+    left, top, right, bottom = p["measured"]
+    assert (right - left, bottom - top) == pytest.approx((4 * scale, 2 * scale), abs=0.2)
+    assert p["path"] == pytest.approx([at["1"], p["path"][1], at["3"], p["path"][1]], abs=0.2)
+    up = {text: pixel for pixel, text in p["y"]}
+    assert (up["1"] + up["0"]) / 2 == pytest.approx(p["path"][1], abs=0.2)
+    (ring,) = np.array(p["truth"]).reshape(1, -1, 2)
+    assert [*ring.min(0), *ring.max(0)] == pytest.approx(p["measured"], abs=0.06 * scale)
+    assert p["names"] == ["right, m", "forward, m"]
 
 
 def test_model_can_be_coloured_by_attributes_of_points():

@@ -1,8 +1,8 @@
 """`report.html`: a result as one page for a human reader, without external resources.
 
 `write_report` collects the values of each section, which a template turns into HTML. Its parts
-serve other pages, too: plots as SVG that follow the page's theme, images as data URIs, the content
-of the 3D view as compressed arrays, and numbers in words.
+serve other pages, too: charts and plans that follow the page's theme, images as data URIs, the
+content of the 3D view as compressed arrays, and numbers in words.
 """
 
 from typing import TYPE_CHECKING

@@ -59,10 +59,15 @@ def secured(html: str) -> str:
     return re.sub("<meta charset=[^>]*>", lambda head: head[0] + meta, html, count=1)
 
 
-def script() -> str:
-    """Return the script of a page with a 3D view."""
-    parts = "\n".join(asset(f"js/{name}.js") for name in SCRIPTS)
-    return f'"use strict";\n(() => {{\n{parts}}})();'
+def script(*, charts: bool = False) -> str:
+    """Return the script of a page with a 3D view, and with charts if it has any."""
+    files = [f"js/{name}.js" for name in SCRIPTS]
+    licence = ""
+    if charts:
+        files = ["vendor/uPlot.iife.min.js", *files, "js/charts.js"]
+        licence = f"/*!\n{asset('vendor/uPlot.LICENSE')}*/\n"
+    parts = "\n".join(map(asset, files))
+    return f'{licence}"use strict";\n(() => {{\n{parts}}})();'
 
 
 def asset(name: str) -> str:

@@ -69,7 +69,7 @@ def _strip(
     return [(record, frame_text(record, components)) for record in worst]
 
 
-def _health(records: Sequence[FrameRecord]) -> list[str]:
+def _health(records: Sequence[FrameRecord]) -> list[Values]:
     """The plots of inliers and residuals over frames."""
     index = np.array([r.index for r in records], float)
     bad = index[[r.status in ("lost", "skipped") for r in records]]
@@ -80,9 +80,8 @@ def _health(records: Sequence[FrameRecord]) -> list[str]:
     ):
         y = scale * np.array(values, float)  # NaN where there is none
         if np.isfinite(y).any():
-            series = [(y, plots.AFTER, "-")]
             figures.append(
-                plots.lines(index, series, label=label, ylabel=ylabel, bad=bad, floor=True)
+                plots.lines(index, {"after": y}, label=label, ylabel=ylabel, bad=bad, floor=True)
             )
     return figures
 

@@ -134,7 +134,7 @@ def views(s: Subject) -> Values:
     R = s.R_display_world
     truth = None if s.truth is None else s.truth @ R.T
 
-    def drawing(points: Float64, poses: Float64, view: str, name: str) -> str:
+    def drawing(points: Float64, poses: Float64, view: str, name: str) -> Values:
         measured = np.percentile(points, [OUTER, 100 - OUTER], axis=0)
         path, label = poses[:, :3, 3] @ R.T, f"Model, {name}"
         return plots.model(points, path, truth, view, measured=measured, label=label)

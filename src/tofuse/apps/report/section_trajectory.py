@@ -26,10 +26,7 @@ def error(s: Subject) -> Values:
         scale, unit = (180 / np.pi, "degrees") if k == 3 else (1.0, "m")
         if k < 3 and np.nanmax(np.abs([before[:, k], after[:, k]])) < 0.1:
             scale, unit = 1000.0, "mm"
-        series = [
-            (scale * before[:, k], plots.BEFORE, "--"),
-            (scale * after[:, k], plots.AFTER, "-"),
-        ]
+        series = {"before": scale * before[:, k], "after": scale * after[:, k]}
         label = f"{quantity.capitalize()} in {axis} over frames, before and after optimisation"
         ylabel = f"{axis}, {unit}"
         figures.append(plots.lines(s.index, series, label=label, ylabel=ylabel, zero=True, bad=bad))
@@ -89,7 +86,7 @@ def _rows(name: str, offsets: Float64, compared: bool) -> list[tuple[str, Float6
     return [(f"{name}, {kind}", row) for kind, row in kinds.items()]
 
 
-def _uncertainty(s: Subject) -> list[str]:
+def _uncertainty(s: Subject) -> list[Values]:
     """Plots of the pose uncertainty over frames: one sigma in the worst direction."""
     C = np.full((len(s.index), 6, 6), np.nan)
     for k, record in enumerate(s.result.diagnostics.frames[: len(C)]):
@@ -104,7 +101,7 @@ def _uncertainty(s: Subject) -> list[str]:
     return [
         plots.lines(
             s.index,
-            [(sigma[:, k], plots.AFTER, "-")],
+            {"after": sigma[:, k]},
             label=f"Standard deviation of the {quantity} over frames",
             ylabel=f"{quantity}, {unit}",
             floor=True,
@@ -123,16 +120,15 @@ def optimisation(s: Subject) -> Values:
     if len(finite):
         text = f"From {finite[0]:.4g} to {finite[-1]:.4g}"
         text += f" in {words.count(len(values) - 1, 'iteration')}."
-        svg = plots.lines(
+        chart = plots.lines(
             np.arange(len(values), dtype=float),
-            [(values, plots.AFTER, "-")],
+            {"after": values},
             label="Objective over iterations",
             ylabel="objective",
             xlabel="iteration",
             log=True,
-            size=(480, 240),
         )
-        figures.append(svg)
+        figures.append(chart)
     return {
         "figures": figures,
         "text": text,

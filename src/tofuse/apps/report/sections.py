@@ -30,7 +30,7 @@ def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> No
     OutputError
         If the file can't be written; an earlier one is unchanged then.
     """
-    write_page(path, "report.html.j2", script=script(), **sections(result, extras))
+    write_page(path, "report.html.j2", script=script(charts=True), **sections(result, extras))
 
 
 def sections(result: Reconstruction, extras: ReportExtras) -> Values:
@@ -56,7 +56,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         ("timings", "Time", lambda _: {}),
         ("settings", "Settings", _settings),
     )
-    # Simplifying the surface takes as long as all plots, and releases the interpreter lock.
+    # Simplifying the surface takes as long as the rest, and releases the interpreter lock.
     with job_pool(1, "tofuse-report") as background:
         model = background.submit(section_model.model, subject)
         contents = {name: content(subject) for name, _, content in listed}

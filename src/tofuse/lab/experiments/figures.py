@@ -9,6 +9,7 @@ import numpy as np
 
 from tofuse.apps.report import plots
 from tofuse.engine.arrays import Float64
+from tofuse.lab.experiments import drawing
 from tofuse.lab.experiments.peaks import AXES, PeaksRun, PeaksSweep
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def plan(
     extent = box[1] - box[0]
     inner_width = width - 62.0
     height = float(np.clip(inner_width * extent[1] / extent[0], 120, 1.15 * inner_width))
-    figure, axes = plots.make_figure(width, height + 62, _MARGINS)
+    figure, axes = drawing.make_figure(width, height + 62, _MARGINS)
     scale = max(extent[0] / inner_width, extent[1] / height)
     centre = box.mean(0)
     x0, x1 = centre[0] - scale * inner_width / 2, centre[0] + scale * inner_width / 2
@@ -68,24 +69,24 @@ def plan(
     image[..., 3] = np.where(density > 0, 60 + 13 * np.round(15 * shade), 0).astype(np.uint8)
     axes.imshow(image, extent=(x0, x1, y0, y1), origin="lower", interpolation="none", aspect="auto")
     for outline, color, style in (
-        *((o, plots.BAD, "dashed") for o in true),
-        *((o, plots.AFTER, "solid") for o in measured),
+        *((o, drawing.BAD, "dashed") for o in true),
+        *((o, drawing.AFTER, "solid") for o in measured),
     ):
         closed = np.vstack([outline, outline[:1]])
         axes.plot(closed[:, 0], closed[:, 1], color=color, linestyle=style, linewidth=1.5)
-    axes.plot(cameras[:, 0], cameras[:, 1], color=plots.INK, linewidth=1)
-    axes.plot(cameras[:1, 0], cameras[:1, 1], "o", color=plots.INK, markersize=4)
+    axes.plot(cameras[:, 0], cameras[:, 1], color=drawing.INK, linewidth=1)
+    axes.plot(cameras[:1, 0], cameras[:1, 1], "o", color=drawing.INK, markersize=4)
     axes.set_xlim(x0, x1)
     axes.set_ylim(y0, y1)
     for axis, size in ((axes.xaxis, inner_width), (axes.yaxis, height)):
-        axis.set_major_locator(plots.locator(size / 45))
+        axis.set_major_locator(drawing.locator(size / 45))
     _label(axes, names[0], f"{title} — {names[1]}")
-    return plots.svg(figure, label)
+    return drawing.svg(figure, label)
 
 
 def _label(axes: Axes, x: str, title: str) -> None:
-    axes.set_xlabel(x, color=plots.MUTED, fontsize=10.5, labelpad=2)
-    axes.set_title(title, color=plots.INK, fontsize=11, loc="left", pad=6, x=-0.1)
+    axes.set_xlabel(x, color=drawing.MUTED, fontsize=10.5, labelpad=2)
+    axes.set_title(title, color=drawing.INK, fontsize=11, loc="left", pad=6, x=-0.1)
 
 
 def drift(
@@ -95,26 +96,23 @@ def drift(
 
     `other_method` is that of the other method before and after, dotted.
     """
-    return plots.lines(
-        np.arange(len(before), dtype=float),
+    return drawing.lines(
         [
-            (100 * other_method[0], plots.BEFORE, ":"),
-            (100 * other_method[1], plots.AFTER, ":"),
-            (100 * before, plots.BEFORE, "-"),
-            (100 * after, plots.AFTER, "-"),
+            (100 * other_method[0], drawing.BEFORE, ":"),
+            (100 * other_method[1], drawing.AFTER, ":"),
+            (100 * before, drawing.BEFORE, "-"),
+            (100 * after, drawing.AFTER, "-"),
         ],
         label=label,
         ylabel=f"error in {axis}, cm",
-        zero=True,
         size=(330, 200),
     )
 
 
 def objective(values: Sequence[float], *, label: str) -> str:
     """Plot the optimiser's objective at every step (figure 5.3)."""
-    return plots.lines(
-        np.arange(len(values), dtype=float),
-        [(np.array(values), plots.AFTER, "-")],
+    return drawing.lines(
+        [(np.array(values), drawing.AFTER, "-")],
         label=label,
         ylabel="objective (eq 2.10)",
         xlabel="step",
@@ -131,17 +129,22 @@ def cameras(before: Float64, after: Float64, truth: Float64) -> tuple[str, str]:
     box = plots.limits(*projected)
     pictures = [
         _cameras(poses, box, truth, color, f"Cameras {name} optimisation, from above")
-        for poses, color, name in ((before, plots.BEFORE, "before"), (after, plots.AFTER, "after"))
+        for poses, color, name in (
+            (before, drawing.BEFORE, "before"),
+            (after, drawing.AFTER, "after"),
+        )
     ]
     return pictures[0], pictures[1]
 
 
 def _cameras(poses: Float64, box: Float64, truth: Float64, color: str, label: str) -> str:
     """Draw camera positions and viewing directions (n, 4, 4), and the true trajectory, in a box."""
-    figure, axes = plots.plan(box, "above", 380)
+    figure, axes = drawing.plan(box, "above", 380)
     size = 0.05 * float((box[1] - box[0]).max())
     path, centers = (plots.project(p[:, :3, 3], "above") for p in (truth, poses))
-    axes.plot(path[:, 0], path[:, 1], color=plots.REFERENCE, linewidth=1.4, linestyle=(0, (1, 1.2)))
+    axes.plot(
+        path[:, 0], path[:, 1], color=drawing.REFERENCE, linewidth=1.4, linestyle=(0, (1, 1.2))
+    )
     axes.plot(centers[:, 0], centers[:, 1], color=color, linewidth=1)
     shape = size * np.array([[-0.5, 0, 1], [0, 0, 0], [0.5, 0, 1], [-0.5, 0, 1]])
     for k in range(0, len(poses), -(-len(poses) // 72)):
@@ -150,16 +153,16 @@ def _cameras(poses: Float64, box: Float64, truth: Float64, color: str, label: st
         flat = plots.project(world.T, "above")
         axes.plot(flat[:, 0], flat[:, 1], color=color, linewidth=linewidth)
     axes.plot(centers[:1, 0], centers[:1, 1], "o", color=color, markersize=4)
-    return plots.svg(figure, label)
+    return drawing.svg(figure, label)
 
 
 def sweep(result: PeaksSweep) -> list[str]:
     """Draw figure 5.12: mean error and standard deviation of each parameter over the noise."""
     pictures = []
     for k, name in enumerate(AXES):
-        figure, axes = plots.make_figure(330, 220, _MARGINS)
+        figure, axes = drawing.make_figure(330, 220, _MARGINS)
         unit, factor = ("m", 1.0) if k < 3 else ("°", 180 / np.pi)
-        for which, color in ((0, plots.BEFORE), (1, plots.AFTER)):
+        for which, color in ((0, drawing.BEFORE), (1, drawing.AFTER)):
             mean = factor * result.axes[:, which, k]
             deviation = factor * result.axes_std[:, which, k]
             axes.fill_between(
@@ -175,7 +178,7 @@ def sweep(result: PeaksSweep) -> list[str]:
         axes.locator_params(axis="y", nbins=5)
         axes.locator_params(axis="x", nbins=6)
         _label(axes, "sigma, m", f"mean error in {name}, {unit}")
-        pictures.append(plots.svg(figure, f"Mean error in {name} over the noise"))
+        pictures.append(drawing.svg(figure, f"Mean error in {name} over the noise"))
     return pictures
 
 
@@ -192,13 +195,13 @@ def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
         points = np.concatenate(
             [c @ T[:3, :3].T + T[:3, 3] for c, T in zip(clouds, poses, strict=True)]
         )
-        figure, axes = plots.make_figure(400, 400 * 0.95, _MARGINS)
+        figure, axes = drawing.make_figure(400, 400 * 0.95, _MARGINS)
         sample = points[:: max(1, len(points) // 3000)]
         axes.plot(
             sample[:, 0],
             sample[:, 2],
             ".",
-            color=plots.MUTED,
+            color=drawing.MUTED,
             markersize=1.2,
             alpha=0.5,
             rasterized=True,
@@ -206,15 +209,15 @@ def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
         if k == 1:
             for true, estimate in zip(projected[2], projected[1], strict=True):
                 ends = np.stack([true, estimate])
-                axes.plot(ends[:, 0], ends[:, 1], color=plots.GRID, linewidth=1)
+                axes.plot(ends[:, 0], ends[:, 1], color=drawing.GRID, linewidth=1)
             axes.plot(
-                projected[2][:, 0], projected[2][:, 1], "s", color=plots.REFERENCE, markersize=4
+                projected[2][:, 0], projected[2][:, 1], "s", color=drawing.REFERENCE, markersize=4
             )
             axes.plot(
                 projected[1][:, 0],
                 projected[1][:, 1],
                 "o-",
-                color=plots.AFTER,
+                color=drawing.AFTER,
                 markersize=4,
                 linewidth=1,
             )
@@ -222,7 +225,7 @@ def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
             projected[0][:, 0],
             projected[0][:, 1],
             "o-",
-            color=plots.BEFORE,
+            color=drawing.BEFORE,
             markersize=4,
             linewidth=1,
         )
@@ -230,5 +233,5 @@ def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
         axes.set_ylim(box[0, 1], box[1, 1])
         axes.set_aspect("equal", "box")
         _label(axes, "x, m", f"{name} optimisation — z, m")
-        pictures.append(plots.svg(figure, f"The synthetic case {name} optimisation, from above"))
+        pictures.append(drawing.svg(figure, f"The synthetic case {name} optimisation, from above"))
     return pictures[0], pictures[1]
