@@ -58,8 +58,10 @@ def make_texture(
             continue
         for corrector in correctors:
             frame = corrector.apply(frame)
-        view = texture.TextureView.of(frame) if isinstance(frame, RangeFrame) else None
-        if view is not None and (not views or view.intensity.shape == views[0].intensity.shape):
+        if not isinstance(frame, RangeFrame):
+            continue
+        view = texture.TextureView.of(frame, _full_image(recording, frame))
+        if view is not None:
             views.append(view)
             poses.append(result.trajectory[k])
     if not views:
