@@ -164,7 +164,8 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     no_report
         don't draw report.html, which takes up to half of a short run
     texture
-        texture the surface, in mesh.glb and mesh.obj
+        texture the surface in mesh.glb and in the report, of colour images or else of amplitudes
+        (default: if there are enough colour images)
     faces : N
         maximum number of triangles (default: all)
     voxel : LENGTH
@@ -223,7 +224,7 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     out: Path = REQUIRED
     overwrite: bool = False
     no_report: bool = False
-    texture: bool = False
+    texture: bool | None = None
     faces: Count | None = None
     voxel: Length | None = None
     memory: Size | None = None
@@ -399,7 +400,7 @@ class Merge(JsonLines, Seed, Threads, Edited):
     out: Path = REQUIRED
     overwrite: bool = False
     tolerance: Length | None = None
-    texture: bool = False
+    texture: bool | None = None
     faces: Count | None = None
     voxel: Length | None = None
 

@@ -143,12 +143,15 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
 def _texture(
     job: _Job, result: Reconstruction, options: Options, progress: Progress
 ) -> texture.Textured | None:
-    """Make the texture if one is configured; with a note if that is impossible."""
+    """Make the texture unless none is wanted; with a note if one is required and impossible."""
     size = job.config.fusion.texture
     if not size:
         return None
-    texture = texturing.make_texture(job.recording, result, size, options.threads, progress)
-    if texture is None:
+    required = bool(options.texture)
+    texture = texturing.make_texture(
+        job.recording, result, size, options.threads, progress, required=required
+    )
+    if texture is None and required:
         progress.note("no texture: there is no surface, or neither colour nor amplitude")
     return texture
 

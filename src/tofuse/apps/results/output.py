@@ -13,26 +13,28 @@ from tofuse.apps.results.folders import OutputFolder, component_name
 from tofuse.apps.results.run_json import write_run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import job_pool
-from tofuse.engine.fusion import GeometryRecord, Mesh, display_colors, texture
+from tofuse.engine.fusion import GeometryRecord, Mesh, Textured, display_colors
 from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.stopwatch import timing
 from tofuse.formats.export import exchange
-from tofuse.formats.geometry import write_glb, write_obj, write_ply
-from tofuse.formats.images import png_bytes
+from tofuse.formats.geometry import write_glb, write_ply
+from tofuse.formats.images import jpeg_bytes
 from tofuse.formats.poses import write_g2o, write_tum
 
 # Colours of surfaces that changed between sessions, distinguishable by colour-blind people.
 CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
 
+QUALITY = 90  # of a texture as JPEG
+Report = Callable[[Reconstruction, Path, Textured | None], None]
 MAX_PLY_POINTS = 4_000_000  # a larger cloud is compressed
 
 
 def write_result(
     result: Reconstruction,
     folder: OutputFolder,
-    report: Callable[[Reconstruction, Path], None] | None = None,
-    texture: texture.Textured | None = None,
+    report: Report | None = None,
+    texture: Textured | None = None,
 ) -> None:
     """Write all files of a result.
 
@@ -46,9 +48,9 @@ def write_result(
     folder
         The output folder; existing files are replaced together, when all new ones are complete.
     report
-        Writes the report of a result into a folder; None: no report.
+        Writes the report of a result into a folder, with its texture; None: no report.
     texture
-        Texture of the main model for `mesh.glb`; `mesh.obj` is written with it as well.
+        Texture of the main model, for `mesh.glb`.
 
     Raises
     ------
@@ -67,8 +69,8 @@ def write_result(
 def _write_files(
     result: Reconstruction,
     folder: Path,
-    report: Callable[[Reconstruction, Path], None] | None,
-    texture: texture.Textured | None,
+    report: Report | None,
+    texture: Textured | None,
 ) -> None:
     # Both release the interpreter lock for much of their time.
     with job_pool(1, "tofuse-writer") as background:
@@ -78,7 +80,7 @@ def _write_files(
         write_tum(folder / "trajectory.txt", result.timestamps[posed], poses)
         write_g2o(folder / "pose_graph.g2o", result.graph)
         if report is not None:
-            report(result, folder)
+            report(result, folder, texture)
         model.result()
         # Last, since it shares the report's overview of the surface.
         if result.mesh is not None:
@@ -117,7 +119,7 @@ def _write_changes(result: Reconstruction, path: Path) -> None:
 
 
 def _write_scene(
-    mesh: Mesh, T_up_world: Float64, folder: Path, texture: texture.Textured | None
+    mesh: Mesh, T_up_world: Float64, folder: Path, texture: Textured | None
 ) -> None:
     """Write `mesh.glb`, made upright by its node: the overview of the surface, or its texture."""
     node: dict[str, Any] = {"generator": f"tofuse {__version__}", "T_scene_node": T_up_world}
@@ -134,17 +136,16 @@ def _write_scene(
             **node,
         )
         return
-    atlas, image = texture.atlas, png_bytes(texture.image)
-    points, normals = (
-        values[atlas.vertices] for values in (texture.mesh.vertices, texture.mesh.normals)
-    )
-    write_glb(
-        folder / "mesh.glb",
-        GeometryRecord(points, atlas.faces, normals=normals, uv=atlas.uv, texture=image),
-        **node,
-    )
-    R = T_up_world[:3, :3].T
-    write_obj(
-        folder / "mesh.obj",
-        GeometryRecord(points @ R, atlas.faces, normals=normals @ R, uv=atlas.uv, texture=image),
+    write_glb(folder / "mesh.glb", textured_record(texture), **node)
+
+
+def textured_record(texture: Textured) -> GeometryRecord:
+    """Return a surface with its texture as a JPEG, in the world frame."""
+    shown = texture.charts
+    return GeometryRecord(
+        shown.vertices,
+        shown.faces,
+        normals=shown.normals,
+        uv=texture.atlas.uv,
+        texture=jpeg_bytes(texture.image, QUALITY),
     )

@@ -112,7 +112,7 @@ class TextureView:
         """
         z = np.asarray(frame.z, np.float32)
         projection = Projection.of(frame.camera, 1)
-        if frame.color_image is not None:
+        if frame.color_image is not None and frame.color_registered:
             image = frame.color_image if image is None else image
             known = frame.color_image.any(-1)  # else the colour camera didn't see it
             return cls(z, known, np.ascontiguousarray(image), projection)

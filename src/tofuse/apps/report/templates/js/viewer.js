@@ -18,10 +18,13 @@ async function startViewer(box, scene, bus) {
     points = { ...shared, count: scene.count };
     if (scene.model.faces) {
       const faces = await unpack(scene.model.faces, Uint32Array, 3);
+      const picture = scene.model.texture ? await painter.picture(scene.model.texture) : null;
+      if (picture) Object.assign(shared, { picture, uv: await buffered(scene.model.uv, Uint16Array, 2) });
       surface = { ...shared, faces: painter.indices(faces), count: faces.length };
       for (const most of COARSE) {
         const fewer = faces.length > 3 * most ? clustered(place, faces, scene.extent, most) : faces;
-        coarse.push({ ...shared, faces: painter.indices(fewer), count: fewer.length });
+        // Merged vertices are in other charts of the texture: their own colours are shown.
+        coarse.push({ ...shared, uv: fewer === faces ? shared.uv : null, faces: painter.indices(fewer), count: fewer.length });
       }
     }
   }
