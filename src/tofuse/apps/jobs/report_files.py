@@ -32,6 +32,8 @@ def write_report_files(
     result: Reconstruction,
     folder: Path,
     texture: Textured | None = None,
+    *,
+    share: bool = False,
 ) -> None:
     """Write `report.html` into a folder."""
     with timing("imports"):
@@ -53,6 +55,7 @@ def write_report_files(
         truth_points=truth,
         clouds=tuple(item for item in clouds if isinstance(item, CloudFrame)),
         texture=texture,
+        share=share and component is None,
     )
     write_report(result, folder / "report.html", extras)
 

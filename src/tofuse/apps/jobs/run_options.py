@@ -82,6 +82,7 @@ class Options(OpeningOptions, ModelOptions):
     memory: int | None = None
     overwrite: bool = False
     no_report: bool = False
+    share: bool = False
 
 
 def resolve(options: Options, kind: ViewKind = "range") -> Config:

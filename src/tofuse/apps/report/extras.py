@@ -33,6 +33,8 @@ class ReportExtras:
         The rig, with the distances between overlapping surfaces of its cameras in this recording.
     texture
         The surface with a texture, if there is one.
+    share
+        Whether to write a small page with the model alone as well.
     """
 
     title: str
@@ -43,3 +45,4 @@ class ReportExtras:
     headline: str = ""
     rig: Rig | None = None
     texture: Textured | None = None
+    share: bool = False

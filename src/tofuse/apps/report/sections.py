@@ -25,14 +25,22 @@ Section = Callable[[Subject], Values | None]
 
 
 def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> None:
-    """Write `report.html` of a result to `path`, atomically.
+    """Write `report.html` of a result to `path`, atomically; and `share.html` if wanted.
 
     Raises
     ------
     OutputError
         If the file can't be written; an earlier one is unchanged then.
     """
-    write_page(path, "report.html.j2", script=script(), **sections(result, extras))
+    values = sections(result, extras)
+    write_page(path, "report.html.j2", script=script(), **values)
+    if extras.share:
+        scene = values["scene"]
+        if scene is not None:
+            fields = {k: v for k, v in scene["fields"].items() if k == "accuracy"}
+            scene = scene | {"fields": fields, "lines": {}, "frames": None}
+        values |= {"scene": scene}
+        write_page(path.with_name("share.html"), "share.html.j2", script=script(), **values)
 
 
 def sections(result: Reconstruction, extras: ReportExtras) -> Values:

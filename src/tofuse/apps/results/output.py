@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from tofuse.apps.results.folders import OutputFolder, component_name
 from tofuse.apps.results.run_json import write_run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import job_pool
-from tofuse.engine.fusion import GeometryRecord, Mesh, Textured, display_colors
+from tofuse.engine.fusion import GeometryRecord, Mesh, Textured, display_colors, texture
 from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.stopwatch import timing
@@ -25,6 +26,8 @@ from tofuse.formats.poses import write_g2o, write_tum
 # Colours of surfaces that changed between sessions, distinguishable by colour-blind people.
 CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
 
+# Of a simplified surface whose texture is made of the colours of its vertices.
+DISPLAY_FACES, _TEXTURE_SIZE = 60_000, 2048
 QUALITY = 90  # of a texture as JPEG
 Report = Callable[[Reconstruction, Path, Textured | None], None]
 MAX_PLY_POINTS = 4_000_000  # a larger cloud is compressed
@@ -35,6 +38,7 @@ def write_result(
     folder: OutputFolder,
     report: Report | None = None,
     texture: Textured | None = None,
+    share: bool = False,
 ) -> None:
     """Write all files of a result.
 
@@ -51,6 +55,8 @@ def write_result(
         Writes the report of a result into a folder, with its texture; None: no report.
     texture
         Texture of the main model, for `mesh.glb`.
+    share
+        Whether to write `share.usdz` as well.
 
     Raises
     ------
@@ -64,6 +70,10 @@ def write_result(
                 component_folder.mkdir()
                 _write_files(component.result, component_folder, report, None)
         _write_files(result, staging, report, texture)
+        if share and result.mesh is not None and len(result.mesh.faces):
+            record = display_record(result.mesh) if texture is None else textured_record(texture)
+            R = result.T_up_world[:3, :3]
+            exchange.save(record, staging / "share.usdz", R)
 
 
 def _write_files(
@@ -137,6 +147,13 @@ def _write_scene(
         )
         return
     write_glb(folder / "mesh.glb", textured_record(texture), **node)
+
+
+def display_record(mesh: Mesh, faces: int = DISPLAY_FACES) -> GeometryRecord:
+    """Return a simplified surface with the colours of its vertices in a texture."""
+    if mesh.color is None:
+        mesh = replace(mesh, color=np.zeros_like(mesh.vertices, np.uint8))
+    return textured_record(texture.baked(mesh, faces, _TEXTURE_SIZE))
 
 
 def textured_record(texture: Textured) -> GeometryRecord:

@@ -101,7 +101,7 @@ def run_rig(
                     recording, result.result, size, options.threads, progress, required=required
                 )
             progress.stage("writing")
-            _write(result, recording, folder, texture)
+            _write(result, recording, folder, texture, share=options.share)
     return result
 
 
@@ -304,6 +304,8 @@ def _write(
     recording: Recording,
     folder: folders.OutputFolder,
     texture: Textured | None,
+    *,
+    share: bool,
 ) -> None:
     from tofuse.apps.report import ReportExtras, write_report
 
@@ -311,10 +313,10 @@ def _write(
         source = recording.source
         assert isinstance(source, RigSource)
         cameras = ", ".join(camera.name for camera in source.rig.cameras)
-        extras = ReportExtras(f"rig of {cameras}", rig=rig_result.rig, texture=texture)
+        extras = ReportExtras(f"rig of {cameras}", rig=rig_result.rig, texture=texture, share=share)
         write_report(result, target / "report.html", extras)
         if result is rig_result.result:
             posed = np.isfinite(rig_result.poses[:, 0, 0])
             write_tum(target / TRAJECTORY, rig_result.times[posed], rig_result.poses[posed])
 
-    write_result(rig_result.result, folder, report, texture)
+    write_result(rig_result.result, folder, report, texture, share)

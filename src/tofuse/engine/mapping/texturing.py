@@ -18,7 +18,7 @@ from tofuse.engine.sensor import CameraErrors
 
 # Maximum number of views and of textured triangles: more improve little. Images are reduced to at
 # most so many pixels together.
-_VIEWS, _FACES, _PIXELS = 60, 150_000, 60_000_000
+_VIEWS, _FACES, _PIXELS = 60, 100_000, 60_000_000
 # Unless a texture is required: minimum fraction of the surface that the images show, and of their
 # pixels per vertex. With less, vertices hold as many colours, and their images show more of it.
 _MIN_COVERAGE, _MIN_DETAIL = 0.5, 2.0

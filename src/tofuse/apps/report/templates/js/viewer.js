@@ -52,7 +52,7 @@ async function startViewer(box, scene, bus) {
   }
 
   const chosenOf = (name) => { const input = box.querySelector(`[name=${name}]`); return input ? input.value : ""; };
-  const on = (name) => { const input = box.querySelector(`[name=${name}]`); return Boolean(input && input.checked); };
+  const on = (name) => { const input = box.querySelector(`[name=${name}]`); return input ? input.checked : Boolean(ALONE[name]); };
   const view = makeEye(canvas, scene, draw);
   const section = makeSection(box, scene, draw);
   const sigmaOf = (value) => {
@@ -69,7 +69,7 @@ async function startViewer(box, scene, bus) {
     const dressed = (set) => ({ ...set, value: field ? field.values : null, ends: field ? field.ends : null });
     const out = [];
     if (surface && on("mesh")) out.push(dressed(detail ? coarse[detail - 1] : surface));
-    if (points && on("points")) out.push(dressed(points));
+    if (points && on("points") && !(surface && !box.querySelector("[name=points]"))) out.push(dressed(points));
     return out;
   }
   const options = () => ({ peel: on("peel") });
@@ -231,6 +231,8 @@ async function startViewer(box, scene, bus) {
   new ResizeObserver(draw).observe(canvas);
 }
 
+// What a page without switches shows; points where there is no surface.
+const ALONE = { mesh: true, points: true, peel: true };
 const COARSE = [60000, 20000];  // triangles of a surface that moves, where all of them are too many
 const EFFORTS = [[0, 1], [1, 1], [1, 0.75], [2, 0.75], [2, 0.5]];  // which of them, and how many pixels
 
