@@ -102,15 +102,25 @@ def _write_files(
 def _write_model(result: Reconstruction, folder: Path) -> None:
     """Write cloud and surface, in the world frame."""
     # In the coordinates of the input's files, also where float32 doesn't hold them.
-    cloud = result.cloud.record().shifted(result.shift)
+    cloud = _without_black(result.cloud.record()).shifted(result.shift)
     if len(result.cloud) > MAX_PLY_POINTS:
         exchange.save(cloud, folder / "cloud.laz")
     else:
         write_ply(folder / "cloud.ply", cloud)
     if result.mesh is not None:
-        write_ply(folder / "mesh.ply", result.mesh.record())
+        write_ply(folder / "mesh.ply", _without_black(result.mesh.record()))
     if result.changes:
         _write_changes(result, folder / "changes.ply")
+
+
+def _without_black(record: GeometryRecord) -> GeometryRecord:
+    """Return a model with a neutral grey where no colour image shows it.
+
+    Black amplitudes are measured ones.
+    """
+    if record.color is None or (record.color == record.color[:, :1]).all():
+        return record
+    return replace(record, color=display_colors(record.color))
 
 
 def _write_changes(result: Reconstruction, path: Path) -> None:

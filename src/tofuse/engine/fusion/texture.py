@@ -454,14 +454,14 @@ def _gains(logs: Float64, weights: Float64) -> Float64:
 
 
 def _filled(image: UInt8, mask: Bool) -> UInt8:
-    """Fill empty texels smoothly with the colours around them, so that nothing bleeds into charts.
+    """Fill empty texels, which are 0, with the colours around them: none bleeds into charts.
 
     From coarser to finer levels (pull and push; Gortler et al. 1996).
     """
     if mask.all() or not mask.any():
         return image
     weights, levels = [], []
-    weight, color = mask.astype(np.float32), np.where(mask[..., None], image, 0).astype(np.uint8)
+    weight, color = mask.astype(np.float32), image
     while max(weight.shape) > 1:
         size = [max(1, -(-n // 2)) for n in weight.shape[::-1]]
         sums = cv2.resize(color, size, interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -475,4 +475,4 @@ def _filled(image: UInt8, mask: Bool) -> UInt8:
         fill = cv2.resize(fill, weight.shape[::-1]).reshape(level.shape)
         fill += weight[..., None] * (level - fill)
     smooth = cv2.resize(np.round(fill.clip(0, 255)).astype(np.uint8), mask.shape[::-1])
-    return np.where(mask[..., None], image, smooth)
+    return np.asarray(cv2.copyTo(image, mask.astype(np.uint8), smooth), np.uint8)

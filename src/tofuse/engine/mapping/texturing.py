@@ -73,7 +73,7 @@ def make_texture(
             frame = corrector.apply(frame)
         if not isinstance(frame, RangeFrame) or (frame.color_image is None and not required):
             continue
-        view = texture.TextureView.of(frame, _full_image(recording, frame, most_pixels))
+        view = texture.TextureView.of(frame, full_image(recording, frame, most_pixels))
         if view is not None:
             views.append(view)
             poses.append(result.trajectory[k])
@@ -99,7 +99,7 @@ def _origin(source: Source, index: int) -> tuple[Source, int]:
     return source, index
 
 
-def _full_image(recording: Recording, frame: RangeFrame, most_pixels: int) -> UInt8 | None:
+def full_image(recording: Recording, frame: RangeFrame, most_pixels: int) -> UInt8 | None:
     """Return the colour of a frame as recorded, if it is finer than that at the depth's size."""
     source, index = _origin(recording.source, frame.index)
     read = getattr(source, "full_resolution_color", None)
