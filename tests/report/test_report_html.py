@@ -117,6 +117,7 @@ def shown(tmp_path_factory):
 
 ORDER = [
     "model",
+    "summary",
     "verdict",
     "frames",
     "views",

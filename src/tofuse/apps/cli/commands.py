@@ -96,10 +96,11 @@ def progress_unless_json(
 def run(arguments: cli.Run) -> int:
     """``tofuse run``."""
     from tofuse.apps.cli import stage_times
+    from tofuse.formats.recordings import unzipped
     from tofuse.formats.rigs import recordings_of, rig_file_in
 
     if arguments.rig is None and len(arguments.inputs) == 1:
-        arguments.rig = rig_file_in(arguments.inputs[0])
+        arguments.rig = rig_file_in(unzipped(arguments.inputs[0]))
         if arguments.rig is not None:
             arguments.inputs = [str(path) for path in recordings_of(arguments.rig).values()]
     if arguments.rig is not None:

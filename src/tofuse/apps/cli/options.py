@@ -163,8 +163,11 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
         replace an existing result in --out
     no_report
         don't draw report.html, which takes up to half of a short run
+    share
+        write share.html and share.usdz as well: the model alone, to send and to show in a room
     texture
-        texture the surface, in mesh.glb and mesh.obj
+        texture the surface in mesh.glb and in the report, of colour images or else of amplitudes
+        (default: if there are enough colour images)
     faces : N
         maximum number of triangles (default: all)
     voxel : LENGTH
@@ -223,7 +226,8 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     out: Path = REQUIRED
     overwrite: bool = False
     no_report: bool = False
-    texture: bool = False
+    share: bool = False
+    texture: bool | None = None
     faces: Count | None = None
     voxel: Length | None = None
     memory: Size | None = None
@@ -399,7 +403,7 @@ class Merge(JsonLines, Seed, Threads, Edited):
     out: Path = REQUIRED
     overwrite: bool = False
     tolerance: Length | None = None
-    texture: bool = False
+    texture: bool | None = None
     faces: Count | None = None
     voxel: Length | None = None
 

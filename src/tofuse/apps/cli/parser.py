@@ -207,7 +207,7 @@ def _add_options(parser: argparse.ArgumentParser, command: type[Command]) -> Non
                     containers[command] = container.add_mutually_exclusive_group()
                 container = containers[command]
             option, settings = _settings(name, hint, vars(base))
-            if settings.get("action") != "store_true":
+            if "action" not in settings:
                 settings["metavar"] = metavar
             container.add_argument(option, help=help_text, **settings)
 
@@ -218,6 +218,8 @@ def _settings(name: str, hint: Any, defaults: Mapping[str, Any]) -> tuple[str, d
     default = defaults.get(name)
     if hint is bool:
         return option, {"action": "store_true"}
+    if hint == bool | None:
+        return option, {"action": argparse.BooleanOptionalAction, "default": default}
     settings: dict[str, Any] = {"default": default}
     if default is REQUIRED:
         settings = {"required": True}

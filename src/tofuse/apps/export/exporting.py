@@ -16,6 +16,7 @@ from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion import GeometryRecord, Mesh, texture
 from tofuse.formats.export import exchange
 from tofuse.formats.files import atomic, staging, stamps
+from tofuse.formats.geometry import read_textured_glb
 from tofuse.formats.images import jpeg_bytes
 from tofuse.formats.poses import associate, read_tum, write_kitti, write_log
 
@@ -69,7 +70,17 @@ class _Result:
 
     @cached_property
     def textured(self) -> GeometryRecord:
-        """The simplified mesh, with its colours in a texture unless that takes too long."""
+        """The surface with the texture of mesh.glb; else simplified, with its colours in a texture.
+
+        Without a texture if that takes too long.
+        """
+        found = None if self.faces else read_textured_glb(self.folder / "mesh.glb")
+        if found is not None:
+            record, in_world = found
+            if in_world:
+                return record
+            points, normals = (v @ self.R_up_world for v in (record.points, record.normals))
+            return replace(record, points=points, normals=normals)
         max_faces = self.faces or FACES
         n_faces = min(max_faces, len(self.mesh.faces))
         if self.mesh.color is None or not 0 < n_faces <= _MAX_TEXTURED_FACES:
@@ -145,6 +156,7 @@ FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
     "glb": ("mesh.glb", _mesh),
     "gltf": ("mesh.gltf", _mesh),
     "obj": ("mesh.obj", _mesh),
+    "usdz": ("mesh.usdz", _mesh),
     "stl": ("mesh.stl", _stl),
     "kitti": ("trajectory.kitti.txt", _kitti),
     "log": ("trajectory.log", _log),

@@ -184,10 +184,9 @@ class _Renderer:
         """(H, W, 3) RGB of a frame, black where unknown; None without colour and amplitude."""
         if frame.color_image is not None and frame.color_registered:
             return frame.color_image
-        view = texture.TextureView.of(replace(frame, color_image=None))
-        if view is None:
+        intensity = texture.albedo(frame)
+        if intensity is None:
             return None
-        intensity = view.intensity[..., 0]
         lit = intensity > 0
         if self._white is None and lit.any():
             self._white = float(np.percentile(intensity[lit], _WHITE_PERCENTILE))

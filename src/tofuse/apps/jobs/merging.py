@@ -290,7 +290,12 @@ def merge_files(
         if config.fusion.texture:
             recording, _ = joined_recording(sessions)
             texture = texturing.make_texture(
-                recording, result, config.fusion.texture, options.threads, progress
+                recording,
+                result,
+                config.fusion.texture,
+                options.threads,
+                progress,
+                required=bool(options.texture),
             )
         progress.stage("writing")
         with threadpool_limits(1):
@@ -298,12 +303,13 @@ def merge_files(
     return result
 
 
-def _report(result: Reconstruction, folder: Path) -> None:
+def _report(result: Reconstruction, folder: Path, texture: Textured | None) -> None:
     from tofuse.apps.report import ReportExtras, write_report
 
     names = ", ".join(session.name for session in result.sessions)
     extras = ReportExtras(
         title=f"{names} merged" if names else f"{folder.name} of a merged result",
         headline=" ".join(session_words.session_sentences(result)),
+        texture=texture,
     )
     write_report(result, folder / "report.html", extras)

@@ -13,6 +13,7 @@ from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.filters import apply_filters
 from tofuse.engine.frames import CloudFrame, Frame, Recording
+from tofuse.engine.fusion import Textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Config, changed, reconstructing
 from tofuse.engine.parts import name_of
@@ -26,7 +27,13 @@ _TRUTH_POINTS = 100_000
 
 @timing("report")
 def write_report_files(
-    recording: Recording, config: Config, result: Reconstruction, folder: Path
+    recording: Recording,
+    config: Config,
+    result: Reconstruction,
+    folder: Path,
+    texture: Textured | None = None,
+    *,
+    share: bool = False,
 ) -> None:
     """Write `report.html` into a folder."""
     with timing("imports"):
@@ -47,6 +54,8 @@ def write_report_files(
         reference=reference_in_world(recording, result),
         truth_points=truth,
         clouds=tuple(item for item in clouds if isinstance(item, CloudFrame)),
+        texture=texture,
+        share=share and component is None,
     )
     write_report(result, folder / "report.html", extras)
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from tofuse.apps.results import run_json
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
+from tofuse.engine.fusion import Fusion
 from tofuse.engine.mapping import (
     MIN_MEMORY_MB,
     Config,
@@ -16,7 +17,6 @@ from tofuse.engine.mapping import (
     adaptation,
     changed,
     from_method,
-    texturing,
 )
 from tofuse.engine.sensor import range_and_amplitude
 from tofuse.formats.files import reading
@@ -36,7 +36,7 @@ class ModelOptions:
     tolerance
         Accuracy required of a good model, m.
     texture
-        Whether the surface gets a texture.
+        Whether the surface gets a texture; None where colour images are fit for one.
     faces
         Maximum number of triangles.
     voxel
@@ -44,13 +44,13 @@ class ModelOptions:
     """
 
     tolerance: float | None = None
-    texture: bool = False
+    texture: bool | None = None
     faces: int | None = None
     voxel: float | None = None
 
     def applied(self, config: Config) -> Config:
         """Return the configuration with these options."""
-        texture = texturing.TEXTURE if self.texture and not config.fusion.texture else None
+        texture = {None: None, False: 0, True: config.fusion.texture or Fusion.texture}[self.texture]
         options: tuple[tuple[str, object, dict[str, Any]], ...] = (
             ("texture", texture, {"fusion": {"texture": texture}}),
             ("faces", self.faces, {"fusion": {"faces": self.faces}}),
@@ -82,6 +82,7 @@ class Options(OpeningOptions, ModelOptions):
     memory: int | None = None
     overwrite: bool = False
     no_report: bool = False
+    share: bool = False
 
 
 def resolve(options: Options, kind: ViewKind = "range") -> Config:

@@ -59,6 +59,10 @@ def run(
         If nothing could be written; see the message for the remedy.
     """
     progress = progress or Silent()
+    if options.share and options.no_report:
+        raise InputError(
+            "is a part of the report", where="--share", remedy="leave --no-report out"
+        )
     if folder is None:
         folders.check_output(options.out, overwrite=options.overwrite)
     job = _open(inputs, options, progress)
@@ -88,8 +92,12 @@ def run(
             # BLAS results depend on its number of threads, and idle threads busy-wait.
             with threadpool_limits(1), timing("writing"):
                 trim_memory()
-                report = partial(write_report_files, job.recording, job.config)
-                write_result(result, out, None if options.no_report else report, texture)
+                report = partial(
+                    write_report_files, job.recording, job.config, share=options.share
+                )
+                write_result(
+                    result, out, None if options.no_report else report, texture, options.share
+                )
         except BaseException as error:
             if tracked_file is not None:
                 tracked_file.keep_after(error)
@@ -143,12 +151,15 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
 def _texture(
     job: _Job, result: Reconstruction, options: Options, progress: Progress
 ) -> texture.Textured | None:
-    """Make the texture if one is configured; with a note if that is impossible."""
+    """Make the texture unless none is wanted; with a note if one is required and impossible."""
     size = job.config.fusion.texture
     if not size:
         return None
-    texture = texturing.make_texture(job.recording, result, size, options.threads, progress)
-    if texture is None:
+    required = bool(options.texture)
+    texture = texturing.make_texture(
+        job.recording, result, size, options.threads, progress, required=required
+    )
+    if texture is None and required:
         progress.note("no texture: there is no surface, or neither colour nor amplitude")
     return texture
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.frames import CloudFrame, Frame
+from tofuse.engine.fusion import Textured
 from tofuse.formats.rigs import Rig
 
 
@@ -30,6 +31,10 @@ class ReportExtras:
         Text above everything else; may be empty.
     rig
         The rig, with the distances between overlapping surfaces of its cameras in this recording.
+    texture
+        The surface with a texture, if there is one.
+    share
+        Whether to write a small page with the model alone as well.
     """
 
     title: str
@@ -39,3 +44,5 @@ class ReportExtras:
     clouds: tuple[CloudFrame, ...] = ()
     headline: str = ""
     rig: Rig | None = None
+    texture: Textured | None = None
+    share: bool = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -11,10 +12,12 @@ import numpy as np
 from tofuse.apps.report import thumbnails
 from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
-from tofuse.engine.fusion import Cloud, Mesh, display_colors
+from tofuse.engine.fusion import Cloud, Mesh, Textured, display_colors
 from tofuse.engine.results import Reconstruction
+from tofuse.formats.images import jpeg_bytes
 
 MAX_POINTS = 150_000
+JPEG_QUALITY = 88  # of a texture
 _MAX_SEGMENTS = 1000  # segments of a trajectory
 _MAX_EXTENT_RATIO = 1.8  # of model and cameras to the model; beyond, cameras are not framed
 _MAX_NORMALS, _MIN_AREA_RATIO = 5000, 1.05  # sampled normals; area to the default view's
@@ -47,6 +50,8 @@ class Scene:
         (L, 2, 3) camera centres of the accepted loop closures.
     surface
         The full surface; None without one.
+    texture
+        The texture of the surface, which is then `Textured.charts`; None without one.
     sigma, views
         (K,) standard deviation of the points, m, and (K,) number of views that observed them; None
         if unknown.
@@ -62,6 +67,7 @@ class Scene:
     reference: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
     loops: Float64 = field(default_factory=lambda: np.zeros((0, 2, 3)))
     surface: Mesh | None = None
+    texture: Textured | None = None
     sigma: Float32 | None = None
     views: Int32 | None = None
 
@@ -70,7 +76,7 @@ class Scene:
         """The surface, simplified for a browser on a phone; None without one."""
         if self.surface is None or len(self.surface.faces) == 0:
             return None
-        return self.surface.overview
+        return self.surface if self.texture is not None else self.surface.overview
 
     @property
     def box(self) -> Float64:
@@ -144,7 +150,10 @@ def finite_poses(poses: Float64 | None) -> Float64:
 
 
 def make_scene(
-    result: Reconstruction, rows: dict[int, int], reference: Float64 | None = None
+    result: Reconstruction,
+    rows: dict[int, int],
+    reference: Float64 | None = None,
+    texture: Textured | None = None,
 ) -> Scene:
     """Collect and subsample the content of the 3D view.
 
@@ -156,6 +165,8 @@ def make_scene(
         Row of the trajectory, by frame index.
     reference
         (N, 4, 4) reference poses, NaN where there is none; or None.
+    texture
+        The surface with a texture, if there is one.
     """
     cloud = result.cloud
     sampled = random_subset(len(cloud), MAX_POINTS)
@@ -178,7 +189,8 @@ def make_scene(
         finite_poses(result.trajectory),
         finite_poses(reference),
         loops[np.isfinite(loops).all((1, 2))],
-        _display_colors(result.mesh),
+        _display_colors(result.mesh) if texture is None else texture.charts,
+        texture,
         None if cloud.sigma is None else cloud.sigma[sampled],
         None if cloud.views is None else cloud.views[sampled],
     )
@@ -224,7 +236,16 @@ def _packed_model(scene: Scene, steps: UInt16) -> dict[str, Any]:
         "colors": pack(colors),
         "normals": None if normals is None else pack(normal_bytes(normals)),
         "faces": faces,
+        **_packed_texture(scene.texture),
     }
+
+
+def _packed_texture(texture: Textured | None) -> dict[str, Any]:
+    if texture is None:
+        return {"uv": None, "texture": None}
+    uv = quantized(texture.atlas.uv.astype(float), np.zeros(2), np.ones(2))
+    image = base64.b64encode(jpeg_bytes(texture.image, JPEG_QUALITY)).decode()
+    return {"uv": pack(uv), "texture": f"data:image/jpeg;base64,{image}"}
 
 
 def _display_colors(mesh: Mesh | None) -> Mesh | None:

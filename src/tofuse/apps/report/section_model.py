@@ -10,7 +10,7 @@ from tofuse.apps.report import plots, thumbnails, words
 from tofuse.apps.report.fields import accuracy, fields
 from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import CAMERA_COLORS, opening_yaw, packed, render
-from tofuse.apps.report.subject import OUTER, Subject, Values
+from tofuse.apps.report.subject import OUTER_ENDS, Subject, Values
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole, RayTable
 from tofuse.engine.frames import RangeFrame
@@ -35,8 +35,9 @@ def model(s: Subject) -> Values:
     names = rig["cameras"] if rig else ()
     colors = [CAMERA_COLORS[k % len(CAMERA_COLORS)] for k in range(len(names))]
     color_source = _color_source(s)
-    if scene.mesh is not None and scene.surface is not None:
-        thinned = words.thinned(len(scene.mesh.faces), len(scene.surface.faces), "triangles")
+    if scene.mesh is not None:
+        total = 0 if s.result.mesh is None else len(s.result.mesh.faces)
+        thinned = words.thinned(len(scene.mesh.faces), total, "triangles")
     else:
         thinned = words.thinned(len(scene.points), scene.total, "points")
     return {
@@ -135,7 +136,7 @@ def views(s: Subject) -> Values:
     truth = None if s.truth is None else s.truth @ R.T
 
     def drawing(points: Float64, poses: Float64, view: str, name: str) -> Values:
-        measured = np.percentile(points, [OUTER, 100 - OUTER], axis=0)
+        measured = np.percentile(points, OUTER_ENDS, axis=0)
         path, label = poses[:, :3, 3] @ R.T, f"Model, {name}"
         return plots.model(points, path, truth, view, measured=measured, label=label)
 
@@ -152,7 +153,7 @@ def views(s: Subject) -> Values:
     every = s.result.cloud.points @ R.T.astype(np.float32)
     every = every[np.isfinite(every).all(1)]
     sizes = [
-        np.ptp(np.percentile(points, [OUTER, 100 - OUTER], axis=0), axis=0),
+        np.ptp(np.percentile(points, OUTER_ENDS, axis=0), axis=0),
         np.ptp(every, axis=0),
         np.zeros(3) if truth is None else np.ptp(truth, axis=0),
     ]

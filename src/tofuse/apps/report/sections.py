@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from tofuse._version import __version__
 from tofuse.apps.report import (
     section_frames,
@@ -15,7 +17,7 @@ from tofuse.apps.report import (
 )
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.html import script, write_page
-from tofuse.apps.report.subject import Subject, Values
+from tofuse.apps.report.subject import OUTER_ENDS, Subject, Values
 from tofuse.engine.compute import job_pool
 from tofuse.engine.results import Reconstruction, accuracy_card
 
@@ -23,14 +25,22 @@ Section = Callable[[Subject], Values | None]
 
 
 def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> None:
-    """Write `report.html` of a result to `path`, atomically.
+    """Write `report.html` of a result to `path`, atomically; and `share.html` if wanted.
 
     Raises
     ------
     OutputError
         If the file can't be written; an earlier one is unchanged then.
     """
-    write_page(path, "report.html.j2", script=script(charts=True), **sections(result, extras))
+    values = sections(result, extras)
+    write_page(path, "report.html.j2", script=script(charts=True), **values)
+    if extras.share:
+        scene = values["scene"]
+        if scene is not None:
+            fields = {k: v for k, v in scene["fields"].items() if k == "accuracy"}
+            scene = scene | {"fields": fields, "lines": {}, "frames": None}
+        values |= {"scene": scene}
+        write_page(path.with_name("share.html"), "share.html.j2", script=script(), **values)
 
 
 def sections(result: Reconstruction, extras: ReportExtras) -> Values:
@@ -81,6 +91,9 @@ def _verdict(s: Subject) -> Values:
         "bound": accuracy_card.bound(a, s.result.cloud.diagonal_m).removeprefix("accuracy "),
         "weakest": accuracy_card.weakest_frame(a),
         "frames": frames,
+        "plain": _plain(s),
+        "outcome": _OUTCOMES[d.verdict],
+        "advice": "" if d.verdict == "good" else accuracy_card.advice(d.reasons),
         "card_tone": d.verdict if d.accuracy.assessed else "",
         "tone": d.verdict,
         "posed": int(s.result.has_pose.sum()),
@@ -88,6 +101,27 @@ def _verdict(s: Subject) -> Values:
         "decisive": any(f["level"] == d.verdict for f in findings),
         "findings": findings,
     }
+
+
+_OUTCOMES = {
+    "good": "No problems were found.",
+    "degraded": "Use it with care: parts of it may be off.",
+    "failed": "Do not rely on it: its shape may be wrong.",
+}
+
+
+def _plain(s: Subject) -> str:
+    """Return size and accuracy in one sentence for everybody."""
+    if not len(s.scene.points):
+        return "There is no model."
+    sizes = np.ptp(np.percentile(s.scene.points @ s.R_display_world.T, OUTER_ENDS, axis=0), axis=0)
+    width, height, depth = map(words.length, sizes.tolist())
+    accuracy = s.result.diagnostics.accuracy
+    if accuracy.assessed and np.isfinite(accuracy.position_m):
+        known = f"accurate to about {words.length(accuracy.position_m)}"
+    else:
+        known = "but how accurate it is could not be determined"
+    return f"It is {width} wide, {height} high and {depth} deep, {known}."
 
 
 def _settings(s: Subject) -> Values:

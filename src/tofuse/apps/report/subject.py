@@ -16,6 +16,7 @@ from tofuse.engine.results import Reconstruction
 Values = dict[str, Any]
 
 OUTER = 0.25  # percent of the points at each end that the measured size excludes
+OUTER_ENDS = (OUTER, 100 - OUTER)
 ROWS = 150  # maximum in a table
 _ANGLES = np.arange(-44.5, 45.5, 0.5)[:, None]  # degrees
 _MIN_BOX_FILL = 0.9  # minimum fraction of a box in the hull of points that have its shape
@@ -64,7 +65,7 @@ class Subject:
             or len(finite_poses(reference[result.has_pose])) == 0
         ):
             reference = None
-        scene = make_scene(result, rows, reference)
+        scene = make_scene(result, rows, reference, extras.texture)
         truth = extras.truth_points
         if truth is not None:
             truth = truth[np.isfinite(truth).all(1)]

@@ -22,10 +22,10 @@ RECORDING = "recording"  # written by `tofuse demo` next to its result, and kept
 # Files of a result, by `tofuse run` and `tofuse export`; all of them are removed with it.
 _FILE = (
     r"trajectory\.(txt|kitti\.txt|log)|rig_trajectory\.txt|pose_graph\.g2o|changes\.ply|"
-    r"cloud\.(ply|pcd|las|laz|e57)|mesh\.(ply|glb|gltf|obj|mtl|png|jpg|stl)|"
-    r"report\.html|(run|judge)\.json|"
+    r"cloud\.(ply|pcd|las|laz|e57)|mesh\.(ply|glb|gltf|obj|mtl|png|jpg|stl|usdz)|"
+    r"report\.html|share\.(html|usdz)|(run|judge)\.json|"
     # Of version 0.2 only.
-    r"view\.npz|mesh\.usdz|tiles/(tileset\.json|\d{1,4}(-\d{1,9}){3}\.glb)"
+    r"view\.npz|tiles/(tileset\.json|\d{1,4}(-\d{1,9}){3}\.glb)"
 )
 # The model of a separate component is in its own folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)

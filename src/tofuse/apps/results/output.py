@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,26 +14,31 @@ from tofuse.apps.results.folders import OutputFolder, component_name
 from tofuse.apps.results.run_json import write_run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import job_pool
-from tofuse.engine.fusion import GeometryRecord, Mesh, display_colors, texture
+from tofuse.engine.fusion import GeometryRecord, Mesh, Textured, display_colors, texture
 from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.stopwatch import timing
 from tofuse.formats.export import exchange
-from tofuse.formats.geometry import write_glb, write_obj, write_ply
-from tofuse.formats.images import png_bytes
+from tofuse.formats.geometry import write_glb, write_ply
+from tofuse.formats.images import jpeg_bytes
 from tofuse.formats.poses import write_g2o, write_tum
 
 # Colours of surfaces that changed between sessions, distinguishable by colour-blind people.
 CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
 
+# Of a simplified surface whose texture is made of the colours of its vertices.
+DISPLAY_FACES, _TEXTURE_SIZE = 60_000, 2048
+QUALITY = 90  # of a texture as JPEG
+Report = Callable[[Reconstruction, Path, Textured | None], None]
 MAX_PLY_POINTS = 4_000_000  # a larger cloud is compressed
 
 
 def write_result(
     result: Reconstruction,
     folder: OutputFolder,
-    report: Callable[[Reconstruction, Path], None] | None = None,
-    texture: texture.Textured | None = None,
+    report: Report | None = None,
+    texture: Textured | None = None,
+    share: bool = False,
 ) -> None:
     """Write all files of a result.
 
@@ -46,9 +52,11 @@ def write_result(
     folder
         The output folder; existing files are replaced together, when all new ones are complete.
     report
-        Writes the report of a result into a folder; None: no report.
+        Writes the report of a result into a folder, with its texture; None: no report.
     texture
-        Texture of the main model for `mesh.glb`; `mesh.obj` is written with it as well.
+        Texture of the main model, for `mesh.glb`.
+    share
+        Whether to write `share.usdz` as well.
 
     Raises
     ------
@@ -62,13 +70,17 @@ def write_result(
                 component_folder.mkdir()
                 _write_files(component.result, component_folder, report, None)
         _write_files(result, staging, report, texture)
+        if share and result.mesh is not None and len(result.mesh.faces):
+            record = display_record(result.mesh) if texture is None else textured_record(texture)
+            R = result.T_up_world[:3, :3]
+            exchange.save(record, staging / "share.usdz", R)
 
 
 def _write_files(
     result: Reconstruction,
     folder: Path,
-    report: Callable[[Reconstruction, Path], None] | None,
-    texture: texture.Textured | None,
+    report: Report | None,
+    texture: Textured | None,
 ) -> None:
     # Both release the interpreter lock for much of their time.
     with job_pool(1, "tofuse-writer") as background:
@@ -78,7 +90,7 @@ def _write_files(
         write_tum(folder / "trajectory.txt", result.timestamps[posed], poses)
         write_g2o(folder / "pose_graph.g2o", result.graph)
         if report is not None:
-            report(result, folder)
+            report(result, folder, texture)
         model.result()
         # Last, since it shares the report's overview of the surface.
         if result.mesh is not None:
@@ -90,15 +102,25 @@ def _write_files(
 def _write_model(result: Reconstruction, folder: Path) -> None:
     """Write cloud and surface, in the world frame."""
     # In the coordinates of the input's files, also where float32 doesn't hold them.
-    cloud = result.cloud.record().shifted(result.shift)
+    cloud = _without_black(result.cloud.record()).shifted(result.shift)
     if len(result.cloud) > MAX_PLY_POINTS:
         exchange.save(cloud, folder / "cloud.laz")
     else:
         write_ply(folder / "cloud.ply", cloud)
     if result.mesh is not None:
-        write_ply(folder / "mesh.ply", result.mesh.record())
+        write_ply(folder / "mesh.ply", _without_black(result.mesh.record()))
     if result.changes:
         _write_changes(result, folder / "changes.ply")
+
+
+def _without_black(record: GeometryRecord) -> GeometryRecord:
+    """Return a model with a neutral grey where no colour image shows it.
+
+    Black amplitudes are measured ones.
+    """
+    if record.color is None or (record.color == record.color[:, :1]).all():
+        return record
+    return replace(record, color=display_colors(record.color))
 
 
 def _write_changes(result: Reconstruction, path: Path) -> None:
@@ -117,7 +139,7 @@ def _write_changes(result: Reconstruction, path: Path) -> None:
 
 
 def _write_scene(
-    mesh: Mesh, T_up_world: Float64, folder: Path, texture: texture.Textured | None
+    mesh: Mesh, T_up_world: Float64, folder: Path, texture: Textured | None
 ) -> None:
     """Write `mesh.glb`, made upright by its node: the overview of the surface, or its texture."""
     node: dict[str, Any] = {"generator": f"tofuse {__version__}", "T_scene_node": T_up_world}
@@ -134,17 +156,23 @@ def _write_scene(
             **node,
         )
         return
-    atlas, image = texture.atlas, png_bytes(texture.image)
-    points, normals = (
-        values[atlas.vertices] for values in (texture.mesh.vertices, texture.mesh.normals)
-    )
-    write_glb(
-        folder / "mesh.glb",
-        GeometryRecord(points, atlas.faces, normals=normals, uv=atlas.uv, texture=image),
-        **node,
-    )
-    R = T_up_world[:3, :3].T
-    write_obj(
-        folder / "mesh.obj",
-        GeometryRecord(points @ R, atlas.faces, normals=normals @ R, uv=atlas.uv, texture=image),
+    write_glb(folder / "mesh.glb", textured_record(texture), **node)
+
+
+def display_record(mesh: Mesh, faces: int = DISPLAY_FACES) -> GeometryRecord:
+    """Return a simplified surface with the colours of its vertices in a texture."""
+    if mesh.color is None:
+        mesh = replace(mesh, color=np.zeros_like(mesh.vertices, np.uint8))
+    return textured_record(texture.baked(mesh, faces, _TEXTURE_SIZE))
+
+
+def textured_record(texture: Textured) -> GeometryRecord:
+    """Return a surface with its texture as a JPEG, in the world frame."""
+    shown = texture.charts
+    return GeometryRecord(
+        shown.vertices,
+        shown.faces,
+        normals=shown.normals,
+        uv=texture.atlas.uv,
+        texture=jpeg_bytes(texture.image, QUALITY),
     )

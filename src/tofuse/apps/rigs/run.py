@@ -20,10 +20,11 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.compute import threads as using_threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
+from tofuse.engine.fusion import Textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured
 from tofuse.engine.loops import Nearby
-from tofuse.engine.mapping import Config, adaptation, reconstructing
+from tofuse.engine.mapping import Config, adaptation, reconstructing, texturing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import AlreadyRefined, NoRefinement
@@ -93,8 +94,14 @@ def run_rig(
             result = reconstruct_rig(
                 cameras, recording, config, seed=options.seed or 0, progress=progress
             )
+            texture = None
+            if size := config.fusion.texture:
+                required = bool(options.texture)
+                texture = texturing.make_texture(
+                    recording, result.result, size, options.threads, progress, required=required
+                )
             progress.stage("writing")
-            _write(result, recording, folder)
+            _write(result, recording, folder, texture, share=options.share)
     return result
 
 
@@ -292,17 +299,24 @@ def _check_calibration(
     return displaced, disagreements(views, calibrated)
 
 
-def _write(rig_result: RigResult, recording: Recording, folder: folders.OutputFolder) -> None:
+def _write(
+    rig_result: RigResult,
+    recording: Recording,
+    folder: folders.OutputFolder,
+    texture: Textured | None,
+    *,
+    share: bool,
+) -> None:
     from tofuse.apps.report import ReportExtras, write_report
 
-    def report(result: Reconstruction, target: Path) -> None:
+    def report(result: Reconstruction, target: Path, texture: Textured | None) -> None:
         source = recording.source
         assert isinstance(source, RigSource)
         cameras = ", ".join(camera.name for camera in source.rig.cameras)
-        extras = ReportExtras(f"rig of {cameras}", rig=rig_result.rig)
+        extras = ReportExtras(f"rig of {cameras}", rig=rig_result.rig, texture=texture, share=share)
         write_report(result, target / "report.html", extras)
         if result is rig_result.result:
             posed = np.isfinite(rig_result.poses[:, 0, 0])
             write_tum(target / TRAJECTORY, rig_result.times[posed], rig_result.poses[posed])
 
-    write_result(rig_result.result, folder, report)
+    write_result(rig_result.result, folder, report, texture, share)

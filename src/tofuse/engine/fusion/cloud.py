@@ -23,8 +23,8 @@ NO_COLOR = (142, 142, 142)
 
 
 def has_color(colors: UInt8) -> Bool:
-    """Return which of the colours (N, 3) are known, (N,)."""
-    return np.asarray(colors.any(1), np.bool_)
+    """Return which of the colours (N, 3) are known, (N,): neither black nor the neutral grey."""
+    return np.asarray(colors.any(1) & (colors != np.uint8(NO_COLOR)).any(1), np.bool_)
 
 
 def display_colors(colors: UInt8) -> UInt8:

@@ -30,7 +30,7 @@ class Fusion(Bounded):
     faces
         Maximum number of triangles; 0 keeps all. The cloud keeps all points.
     texture
-        Edge of the texture of the surface, in texels: 64 to 8192, or 0 for none.
+        Maximum edge of the texture of the surface, in texels: 64 to 8192, or 0 for none.
     """
 
     voxel_m: Annotated[float | None, Bounds(1e-5, 100, exclusive=True)] = None
@@ -38,7 +38,7 @@ class Fusion(Bounded):
     island: Annotated[int, Bounds(0)] = 100
     memory_mb: Annotated[int, Bounds(1, 1_000_000)] = 600
     faces: Annotated[int, Bounds(0)] = 0
-    texture: int = 0
+    texture: int = 2048
 
     def __post_init__(self) -> None:
         super().__post_init__()

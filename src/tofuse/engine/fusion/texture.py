@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Bool, Float32, Float64, Int32, UInt8
+from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Intp, UInt8
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.engine.fusion.atlas import MARGIN, Atlas, unwrap
+from tofuse.engine.fusion.atlas import Atlas, chart_atlas, unwrap
 from tofuse.engine.fusion.atlas_kernels import (
     NO_TRIANGLE,
-    Blending,
-    ColoredView,
-    add_view,
-    draw_triangles,
+    Canvas,
+    Pictures,
+    SeenBy,
+    finish,
+    paint_triangles,
+    weigh_points,
 )
 from tofuse.engine.fusion.cloud import NO_COLOR, display_colors, grey_of, has_color
 from tofuse.engine.fusion.mesh import Mesh
@@ -28,17 +30,19 @@ from tofuse.engine.views import Projection
 
 # Depth tolerance of the visibility test: m, plus a fraction of the depth.
 _TOLERANCE_M, _TOLERANCE_FRACTION = 0.02, 0.02
-_BORDER = 0.08  # margin that is blended out, as a fraction of the image's height
-# Exponent of the weights, by which the best view dominates.
-_WEIGHT_EXPONENT = 4.0
+# Width of the margin in which a view's weight decreases, as a fraction of the image's height; how
+# much of it is left at an edge of depth; and pixels next to unknown colour that are not used.
+_BORDER, _AT_EDGE, _ERODED = 0.08, 0.03, 2
+_COARSE = 48  # pixels of the longer side of the images that are blended widely
+_CANDIDATES = 4  # views that paint a triangle
 _CHUNKS = 16
 _MAX_SAMPLES = 20_000  # vertices at which exposures are compared
 _CHUNK_TEXELS = 1 << 14
 # Robust limit of residuals of the log intensity, and iterations.
 _ROBUST_LIMIT, _ITERATIONS = 0.15, 4
 _MAX_LOG_GAIN = 1.0
-# Minimum intensity that is compared, as a fraction of the maximum.
-_MIN_INTENSITY = 0.02
+# Intensities that are compared: above black, below saturation.
+_MIN_INTENSITY, _MAX_INTENSITY = 5.0, 250.0
 # For colours of vertices: texels per vertex, vertices that a texel interpolates, minimum size.
 _TEXELS_PER_VERTEX, _NEIGHBOURS, _MIN_SIZE = 2.0, 4, 64
 
@@ -56,9 +60,12 @@ class Textured:
     image
         (H, W, 3) uint8 RGB.
     gains
-        (V, C) exposure factor of each view.
+        (V, 3) exposure factor of each view.
     coverage
-        Fraction of the texture that views observed; the rest has the colours of the vertices.
+        Fraction of the area of the surface that views observed; the rest has the colours of the
+        vertices.
+    detail
+        Pixels of the views per vertex of what they observed.
     """
 
     mesh: Mesh
@@ -66,6 +73,14 @@ class Textured:
     image: UInt8
     gains: Float64
     coverage: float
+    detail: float = 0.0
+
+    @property
+    def charts(self) -> Mesh:
+        """The surface with one vertex per row of the atlas, in the colours of the texture."""
+        parts = self.mesh.with_vertices(self.atlas.vertices, self.atlas.faces)
+        column, row = np.rint(self.atlas.texels).astype(int).T
+        return replace(parts, color=self.image[row, column])
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,40 +91,88 @@ class TextureView:
     ----------
     z
         (H, W) m, 0 where unknown.
-    intensity
-        (H, W, 3) RGB, or (H, W, 1) albedo in counts times m^2; negative where unknown.
+    known
+        (H, W) whether the colour of a pixel is known.
+    image
+        (h, w, 3) uint8 RGB of the same field of view, of any resolution.
     projection
-        Projection of points into the image.
+        Projection of points into the image of z.
     """
 
     z: Float32
-    intensity: Float32
+    known: Bool
+    image: UInt8
     projection: Projection
 
     @classmethod
-    def of(cls, frame: RangeFrame) -> TextureView | None:
-        """Take the colour of a frame, or its amplitude; None if it has neither."""
+    def of(cls, frame: RangeFrame, image: UInt8 | None = None) -> TextureView | None:
+        """Take the colour of a frame, by default as it has it, or else its amplitude.
+
+        None if it has neither.
+        """
         z = np.asarray(frame.z, np.float32)
         projection = Projection.of(frame.camera, 1)
-        if frame.color_image is not None:
-            intensity = frame.color_image.astype(np.float32)
-            intensity[~frame.color_image.any(-1)] = -1  # the colour camera didn't see it
-            return cls(z, np.ascontiguousarray(intensity), projection)
-        if frame.amplitude_image is None:
+        if frame.color_image is not None and frame.color_registered:
+            image = frame.color_image if image is None else image
+            known = frame.color_image.any(-1)  # else the colour camera didn't see it
+            return cls(z, known, np.ascontiguousarray(image), projection)
+        light = albedo(frame)
+        if light is None:
             return None
-        amplitude = frame.amplitude_image
-        unknown = ~(amplitude > 0) | (amplitude >= SATURATED_AMPLITUDE) | (z <= 0)
-        if frame.amplitude_kind != "range_compensated":
-            amplitude = amplitude * np.square(z * ray_lengths(frame.camera))
-        intensity = np.where(unknown, -1, np.nan_to_num(amplitude)).astype(np.float32)
-        return cls(z, np.ascontiguousarray(intensity[..., None]), projection)
+        known = light >= 0
+        image = np.zeros((*z.shape, 3), np.uint8)
+        image[known] = grey_of(light[known].astype(float))
+        return cls(z, known, image, projection)
+
+    @property
+    def reach(self) -> Float32:
+        """(H, W) weight of each pixel: 0 next to unknown ones, less towards edges."""
+        z, border = self.z, max(2.0, _BORDER * len(self.z))
+        known = np.pad(self.known, 1).astype(np.uint8)
+        inner = cv2.distanceTransform(known, cv2.DIST_L2, 3)[1:-1, 1:-1] - _ERODED
+        limit = _TOLERANCE_M + _TOLERANCE_FRACTION * z
+        smooth = np.ones(z.shape, np.uint8)
+        smooth[:, 1:] &= np.abs(z[:, 1:] - z[:, :-1]) < limit[:, 1:]
+        smooth[1:] &= np.abs(z[1:] - z[:-1]) < limit[1:]
+        from_edge = cv2.distanceTransform(smooth, cv2.DIST_L2, 3)
+        weight = np.minimum(inner / border, np.maximum(from_edge / border, _AT_EDGE))
+        return np.ascontiguousarray(weight.clip(0, 1), np.float32)
+
+    @property
+    def coarse(self) -> Float32:
+        """(h, w, 3) the image, blurred and subsampled; unknown pixels do not darken it."""
+        height, width = self.z.shape
+        step = max(height, width) / _COARSE
+        size = max(2, round(width / step)), max(2, round(height / step))
+        known = self.known.astype(np.float32)
+        small = cv2.resize(self.image, (width, height), interpolation=cv2.INTER_AREA)
+        sums = cv2.resize(small * known[..., None], size, interpolation=cv2.INTER_AREA)
+        share = cv2.resize(known, size, interpolation=cv2.INTER_AREA)[..., None]
+        mean = sums / np.maximum(share, 1e-3)
+        return np.ascontiguousarray(mean, np.float32)
+
+
+def albedo(frame: RangeFrame) -> Float32 | None:
+    """Return the albedo (H, W) of a frame in counts times m^2, -1 where unknown.
+
+    None if it has no amplitude.
+    """
+    if frame.amplitude_image is None:
+        return None
+    z, amplitude = np.asarray(frame.z, np.float32), frame.amplitude_image
+    unknown = ~(amplitude > 0) | (amplitude >= SATURATED_AMPLITUDE) | (z <= 0)
+    if frame.amplitude_kind != "range_compensated":
+        amplitude = amplitude * np.square(z * ray_lengths(frame.camera))
+    return np.where(unknown, -1, np.nan_to_num(amplitude)).astype(np.float32)
 
 
 def textured(mesh: Mesh, views: Sequence[TextureView], poses: Float64, size: int) -> Textured:
     """Texture a surface with the views.
 
-    Each texel is the weighted mean of the views that observe it; close views with a small angle of
-    incidence dominate. Exposures are equalised beforehand.
+    Charts are connected triangles that one view shows best, as they appear in it, so that the
+    texture has the resolution of the images. A texel has the fine details of the best view, and a
+    weighted mean of the coarse colours of all candidates (two bands; Burt and Adelson 1983), with
+    equalised exposures, so that no seams are visible.
 
     Parameters
     ----------
@@ -120,30 +183,169 @@ def textured(mesh: Mesh, views: Sequence[TextureView], poses: Float64, size: int
     poses
         (V, 4, 4) T_world_camera.
     size
-        Edge of the texture.
+        Maximum edge of the texture.
     """
-    texels = _Texels.of(mesh, size)
-    points, normals = texels.points, texels.normals
-    gains = exposures(mesh, views, poses)
-    channels = views[0].intensity.shape[2]
-    sums = np.zeros((len(points), channels), np.float32)
-    weights = np.zeros(len(points), np.float32)
-    for view, T, gain in zip(views, poses, gains, strict=True):
-        _accumulate(view, T, points, normals, sums, weights, gain)
-    observed = weights > 0
-    intensity = sums[observed] / weights[observed, None]
-    if channels == 3:
-        rgb = np.round(intensity.clip(0, 255)).astype(np.uint8)
-    else:
-        rgb = grey_of(intensity[:, 0].astype(float))
-    colors = np.empty((len(points), 3), np.uint8)
-    colors[observed] = rgb
-    colors[~observed] = NO_COLOR
-    if mesh.color is not None:
-        vertex_colors = texels.at_texels(display_colors(mesh.color), ~observed)
-        colors[~observed] = np.round(vertex_colors.clip(0, 255)).astype(np.uint8)
-    fraction = float(observed.mean()) if len(observed) else 0.0
-    return Textured(mesh, texels.atlas, texels.filled(colors), gains, fraction)
+    seen = _Seen.of(mesh, views, poses)
+    gains = seen.exposures()
+    candidates, label = seen.candidates(mesh.faces)
+    whole = label >= 0
+    pixels = seen.image_pixels(label, mesh.faces)
+    observed = max(int((seen.weights > 0).any(0).sum()), 1)
+    detail = float(_areas(pixels[whole]).sum()) / observed
+    label[~whole], pixels[~whole] = _flattened(mesh, ~whole)
+    atlas = chart_atlas(mesh.faces, label, pixels, size)
+    image = _painted(mesh, seen, gains, candidates, atlas)
+    area = _areas(mesh.vertices[mesh.faces])
+    share = float(area[whole].sum() / max(area.sum(), 1e-30))
+    return Textured(mesh, atlas, image, gains, share, detail)
+
+
+def _areas(corners: NDArray[np.generic]) -> Float64:
+    """Return the areas (M,) of triangles (M, 3, 2) or (M, 3, 3)."""
+    a, b = (corners[:, k].astype(float) - corners[:, 0] for k in (1, 2))
+    squared = (a * a).sum(1) * (b * b).sum(1) - (a * b).sum(1) ** 2
+    return np.asarray(np.sqrt(np.maximum(squared, 0)) / 2, np.float64)
+
+
+def _flattened(mesh: Mesh, faces: Bool) -> tuple[Int32, Float32]:
+    """Return labels (K,) and texels (K, 3, 2) of triangles without a view.
+
+    Seen along the axis that they face, -1 to -6, one texel per vertex: they have no fine colours.
+    """
+    corners = mesh.faces[faces]
+    normal = mesh.normals[corners].sum(1)
+    axis = np.abs(normal).argmax(1)
+    positive = np.take_along_axis(normal, axis[:, None], 1)[:, 0] > 0
+    plane = np.array([[1, 2], [2, 0], [0, 1]])[axis]
+    p = mesh.vertices[corners] / max(mesh.spacing, 1e-9)
+    texels = np.take_along_axis(p, plane[:, None], 2)
+    return (-1 - axis - 3 * positive).astype(np.int32), texels.astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Which views show the vertices of a mesh.
+
+    Attributes
+    ----------
+    views, poses
+        As for `textured`.
+    weights
+        (V, N) how well each view shows each vertex; 0 where it does not.
+    pixels
+        (V, N, 2) column and row in the view's image of z.
+    """
+
+    views: Sequence[TextureView]
+    poses: Float64
+    weights: Float32
+    pixels: Float32
+
+    @classmethod
+    def of(cls, mesh: Mesh, views: Sequence[TextureView], poses: Float64) -> _Seen:
+        weights = np.zeros((len(views), len(mesh)), np.float32)
+        pixels = np.zeros((len(views), len(mesh), 2), np.float32)
+        points, normals = (np.ascontiguousarray(v) for v in (mesh.vertices, mesh.normals))
+        for view, T, weight, pixel in zip(views, se3.inverse(poses), weights, pixels, strict=True):
+            lens = view.projection
+            tested = SeenBy(view.z, view.reach, lens.lookup, lens.frame)
+            limits = (_TOLERANCE_M, _TOLERANCE_FRACTION)
+            run_chunks(
+                lambda a, b: weigh_points(
+                    points, normals, tested, T, *limits, weight, pixel, a, b  # noqa: B023
+                ),
+                len(points),
+                _CHUNKS,
+            )
+        return cls(views, poses, weights, pixels)
+
+    def exposures(self) -> Float64:
+        """Return exposure factors (V, 3) of the channels of the views.
+
+        Robust least squares of the differences between the log intensities of all pairs of views
+        of a point (Brown and Lowe 2007, section 6). The mean of the logarithms of the factors
+        is 0.
+        """
+        step = max(1, self.weights.shape[1] // _MAX_SAMPLES)
+        weights = (self.weights[:, ::step] > 0).astype(float)
+        colors = np.zeros((*weights.shape, 3))
+        for view, pixels, color in zip(self.views, self.pixels[:, ::step], colors, strict=True):
+            height, width = view.z.shape
+            small = cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA)
+            u, v = pixels.T[:, None]
+            sampled = cv2.remap(small.astype(np.float32), u, v, cv2.INTER_LINEAR)
+            color[:] = sampled.reshape(-1, 3)
+        weights *= ((colors > _MIN_INTENSITY) & (colors < _MAX_INTENSITY)).all(-1)
+        logs = np.log(np.maximum(colors, _MIN_INTENSITY))
+        return np.stack([_gains(logs[..., c], weights) for c in range(3)], -1)
+
+    def candidates(self, faces: Int32) -> tuple[Int32, Int32]:
+        """Return the best views (M, K) of each triangle, best first, and the best whole one (M,).
+
+        -1 where there is none: a view may show a triangle in part, but a whole one is needed to lay
+        out the triangle as it appears there.
+        """
+        corners = self.weights[:, faces]
+        score, whole = corners.sum(-1), (corners > 0).all(-1)
+        count = min(_CANDIDATES, len(self.views))
+        best = np.argsort(-(score + whole * score.max(initial=0.0)), axis=0, kind="stable")[:count]
+        shown = np.take_along_axis(score, best, 0) > 0
+        label = np.where(np.take_along_axis(whole, best[:1], 0)[0], best[0], -1)
+        return np.where(shown, best, -1).T.astype(np.int32), label.astype(np.int32)
+
+    def image_pixels(self, label: Int32, faces: Int32) -> Float32:
+        """Return where the corners (M, 3, 2) of triangles are in the images of their labels (M,)."""
+        out = np.zeros((*faces.shape, 2), np.float32)
+        for k, view in enumerate(self.views):
+            own = label == k
+            out[own] = (self.pixels[k][faces[own]] + 0.5) * _scale(view.image, view.z) - 0.5
+        return out
+
+
+def _scale(image: NDArray[np.generic], z: Float32) -> Float64:
+    """Columns and rows (2,) of an image per column and row of a depth image."""
+    return np.array([image.shape[1] / z.shape[1], image.shape[0] / z.shape[0]])
+
+
+def _painted(
+    mesh: Mesh, seen: _Seen, gains: Float64, candidates: Int32, atlas: Atlas
+) -> UInt8:
+    """Return the image (S, S, 3) of a texture."""
+    shape = (atlas.size, atlas.size)
+    owner, coordinates = atlas.drawn()
+    canvas = Canvas(
+        owner,
+        coordinates,
+        *(np.zeros((*shape, *more), np.float32) for more in ((), (3,), (), (3,))),
+    )
+    corners = atlas.texels[atlas.faces]
+    points, faces = np.ascontiguousarray(mesh.vertices), mesh.faces
+
+    def paint(k: int, T_camera_world: Float64) -> None:
+        view = seen.views[k]
+        triangles = np.flatnonzero((candidates == k).any(1)).astype(np.int32)
+        coarse, lens = view.coarse, view.projection
+        scales = np.stack([_scale(view.image, view.z), _scale(coarse, view.z)])
+        pictures = Pictures(view.image, coarse, scales, gains[k], lens.lookup, lens.frame)
+        scene = (corners, faces, points, seen.weights[k], pictures, T_camera_world, canvas)
+        run_chunks(
+            lambda a, b: paint_triangles(triangles, *scene, a, b), len(triangles), _CHUNKS
+        )
+
+    for k, T_camera_world in enumerate(se3.inverse(seen.poses)):
+        paint(k, T_camera_world)
+    image = np.zeros((*shape, 3), np.uint8)
+    unseen = ~(seen.weights > 0).any(0)
+    base = _base_colors(mesh)
+    run_chunks(lambda a, b: finish(canvas, faces, unseen, base, image, a, b), len(image), _CHUNKS)
+    return _filled(image, owner != NO_TRIANGLE)
+
+
+def _base_colors(mesh: Mesh) -> UInt8:
+    """Return colours (N, 3) of vertices, for what no view shows."""
+    if mesh.color is None:
+        return np.full((len(mesh), 3), NO_COLOR, np.uint8)
+    return display_colors(mesh.color)
 
 
 def baked(mesh: Mesh, faces: int, size: int) -> Textured:
@@ -165,12 +367,14 @@ def baked(mesh: Mesh, faces: int, size: int) -> Textured:
     assert mesh.color is not None
     decimated = mesh.decimated(faces)
     size = int(np.clip(np.ceil(np.sqrt(_TEXELS_PER_VERTEX * len(mesh))), _MIN_SIZE, size))
-    texels = _Texels.of(decimated, size)
+    texels = _Texels.of(decimated, unwrap(decimated, size))
     if decimated is mesh:
         colors = texels.at_texels(display_colors(mesh.color))
     else:
-        nearest, distance2 = KdTree(mesh.vertices).neighbours(texels.points, _NEIGHBOURS)
-        facing = np.einsum("nki,ni->nk", mesh.normals[nearest], texels.normals) > 0
+        points = texels.at_texels(decimated.vertices)
+        nearest, distance2 = KdTree(mesh.vertices).neighbours(points, _NEIGHBOURS)
+        normals = texels.at_texels(decimated.normals)
+        facing = np.einsum("nki,ni->nk", mesh.normals[nearest], normals) > 0
         facing |= ~facing.any(1, keepdims=True)
         closest = distance2.min(1, keepdims=True)
         weights = np.where((nearest >= 0) & facing, 1 / (distance2 + closest + 1e-12), 0)
@@ -191,42 +395,30 @@ class _Texels:
     ----------
     mask
         (size, size) True at these texels; there are K.
-    points, normals
-        (K, 3) of the surface at these texels.
+    corners, barycentric
+        (K, 3) rows of the vertices of their triangles, and (K, 2) places in these.
     """
 
     atlas: Atlas
     mask: Bool
     corners: Int32
     barycentric: Float32
-    points: Float32
-    normals: Float32
 
     @classmethod
-    def of(cls, mesh: Mesh, size: int) -> _Texels:
-        atlas = unwrap(mesh, size)
-        owner = np.full((atlas.size, atlas.size), NO_TRIANGLE, np.int32)
-        coordinates = np.zeros((atlas.size, atlas.size, 2), np.float32)
-        draw_triangles(atlas.texels[atlas.faces], MARGIN, owner, coordinates)
+    def of(cls, mesh: Mesh, atlas: Atlas) -> _Texels:
+        owner, coordinates = atlas.drawn()
         mask = owner != NO_TRIANGLE
-        corners = atlas.vertices[atlas.faces[owner[mask]]]
-        barycentric = coordinates[mask]
-        points = _interpolated(mesh.vertices, corners, barycentric)
-        normals = _interpolated(mesh.normals, corners, barycentric)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-        return cls(atlas, mask, corners, barycentric, points, normals)
+        return cls(atlas, mask, atlas.vertices[atlas.faces[owner[mask]]], coordinates[mask])
 
-    def at_texels(self, values: NDArray[np.generic], where: Bool | None = None) -> Float32:
-        """Interpolate values of the vertices (N, C) at the texels (K, C), or at a subset."""
-        if where is None:
-            return _interpolated(values, self.corners, self.barycentric)
-        return _interpolated(values, self.corners[where], self.barycentric[where])
+    def at_texels(self, values: NDArray[np.generic]) -> Float32:
+        """Interpolate values of the vertices (N, C) at the texels (K, C)."""
+        return _interpolated(values, self.corners, self.barycentric)
 
     def filled(self, colors: UInt8) -> UInt8:
         """Return the image (size, size, 3) of the colours (K, 3), without empty texels."""
         image = np.zeros((*self.mask.shape, 3), np.uint8)
         image[self.mask] = colors
-        return _dilate_colors(image, self.mask)
+        return _filled(image, self.mask)
 
 
 def _interpolated(values: NDArray[np.generic], corners: Int32, barycentric: Float32) -> Float32:
@@ -240,36 +432,6 @@ def _interpolated(values: NDArray[np.generic], corners: Int32, barycentric: Floa
             corner_values[:, 0] * (1 - b - c) + corner_values[:, 1] * b + corner_values[:, 2] * c
         )
     return out
-
-
-def exposures(mesh: Mesh, views: Sequence[TextureView], poses: Float64) -> Float64:
-    """Return exposure factors (V, C) of the views at their poses (V, 4, 4).
-
-    Robust least squares of the differences between the log intensities of all pairs of views of a
-    point. The mean of the logarithms of the factors is 0.
-    """
-    step = max(1, len(mesh) // _MAX_SAMPLES)
-    points = np.ascontiguousarray(mesh.vertices[::step])
-    normals = np.ascontiguousarray(mesh.normals[::step])
-    count, channels = len(views), views[0].intensity.shape[2]
-    logs = np.zeros((count, len(points), channels))
-    weights = np.zeros((count, len(points)))
-    max_intensity = max(float(np.percentile(view.intensity, 99)) for view in views)
-    for k, (view, T) in enumerate(zip(views, poses, strict=True)):
-        sums, weight = (
-            np.zeros((len(points), channels), np.float32),
-            np.zeros(len(points), np.float32),
-        )
-        _accumulate(view, T, points, normals, sums, weight, np.ones(channels))
-        observed = weight > 0
-        intensity = sums[observed] / weight[observed, None]
-        # Nearly black or saturated intensities are not compared.
-        usable = (intensity > _MIN_INTENSITY * max_intensity).all(1) & (
-            (intensity < 250).all(1) if channels == 3 else True
-        )
-        logs[k, observed] = np.log(np.maximum(intensity, _MIN_INTENSITY * max_intensity))
-        weights[k, observed] = usable
-    return np.stack([_gains(logs[..., c], weights) for c in range(channels)], -1)
 
 
 def _gains(logs: Float64, weights: Float64) -> Float64:
@@ -291,36 +453,26 @@ def _gains(logs: Float64, weights: Float64) -> Float64:
     return np.asarray(np.exp(gain.clip(-_MAX_LOG_GAIN, _MAX_LOG_GAIN)), np.float64)
 
 
-def _accumulate(
-    view: TextureView,
-    T_world_camera: Float64,
-    points: Float32,
-    normals: Float32,
-    sums: Float32,
-    weights: Float32,
-    gain: Float64,
-) -> None:
-    intensity = np.where(
-        view.intensity < 0, view.intensity, view.intensity * gain.astype(np.float32)
-    )
-    T = se3.inverse(T_world_camera)
-    border = max(2.0, _BORDER * view.z.shape[0])
-    colored_view = ColoredView(view.z, intensity, view.projection.lookup, view.projection.frame)
-    blending = Blending(_TOLERANCE_M, _TOLERANCE_FRACTION, border, _WEIGHT_EXPONENT)
-    run_chunks(
-        lambda a, b: add_view(points, normals, colored_view, T, blending, sums, weights, a, b),
-        len(points),
-        _CHUNKS,
-    )
+def _filled(image: UInt8, mask: Bool) -> UInt8:
+    """Fill empty texels, which are 0, with the colours around them: none bleeds into charts.
 
-
-def _dilate_colors(image: UInt8, mask: Bool) -> UInt8:
-    """Fill empty texels with the nearest colour, so that mipmaps don't darken."""
+    From coarser to finer levels (pull and push; Gortler et al. 1996).
+    """
     if mask.all() or not mask.any():
         return image
-    _, labels = cv2.distanceTransformWithLabels(
-        (~mask).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    label_colors = np.zeros((int(labels.max()) + 1, 3), np.uint8)
-    label_colors[labels[mask]] = image[mask]
-    return label_colors[labels]
+    weights, levels = [], []
+    weight, color = mask.astype(np.float32), image
+    while max(weight.shape) > 1:
+        size = [max(1, -(-n // 2)) for n in weight.shape[::-1]]
+        sums = cv2.resize(color, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        weight = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+        levels.append(sums / np.maximum(weight, 1e-6)[..., None])
+        weight = np.minimum(weight * 4, 1)
+        weights.append(weight)
+        color = levels[-1] * weight[..., None]
+    fill = levels.pop()
+    for level, weight in zip(levels[::-1], weights[-2::-1], strict=True):
+        fill = cv2.resize(fill, weight.shape[::-1]).reshape(level.shape)
+        fill += weight[..., None] * (level - fill)
+    smooth = cv2.resize(np.round(fill.clip(0, 255)).astype(np.uint8), mask.shape[::-1])
+    return np.asarray(cv2.copyTo(image, mask.astype(np.uint8), smooth), np.uint8)

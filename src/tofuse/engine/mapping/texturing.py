@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from tofuse.engine.arrays import Bool, UInt8
 from tofuse.engine.compute import threads as use_threads
-from tofuse.engine.errors import UnreadableFrameError
-from tofuse.engine.frames import RangeFrame, Recording
+from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.frames import RangeFrame, Recording, Source
 from tofuse.engine.fusion import texture
 from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors
 
-# Maximum number of views and of textured triangles: more improve little, and unwrap slowly.
-_VIEWS, _FACES = 60, 60_000
+# Maximum number of views and of textured triangles: more improve little. Images are reduced to at
+# most so many pixels together.
+_VIEWS, _FACES, _PIXELS = 60, 100_000, 60_000_000
+# Unless a texture is required: minimum fraction of the surface that the images show, and of their
+# pixels per vertex. With less, vertices hold as many colours, and their images show more of it.
+_MIN_COVERAGE, _MIN_DETAIL = 0.5, 2.0
 # Metres of motion that blur as much as one radian.
 _METRES_PER_RADIAN = 1.0
-TEXTURE = 2048  # default size in texels
 
 
 def make_texture(
@@ -27,8 +32,13 @@ def make_texture(
     size: int,
     threads: int | None = None,
     progress: Progress | None = None,
+    *,
+    required: bool = False,
 ) -> texture.Textured | None:
-    """Make the texture of a model's surface; None without a surface, colour and amplitude.
+    """Make the texture of a model's surface; None without a surface or without colour.
+
+    Unless a texture is required, also None if the images show too little of the surface, or are
+    too small, to look better than the colours of the vertices.
 
     Parameters
     ----------
@@ -40,11 +50,14 @@ def make_texture(
         Number of threads; None: all cores. The result does not depend on it.
     progress
         Receives the stage.
+    required
+        Whether to make one of any images, and of amplitudes where there is no colour.
     """
     mesh = result.mesh
     if mesh is None or not len(mesh.faces):
         return None
-    frame_positions = steadiest_frames(result)
+    frame_positions = steadiest_frames(result, _colored(recording))
+    most_pixels = _PIXELS // max(len(frame_positions), 1)
     correctors = CameraErrors.made_with(result.config)
     progress = progress or Silent()
     progress.stage("painting", len(frame_positions))
@@ -58,24 +71,64 @@ def make_texture(
             continue
         for corrector in correctors:
             frame = corrector.apply(frame)
-        view = texture.TextureView.of(frame) if isinstance(frame, RangeFrame) else None
-        if view is not None and (not views or view.intensity.shape == views[0].intensity.shape):
+        if not isinstance(frame, RangeFrame) or (frame.color_image is None and not required):
+            continue
+        view = texture.TextureView.of(frame, full_image(recording, frame, most_pixels))
+        if view is not None:
             views.append(view)
             poses.append(result.trajectory[k])
     if not views:
         return None
     # BLAS results depend on its number of threads; those of our kernels don't.
     with use_threads(threads), threadpool_limits(1):
-        return texture.textured(mesh.decimated(_FACES), views, np.array(poses), size)
+        made = texture.textured(mesh.clustered(_FACES), views, np.array(poses), size)
+    worthwhile = made.coverage >= _MIN_COVERAGE and made.detail >= _MIN_DETAIL
+    return made if worthwhile or required else None
 
 
-def steadiest_frames(result: Reconstruction) -> list[int]:
+def _colored(recording: Recording) -> Bool:
+    """Return which frames (M,) may have colour: phones record it less often than depth."""
+    origins = (_origin(recording.source, k) for k in recording.indices.tolist())
+    return np.array([getattr(s, "has_color", lambda _: True)(k) for s, k in origins], bool)
+
+
+def _origin(source: Source, index: int) -> tuple[Source, int]:
+    """Return the source and the index there of a frame of a source made of others."""
+    while (origin := getattr(source, "origin", None)) is not None:
+        source, index = origin(index)
+    return source, index
+
+
+def full_image(recording: Recording, frame: RangeFrame, most_pixels: int) -> UInt8 | None:
+    """Return the colour of a frame as recorded, if it is finer than that at the depth's size."""
+    source, index = _origin(recording.source, frame.index)
+    read = getattr(source, "full_resolution_color", None)
+    if read is None or frame.color_image is None:
+        return None
+    try:
+        image: UInt8 | None = read(index)
+    except InputError:
+        return None
+    if image is None or len(image) <= len(frame.color_image):
+        return None
+    step = int(np.ceil(np.sqrt(image.shape[0] * image.shape[1] / max(most_pixels, 1))))
+    if step == 1:
+        return image
+    size = (image.shape[1] // step, image.shape[0] // step)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def steadiest_frames(result: Reconstruction, usable: Bool | None = None) -> list[int]:
     """Return positions of tracked frames: the one with the least motion blur of each segment.
 
-    The trajectory is divided into at most `_VIEWS` segments of equal numbers of frames.
+    The trajectory is divided into at most `_VIEWS` segments of equal numbers of frames, of those
+    that are `usable` (M,), if there are any.
     """
-    tracked = [k for k, f in enumerate(result.diagnostics.frames) if f.status == "tracked"]
-    posed = np.array([k for k in tracked if result.has_pose[k]], np.intp)
+    chosen = result.has_pose.copy()
+    chosen &= [frame.status == "tracked" for frame in result.diagnostics.frames]
+    if usable is not None and (chosen & usable).any():
+        chosen &= usable
+    posed = np.flatnonzero(chosen)
     if len(posed) <= _VIEWS:
         return [int(k) for k in posed]
     motion = se3.log(se3.inverse(result.trajectory[posed[:-1]]) @ result.trajectory[posed[1:]])

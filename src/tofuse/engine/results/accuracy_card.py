@@ -24,12 +24,12 @@ def card(result: Reconstruction) -> list[str]:
     parts.append(f"{int(result.has_pose.sum())} of {readable} frames{loops}")
     if weakest := weakest_frame(d.accuracy):
         parts.append(f"weakest: {weakest}")
-    if d.verdict != "good" and (advice := _advice(d.reasons)):
-        parts.append(f"to improve: {advice[0].lower()}{advice[1:].rstrip('.')}")
+    if d.verdict != "good" and (text := advice(d.reasons)):
+        parts.append(f"to improve: {text[0].lower()}{text[1:].rstrip('.')}")
     return parts
 
 
-def _advice(reasons: Sequence[Reason]) -> str:
+def advice(reasons: Sequence[Reason]) -> str:
     """Return the advice for the most severe reason, or for one that may cause all others."""
     by_code = {r.code: ADVICE.get(r.code, "") for r in ranked(reasons)}
     if "faulty_recording" in by_code:

@@ -21,6 +21,7 @@ from tofuse.formats.geometry import (
     write_obj,
     write_pcd,
     write_ply,
+    write_usdz,
 )
 
 # From x right, y down, z forward into glTF's x right, y up, z towards the viewer.
@@ -132,6 +133,7 @@ _Write = Callable[[GeometryRecord, str | Path, Float64], None]
 _MESHES: dict[str, _Write] = {
     ".glb": lambda mesh, path, R: write_glb(path, _for_display(mesh, R), generator=_GENERATOR),
     ".gltf": lambda mesh, path, R: write_gltf(path, _for_display(mesh, R), generator=_GENERATOR),
+    ".usdz": lambda mesh, path, R: write_usdz(path, _for_display(mesh, R)),
     ".ply": _ply,
     ".obj": lambda mesh, path, R: write_obj(path, _for_display(mesh, R)),
     ".stl": _stl,

@@ -9,10 +9,11 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.formats.geometry.e57 import write_e57
-    from tofuse.formats.geometry.glb import write_glb, write_gltf
+    from tofuse.formats.geometry.glb import read_textured_glb, write_glb, write_gltf
     from tofuse.formats.geometry.las import write_las
     from tofuse.formats.geometry.obj import write_obj
     from tofuse.formats.geometry.pcd import Pcd, read_pcd, write_pcd
     from tofuse.formats.geometry.ply import read_ply, write_ply
+    from tofuse.formats.geometry.usdz import write_usdz
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

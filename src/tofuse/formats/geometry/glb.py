@@ -141,6 +141,31 @@ def _document(
     return document, body
 
 
+def read_textured_glb(path: Path) -> tuple[GeometryRecord, bool] | None:
+    """Read the mesh of a .glb file of `write_glb` if it has a texture; None for any other file.
+
+    Also returns whether the file turns it by a node, so that it is in the frame of the world.
+    """
+    try:
+        data = path.read_bytes()
+        length = struct.unpack_from("<I", data, 12)[0]
+        document = json.loads(data[20 : 20 + length])
+        body = memoryview(data)[28 + length :]
+        parts = [body[v["byteOffset"] :][: v["byteLength"]] for v in document["bufferViews"]]
+        primitive = document["meshes"][0]["primitives"][0]
+        image = bytes(parts[document["images"][0]["bufferView"]])
+        faces = np.frombuffer(parts[primitive["indices"]], "<u4").reshape(-1, 3).astype(np.int32)
+        columns = [
+            np.frombuffer(parts[primitive["attributes"][name]], "<f4").reshape(-1, width)
+            for name, width in (("POSITION", 3), ("NORMAL", 3), ("TEXCOORD_0", 2))
+        ]
+        points, normals, uv = columns
+        record = GeometryRecord(points, faces, normals=normals, uv=uv, texture=image)
+        return record, "matrix" in document["nodes"][0]
+    except (OSError, ValueError, LookupError, TypeError, struct.error):
+        return None
+
+
 def _accessor(view: int, values: NDArray[np.generic]) -> dict[str, Any]:
     component = {"f": _FLOAT, "u2": _USHORT, "u4": _UINT}
     code = values.dtype.kind if values.dtype.kind == "f" else f"u{values.dtype.itemsize}"

@@ -220,7 +220,7 @@ def _decode(data: bytes, header: ImageHeader) -> NDArray[Any]:
         else cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     )
     image = decoded(data, flags, (header.height, header.width))
-    return image if grey else np.ascontiguousarray(image[..., ::-1])
+    return image if grey else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
 
 def decoded(data: bytes, flags: int, shape: tuple[int, int]) -> NDArray[Any]:

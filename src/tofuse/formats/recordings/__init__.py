@@ -21,5 +21,6 @@ if TYPE_CHECKING:
         open_view,
         read_reference,
     )
+    from tofuse.formats.recordings.archives import unzipped
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

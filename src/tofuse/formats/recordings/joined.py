@@ -55,10 +55,15 @@ class JoinedSource:
             times.append(part_times)
         return np.concatenate(times)
 
+    def origin(self, index: int) -> tuple[Source, int]:
+        """Return the source that a frame is from, and its index there."""
+        part = int(np.searchsorted(self.starts, index, side="right")) - 1
+        return self.parts[part], index - int(self.starts[part])
+
     def read(self, index: int) -> Frame:
         """See `Source.read`."""
-        part = int(np.searchsorted(self.starts, index, side="right")) - 1
-        frame = self.parts[part].read(index - int(self.starts[part]))
+        part, index_there = self.origin(index)
+        frame = part.read(index_there)
         return replace(frame, index=index, timestamp=float(self.timestamps[index]))
 
 
@@ -97,6 +102,10 @@ class LimitedSource:
         self.gravity = source.gravity
         self.warnings = source.warnings
         self.metadata = source.metadata
+
+    def origin(self, index: int) -> tuple[Source, int]:
+        """See `JoinedSource.origin`."""
+        return self.source, index
 
     def read(self, index: int) -> Frame:
         """See `Source.read`."""

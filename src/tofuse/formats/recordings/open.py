@@ -19,6 +19,7 @@ from tofuse.formats.files import reading
 from tofuse.formats.poses import TimedPoses, read_poses
 from tofuse.formats.recordings.joined import JoinedSource, LimitedSource
 from tofuse.formats.recordings.still import average_still
+from tofuse.formats.recordings.archives import unzipped
 from tofuse.formats.rigs import RigSource, read_rig, recordings_of, rig_file_in
 from tofuse.formats.sources import Reader, ReaderOptions, Sniff
 
@@ -58,7 +59,8 @@ def open_recording(
     Parameters
     ----------
     paths
-        Files or folders; several are joined in the order given. A folder of native or SR4000
+        Files, folders or .zip files of these; several are joined in the order given. A folder of
+        native or SR4000
         recordings is joined in name order; if it contains a rig.json, its recordings are the
         cameras of a rig, one image of each in turn.
     format
@@ -81,8 +83,9 @@ def open_recording(
     if not paths:
         raise InputError("no recording was given", remedy="pass a path")
     _check_depths(min_depth, max_depth)
+    inner = [unzipped(path) for path in paths]
     options = ReaderOptions(None if camera is None else Path(camera), topic)
-    rig_file = rig_file_in(paths[0]) if len(paths) == 1 else None
+    rig_file = rig_file_in(inner[0]) if len(inner) == 1 else None
     if rig_file is not None:
         rig = _rig_source(rig_file, format, options)
         if min_depth is not None or max_depth is not None:
@@ -90,15 +93,15 @@ def open_recording(
                 "do not apply to a rig", where="min_depth, max_depth", remedy="leave them out"
             )
         return Recording.of(rig, str(paths[0]), "rig")
-    for path in paths:
-        _check_kind(Path(path))
-    located = [item for path in paths for item in _resolve(Path(path), format)]
+    for path in inner:
+        _check_kind(path)
+    located = [item for path in inner for item in _resolve(path, format)]
     sources = [item.reader.open(item.path, options) for item in located]
     source: Source = sources[0]
     if len(sources) > 1:
         source = JoinedSource(sources, _short_names([item.path for item in located]))
     _check_usable(source, paths[0])
-    noise_file = Path(paths[0]) / "noise.json"
+    noise_file = inner[0] / "noise.json"
     if len(paths) == 1 and reading.is_folder(noise_file.parent) and reading.is_file(noise_file):
         source.metadata[NOISE_MODEL] = read_noise(noise_file)
     if min_depth is not None or max_depth is not None:
@@ -310,7 +313,7 @@ def read_reference(path: str | Path) -> TimedPoses:
     InputError
         If it can't be read, or the recording has no reference poses.
     """
-    path = Path(path)
+    path = unzipped(path)
     poses_file = path / "groundtruth.txt" if path.is_dir() else path
     readers_of_poses: list[Callable[[], TimedPoses | Recording]]
     readers_of_poses = [lambda: read_poses(poses_file), lambda: open_recording(path)]

@@ -97,6 +97,11 @@ class RigSource:
         """(N, 4, 4) mounting pose of the camera of each frame."""
         return np.stack([self.rig.cameras[c].T_rig_camera for c in self.camera])
 
+    def origin(self, index: int) -> tuple[Source, int]:
+        """Return the source that a frame is from, and its index there."""
+        recording = self._recordings[int(self.camera[index])]
+        return recording.source, int(recording.indices[self._row[index]])
+
     def read(self, index: int) -> Frame:
         """See `Source.read`."""
         camera = int(self.camera[index])

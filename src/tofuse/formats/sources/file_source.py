@@ -91,6 +91,10 @@ class FileSource(ABC):
         """
         return None
 
+    def has_color(self, index: int) -> bool:
+        """Whether a frame may have colour, as far as is known without reading it."""
+        return True
+
     def read_sidecars(self, folder: Path) -> None:
         """Read timestamps.txt, groundtruth.txt and odometry.txt, as far as the folder has them."""
         path = folder / "timestamps.txt"

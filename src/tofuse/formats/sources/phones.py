@@ -112,6 +112,10 @@ class PhoneSource(FileSource):
         path = self.color[index]
         return None if path is None else read_color(path)
 
+    def has_color(self, index: int) -> bool:
+        """See `FileSource.has_color`."""
+        return self.color[index] is not None
+
     def color_path(self, index: int) -> Path:
         """Return the file with the colour of a frame."""
         return self.color[index] or self.files[index]

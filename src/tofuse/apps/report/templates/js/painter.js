@@ -2,11 +2,13 @@
 const MODEL = `
   attribute vec3 place, color, normal;
   attribute float value;
+  attribute vec2 uv;
   uniform mat4 view, lens;
   uniform vec3 low, extent, eye;
   uniform vec2 ends;
-  uniform float size, peel, shade, byValue, least, most;
+  uniform float size, peel, shade, byValue, painted, least, most;
   varying vec3 tint, world;
+  varying vec2 at;
   varying float depth, kept;
   // Viridis (van der Walt and Smith), by a polynomial.
   vec3 ramp(float t) {
@@ -23,11 +25,12 @@ const MODEL = `
     world = p;
     depth = -v.z;
     kept = value;
+    at = uv;
     // Colours that stand for values are shown as they are in the bar; others are lit from the eye.
     if (byValue > .5) tint = clamp(ramp(clamp((value - ends.x) / (ends.y - ends.x), 0., 1.)), 0., 1.);
     else {
       tint = color;
-      if (shade > .5) {
+      if (shade > .5 && painted < .5) {
         float facing = abs(dot(normal, normalize(eye - p))), above = .5 - .5 * normal.y;
         tint = color * (.34 + .52 * facing + .22 * above) + .03;
       }
@@ -38,8 +41,15 @@ const CLIP = `
   varying float depth, kept;
   uniform vec3 from, to;
   void clip() { if (any(lessThan(world, from)) || any(greaterThan(world, to))) discard; }`;
+// A texture has the light of the scene in it, and is not lit again.
 const TINT = `precision highp float; ${CLIP}
-  void main() { clip(); gl_FragColor = vec4(tint, 1.); }`;
+  varying vec2 at;
+  uniform float painted, byValue;
+  uniform sampler2D picture;
+  void main() {
+    clip();
+    gl_FragColor = vec4(painted > .5 && byValue < .5 ? texture2D(picture, at).rgb : tint, 1.);
+  }`;
 // Depth in 24 bits and the value in 8, to read what lies below a pixel.
 const PROBE = `precision highp float; ${CLIP}
   uniform float far;
@@ -97,13 +107,29 @@ function makePainter(canvas, scene) {
     gl.bufferData(target, array, use);
     return b;
   }
+  // A texture of an image's address; null where the browser can't take it.
+  async function picture(source) {
+    const image = new Image();
+    image.src = source;
+    try { await image.decode(); } catch (error) { return null; }
+    if (image.width > gl.getParameter(gl.MAX_TEXTURE_SIZE)) return null;
+    const made = gl.createTexture(), whole = (n) => (n & (n - 1)) === 0;
+    gl.bindTexture(gl.TEXTURE_2D, made);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, image);
+    const mipmaps = whole(image.width) && whole(image.height);
+    if (mipmaps) gl.generateMipmap(gl.TEXTURE_2D);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, mipmaps ? gl.LINEAR_MIPMAP_LINEAR : gl.LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    return made;
+  }
   const indices = (array) => buffer(array, gl.ELEMENT_ARRAY_BUFFER);
   function attribute(of, name, source, type, scaled, numbers = 3) {
     const at = of.attributes[name];
     if (at === undefined) return;
     if (!source || Array.isArray(source)) {
       gl.disableVertexAttribArray(at);
-      if (numbers === 1) gl.vertexAttrib1f(at, 0); else gl.vertexAttrib3fv(at, source || [0, 0, 1]);
+      if (numbers < 3) gl.vertexAttrib2f(at, 0, 0); else gl.vertexAttrib3fv(at, source || [0, 0, 1]);
       return;
     }
     gl.bindBuffer(gl.ARRAY_BUFFER, source);
@@ -143,6 +169,9 @@ function makePainter(canvas, scene) {
       gl.uniform1f(u.byValue, set.value && !probing ? 1 : 0);
       gl.uniform2fv(u.ends, set.ends || [0, 1]);
       gl.uniform1f(u.shade, set.normal ? 1 : 0);
+      gl.uniform1f(u.painted, set.picture && set.uv && !probing ? 1 : 0);
+      if (set.picture) gl.bindTexture(gl.TEXTURE_2D, set.picture);
+      attribute(of, "uv", set.uv, gl.UNSIGNED_SHORT, true, 2);
       gl.uniform1f(u.peel, !set.faces && peel && set.normal ? 1 : 0);
       attribute(of, "value", set.value, gl.UNSIGNED_BYTE, true, 1);
       attribute(of, "place", set.place, gl.UNSIGNED_SHORT, true);
@@ -185,6 +214,7 @@ function makePainter(canvas, scene) {
   gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT16, N, N);
   gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, gl.getParameter(gl.RENDERBUFFER_BINDING));
   gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  gl.bindTexture(gl.TEXTURE_2D, null);
 
   function read(sets, view, section, x, y, options) {
     const ratio = canvas.width / canvas.clientWidth, data = new Uint8Array(4 * N * N), half = (N - 1) / 2;
@@ -208,5 +238,5 @@ function makePainter(canvas, scene) {
     }
     return best;
   }
-  return { gl, buffer, indices, begin, model, lines, read };
+  return { gl, buffer, indices, picture, begin, model, lines, read };
 }

@@ -18,10 +18,13 @@ async function startViewer(box, scene, bus) {
     points = { ...shared, count: scene.count };
     if (scene.model.faces) {
       const faces = await unpack(scene.model.faces, Uint32Array, 3);
+      const picture = scene.model.texture ? await painter.picture(scene.model.texture) : null;
+      if (picture) Object.assign(shared, { picture, uv: await buffered(scene.model.uv, Uint16Array, 2) });
       surface = { ...shared, faces: painter.indices(faces), count: faces.length };
       for (const most of COARSE) {
         const fewer = faces.length > 3 * most ? clustered(place, faces, scene.extent, most) : faces;
-        coarse.push({ ...shared, faces: painter.indices(fewer), count: fewer.length });
+        // Merged vertices are in other charts of the texture: their own colours are shown.
+        coarse.push({ ...shared, uv: fewer === faces ? shared.uv : null, faces: painter.indices(fewer), count: fewer.length });
       }
     }
   }
@@ -49,7 +52,7 @@ async function startViewer(box, scene, bus) {
   }
 
   const chosenOf = (name) => { const input = box.querySelector(`[name=${name}]`); return input ? input.value : ""; };
-  const on = (name) => { const input = box.querySelector(`[name=${name}]`); return Boolean(input && input.checked); };
+  const on = (name) => { const input = box.querySelector(`[name=${name}]`); return input ? input.checked : Boolean(ALONE[name]); };
   const view = makeEye(canvas, scene, draw);
   const section = makeSection(box, scene, draw);
   const sigmaOf = (value) => {
@@ -66,7 +69,7 @@ async function startViewer(box, scene, bus) {
     const dressed = (set) => ({ ...set, value: field ? field.values : null, ends: field ? field.ends : null });
     const out = [];
     if (surface && on("mesh")) out.push(dressed(detail ? coarse[detail - 1] : surface));
-    if (points && on("points")) out.push(dressed(points));
+    if (points && on("points") && !(surface && !box.querySelector("[name=points]"))) out.push(dressed(points));
     return out;
   }
   const options = () => ({ peel: on("peel") });
@@ -228,6 +231,8 @@ async function startViewer(box, scene, bus) {
   new ResizeObserver(draw).observe(canvas);
 }
 
+// What a page without switches shows; points where there is no surface.
+const ALONE = { mesh: true, points: true, peel: true };
 const COARSE = [60000, 20000];  // triangles of a surface that moves, where all of them are too many
 const EFFORTS = [[0, 1], [1, 1], [1, 0.75], [2, 0.75], [2, 0.5]];  // which of them, and how many pixels
 

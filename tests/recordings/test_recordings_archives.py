@@ -1,0 +1,133 @@
+"""Recordings in .zip files, as phones share them."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import made_phones as made
+from tofuse.engine.errors import InputError
+from tofuse.formats.recordings.open import open_recording, open_view
+from tofuse.formats.recordings.archives import unzipped
+
+
+def zipped(folder: Path, path: Path, inside: str = "") -> Path:
+    """An archive of a folder, with what macOS adds."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in sorted(p for p in folder.rglob("*") if p.is_file()):
+            archive.write(file, Path(inside) / file.relative_to(folder))
+        archive.writestr("__MACOSX/._frame_00000.json", b"\0\5\26\7")
+        archive.writestr(f"{inside}/.DS_Store".lstrip("/"), b"Bud1")
+    return path
+
+
+@pytest.mark.parametrize(
+    "make", [made.make_scanner_app, made.make_stray, made.make_record3d], ids=lambda m: m.__name__
+)
+@pytest.mark.parametrize("inside", ["", "2026-11-02 scan", "export/scan 1"])
+def test_export_of_app_opens_as_it_is(make, inside: str, tmp_path: Path) -> None:
+    make(tmp_path / "scan")
+    expected = open_recording(tmp_path / "scan")
+    path = zipped(tmp_path / "scan", tmp_path / "scan.ZIP", inside)
+    shutil.rmtree(tmp_path / "scan")
+    found = open_recording(path)
+    assert (found.format, found.path) == (expected.format, str(path))
+    np.testing.assert_array_equal(found.timestamps, expected.timestamps)
+    for k in range(len(found)):
+        assert np.isfinite(found[k].depth).all()
+    assert len(open_view(f"{path}#1").frame)
+    assert unzipped(path) == unzipped(path)
+
+
+def test_archive_of_single_file_is_that_file(tmp_path: Path) -> None:
+    pytest.importorskip("lzfse")
+    made.make_r3d(tmp_path / "scan.r3d")
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.write(tmp_path / "scan.r3d", "scan.r3d")
+    assert open_recording(tmp_path / "a.zip").format == "record3d"
+
+
+def test_unpacked_files_are_removed_with_the_process(tmp_path: Path) -> None:
+    made.make_scanner_app(tmp_path / "scan")
+    path = zipped(tmp_path / "scan", tmp_path / "scan.zip")
+    code = (
+        "import sys; from tofuse.formats.recordings import open_recording, unzipped;"
+        "open_recording(sys.argv[1]); print(unzipped(sys.argv[1]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, path], capture_output=True, text=True, check=True
+    )
+    folder = Path(done.stdout.strip())
+    assert folder.name == path.name
+    assert not folder.parent.exists()
+
+
+def encrypted(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("info.json", "{}")
+    data = bytearray(path.read_bytes())
+    for signature, offset in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
+        struct.pack_into("<H", data, data.index(signature) + offset, 1)
+    path.write_bytes(data)
+
+
+def with_member(name: str, link: bool = False):
+    def make(path: Path) -> None:
+        member = zipfile.ZipInfo(name)
+        member.external_attr = (0o120777 if link else 0o100644) << 16
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr(member, "/etc/passwd")
+
+    return make
+
+
+def bomb(path: Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("depth.raw", bytes(200_000_000))
+
+
+def cut_off(path: Path) -> None:
+    made.make_scanner_app(path.with_suffix(""))
+    zipped(path.with_suffix(""), path)
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def damaged(path: Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("info.json", b"abcdefgh" * 1000)
+    data = bytearray(path.read_bytes())
+    data[45:50] = b"\xff" * 5
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("make", "problem"),
+    [
+        (encrypted, "is encrypted"),
+        (with_member("../outside.txt"), "outside of itself"),
+        (with_member("/outside.txt"), "outside of itself"),
+        (with_member("..\\outside.txt"), "outside of itself"),
+        (with_member("C:\\outside.txt"), "outside of itself"),
+        (with_member("link", link=True), "contains a link"),
+        (bomb, "far more than measurements"),
+        (cut_off, "copy the file again"),
+        (damaged, "copy the file again"),
+        (lambda path: zipfile.ZipFile(path, "w").close(), "is an empty archive"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_unsafe_archive_is_refused_in_one_line(make, problem: str, tmp_path: Path) -> None:
+    path = tmp_path / "scan.zip"
+    make(path)
+    with pytest.raises(InputError, match=problem) as error:
+        open_recording(path)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+    assert not (tmp_path.parent / "outside.txt").exists()
