@@ -1,7 +1,7 @@
 """Probability that the pose between two views is right.
 
-Logistic models with the same regressors, one fitted to simulated pairs of images
-(``benchmarks/pairs.py fit``), one to clouds (``benchmarks/cloud_pairs.py fit``). Both commands also
+Logistic models, one fitted to simulated pairs of images (``benchmarks/pairs.py fit``), one to
+clouds (``benchmarks/cloud_pairs.py fit``). Both commands also
 print the calibration on held-out pairs. The regressors are dimensionless fractions, independent of
 the camera's noise, so that they transfer to other cameras. A pose is right within 5 % of the depth
 and 4 degrees, which allows for systematic errors of the camera at large baselines.
@@ -42,10 +42,9 @@ class ProbabilityModel:
 # Fitted to images: 351 searched poses, 370 poses aligned from a guess. On held-out scenes the area
 # under the ROC curve is 0.99 and 0.91.
 IMAGES = ProbabilityModel(search=(0.34, 6.17, -6.40, -4.21), local=(0.55, 7.01, -6.02))
-# Fitted to clouds: 146 searched poses. On 226 held-out pairs, some without overlap, the area is
-# 0.98; of 90 accepted poses 2 were wrong, one by 0.13 m, one in a room of the same size without a
-# known viewpoint.
-CLOUDS = ProbabilityModel(search=(-1.82, 6.08, -4.78, -0.69), local=(-2.29, 9.96, -5.5))
+# Contradiction of clouds beyond which more is no stronger evidence.
+_MUCH_CONTRADICTION = 0.05
+CLOUDS = ProbabilityModel(search=(-0.84, 12.49, -1.87, -6.61), local=(-2.29, 9.96, -5.5))
 
 
 @dataclass(frozen=True)
@@ -159,6 +158,35 @@ class PoseEvidence:
             f"the probability that the pose is right is {self.probability:.0%}, below "
             f"{ACCEPTED:.0%}"
         )
+
+
+@dataclass(frozen=True)
+class CloudEvidence(PoseEvidence):
+    """Evidence for and against a pose of two clouds.
+
+    Attributes
+    ----------
+    surface_lead
+        Number of distinct surfaces that coincide, less that of the best rival, relative to those
+        that are near.
+    free_space
+        Whether the free space of both views is known.
+    """
+
+    surface_lead: float = 0.0
+    free_space: bool = True
+
+    @property
+    def search_regressors(self) -> Float64:
+        """Regressors (4,) of a pose that was compared with rivals.
+
+        Clouds overlap by any amount, so that their lead is relative to the overlap. Degenerate
+        directions leave none, as poses along them fit as well. What cannot be contradicted, for
+        want of free space, is less certain.
+        """
+        lead = 0.0 if self.degenerate else min(max(self.surface_lead, 0.0), 1.0)
+        contradiction = min(self.contradiction / _MUCH_CONTRADICTION, 1.0)
+        return np.array([1, lead, not self.free_space, contradiction])
 
 
 def logistic(x: float) -> float:
