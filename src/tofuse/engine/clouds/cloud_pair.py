@@ -151,14 +151,14 @@ class _CloudViews:
         """Return the evidence for a pose."""
         agreement = pose.agreement
         most = max((rival.agreement.surfaces for rival in rivals), default=0.0)
-        surface_lead = (agreement.surfaces - most) / max(agreement.near_surfaces, 1e-9)
         return pose_probability.CloudEvidence(
             agreement.support,
             agreement.contradiction,
             lead,
             degenerate,
             pose_probability.CLOUDS,
-            surface_lead=surface_lead,
+            surface_lead=agreement.surfaces - most,
+            near_surfaces=agreement.near_surfaces,
             free_space=self.has_free_space,
         )
 
