@@ -3,7 +3,8 @@
 `table` prints, for each kind of pair, how many poses are right (within 0.1 m, or 5 % of the extent
 if that is less, at the centre of the source, and 4 degrees), how many of those are accepted, and
 how many are accepted and wrong; also for Open3D's RANSAC over FPFH with point-to-plane ICP, and for
-KISS-Matcher, if installed, with voxels of 1/100 of the target's extent. Clouds have at most 20,000
+KISS-Matcher, if installed, with voxels of 1/100 of the target's extent; then how many poses of each
+place are right by the probability that they are stated with. Clouds have at most 20,000
 points. "moved" clouds were transformed into another frame, so that their viewpoint is unknown; in
 "sparse" pairs the source has a tenth of the target's points. `fit` fits the logistic models of
 `tofuse.engine.search.pose_probability` to simulated pairs. `viewpoints` counts the clouds whose
@@ -19,6 +20,7 @@ Simulated scenes are made once and kept in benchmarks/out/recordings/pairs.
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -29,6 +31,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tofuse.engine.arrays import Float32, Float64
 
@@ -58,6 +61,8 @@ _NOISE_M, _RANGE_M, _THINNED_M, _MOVED = 0.003, 5.0, 0.025, 0.3
 _DRIFT = np.array([0.002] * 3 + [0.001] * 3)
 # A rotating object stands in front of a static background.
 OBJECT_M = 1.6
+# Stated probabilities of which the table counts the right poses.
+_BINS = (0.0, 0.3, 0.7, 0.9, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,6 +283,48 @@ def _lidar_pair(data: Path, _max_pairs: int, _rng: np.random.Generator) -> Itera
     yield Pair(source.points.astype(float), target.points.astype(float), true)
 
 
+def _dragon(data: Path, max_pairs: int, _rng: np.random.Generator) -> Iterator[Pair]:
+    """Range scans of a turning dragon of 0.2 m, 24 to 96 degrees apart."""
+    folder = data / "stanford_dragon"
+    if not folder.is_dir():
+        raise FileNotFoundError(folder)
+    scans, poses = np.load(folder / "scans.npz"), {}
+    for line in (folder / "dragonStandRight.conf").read_text().splitlines():
+        kind, *words = line.split() or [""]
+        if kind == "bmesh":
+            T = np.eye(4)
+            T[:3, :3] = Rotation.from_quat([float(w) for w in words[4:8]]).as_matrix().T
+            T[:3, 3] = [float(w) for w in words[1:4]]
+            poses[int(words[0].removesuffix(".ply").split("_")[-1])] = T
+    found = {int(name.split("_")[-1]): scans[name].astype(float) for name in scans.files}
+    angles = sorted(poses)
+    for apart in (1, 2, 3, 4):
+        for k in np.linspace(0, len(angles) - 1, max_pairs).astype(int):
+            i, j = angles[k], angles[(k + apart) % len(angles)]
+            yield Pair(found[j], found[i], se3.inverse(poses[i]) @ poses[j])
+
+
+def fragments(split: str) -> Maker:
+    """Fragments of the 3DMatch benchmark, the same number of pairs of each scene."""
+
+    def make(data: Path, max_pairs: int, rng: np.random.Generator) -> Iterator[Pair]:
+        folders = sorted((data / "pairs_3dmatch").glob("*/fragments.npz"))
+        if not folders:
+            raise FileNotFoundError(data / "pairs_3dmatch")
+        for file in folders:
+            stored = np.load(file)
+            log = (file.parent / f"{split}.gt.log").read_text()
+            numbers = np.array(log.split(), float).reshape(-1, 19)
+            apart = numbers[:, 1] - numbers[:, 0] > (split == "3DMatch")
+            for i, j, _, *T in rng.permutation(numbers[apart])[: 3 * max_pairs]:
+                target, source = (
+                    stored[f"points_{k:.0f}"] * 0.00025 + stored[f"offset_{k:.0f}"] for k in (i, j)
+                )
+                yield Pair(source, target, np.reshape(T, (4, 4)))
+
+    return make
+
+
 _FRAMES = (
     ("room", "Furnished room, SR4000", (1, 2, 3), "room", False),
     ("empty-room", "Empty room, SR4000", (1, 3), "room", False),
@@ -317,6 +364,9 @@ KINDS = {
         Kind("scans-moved", "Scans of the flat, moved", scans("flat", moved=True), "flat"),
         Kind("scans-2", "Scans of another flat", scans("flat", seed=3), "flat", False),
         Kind("lidar", "LiDAR outdoors", _lidar_pair, "lidar", False),
+        Kind("dragon", "Laser scans of a dragon", _dragon, "dragon"),
+        Kind("fragments", "Fragments of 3DMatch", fragments("3DMatch"), "fragments"),
+        Kind("fragments-low", "Fragments of 3DLoMatch", fragments("3DLoMatch"), "fragments"),
         # Scenes that are not in the table.
         *(
             Kind(
@@ -379,7 +429,7 @@ def print_table(names: list[str], data: Path, max_pairs: int) -> None:
         "| Clouds | right | of these accepted | accepted and wrong | s a pair"
         " | Open3D | s | KISS-Matcher | s |\n|---|---|---|---|---|---|---|---|---|"
     )
-    p, right = [], []
+    p, right, by_family = [], [], {}  # type: ignore[var-annotated]
     for name in names:
         ours, theirs = [], ([], [])  # type: ignore[var-annotated]
         try:
@@ -398,6 +448,7 @@ def print_table(names: list[str], data: Path, max_pairs: int) -> None:
                 method = peer.method(voxel)
                 if method is not None:
                     rows.append(timed(method, pair))
+        by_family.setdefault(KINDS[name].family, []).extend(ours)
         print(_row(KINDS[name].title, ours, theirs), flush=True)
     wrong = sum(x >= pairs.ACCEPTED and not r for x, r in zip(p, right, strict=True))
     print(
@@ -405,7 +456,22 @@ def print_table(names: list[str], data: Path, max_pairs: int) -> None:
     )
     print(f"area under the ROC curve {pairs.roc_area(np.array(p), np.array(right)):.3f}")
     pairs.print_calibration(np.array(p), np.array(right))
+    _print_reliability(by_family)
     _print_decoys(names, data, max_pairs)
+
+
+def _print_reliability(by_family: dict[str, list[tuple[bool, bool, float, float]]]) -> None:
+    """Print how many poses are right, for each place and range of the stated probability."""
+    bins = [f"{low:g} to {high:g}" for low, high in itertools.pairwise(_BINS)]
+    print(f"\n| probability | {' | '.join(bins)} |\n|{'---|' * (len(bins) + 1)}")
+    for family, rows in by_family.items():
+        which = np.searchsorted(_BINS, [row[2] for row in rows], side="right") - 1
+        which = np.minimum(which, len(bins) - 1)
+        cells = []
+        for k in range(len(bins)):
+            right = [row[0] for row, bin_ in zip(rows, which, strict=True) if bin_ == k]
+            cells.append(f"{sum(right)} of {len(right)}")
+        print(f"| {family} | {' | '.join(cells)} |")
 
 
 def _row(title: str, ours: list, theirs: tuple[list, list]) -> str:  # type: ignore[type-arg]
@@ -458,7 +524,7 @@ def print_fit(data: Path, max_pairs: int) -> None:
     fitted = [kind.name for kind in KINDS.values() if kind.fitted]
     others = [kind.name for kind in KINDS.values() if kind.shown and not kind.fitted]
     titles = (
-        "Searched: constant, sqrt of margin, sqrt of contradiction, degenerate",
+        "Searched: constant, sqrt of lead in surfaces, no free space, contradiction",
         "Followed: constant, support, sqrt of contradiction",
     )
     for title, rows in zip(titles, samples(fitted, data, max_pairs), strict=True):

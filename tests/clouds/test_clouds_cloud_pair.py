@@ -28,7 +28,7 @@ from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp.coarse_to_fine import averaged
-from tofuse.engine.search.pose_probability import CLOUDS, PoseEvidence
+from tofuse.engine.search.pose_probability import CLOUDS, CloudEvidence
 from tofuse.engine.tracking.pairwise import Pairwise
 from tofuse.formats.geometry.ply import write_ply
 from tofuse.lab.simulation.effects import Effects
@@ -263,14 +263,43 @@ def test_agreement_is_symmetric(scans):
     assert there.support == pytest.approx(back.support, abs=1e-9)
 
 
-def test_evidence_without_free_space_depends_on_margin():
-    """Images and clouds have their own models of evidence."""
-    cases = [
-        PoseEvidence(0.6, c, m, k, CLOUDS) for c, m, k in ((0, 0.6, 0), (0.03, 0.25, 0), (0, 0, 1))
+def test_evidence_of_clouds_is_lead_in_distinct_surfaces():
+    """Whatever fraction of the points walls cover, a room with the same walls is not believed."""
+
+    def evidence(lead, near=40.0, contradiction=0.0, degenerate=0, free_space=True):
+        return CloudEvidence(
+            0.6, contradiction, 0.6, degenerate, CLOUDS, lead, near, free_space=free_space
+        )
+
+    right, few, walls, blind, contradicted, slides = cases = [
+        evidence(25.0),
+        evidence(5.0, near=8.0),
+        evidence(1.0),
+        evidence(25.0, free_space=False),
+        evidence(25.0, contradiction=0.04),
+        evidence(25.0, degenerate=1),
     ]
-    right, other_room, slides = (case.probability for case in cases)
-    assert right > 0.9 > 0.7 > other_room > slides
-    assert "degenerate" in cases[2].rejection_reason()
+    assert right.probability > 0.9 > few.probability > walls.probability
+    assert right.probability > blind.probability
+    assert right.probability > contradicted.probability
+    assert "degenerate" in slides.rejection_reason()
+    assert all(evidence(lead).probability <= 0.5 for lead in (0.0, -3.0)), cases
+
+
+def test_each_plane_counts_as_one_surface():
+    """However many points it has."""
+    rng = np.random.default_rng(0)
+    boards = [
+        (rng.uniform(-1, 1, (4000, 3)) * [size, size, 0] + [0, 0, z])
+        for z, size in ((0.0, 3.0), (1.0, 1.0), (2.0, 0.6))
+    ]
+    for count in (1, 3):
+        points = np.concatenate(boards[:count])
+        agreement = cloud_agreement(*maps(points, points, 0.12), np.eye(4))
+        assert agreement.surfaces == pytest.approx(count, rel=0.02)
+        assert agreement.near_surfaces == pytest.approx(count, rel=0.02)
+    shifted = cloud_agreement(*maps(points, points, 0.12), se3.exp([0, 0, 1, 0, 0, 0]))
+    assert shifted.surfaces < 0.8 * count
 
 
 # Registration
@@ -316,7 +345,7 @@ def test_clouds_of_different_density(scans):
 def test_views_without_overlap_are_rejected(scans):
     _, elsewhere = scanned([2.5, -2.5, 1.3], 1.0, seed=3)
     for source, target, reason in (
-        (elsewhere, scans[1], "probability"),
+        (elsewhere, scans[1], "another pose fits nearly as well"),
         (np.random.default_rng(0).normal(size=(3000, 3)), scans[1], "points of both views"),
     ):
         found = tofuse.register(source, target)

@@ -33,9 +33,30 @@ _SIGMAS, _CURVATURE_TOLERANCE = 3.0, 0.25
 _MAX_DISTANCE = 2.0
 # Cosine of the largest angle between normals of surfaces that support each other.
 _MIN_NORMAL_COSINE = 0.75
+# Cosine of the largest angle between normals of points on one plane, and points compared at once.
+_COPLANAR_COSINE, _CHUNK = 0.9, 500
 # A point is in free space if it lies in front of the surface by more than this fraction of the
 # range plus the tolerance.
 _IN_FRONT = 0.02
+
+
+@dataclass(frozen=True)
+class CloudAgreement(pair_agreement.Agreement):
+    """Agreement of two clouds, also by distinct surfaces.
+
+    Two walls and a floor can be laid over those of any other room, whatever fraction of the points
+    lies on them. So all points on one plane count as one surface, and those beside it by as much.
+
+    Attributes
+    ----------
+    surfaces
+        Number of distinct surfaces that coincide.
+    near_surfaces
+        Number of those that are near one of the other view, whether or not they coincide.
+    """
+
+    surfaces: float = 0.0
+    near_surfaces: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +114,18 @@ class CloudMap:
         valid = valid[:: max(1, -(-len(valid) // _COMPARED_POINTS))]
         return self.view.points[valid].astype(np.float64), self.normals[valid]
 
+    @cached_property
+    def surface_share(self) -> Float64:
+        """Share (n,) of each compared point in its plane: 1 / number of them on that."""
+        points, normals = self.compared
+        count = np.empty(len(points))
+        for k in range(0, len(points), _CHUNK):
+            p, n = points[k : k + _CHUNK], normals[k : k + _CHUNK]
+            beside = np.abs((p * n).sum(1)[:, None] - n @ points.T)
+            parallel = np.abs(n @ normals.T) > _COPLANAR_COSINE
+            count[k : k + _CHUNK] = (parallel & (beside < tolerance(self, self))).sum(1)
+        return 1 / np.maximum(count, 1)
+
 
 def _tested_points(view: CloudFrame, shape: surface_shape.Shape, viewpoint: Float64) -> Float64:
     """Return points (m, 3) on surfaces, except at edges and grazing incidence."""
@@ -111,9 +144,7 @@ def tolerance(source: CloudMap, target: CloudMap) -> float:
     return _SIGMAS * noise + _CURVATURE_TOLERANCE * max(source.size, target.size)
 
 
-def cloud_agreement(
-    source: CloudMap, target: CloudMap, T_target_source: Float64
-) -> pair_agreement.Agreement:
+def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64) -> CloudAgreement:
     """Return the agreement of both views at a pose (4, 4).
 
     `overlap` counts points that are near a surface or in free space. Without a known viewpoint
@@ -122,8 +153,10 @@ def cloud_agreement(
     max_distance = tolerance(source, target)
     directions = ((source, target, T_target_source), (target, source, se3.inverse(T_target_source)))
     statistics = [_one_direction(a, b, T, max_distance) for a, b, T in directions]
-    near_fraction, on_surface, violation, squares = np.mean(statistics, axis=0)
-    return pair_agreement.Agreement(
+    near_fraction, on_surface, violation, squares, surfaces, near_surfaces = np.mean(
+        statistics, axis=0
+    )
+    return CloudAgreement(
         overlap=float(near_fraction + violation),
         support=float(on_surface),
         violation=float(violation),
@@ -131,16 +164,21 @@ def cloud_agreement(
         rms_m=float(np.sqrt(squares / on_surface)) if on_surface else np.inf,
         points=sum(len(view.compared[0]) for view in (source, target)),
         score=float(on_surface - VIOLATION_WEIGHT * min(violation, MAX_VIOLATION)),
+        surfaces=float(surfaces),
+        near_surfaces=float(near_surfaces),
     )
 
 
 def _one_direction(
     view: CloudMap, other: CloudMap, T: Float64, max_distance: float
-) -> tuple[float, float, float, float]:
-    """Return fractions near a surface, on one, in free space; and mean square distance, m^2."""
+) -> tuple[float, ...]:
+    """Return fractions near a surface, on one, in free space; mean square distance, m^2; surfaces.
+
+    See `CloudAgreement` for the last two, which coincide and which are near.
+    """
     points, normals = view.compared
     if not len(points):
-        return 0.0, 0.0, 0.0, 0.0
+        return (0.0,) * 6
     points, normals = se3.transform(T, points), normals @ T[:3, :3].T
     is_near, distance, same_normal = _surface_at(other, points, normals, max(view.size, other.size))
     on_surface = is_near & same_normal & (distance < max_distance)
@@ -150,6 +188,8 @@ def _one_direction(
         float(np.mean(on_surface)),
         violation,
         float((distance[on_surface] ** 2).sum() / len(distance)),
+        float(view.surface_share[on_surface].sum()),
+        float(view.surface_share[is_near].sum()),
     )
 
 

@@ -3,7 +3,8 @@
 The clouds are first aligned from the guess. If one is given, and their agreement makes that pose
 practically certain, it is returned. Else poses are proposed by feature matching
 (`clouds.fpfh`); each is aligned and evaluated by the agreement of both clouds
-(`clouds.cloud_agreement`) and by its lead over rival poses. Without a guess rivals are
+(`clouds.cloud_agreement`) and by its lead over rival poses. That is counted in points, and in
+distinct surfaces, which decide whether the pose is believed. Without a guess rivals are
 searched in any case: however well a symmetric body fits, it fits as well in another pose.
 """
 
@@ -16,7 +17,12 @@ import numpy as np
 
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
+from tofuse.engine.clouds.cloud_agreement import (
+    NEIGHBOURS,
+    CloudAgreement,
+    CloudMap,
+    cloud_agreement,
+)
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
 from tofuse.engine.clouds.fpfh import MATCH_WEIGHT, Candidates, candidates, log_matches
 from tofuse.engine.clouds.robust_motion import are_distinct
@@ -32,7 +38,7 @@ from tofuse.engine.icp import (
     spacing,
     surface_metrics,
 )
-from tofuse.engine.search import pair_agreement, pose_probability
+from tofuse.engine.search import pose_probability
 
 # Maximum number of points of each averaged view.
 _POINTS = 7_000
@@ -64,7 +70,7 @@ class _Pose:
     """A pose T_target_source (4, 4) and its agreement."""
 
     T_target_source: Float64
-    agreement: pair_agreement.Agreement
+    agreement: CloudAgreement
     # Start of its alignment; None for proposals.
     guess: Float64 | None = None
     # MSAC score of the feature matches at the pose.
@@ -77,7 +83,7 @@ class _Pose:
 
 
 # Placeholder for the rival of a pose without one; it has no support.
-_NO_RIVAL = _Pose(np.eye(4), pair_agreement.Agreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0))
+_NO_RIVAL = _Pose(np.eye(4), CloudAgreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,11 +142,24 @@ class _CloudViews:
         return aligned if aligned.agreement.score >= initial.agreement.score else initial
 
     def evidence(
-        self, pose: _Pose, lead: float | None = None, degenerate: int = 0
-    ) -> pose_probability.PoseEvidence:
+        self,
+        pose: _Pose,
+        lead: float | None = None,
+        degenerate: int = 0,
+        rivals: Sequence[_Pose] = (),
+    ) -> pose_probability.CloudEvidence:
         """Return the evidence for a pose."""
-        return pose_probability.PoseEvidence.of(
-            pose.agreement, lead, degenerate, pose_probability.CLOUDS
+        agreement = pose.agreement
+        most = max((rival.agreement.surfaces for rival in rivals), default=0.0)
+        return pose_probability.CloudEvidence(
+            agreement.support,
+            agreement.contradiction,
+            lead,
+            degenerate,
+            pose_probability.CLOUDS,
+            surface_lead=agreement.surfaces - most,
+            near_surfaces=agreement.near_surfaces,
+            free_space=self.has_free_space,
         )
 
     def with_information(self, registration: Registration) -> Registration:
@@ -461,6 +480,9 @@ def _registration(
     lead = None if rival is None else agreement.score - max(rival.agreement.score, 0.0)
     if lead is not None and len(registration.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well
-    evidence = views.evidence(pose, lead, len(registration.unobservable))
+    rivals = [
+        p for p in poses or () if views.are_distinct_poses(p.T_target_source, pose.T_target_source)
+    ]
+    evidence = views.evidence(pose, lead, len(registration.unobservable), rivals)
     runner_up = None if rival is None or rival is _NO_RIVAL else rival.T_target_source
     return evidence.applied(registration, agreement, runner_up)
