@@ -301,8 +301,8 @@ class Batch(Command):
 class Register(Json, Threads, Source):
     """Register two files or frames.
 
-    A view is a file with a single view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: frame 12 of
-    a recording, counting from 0.
+    A view is a file with a single view (PLY, PCD, LAS, LAZ, E57, ...), a mesh (PLY, OBJ, STL,
+    GLB), a result, or REC#12: frame 12 of a recording, counting from 0.
 
     Attributes
     ----------
@@ -312,6 +312,8 @@ class Register(Json, Threads, Source):
         the view that stays fixed
     guess : FILE
         initial guess of T_target_source (none)
+    method : NAME
+        registration method, such as icp (any-pair)
     out : DIR
         folder for the result (none)
     overwrite
@@ -327,6 +329,7 @@ class Register(Json, Threads, Source):
     source: str
     target: str
     guess: Path | None = None
+    method: str | None = None
     out: Path | None = None
     overwrite: bool = False
 

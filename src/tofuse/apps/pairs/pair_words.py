@@ -91,7 +91,7 @@ def overlap(result: PairResult) -> str:
 
 def sigma(result: PairResult) -> str:
     """Return one standard deviation in the worst observable direction as text."""
-    metres, radians = result.sigma
+    metres, radians = result.registration.sigma
     parts = []
     if metres is not None:
         parts.append(f"{1000 * metres:.2f} mm")
