@@ -20,6 +20,10 @@ def decision(result: PairResult) -> tuple[str, str]:
     if registration.probability is not None:
         parts.append(f"probability {_probability(registration.probability)}")
     if registration.believed:
+        if registration.given_guess:
+            near = "identity" if result.guess is None else "guess"
+            rival = "none was tried" if registration.runner_up is None else "one fits as well"
+            parts.append(f"given the {near}: of other poses {rival}")
         return "Accepted", "; ".join(parts)
     reason = registration.reason
     if registration.believed is None:

@@ -48,8 +48,8 @@ def register(
         a `Mesh`, sampled evenly by area; a `Reconstruction`: its cloud. Or the path of a result, of
         a mesh (.ply, .obj, .stl, .glb; m) or of a view as in ``tofuse register``.
     guess
-        (4, 4) T_target_source to start from; the identity unless given. Of ambiguous poses of two
-        images the one at the guess is returned.
+        (4, 4) T_target_source to start from; the identity unless given. Of ambiguous poses the one
+        at the guess is returned.
     method
         Registration method, or the name of one ("icp", "coarse-to-fine"); the above unless given.
     seed
@@ -61,7 +61,8 @@ def register(
     whether the pose is verified, `probability` how probably it is right (images: within 5 % of the
     depth and 4 degrees; clouds: within 5 % of the extent), and `reason` why it is rejected: too
     little support or too little lead over `runner_up`, contradiction, degenerate directions.
-    `converged` implies none of that. `sigma` (m, rad) and `covariance` state its accuracy.
+    `given_guess`: whether that holds only near the guess, as another pose fits as well, or none was
+    tried. `converged` implies none of that. `sigma` (m, rad) and `covariance` state its accuracy.
     Degenerate directions (three on a flat wall) are in `unobservable`, and keep the guess. A
     `method` without verification leaves `believed` None.
 

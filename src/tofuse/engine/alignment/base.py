@@ -65,6 +65,9 @@ class Registration:
         Fraction of the points in the other view's free space.
     confirmed
         Whether an alignment from the guess converges to the pose of the search.
+    given_guess
+        Whether `believed` and `probability` hold only for poses near the guess, or near the
+        identity without one: another pose fits as well, or none was tried.
     reference_point
         (3,) of the source, m: its `shift` for clouds in map coordinates, else its origin.
     """
@@ -89,10 +92,13 @@ class Registration:
     contradiction: float | None = None
     violation: float | None = None
     confirmed: bool = False
+    given_guess: bool = False
     reference_point: Float64 = field(default_factory=lambda: np.zeros(3))
 
     def __repr__(self) -> str:
         decision = {True: "accepted", False: "rejected", None: "not verified"}[self.believed]
+        if self.believed and self.given_guess:
+            decision += " given the guess"
         t, w = self.T_target_source[:3, 3], se3.so3_log(self.T_target_source[:3, :3])
         return (
             f"Registration: {decision}, translation {np.linalg.norm(t):.4f} m, "

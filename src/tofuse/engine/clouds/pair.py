@@ -74,7 +74,9 @@ class AnyPair(Registrar):
         if image_registration is not None and are_images:
             return image_registration
         if image_registration is not None and image_registration.believed:
-            return with_cloud_information(source, target, image_registration, rng)
+            found = with_cloud_information(source, target, image_registration, rng)
+            if guess is not None or not found.given_guess:
+                return found
         if not searches and guess is not None:
             return follow_clouds(source, target, guess, rng)
         return register_clouds(source, target, guess, rng, image_registration)
