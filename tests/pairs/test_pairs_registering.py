@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from registration_scenes import error, stone, turn
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
 from tofuse.engine.geometry import se3
 from tofuse.formats.export import exchange
-from tofuse.formats.geometry import write_ply
+from tofuse.formats.geometry import read_ply, write_ply
 from tofuse.lab.world import mesh as meshes
 
 T_TRUE = turn([1, 2, 0.5], 5)
@@ -121,6 +122,24 @@ def test_unbounded_accuracy_is_none() -> None:
     assert len(found.unobservable) == 3
     assert found.covariance is None
     assert 0 < found.sigma[0] < 0.01
+
+
+@pytest.mark.nightly_part
+def test_command_writes_the_scale(tmp_path, capfd) -> None:
+    source, target = stone(3000, 1, 0.001), stone(3000, 0, 0.001)
+    for name, points in (("source", 3 * source), ("target", target)):
+        write_ply(tmp_path / f"{name}.ply", GeometryRecord(points))
+    words = ("register", tmp_path / "source.ply", tmp_path / "target.ply", "--scale")
+    call(*words, "--out", tmp_path / "out")
+    assert re.search(r"scale +0\.333\d* ± ", capfd.readouterr().out)
+    data = json.loads((tmp_path / "out" / "registration.json").read_text())
+    assert data["scale"] == pytest.approx(1 / 3, rel=0.003)
+    assert 0 < data["scale_sigma"] < 0.003
+    similarity = np.loadtxt(tmp_path / "out" / "transform.txt")
+    moved = 3 * source @ similarity[:3, :3].T + similarity[:3, 3]
+    np.testing.assert_allclose(moved, source, atol=0.02)
+    aligned = read_ply(tmp_path / "out" / "aligned.ply").points
+    np.testing.assert_allclose(aligned, moved, atol=1e-5)
 
 
 @pytest.mark.parametrize(

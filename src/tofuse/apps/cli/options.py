@@ -314,6 +314,8 @@ class Register(Json, Threads, Source):
         initial guess of T_target_source (none)
     method : NAME
         registration method, such as icp (any-pair)
+    scale
+        the source is of unknown scale, as models from images alone are
     out : DIR
         folder for the result (none)
     overwrite
@@ -330,6 +332,7 @@ class Register(Json, Threads, Source):
     target: str
     guess: Path | None = None
     method: str | None = None
+    scale: bool = False
     out: Path | None = None
     overwrite: bool = False
 

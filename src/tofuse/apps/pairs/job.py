@@ -9,7 +9,7 @@ from time import perf_counter
 
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.pairs.registering import registered_near, registrar_of
+from tofuse.apps.pairs.registering import registered_near, registered_scaled, registrar_of
 from tofuse.apps.pairs.result import (
     CONTRACT,
     MARKER,
@@ -39,6 +39,8 @@ class PairOptions:
         File with the initial T_target_source; see `read_pose`.
     method
         Name of a registration method; None for `AnyPair`.
+    scale
+        Whether the source is of unknown scale.
     out
         Folder for the result; None writes none.
     overwrite
@@ -51,6 +53,7 @@ class PairOptions:
 
     guess: Path | None = None
     method: str | None = None
+    scale: bool = False
     out: Path | None = None
     overwrite: bool = False
     format: str | None = None
@@ -100,7 +103,10 @@ def _registered(
     near = NearOrigin.of(views[0].frame, views[1].frame, guess)
     progress.stage("registering")
     start_s = perf_counter()
-    registration = registered_near(near, registrar_of(options.method))
+    if options.scale:
+        near, registration = registered_scaled(near, options.method)
+    else:
+        registration = registered_near(near, registrar_of(options.method))
     seconds = perf_counter() - start_s
     name = None if options.guess is None else str(options.guess)
     near_source = replace(views[0], frame=near.source)
@@ -133,7 +139,7 @@ def _write(result: PairResult, folder: folders.OutputFolder) -> None:
     from tofuse.apps.pairs.page import write_pair_report
 
     with folder.staging() as staging:
-        atomic.write_text(staging / "transform.txt", pose_text(result.T_target_source))
+        atomic.write_text(staging / "transform.txt", pose_text(result.similarity))
         write_aligned(result, staging / "aligned.ply")
         write_pair_report(result, staging / "report.html")
         text = json.dumps(pair_json(result), indent=1, allow_nan=False)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.apps.pairs.result import PairResult
+from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 
@@ -43,6 +44,7 @@ def lines(result: PairResult) -> list[tuple[str, str]]:
         translation += f"\n{displacement} at {vector(center, 0)}, the source's centre"
     rms_m = result.registration.rms_m
     found = [
+        *scale(result.registration),
         ("translation", translation),
         ("rotation", rotation(result)),
         ("T_target_source", matrix(result)),
@@ -58,6 +60,15 @@ def lines(result: PairResult) -> list[tuple[str, str]]:
     if rival := runner_up(result):
         found.append(("runner-up", rival))
     return found
+
+
+def scale(registration: Registration) -> list[tuple[str, str]]:
+    """Return name and value of the scale; nothing if it was not estimated."""
+    sigma = registration.scale_sigma
+    if sigma is None:
+        return []
+    factor = f"{registration.scale:.5g} \N{PLUS-MINUS SIGN} {sigma:.1g}"
+    return [("scale", f"{factor} (1\N{GREEK SMALL LETTER SIGMA}), factor of the source's points")]
 
 
 def rotation(result: PairResult) -> str:

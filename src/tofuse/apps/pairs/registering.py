@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from tofuse.apps.pairs.views import View, view_of
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.clouds import AnyPair, NearOrigin
+from tofuse.engine.clouds import AnyPair, NearOrigin, register_similar
 from tofuse.engine.compute import one_blas_thread
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
@@ -28,6 +28,7 @@ def register(
     *,
     guess: ArrayLike | None = None,
     method: Registrar | str | None = None,
+    scale: bool = False,
     seed: int = 0,
 ) -> Registration:
     """Register two views, clouds, meshes or results.
@@ -52,6 +53,10 @@ def register(
         at the guess is returned.
     method
         Registration method, or the name of one ("icp", "coarse-to-fine"); the above unless given.
+    scale
+        Whether the source is of unknown scale, as models from images alone are. Then `scale` is the
+        factor of its points before `T_target_source` is applied, between a fourth and four times
+        that of equal extents, and `scale_sigma` its standard deviation; seconds.
     seed
         Seed of the random selection of points, for methods that use one.
 
@@ -70,15 +75,19 @@ def register(
     ------
     InputError
         If a view can't be used or has fewer than ten finite points, the guess is no rigid motion,
-        or there is no such method.
+        or there is no such method; if `scale` is combined with a guess or a method.
     RegistrationError
-        If too few points correspond, an image is empty, or the median depths of two images differ
-        more than fourfold.
+        If too few points correspond, clouds fit at no scale, an image is empty, or the median
+        depths of two images differ more than fourfold.
     """
     check_number(seed, Bounds(0), "seed", whole=True)
     start = None if guess is None else se3.check_pose(guess, where="guess")
     near = NearOrigin.of(view_of(source, "source"), view_of(target, "target"), start)
-    return near.in_files(registered_near(near, registrar_of(method), seed))
+    if scale:
+        near, registration = registered_scaled(near, method, seed)
+    else:
+        registration = registered_near(near, registrar_of(method), seed)
+    return near.in_files(registration)
 
 
 def registrar_of(method: Registrar | str | None) -> Registrar:
@@ -105,6 +114,24 @@ def registrar_of(method: Registrar | str | None) -> Registrar:
             f"is {method!r}", where="method", remedy=f"use one of {', '.join(sorted(named))}"
         )
     return method
+
+
+def registered_scaled(
+    near: NearOrigin, method: Registrar | str | None = None, seed: int = 0
+) -> tuple[NearOrigin, Registration]:
+    """Return two views, the source at the scale of the target, and their registration.
+
+    Raises
+    ------
+    InputError
+        If there is a guess or a method.
+    """
+    for name, value in (("guess", near.guess), ("method", method)):
+        if value is not None:
+            raise InputError("does not apply to --scale", where=name, remedy="leave one out")
+    with one_blas_thread():
+        found = register_similar(near.source, near.target, np.random.default_rng([seed, 0]))
+    return replace(near, source=found.source), found.registration
 
 
 def _required_options(part: Any) -> list[str]:

@@ -31,7 +31,8 @@ class PairResult:
     Attributes
     ----------
     source, target
-        The views, near the origin: a cloud in map coordinates has the `shift` to them.
+        The views, near the origin: a cloud in map coordinates has the `shift` to them. A source of
+        unknown scale is at the scale that was found.
     registration
         The registration of these views.
     guess
@@ -56,6 +57,11 @@ class PairResult:
     def T_target_source(self) -> Float64:
         """(4, 4), maps coordinates of the source's file to those of the target's."""
         return self.in_files.T_target_source
+
+    @property
+    def similarity(self) -> Float64:
+        """(4, 4) T_target_source with the scale: it maps unscaled coordinates of the source."""
+        return self.T_target_source @ np.diag([*[self.registration.scale] * 3, 1.0])
 
     @property
     def moved_m(self) -> Float64:
@@ -130,6 +136,8 @@ def pair_json(result: PairResult) -> dict[str, Any]:
             "target": _view_json(result.target),
             "guess": result.guess,
             "T_target_source": result.T_target_source,
+            "scale": registration.scale,
+            "scale_sigma": registration.scale_sigma,
             **{name: getattr(registration, name) for name in _EVIDENCE},
             "runner_up": result.runner_up,
             "unobservable": registration.unobservable,

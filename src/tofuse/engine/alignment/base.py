@@ -68,6 +68,9 @@ class Registration:
     given_guess
         Whether `believed` and `probability` hold only for poses near the guess, or near the
         identity without one: another pose fits as well, or none was tried.
+    scale, scale_sigma
+        Factor of the source's points before `T_target_source` is applied, and its standard
+        deviation; 1 and None where it was not estimated.
     reference_point
         (3,) of the source, m: its `shift` for clouds in map coordinates, else its origin.
     """
@@ -93,6 +96,8 @@ class Registration:
     violation: float | None = None
     confirmed: bool = False
     given_guess: bool = False
+    scale: float = 1.0
+    scale_sigma: float | None = None
     reference_point: Float64 = field(default_factory=lambda: np.zeros(3))
 
     def __repr__(self) -> str:
