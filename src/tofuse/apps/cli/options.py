@@ -352,6 +352,8 @@ class Judge(Json, Threads, Selection):
         replace an existing result in --out
     tolerance : LENGTH
         accuracy required of good poses, e.g. 30mm (0.5 % of the model, at least 10mm)
+    scale
+        the poses are of unknown scale: estimate it from the depth (only if they can't be in metres)
 
     Exit status
     -----------
@@ -367,6 +369,7 @@ class Judge(Json, Threads, Selection):
     out: Path | None = None
     overwrite: bool = False
     tolerance: Length | None = None
+    scale: bool = False
 
 
 class Merge(JsonLines, Seed, Threads, Edited):
