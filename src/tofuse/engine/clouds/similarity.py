@@ -201,8 +201,8 @@ class _Pair:
         if np.count_nonzero(matched) < surface_metrics.MIN_PAIRS:
             return None
         q = self.target.view.points[nearest[matched]].astype(np.float64)
-        # With the mean normal, distances along a curved surface cancel (Rusinkiewicz 2019); with one
-        # of both a convex body would grow.
+        # With the mean normal, distances along a curved surface cancel (Rusinkiewicz 2019); with
+        # one of both a convex body would grow.
         p = moved[matched]
         n = normals[matched] + np.sign(cosine[matched, None]) * own_normals[matched]
         n /= np.linalg.norm(n, axis=1, keepdims=True)
