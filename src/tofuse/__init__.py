@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from tofuse.apps.inspection.inspect import inspect_recording as inspect
     from tofuse.apps.jobs.evaluating import Evaluation, evaluate
     from tofuse.apps.jobs.judging import Judgement, judge
+    from tofuse.apps.pairs.registering import register
     from tofuse.engine.alignment.base import Registration
     from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, Rational, RayTable
-    from tofuse.engine.clouds.pair import register
     from tofuse.engine.errors import InputError, OutputError, RegistrationError, TofuseError
     from tofuse.engine.frames.frames import CloudFrame, RangeFrame
     from tofuse.engine.frames.from_arrays import from_arrays

@@ -286,6 +286,11 @@ def made(T: np.ndarray, **more: object) -> Registration:
         ({"believed": True, "probability": 0.97}, 0, "accepted: probability 97 %"),
         ({"believed": True, "probability": 0.9999}, 0, "accepted: probability above 99 %"),
         (
+            {"believed": True, "probability": 0.97, "given_guess": True},
+            0,
+            "accepted: probability 97 %; given the identity: of other poses none was tried",
+        ),
+        (
             {"believed": False, "probability": 0.2, "reason": "too little overlap"},
             3,
             "rejected: probability 20 %; too little overlap",

@@ -12,7 +12,7 @@ import pytest
 
 import tofuse
 from tofuse.apps.cli.program import main
-from tofuse.apps.jobs.judging import device_sentence, poses_for
+from tofuse.apps.jobs.judging import device_sentence, poses_for, sentence
 from tofuse.apps.results.folders import RESULT
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
@@ -21,6 +21,8 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pose_accuracy import Accuracy
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.formats.poses.trajectory import write_tum
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +79,51 @@ def test_stated_error_of_wrong_poses_is_correct(of_bent, truth) -> None:
     assert refined.diagnostics.accuracy.position_m < 0.01
     assert refined.diagnostics.verdict == "good"
     assert of_bent.refined_consistency.rms_m < of_bent.consistency.rms_m
+
+
+@pytest.fixture(scope="module")
+def on_rail(tmp_path_factory):
+    """A camera that moves sideways."""
+    folder = tmp_path_factory.mktemp("rail") / "rail"
+    simulate("rail", folder, frames=8, every=8, effects=Effects.none(shot_noise=True))
+    return tofuse.open(folder)
+
+
+def scaled(poses, factor):
+    out = poses.copy()
+    out[:, :3, 3] *= factor
+    return out
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.2, pytest.param(5.0, marks=pytest.mark.nightly_part)])
+def test_poses_of_another_scale_are_judged_in_metres(factor, on_rail):
+    found = tofuse.judge(on_rail, scaled(on_rail.reference, factor))
+    scale = found.scale
+    assert scale.applied == (factor != 1)
+    assert abs(scale.factor * factor - 1) < 3 * scale.sigma * factor
+    assert scale.sigma * factor < 0.03
+    assert found.verdict == "good"
+    assert found.accuracy.position_m < 0.03
+    text = f"poses.txt times {scale.factor:.4g} \N{PLUS-MINUS SIGN} "
+    assert sentence(found, "poses.txt").startswith(text) == scale.applied
+    assert found.to_dict()["scale"]["factor"] == scale.factor
+    if not scale.applied:
+        np.testing.assert_array_equal(found.poses, on_rail.reference)
+
+
+@pytest.mark.nightly_part
+def test_small_error_of_scale_is_an_error_unless_scale_is_unknown(on_rail):
+    poses = scaled(on_rail.reference, 1.08)
+    assert not tofuse.judge(on_rail, poses).scale.applied
+    found = tofuse.judge(on_rail, poses, scale=True)
+    assert found.scale.applied
+    assert found.scale.factor == pytest.approx(1 / 1.08, abs=3 * found.scale.sigma)
+
+
+def test_rotations_have_no_scale(of_truth, recording, truth) -> None:
+    assert of_truth.scale is None
+    with pytest.raises(InputError, match="scale: can't be estimated"):
+        tofuse.judge(recording, truth, scale=True)
 
 
 @pytest.mark.nightly

@@ -391,7 +391,8 @@ def test_reasons_are_merged_and_sorted() -> None:
 def test_disconnected_parts_are_named() -> None:
     (reason,) = judge(CASES["disconnected"])[1]
     assert reason.ranges == ((7, 8),)
-    text = "The recording consists of 2 disconnected parts: frames 0-6, 7-8; no overlap found."
+    text = "The recording consists of 2 disconnected parts: frames 0-6, 7-8; no "
+    text += "pose between them could be verified."
     assert reason.text == text
     (bridged,) = judge(CASES["bridged_gap"])[1]
     text = "Frames 5-8 are connected to the rest by extrapolated motion only."
@@ -415,7 +416,7 @@ def test_parts_of_several_ranges_with_lost_frames() -> None:
     assert verdict == "degraded"
     assert (parts.code, parts.ranges) == ("disconnected", ((10, 11), (14, 15)))
     # What is linked to the main part belongs to it; lost frames belong to none.
-    assert "frames 0-4, 6-8, 12-13, 16-19; frames 10-11, 14-15; no overlap" in parts.text
+    assert "frames 0-4, 6-8, 12-13, 16-19; frames 10-11, 14-15; no pose" in parts.text
     assert (lost.code, lost.ranges) == ("lost_frames", ((5, 5), (9, 9)))
 
 
@@ -475,3 +476,11 @@ def test_calibration_without_loop_confirmation_is_noted() -> None:
         replace(found, alarm=True, gap=gap),  # which is an alarm
     ):
         assert warnings_of(quiet) == []
+
+
+def test_scanners_see_farther_than_cameras() -> None:
+    far = evidence(depths=(25.0,) * 9)
+    assert [r.code for r in judge(far)[1]] == ["implausible_depth"]
+    assert "implausible_depth" not in [r.code for r in judge(replace(far, scans=True))[1]]
+    (reason,) = judge(replace(far, scans=True, depths=(2500.0,) * 9))[1]
+    assert "farther than scanners see" in reason.text

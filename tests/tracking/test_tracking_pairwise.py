@@ -70,3 +70,56 @@ def test_interruption_resets_predicted_motion() -> None:
     tracker.interrupt()
     tracker.push(CloudFrame(3, 3.0, points))
     np.testing.assert_allclose(method.guesses, [0.0, 0.1, 0.0], atol=1e-9)
+
+
+@dataclass(frozen=True)
+class Doubtful(AnyPair):
+    """Searches find a pose that is probable, or none; alignments find the one near their guess."""
+
+    searched: tuple[float | None, ...] = ()
+    actual: tuple[float, ...] = ()
+
+    def register(self, source, target, guess, rng):
+        k = source.index
+        x, probability = self.searched[k], 0.8
+        if not self.search:
+            near = abs(guess[0, 3] - self.actual[k]) < 0.1
+            x, probability = (self.actual[k] if near else float(guess[0, 3])), 0.95 if near else 0.1
+        if x is None:
+            x, probability = 0.0, 0.1
+        T = se3.exp(np.array([x, 0, 0, 0, 0, 0]))
+        return Registration(
+            T, True, 1, 100, 100, 0.0, 0.0, np.eye(6),
+            believed=probability >= 0.9, probability=probability, reason="doubtful",
+        )  # fmt: skip
+
+
+def followed(guess, odometry, searched):
+    """The steps of views that move by a metre each, with odometry's positions."""
+    method = Doubtful(searched=searched, actual=(0.0, *[1.0] * (len(odometry) - 1)))
+    tracker = Pairwise(registration=method, guess=guess).start(0)
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 3)).astype(np.float32)
+    return [
+        tracker.push(CloudFrame(k, float(k), points), se3.exp([x, 0, 0, 0, 0, 0.0]))
+        for k, x in enumerate(odometry)
+    ]
+
+
+def test_odometry_that_agrees_with_searches_replaces_them() -> None:
+    """At first it confirms probable poses of searches; then it connects views without one."""
+    odometry = (0.0, 1.03, 1.98, 3.02, 4.0)
+    steps = followed("odometry", odometry, (0.0, 1.0, 1.0, None, None))
+    assert [step.component for step in steps] == [0] * 5
+    assert not any(step.doubtful for step in steps)
+    np.testing.assert_allclose(steps[-1].T_component_camera[0, 3], 4.0)
+    # Without odometry as guess, poses are doubtful, and views disconnected.
+    steps = followed("previous", odometry, (0.0, 1.0, 1.0, None, None))
+    assert steps[1].doubtful
+    assert steps[3].component == 1
+
+
+def test_odometry_that_contradicts_searches_is_not_used() -> None:
+    steps = followed("odometry", (0.0, 2.0, 4.0, 6.0, 8.0), (0.0, 1.0, 1.0, None, None))
+    assert steps[1].doubtful
+    assert steps[2].doubtful
+    assert steps[3].component == 1

@@ -305,8 +305,8 @@ class Batch(Command):
 class Register(Json, Threads, Source):
     """Register two files or frames.
 
-    A view is a file with a single view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: frame 12 of
-    a recording, counting from 0.
+    A view is a file with a single view (PLY, PCD, LAS, LAZ, E57, ...), a mesh (PLY, OBJ, STL,
+    GLB), a result, or REC#12: frame 12 of a recording, counting from 0.
 
     Attributes
     ----------
@@ -316,6 +316,10 @@ class Register(Json, Threads, Source):
         the view that stays fixed
     guess : FILE
         initial guess of T_target_source (none)
+    method : NAME
+        registration method, such as icp (any-pair)
+    scale
+        the source is of unknown scale, as models from images alone are
     out : DIR
         folder for the result (none)
     overwrite
@@ -331,6 +335,8 @@ class Register(Json, Threads, Source):
     source: str
     target: str
     guess: Path | None = None
+    method: str | None = None
+    scale: bool = False
     out: Path | None = None
     overwrite: bool = False
 
@@ -350,6 +356,8 @@ class Judge(Json, Threads, Selection):
         replace an existing result in --out
     tolerance : LENGTH
         accuracy required of good poses, e.g. 30mm (0.5 % of the model, at least 10mm)
+    scale
+        the poses are of unknown scale: estimate it from the depth (only if they can't be in metres)
 
     Exit status
     -----------
@@ -365,6 +373,7 @@ class Judge(Json, Threads, Selection):
     out: Path | None = None
     overwrite: bool = False
     tolerance: Length | None = None
+    scale: bool = False
 
 
 class Merge(JsonLines, Seed, Threads, Edited):

@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from tofuse.apps.jobs import pose_scale
 from tofuse.apps.results import folders, run_json, write_result
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
@@ -66,7 +67,8 @@ class Judgement:
     Attributes
     ----------
     poses
-        (N, 4, 4) T_world_camera of the frames as given, NaN where there is none.
+        (N, 4, 4) T_world_camera of the frames as given, NaN where there is none; multiplied by the
+        scale if that was applied.
     accuracy
         Of these poses.
     verdict, reasons
@@ -83,6 +85,8 @@ class Judgement:
         images support that better.
     started
         Whether `refined` was initialised with the poses.
+    scale
+        Metres per unit of the poses as given; None if it can't be estimated, as from rotations.
     """
 
     poses: Float64
@@ -95,6 +99,7 @@ class Judgement:
     displacement_m: Float64
     refined: Reconstruction
     started: bool = True
+    scale: pose_scale.PoseScale | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `judge.json`, with inf as it is."""
@@ -107,6 +112,7 @@ class Judgement:
             "map_consistency": _dict(self.consistency),
             "deviation": _dict(self.deviation),
             "displacement_m": self.displacement_m,
+            "scale": None if self.scale is None else asdict(self.scale),
             "refined": {
                 "from_these_poses": self.started,
                 "verdict": self.refined.diagnostics.verdict,
@@ -125,6 +131,7 @@ def judge(
     trajectory: str | Path | Float64 | Reconstruction,
     *,
     tolerance_m: float | None = None,
+    scale: bool = False,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Judgement:
@@ -140,6 +147,9 @@ def judge(
         assigned to the nearest frames in time, within 20 ms.
     tolerance_m
         Accuracy required of good poses, m; see `Config`.
+    scale
+        Whether the poses are of unknown scale, which is then estimated from the depth and applied.
+        Otherwise it is if it can't be that of metres, and the images agree better with it.
     threads
         Number of threads; None: all cores. The result does not depend on it.
     progress
@@ -148,7 +158,8 @@ def judge(
     Raises
     ------
     InputError
-        If fewer than two frames have a pose, or the recording contains clouds.
+        If fewer than two frames have a pose, or the recording contains clouds; if the scale is
+        unknown and can't be estimated.
     """
     progress = progress or Silent()
     if tolerance_m is not None:
@@ -167,9 +178,12 @@ def judge(
         frame = recording.image(k)
         return None if frame is None else cross_view_agreement.prepare_for_comparison(frame)
 
-    def compared_at(poses: Float64) -> cross_view_agreement.CrossViewConsistency:
+    def views_at(poses: Float64) -> dict[int, PreparedView]:
         posed = evenly_spaced(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
-        views = {k: found for k in posed if (found := view(k)) is not None}
+        return {k: found for k in posed if (found := view(k)) is not None}
+
+    def compared_at(poses: Float64) -> cross_view_agreement.CrossViewConsistency:
+        views = views_at(poses)
         return cross_view_agreement.compare_views(list(views.values()), poses[list(views)])
 
     def reconstructed(
@@ -182,6 +196,19 @@ def judge(
 
     progress.stage("comparing images")
     as_given = compared_at(poses)
+    compared = views_at(poses)
+    estimate = pose_scale.estimated_scale(list(compared.values()), poses[list(compared)])
+    if scale and estimate is None:
+        raise InputError(
+            "can't be estimated: too few views with translation between them fit",
+            where="scale",
+            remedy="leave out --scale, or pass poses of more frames",
+        )
+    if estimate is not None and (scale or estimate.is_other_unit):
+        multiplied = pose_scale.with_scale(poses, estimate.factor)
+        as_scaled = compared_at(multiplied)
+        if scale or _support(as_scaled) > _support(as_given):
+            poses, as_given, estimate = multiplied, as_scaled, replace(estimate, applied=True)
     started = reconstructed(adaptation.with_odometry(recording, poses), given_config)
     best = started
     if _support(started[2]) < _SUPPORTED:
@@ -206,6 +233,7 @@ def judge(
         distances,
         refined,
         best is started,
+        estimate,
     )
 
 
@@ -230,6 +258,7 @@ class JudgeOptions(OpeningOptions):
     out: Path | None = None
     overwrite: bool = False
     tolerance: float | None = None
+    scale: bool = False
     threads: int | None = None
 
 
@@ -261,6 +290,7 @@ def judge_files(
             recording,
             trajectory,
             tolerance_m=options.tolerance,
+            scale=options.scale,
             threads=options.threads,
             progress=progress,
         )
@@ -299,9 +329,16 @@ def sentence(judgement: Judgement, name: str) -> str:
     readable = [f.status != "skipped" for f in judgement.refined.diagnostics.frames]
     posed = np.isfinite(judgement.poses[readable, 0, 0])
     return (
-        f"{name}: {given_bound}, poses of {posed.sum()} of {len(posed)} frames; {label}: "
-        f"{refined_bound}.{_agreement(judgement.deviation)}"
+        f"{name}{_scale(judgement.scale)}: {given_bound}, poses of {posed.sum()} of {len(posed)} "
+        f"frames; {label}: {refined_bound}.{_agreement(judgement.deviation)}"
     )
+
+
+def _scale(scale: pose_scale.PoseScale | None) -> str:
+    """State the scale that was applied to the poses."""
+    if scale is None or not scale.applied:
+        return ""
+    return f" times {scale.factor:.4g} \N{PLUS-MINUS SIGN} {scale.sigma:.1g} m (scale by depth)"
 
 
 def _agreement(deviation: pose_deviation.Deviation | None) -> str:

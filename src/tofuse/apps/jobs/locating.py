@@ -284,7 +284,7 @@ def _located_cloud(
     if cloud is None:
         raise InputError("has no cloud.ply", where=result, remedy="run `tofuse run` again")
     pair = register_files(name, str(cloud), PairOptions(threads=options.threads), progress)
-    registration, C = pair.in_files, pair.covariance
+    registration, C = pair.in_files, pair.registration.covariance
     location = locating.Location(
         registration.T_target_source,
         np.full((6, 6), np.nan) if C is None else C,

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
+from tofuse.apps.pairs.registering import registered_near, registered_scaled, registrar_of
 from tofuse.apps.pairs.result import (
     CONTRACT,
     MARKER,
@@ -17,15 +17,16 @@ from tofuse.apps.pairs.result import (
     pair_json,
     write_aligned,
 )
+from tofuse.apps.pairs.views import named_view
 from tofuse.apps.results import folders
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds import AnyPair, NearOrigin
+from tofuse.engine.clouds import NearOrigin
 from tofuse.engine.compute import threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.progress import Progress, Silent
 from tofuse.formats.files import atomic
 from tofuse.formats.poses import pose_text, read_pose
-from tofuse.formats.recordings import SingleView, open_view
+from tofuse.formats.recordings import SingleView
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,10 @@ class PairOptions:
     ----------
     guess
         File with the initial T_target_source; see `read_pose`.
+    method
+        Name of a registration method; None for `AnyPair`.
+    scale
+        Whether the source is of unknown scale.
     out
         Folder for the result; None writes none.
     overwrite
@@ -47,6 +52,8 @@ class PairOptions:
     """
 
     guess: Path | None = None
+    method: str | None = None
+    scale: bool = False
     out: Path | None = None
     overwrite: bool = False
     format: str | None = None
@@ -58,7 +65,7 @@ class PairOptions:
 def register_files(
     source: str, target: str, options: PairOptions | None = None, progress: Progress | None = None
 ) -> PairResult:
-    """Register the views called `source` and `target` (see `open_view`), and write the result.
+    """Register the views called `source` and `target` (see `named_view`), and write the result.
 
     Raises
     ------
@@ -96,9 +103,10 @@ def _registered(
     near = NearOrigin.of(views[0].frame, views[1].frame, guess)
     progress.stage("registering")
     start_s = perf_counter()
-    registration = AnyPair().register(
-        near.source, near.target, near.guess, np.random.default_rng([0, 0])
-    )
+    if options.scale:
+        near, registration = registered_scaled(near, options.method)
+    else:
+        registration = registered_near(near, registrar_of(options.method))
     seconds = perf_counter() - start_s
     name = None if options.guess is None else str(options.guess)
     near_source = replace(views[0], frame=near.source)
@@ -113,7 +121,7 @@ def _open_both(source: str, target: str, options: PairOptions) -> tuple[SingleVi
     for name in (source, target):
 
         def open_with(camera: Path | None, name: str = name) -> SingleView:
-            return open_view(name, format=options.format, camera=camera, topic=options.topic)
+            return named_view(name, format=options.format, camera=camera, topic=options.topic)
 
         try:
             views.append(open_with(options.camera))
@@ -131,7 +139,7 @@ def _write(result: PairResult, folder: folders.OutputFolder) -> None:
     from tofuse.apps.pairs.page import write_pair_report
 
     with folder.staging() as staging:
-        atomic.write_text(staging / "transform.txt", pose_text(result.T_target_source))
+        atomic.write_text(staging / "transform.txt", pose_text(result.similarity))
         write_aligned(result, staging / "aligned.ply")
         write_pair_report(result, staging / "report.html")
         text = json.dumps(pair_json(result), indent=1, allow_nan=False)

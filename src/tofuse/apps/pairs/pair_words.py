@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.apps.pairs.result import PairResult
+from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 
@@ -20,6 +21,10 @@ def decision(result: PairResult) -> tuple[str, str]:
     if registration.probability is not None:
         parts.append(f"probability {_probability(registration.probability)}")
     if registration.believed:
+        if registration.given_guess:
+            near = "identity" if result.guess is None else "guess"
+            rival = "none was tried" if registration.runner_up is None else "one fits as well"
+            parts.append(f"given the {near}: of other poses {rival}")
         return "Accepted", "; ".join(parts)
     reason = registration.reason
     if registration.believed is None:
@@ -39,6 +44,7 @@ def lines(result: PairResult) -> list[tuple[str, str]]:
         translation += f"\n{displacement} at {vector(center, 0)}, the source's centre"
     rms_m = result.registration.rms_m
     found = [
+        *scale(result.registration),
         ("translation", translation),
         ("rotation", rotation(result)),
         ("T_target_source", matrix(result)),
@@ -54,6 +60,15 @@ def lines(result: PairResult) -> list[tuple[str, str]]:
     if rival := runner_up(result):
         found.append(("runner-up", rival))
     return found
+
+
+def scale(registration: Registration) -> list[tuple[str, str]]:
+    """Return name and value of the scale; nothing if it was not estimated."""
+    sigma = registration.scale_sigma
+    if sigma is None:
+        return []
+    factor = f"{registration.scale:.5g} \N{PLUS-MINUS SIGN} {sigma:.1g}"
+    return [("scale", f"{factor} (1\N{GREEK SMALL LETTER SIGMA}), factor of the source's points")]
 
 
 def rotation(result: PairResult) -> str:
@@ -91,7 +106,7 @@ def overlap(result: PairResult) -> str:
 
 def sigma(result: PairResult) -> str:
     """Return one standard deviation in the worst observable direction as text."""
-    metres, radians = result.sigma
+    metres, radians = result.registration.sigma
     parts = []
     if metres is not None:
         parts.append(f"{1000 * metres:.2f} mm")

@@ -31,7 +31,8 @@ class PairResult:
     Attributes
     ----------
     source, target
-        The views, near the origin: a cloud in map coordinates has the `shift` to them.
+        The views, near the origin: a cloud in map coordinates has the `shift` to them. A source of
+        unknown scale is at the scale that was found.
     registration
         The registration of these views.
     guess
@@ -58,6 +59,11 @@ class PairResult:
         return self.in_files.T_target_source
 
     @property
+    def similarity(self) -> Float64:
+        """(4, 4) T_target_source with the scale: it maps unscaled coordinates of the source."""
+        return self.T_target_source @ np.diag([*[self.registration.scale] * 3, 1.0])
+
+    @property
     def moved_m(self) -> Float64:
         """(3,) displacement of the source's `shift`, m: the translation if that is zero."""
         center = self.source.frame.shift
@@ -81,63 +87,13 @@ class PairResult:
         return float(np.linalg.norm(displacement)), float(se3.angle(se3.inverse(T) @ T_rival))
 
     @cached_property
-    def lever_m(self) -> float:
-        """Median distance of the source's points from its origin: converts radians to metres."""
-        distance = np.linalg.norm(self.source.frame.points.astype(float), axis=1)
-        return max(float(np.median(distance)), 1e-6) if len(distance) else 1.0
-
-    @cached_property
-    def covariance(self) -> Float64 | None:
-        """(6, 6) of the right perturbation at the source's `shift`; None if unbounded."""
-        if len(self.registration.unobservable):
-            return None
-        return self._observed_covariance
-
-    @cached_property
-    def sigma(self) -> tuple[float | None, float | None]:
-        """Standard deviations (m, rad) in the worst observable direction.
-
-        None where not known, or where no direction is observable.
-        """
-        covariance = self._observed_covariance
-        if covariance is None:
-            return None, None
-        sigma_m, sigma_rad = se3.largest_sigmas(covariance).tolist()
-        # In metres both are of similar size; a negligible one is rounding error.
-        limit = 1e-6 * max(sigma_m, sigma_rad * self.lever_m)
-        return (
-            sigma_m if sigma_m > limit else None,
-            sigma_rad if sigma_rad * self.lever_m > limit else None,
-        )
-
-    @property
-    def _observed_covariance(self) -> Float64 | None:
-        """(6, 6), without the unobservable directions; None where the information is unusable."""
-        units = np.array([1, 1, 1, *[self.lever_m] * 3])
-        information = np.asarray(self.registration.information, float)
-        if information.shape != (6, 6) or not np.isfinite(information).all():
-            return None
-        basis = np.eye(6)
-        if len(self.registration.unobservable):
-            _, s, vt = np.linalg.svd(self.registration.unobservable * units)
-            basis = vt[int((s > 1e-9 * s[0]).sum()) :].T
-        if basis.shape[1] == 0:
-            return None
-        scaled = information / np.outer(units, units)
-        values, vectors = np.linalg.eigh(basis.T @ scaled @ basis)
-        if not values[0] > 1e-12 * values[-1]:
-            return None
-        root = basis @ vectors / np.sqrt(values)
-        return root @ root.T / np.outer(units, units)
-
-    @cached_property
     def free_motions(self) -> tuple[Float64, Float64]:
         """Unobservable directions: axes (a, 3) of translations, and axes (b, 3) of rotations."""
         directions = np.asarray(self.registration.unobservable, float).reshape(-1, 6)
         if not len(directions):
             return np.zeros((0, 3)), np.zeros((0, 3))
         # An orthonormal basis in metres, with as many pure translations as possible.
-        _, s, vt = np.linalg.svd(directions * np.array([1, 1, 1, *[self.lever_m] * 3]))
+        _, s, vt = np.linalg.svd(directions * np.array([1, 1, 1, *[self.registration.lever_m] * 3]))
         basis = vt[: int((s > 1e-9 * s[0]).sum())]
         u, rotations, _ = np.linalg.svd(basis[:, 3:])
         basis = u.T @ basis
@@ -158,8 +114,8 @@ class PairResult:
 _MAX_ROTATION = 0.4
 # Attributes of a registration in `registration.json`.
 _EVIDENCE = (
-    "believed", "probability", "reason", "converged", "overlap", "support", "contradiction",
-    "margin",
+    "believed", "probability", "given_guess", "reason", "converged", "overlap", "support",
+    "contradiction", "margin",
 )  # fmt: skip
 _FIT = ("rms_m", "correspondences", "points", "iterations")
 
@@ -170,8 +126,8 @@ def _unit(vectors: Float64) -> Float64:
 
 def pair_json(result: PairResult) -> dict[str, Any]:
     """Return the content of `registration.json`: SI units and radians, null where unknown."""
-    registration, covariance = result.registration, result.covariance
-    sigma_m, sigma_rad = result.sigma
+    registration = result.registration
+    covariance, (sigma_m, sigma_rad) = registration.covariance, registration.sigma
     data: dict[str, Any] = run_json.plain(
         {
             "schema": 1,
@@ -180,6 +136,8 @@ def pair_json(result: PairResult) -> dict[str, Any]:
             "target": _view_json(result.target),
             "guess": result.guess,
             "T_target_source": result.T_target_source,
+            "scale": registration.scale,
+            "scale_sigma": registration.scale_sigma,
             **{name: getattr(registration, name) for name in _EVIDENCE},
             "runner_up": result.runner_up,
             "unobservable": registration.unobservable,

@@ -36,8 +36,8 @@ class Registration:
     rms_m
         Root mean square distance of corresponding points, m.
     information
-        (6, 6) information of the right perturbation (tx ty tz rx ry rz) in the source frame:
-        1/m^2, 1/(m rad), 1/rad^2.
+        (6, 6) information of the right perturbation (tx ty tz rx ry rz) in the source frame, about
+        `reference_point`: 1/m^2, 1/(m rad), 1/rad^2.
     unobservable
         (k, 6) directions of the right perturbation that the data doesn't constrain.
     errors
@@ -65,6 +65,14 @@ class Registration:
         Fraction of the points in the other view's free space.
     confirmed
         Whether an alignment from the guess converges to the pose of the search.
+    given_guess
+        Whether `believed` and `probability` hold only for poses near the guess, or near the
+        identity without one: another pose fits as well, or none was tried.
+    scale, scale_sigma
+        Factor of the source's points before `T_target_source` is applied, and its standard
+        deviation; 1 and None where it was not estimated.
+    reference_point
+        (3,) of the source, m: its `shift` for clouds in map coordinates, else its origin.
     """
 
     T_target_source: Float64
@@ -87,9 +95,15 @@ class Registration:
     contradiction: float | None = None
     violation: float | None = None
     confirmed: bool = False
+    given_guess: bool = False
+    scale: float = 1.0
+    scale_sigma: float | None = None
+    reference_point: Float64 = field(default_factory=lambda: np.zeros(3))
 
     def __repr__(self) -> str:
         decision = {True: "accepted", False: "rejected", None: "not verified"}[self.believed]
+        if self.believed and self.given_guess:
+            decision += " given the guess"
         t, w = self.T_target_source[:3, 3], se3.so3_log(self.T_target_source[:3, :3])
         return (
             f"Registration: {decision}, translation {np.linalg.norm(t):.4f} m, "
@@ -101,6 +115,53 @@ class Registration:
     def inlier_ratio(self) -> float:
         """Corresponding points as a fraction of the source's points, 0 to 1."""
         return self.correspondences / self.points if self.points else 0.0
+
+    @property
+    def covariance(self) -> Float64 | None:
+        """(6, 6), the inverse of `information`: m^2, m rad, rad^2; None if it is unbounded."""
+        return None if len(self.unobservable) else self._observed_covariance
+
+    @property
+    def sigma(self) -> tuple[float | None, float | None]:
+        """Standard deviations (m, rad) in the worst observable direction.
+
+        None where not known, or where no direction is observable.
+        """
+        covariance = self._observed_covariance
+        if covariance is None:
+            return None, None
+        sigma_m, sigma_rad = se3.largest_sigmas(covariance).tolist()
+        # In metres both are of similar size; a negligible one is rounding error.
+        limit = 1e-6 * max(sigma_m, sigma_rad * self.lever_m)
+        return (
+            sigma_m if sigma_m > limit else None,
+            sigma_rad if sigma_rad * self.lever_m > limit else None,
+        )
+
+    @property
+    def lever_m(self) -> float:
+        """Distance at which a rotation moves the points by as much as is known of them, m."""
+        of_translation, of_rotation = np.diag(self.information).reshape(2, 3).sum(1)
+        return float(np.sqrt(of_rotation / of_translation)) if of_translation > 0 else 1.0
+
+    @property
+    def _observed_covariance(self) -> Float64 | None:
+        """(6, 6), without the unobservable directions; None where the information is unusable."""
+        information = np.asarray(self.information, float)
+        if not np.isfinite(information).all():
+            return None
+        units = np.array([1, 1, 1, *[max(self.lever_m, 1e-6)] * 3])
+        basis = np.eye(6)
+        if len(self.unobservable):
+            _, s, vt = np.linalg.svd(self.unobservable * units)
+            basis = vt[int((s > 1e-9 * s[0]).sum()) :].T
+        if basis.shape[1] == 0:
+            return None
+        values, vectors = np.linalg.eigh(basis.T @ (information / np.outer(units, units)) @ basis)
+        if not values[0] > 1e-12 * values[-1]:
+            return None
+        root = basis @ vectors / np.sqrt(values)
+        return np.asarray(root @ root.T / np.outer(units, units), np.float64)
 
     @property
     def is_probable(self) -> bool:
@@ -132,7 +193,10 @@ class Registration:
         T_source_b
             Maps b into the source's frame.
         """
-        adjoint, inverse_adjoint = se3.adjoint(T_source_b), se3.adjoint(se3.inverse(T_source_b))
+        T_reference_b = se3.translation(-self.reference_point) @ T_source_b
+        adjoint, inverse_adjoint = (
+            se3.adjoint(T) for T in (T_reference_b, se3.inverse(T_reference_b))
+        )
         unobservable = self.unobservable @ inverse_adjoint.T
         lengths = np.linalg.norm(unobservable, axis=1, keepdims=True)
         runner_up = self.runner_up
@@ -141,6 +205,7 @@ class Registration:
             T_target_source=T_a_target @ self.T_target_source @ T_source_b,
             information=adjoint.T @ self.information @ adjoint,
             unobservable=unobservable / np.maximum(lengths, 1e-12),
+            reference_point=np.zeros(3),
             runner_up=None if runner_up is None else T_a_target @ runner_up @ T_source_b,
         )
 

@@ -169,6 +169,17 @@ def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64
     )
 
 
+def both_supports(
+    source: CloudMap, target: CloudMap, T_target_source: Float64
+) -> tuple[float, float]:
+    """Return the fractions of the source and of the target on the other's surfaces at a pose."""
+    limit = tolerance(source, target)
+    return (
+        _one_direction(source, target, T_target_source, limit)[1],
+        _one_direction(target, source, se3.inverse(T_target_source), limit)[1],
+    )
+
+
 def _one_direction(
     view: CloudMap, other: CloudMap, T: Float64, max_distance: float
 ) -> tuple[float, ...]:

@@ -1,7 +1,8 @@
 """Global registration of two clouds, with a probability of being right.
 
 The clouds are first aligned from the guess. If one is given, and their agreement makes that pose
-practically certain, it is returned. Else poses are proposed by feature matching
+practically certain, it is returned; if the clouds are symmetric, so that another pose fits as well,
+it holds given the guess only. Else poses are proposed by feature matching
 (`clouds.fpfh`); each is aligned and evaluated by the agreement of both clouds
 (`clouds.cloud_agreement`) and by its lead over rival poses. That is counted in points, and in
 distinct surfaces, which decide whether the pose is believed. Without a guess rivals are
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -55,6 +57,10 @@ _MIN_SUPPORT = 1 / 3
 _MIN_TURNED_OVERLAP = 0.5
 # Probability above which a pose is not searched again without free space.
 _LIKELY = 0.5
+# Points that describe a cloud to find its symmetries, and number of its motions that are aligned.
+_SYMMETRY_POINTS, _MAX_SYMMETRIES = 1500, 6
+# Cache: a view is registered to several others.
+_symmetries: WeakKeyDictionary[Frame, Float64] = WeakKeyDictionary()
 # Loss of score by noise when a pose is aligned again.
 _MAX_SCORE_LOSS = 0.02
 # Points used to test whether a rival converges to the best pose.
@@ -270,7 +276,7 @@ def _registered_views(
     local = replace(views.refined(start), guess=start)
     certain = None if always_search else _certain(views, local)
     if certain is not None and guess is not None:
-        return views.with_information(certain)
+        return views.with_information(_given_guess(views, certain))
     poses = (
         [local]
         if image_registration is None
@@ -343,13 +349,15 @@ def with_cloud_information(
 ) -> Registration:
     """Return a registration of two clouds' images with the information matrix of the clouds.
 
-    Images of clouds have holes, and their noise is unknown.
+    Images of clouds have holes, and their noise is unknown. If the clouds are symmetric, the pose
+    holds given the guess.
     """
     views = _CloudViews.of(source, target, rng)
     unobservable = cloud_unobservable(
         views.source_map, views.target_map, registration.T_target_source
     )
-    return views.with_information(replace(registration, unobservable=unobservable))
+    registration = replace(registration, unobservable=unobservable, given_guess=False)
+    return views.with_information(_given_guess(views, registration))
 
 
 def follow_clouds(
@@ -362,7 +370,8 @@ def follow_clouds(
         coarse = CoarseToFine().register(source, target, guess, rng)
         alternative = replace(views.evaluated(coarse.T_target_source), guess=guess)
         local = max(local, alternative, key=lambda pose: pose.agreement.score)
-    return views.with_information(_registration(views, local))
+    registration = _registration(views, local)
+    return views.with_information(replace(registration, given_guess=True))
 
 
 def _proposed(
@@ -415,6 +424,69 @@ def _turned(views: _CloudViews, pose: _Pose) -> list[_Pose]:
     turned = [views.evaluated(pose.T_target_source @ se3.about(centre, se3.exp(w))) for w in turns]
     least = _MIN_TURNED_OVERLAP * pose.agreement.overlap
     return [views.refined(p.T_target_source) for p in turned if p.agreement.overlap > least]
+
+
+def symmetries(view: Frame) -> Float64:
+    """Return motions (k, 4, 4), except the identity, after which a cloud fits itself.
+
+    One half of its points is registered to the other, by features and about its axes.
+    """
+    if view not in _symmetries:
+        _symmetries[view] = _found_symmetries(view)
+    return _symmetries[view]
+
+
+def _found_symmetries(view: Frame) -> Float64:
+    odd = np.arange(len(view)) % 2 == 1
+    cloud = CloudFrame(view.index, view.timestamp, view.points, origin=view.origin)
+    views = _CloudViews.of(cloud.keep(odd), cloud.keep(~odd), np.random.default_rng(0))
+    views = views.without_free_space()
+    same = views.evaluated(np.eye(4))
+    try:
+        found = candidates(views.source, views.target, points=_SYMMETRY_POINTS).poses
+    except RegistrationError:
+        found = ()
+    proposals = [
+        c.T_target_source
+        for c in found
+        if views.are_distinct_poses(c.T_target_source, same.T_target_source)
+    ]
+    poses = [views.refined(T) for T in proposals[:_MAX_SYMMETRIES]] + _turned(views, same)
+    fitting = [
+        pose.T_target_source
+        for pose in poses
+        if pose.agreement.support > _MIN_TURNED_OVERLAP * same.agreement.support
+        and views.are_distinct_poses(pose.T_target_source, same.T_target_source)
+    ]
+    return np.array(fitting).reshape(-1, 4, 4)
+
+
+def _given_guess(views: _CloudViews, registration: Registration) -> Registration:
+    """Compare an accepted pose with those that fit as well if a view is symmetric.
+
+    With such a rival it would not be accepted after a search: it holds given the guess only.
+    """
+    T = registration.T_target_source
+    own = (*(T @ S for S in symmetries(views.source)), *(S @ T for S in symmetries(views.target)))
+    views = replace(views, rng=np.random.default_rng(0))
+    rivals = [
+        pose
+        for T_rival in own
+        if views.are_distinct_poses((pose := views.refined(T_rival)).T_target_source, T)
+    ]
+    if not rivals:
+        return registration
+    rival, pose = max(rivals, key=lambda rival: rival.agreement.score), views.evaluated(T)
+    evidence = views.evidence(
+        pose,
+        pose.agreement.score - max(rival.agreement.score, 0.0),
+        len(registration.unobservable),
+    )
+    if not evidence.rejection_reason():
+        return registration
+    return replace(
+        registration, margin=evidence.margin, runner_up=rival.T_target_source, given_guess=True
+    )
 
 
 def _pose_distance(a: Float64, b: Float64) -> float:

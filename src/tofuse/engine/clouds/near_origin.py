@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,11 +67,20 @@ class NearOrigin:
         return cls(near[0], near[1], guess)
 
     def in_files(self, registration: Registration) -> Registration:
-        """Return a registration of these views in the coordinates of their files."""
-        if not (self.source.shift.any() or self.target.shift.any()):
-            return registration
+        """Return a registration of these views in the coordinates of their files.
+
+        Information and unobservable directions remain about the origin of the near source: about
+        that of a map, far away, they would lose their digits.
+        """
         to_target_file = se3.translation(self.target.shift)
-        return registration.between(to_target_file, se3.translation(-self.source.shift))
+        from_source_file = se3.translation(-self.source.shift)
+        runner_up = registration.runner_up
+        return replace(
+            registration,
+            T_target_source=to_target_file @ registration.T_target_source @ from_source_file,
+            runner_up=None if runner_up is None else to_target_file @ runner_up @ from_source_file,
+            reference_point=self.source.shift,
+        )
 
 
 def _box(view: Frame) -> Float64:

@@ -1,4 +1,4 @@
-"""``tofuse.register``: registration of one pair of views or clouds; and its default method."""
+"""Registration of one pair of views or clouds: the method of ``tofuse.register``."""
 
 from __future__ import annotations
 
@@ -9,20 +9,16 @@ from typing import ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from tofuse.engine.alignment import Registrar, Registration, UncertaintyOptions
 from tofuse.engine.arrays import Float64
-from tofuse.engine.bounds import Bounds
 from tofuse.engine.clouds.cloud_pair import follow_clouds, register_clouds, with_cloud_information
 from tofuse.engine.clouds.fpfh import candidates
-from tofuse.engine.clouds.near_origin import NearOrigin
 from tofuse.engine.clouds.viewpoint import as_image, viewpoint_of
-from tofuse.engine.compute import one_blas_thread
-from tofuse.engine.errors import InputError, RegistrationError
+from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.parts import check_number, part, registered
+from tofuse.engine.parts import part
 from tofuse.engine.search import follow, register_pair, verification
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
@@ -78,7 +74,9 @@ class AnyPair(Registrar):
         if image_registration is not None and are_images:
             return image_registration
         if image_registration is not None and image_registration.believed:
-            return with_cloud_information(source, target, image_registration, rng)
+            found = with_cloud_information(source, target, image_registration, rng)
+            if guess is not None or not found.given_guess:
+                return found
         if not searches and guess is not None:
             return follow_clouds(source, target, guess, rng)
         return register_clouds(source, target, guess, rng, image_registration)
@@ -156,120 +154,3 @@ def _as_image(view: Frame) -> tuple[PreparedView, Float64] | None:
         return None
     # The optical axis of such an image is not that of a lens.
     return prepare_view(image[0], SurfaceOptions(falloff=0.0)), image[1]
-
-
-def register(
-    source: Frame | ArrayLike,
-    target: Frame | ArrayLike,
-    *,
-    guess: ArrayLike | None = None,
-    method: Registrar | str | None = None,
-    seed: int = 0,
-) -> Registration:
-    """Register two views, or two (N, 3) clouds in m.
-
-    The views are first aligned from the guess. If their agreement makes that pose practically
-    certain, it is returned, within milliseconds for images. Else poses are searched; the best one
-    is aligned and evaluated by the agreement of both views and by its lead over the best rival. Two
-    images, and clouds detected to be seen from their origin, are searched exhaustively
-    (`search.search`: rotations up to 63 degrees about the vertical and 52 about any axis,
-    translations up to 0.6 of the median depth). Clouds are also registered by feature matching
-    (`clouds.fpfh`), under any rotation; without a guess in any case, as a symmetric body fits
-    as well in another pose.
-
-    Parameters
-    ----------
-    source, target
-        Frames of a recording, or arrays; non-finite points are dropped.
-    guess
-        (4, 4) T_target_source to start from; the identity unless given. Of ambiguous poses of two
-        images the one at the guess is returned.
-    method
-        Registration method, or the name of one ("icp", "coarse-to-fine"); the above unless given.
-    seed
-        Seed of the random selection of points, for methods that use one.
-
-    Returns
-    -------
-    `T_target_source` maps points of the source into the target's frame, m. `believed` states
-    whether the pose is verified, `probability` how probably it is right (images: within 5 % of the
-    depth and 4 degrees; clouds: within 5 % of the extent), and `reason` why it is rejected: too
-    little support or too little lead over `runner_up`, contradiction, degenerate directions.
-    `converged` implies none of that. Degenerate directions (three on a flat wall) are in
-    `unobservable`, and keep the guess. A `method` without verification leaves `believed` None.
-
-    Raises
-    ------
-    InputError
-        If an array has the wrong shape or fewer than ten finite points, the guess is no rigid
-        motion, or there is no such method.
-    RegistrationError
-        If too few points correspond, an image is empty, or the median depths of two images differ
-        more than fourfold.
-    """
-    check_number(seed, Bounds(0), "seed", whole=True)
-    start = None if guess is None else se3.check_pose(guess, where="guess")
-    near = NearOrigin.of(_view(source, "source"), _view(target, "target"), start)
-    rng = np.random.default_rng([seed, 0])
-    registrar = _registrar(method)
-    registration = _registered(near.source, near.target, near.guess, registrar, rng)
-    return near.in_files(registration)
-
-
-def _registrar(method: Registrar | str | None) -> Registrar:
-    if method is None:
-        return AnyPair()
-    named = registered("registration")
-    if isinstance(method, str) and method in named:
-        found: Registrar = named[method]()
-        return found
-    if isinstance(method, type | str) or not hasattr(method, "register"):
-        raise InputError(
-            f"is {method!r}", where="method", remedy=f"use one of {', '.join(sorted(named))}"
-        )
-    return method
-
-
-def _registered(
-    source: Frame,
-    target: Frame,
-    guess: Float64 | None,
-    registrar: Registrar,
-    rng: np.random.Generator,
-) -> Registration:
-    with one_blas_thread():
-        if isinstance(registrar, AnyPair):
-            return registrar.register(source, target, guess, rng)
-        return registrar.register(source, target, np.eye(4) if guess is None else guess, rng)
-
-
-def _view(view: Frame | ArrayLike, name: str) -> Frame:
-    if isinstance(view, RangeFrame | CloudFrame):
-        return view
-    return CloudFrame.of(_cloud(view, name))
-
-
-def _cloud(points: ArrayLike, name: str) -> Float64:
-    """Return the finite points of an array (n, 3)."""
-    try:
-        array = np.asarray(points)
-    except ValueError as error:
-        raise InputError("is not an array", where=name, remedy="pass (N, 3) numbers") from error
-    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
-        raise InputError(
-            f"is an array of shape {array.shape} and type {array.dtype}",
-            where=name,
-            remedy="pass a frame, or (N, 3) numbers in metres; for a file, tofuse.open(path)[0]",
-        )
-    finite = array[np.isfinite(array).all(1)].astype(np.float64)
-    if len(finite) < MIN_POINTS:
-        raise InputError(
-            f"has {len(finite)} finite points",
-            where=name,
-            remedy=f"use {MIN_POINTS} or more",
-        )
-    if np.abs(finite).max() > se3.MAX_COORDINATE_M:
-        raise InputError(
-            f"has coordinates up to {np.abs(finite).max():.0e} m", where=name, remedy="use metres"
-        )
-    return finite

@@ -130,6 +130,7 @@ class Assessment:
                 if d > 0 and index in self.tracked.poses
             ),
             ambiguity_m=observations.ambiguity_m,
+            scans=model.mesh is None,
             repeated=tuple(self.log.repeated),
             interruptions=tuple(self.log.interruptions),
             priors=closed.sensors.records,

@@ -26,8 +26,9 @@ WEAK_INLIER_FRACTION = 0.05
 MAX_NOT_CONVERGED = 0.05
 # Largest fraction of degenerate registrations; more accumulate drift.
 MAX_DEGENERATE = 0.1
-# Range of plausible typical depths of ToF cameras, m.
+# Range of plausible typical depths of ToF cameras, m, and the maximum of laser scanners.
 MIN_DEPTH_M, MAX_DEPTH_M = 0.15, 12.0
+_MAX_SCAN_M = 1000.0
 # Views are unordered if there are more jumps than this, and than this fraction of the poses.
 MIN_UNORDERED, UNORDERED_FRACTION = 3, 0.2
 # Largest motion of a camera that stands still.
@@ -83,6 +84,8 @@ class Evidence:
         Median radial range of every frame with a pose, m.
     ambiguity_m
         Ambiguity range of the camera, if known.
+    scans
+        Whether the views are bare clouds, which may be a laser scanner's.
     repeated
         Indices of the frames that equal the one before in every pixel.
     interruptions
@@ -115,6 +118,7 @@ class Evidence:
     given_loops: frozenset[tuple[int, int]] = frozenset()
     depths: tuple[float, ...] = ()
     ambiguity_m: float | None = None
+    scans: bool = False
     repeated: tuple[int, ...] = ()
     interruptions: tuple[int, ...] = ()
     priors: tuple[external_sensors.SensorRecord, ...] = ()
@@ -215,7 +219,7 @@ def _connections(e: Evidence) -> Iterator[Reason]:
             "disconnected",
             frame_ranges.union(r for c in disconnected for r in c.frames),
             f"The recording consists of {len(parts)} disconnected parts: {_listed(parts)}; no "
-            "overlap found.",
+            "pose between them could be verified.",
         )
     for joined_by, motion in (("motion", "extrapolated motion"), ("odometry", "recorded odometry")):
         bridged = frame_ranges.union(
@@ -310,8 +314,8 @@ def _depths(e: Evidence) -> Iterator[Reason]:
         text = f"{statement}, but the camera's ambiguity range is {e.ambiguity_m:.3g} m"
     elif unit_verified:
         return
-    elif typical > MAX_DEPTH_M:
-        text = f"{statement}, farther than ToF cameras see"
+    elif typical > (_MAX_SCAN_M if e.scans else MAX_DEPTH_M):
+        text = f"{statement}, farther than {'scanners' if e.scans else 'ToF cameras'} see"
     elif typical < MIN_DEPTH_M:
         text = f"{statement}, nearer than most ToF cameras see"
     else:

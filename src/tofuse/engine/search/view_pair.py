@@ -120,7 +120,7 @@ def register_pair(
     pair = _Pair.of(source, target, fit_statistics, uncertainty, rival_m)
     local = pair.local_pose(np.eye(4) if guess is None else guess)
     if local is not None and local.is_certain and not always_search:
-        return pair.registration(local, local.evidence, None)
+        return replace(pair.registration(local, local.evidence, None), given_guess=True)
     search = Search.of(
         pair.source,
         pair.target,
@@ -155,7 +155,9 @@ def follow(
         return None
     pair = _Pair.of(source, target, fit_statistics, uncertainty)
     local = pair.local_pose(guess)
-    return None if local is None else pair.registration(local, local.evidence, None)
+    if local is None:
+        return None
+    return replace(pair.registration(local, local.evidence, None), given_guess=True)
 
 
 @dataclass(frozen=True, eq=False)

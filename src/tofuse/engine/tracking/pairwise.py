@@ -168,12 +168,17 @@ class Pairwise(Bounded, Odometry):
         Points that a view must have.
     probable
         Minimum probability of a pose that is not accepted, but kept.
+    guess
+        Predicted motion: "previous", that of the last views; "odometry", that of an odometry file
+        (the former where it has none); "identity". A probable pose that was searched is accepted
+        if odometry leads to the same; odometry that led to the poses of searches replaces them.
     """
 
     registration: AnyPair = field(default_factory=AnyPair)
     references: Annotated[int, Bounds(1)] = 6
     minimum_points: Annotated[int, Bounds(1)] = 10
     probable: Annotated[float, Bounds(0, 1)] = PROBABLE
+    guess: Guess = "previous"
 
     @property
     def takes(self) -> frozenset[str]:
@@ -192,6 +197,7 @@ class _PosedView:
     frame: Frame
     T_component_view: Float64
     component: int
+    T_odometry: Float64 | None = None
 
 
 class _PairwiseTracker(Tracker):
@@ -204,6 +210,8 @@ class _PairwiseTracker(Tracker):
         self._motion = MotionModel()
         self._degenerate = False  # whether some direction of the last motion was degenerate
         self._local_registration = replace(options.registration, search=False)
+        self._T_odometry: Float64 | None = None  # of the present view
+        self._has_odometry = False  # whether its prediction is that of odometry
         # Whether predicted poses of the last views agreed with searches.
         self._motion_confirmed: deque[bool] = deque(maxlen=_MIN_CONFIRMED + 1)
 
@@ -221,6 +229,7 @@ class _PairwiseTracker(Tracker):
             self._motion.interrupt()
             return Step("lost", f"{len(frame)} valid points, {min_points} are needed", None)
         references = [p for p in reversed(self._posed) if p.component == self._component]
+        self._T_odometry, self._has_odometry = T_odometry, False
         local = self._by_prediction(frame, references[0]) if references else None
         confirmed = sum(self._motion_confirmed) >= _MIN_CONFIRMED
         if confirmed and local is not None and local.needs_no_search:
@@ -228,6 +237,8 @@ class _PairwiseTracker(Tracker):
         doubtful: list[_Registered] = []
         for reference in references:
             registered = self._by_search(frame, reference)
+            if registered is not None and reference is references[0]:
+                registered = self._confirmed_by_odometry(frame, registered, local)
             if registered is not None and registered.accepted:
                 if reference is references[0]:
                     self._motion_confirmed.append(
@@ -236,6 +247,8 @@ class _PairwiseTracker(Tracker):
                 return self._continue_component(frame, registered)
             if registered is not None:
                 doubtful.append(registered)
+        if confirmed and self._has_odometry and local is not None and local.accepted:
+            return self._continue_component(frame, local)
         links = self._links(frame)
         # The latest views overlap most with this one.
         probable = [r for r in doubtful if r.probability >= self._options.probable]
@@ -256,7 +269,24 @@ class _PairwiseTracker(Tracker):
             else self._motion.predicted_pose(now)
         )
         guess = np.eye(4) if T is None else se3.inverse(last.T_component_view) @ T
+        if self._options.guess == "identity":
+            guess = np.eye(4)
+        before, now_at = last.T_odometry, self._T_odometry
+        if self._options.guess == "odometry" and before is not None and now_at is not None:
+            motion = se3.inverse(before) @ now_at
+            if np.isfinite(motion).all():
+                guess, self._has_odometry = motion, True
         return self._registered(frame, last, guess, self._local_registration)
+
+    def _confirmed_by_odometry(
+        self, frame: Frame, searched: _Registered, local: _Registered | None
+    ) -> _Registered:
+        """Accept a probable pose of a search if odometry, independent of it, leads there too."""
+        agree = local is not None and local.agrees(searched, frame.points)
+        if not (self._has_odometry and agree and searched.probability >= self._options.probable):
+            return searched
+        registration = replace(searched.registration, believed=True, reason="", confirmed=True)
+        return replace(searched, registration=registration)
 
     def _by_search(self, frame: Frame, reference: _PosedView) -> _Registered | None:
         """Register to an earlier view by a global search."""
@@ -279,7 +309,7 @@ class _PairwiseTracker(Tracker):
         self._degenerate = len(registration.unobservable) > 0
         links = () if self._connected else self._links(frame)
         self._connected |= bool(links)
-        self._posed.append(_PosedView(frame, T, self._component))
+        self._posed.append(_PosedView(frame, T, self._component, self._T_odometry))
         return Step(
             "tracked",
             "" if registered.accepted else registration.reason,
@@ -298,7 +328,7 @@ class _PairwiseTracker(Tracker):
         self._connected = self._component == 0 or bool(links)
         self._motion.interrupt()
         self._motion.update(np.eye(4), _moment(frame))
-        self._posed.append(_PosedView(frame, np.eye(4), self._component))
+        self._posed.append(_PosedView(frame, np.eye(4), self._component, self._T_odometry))
         reason = "" if rejected is None else f"not connected: {rejected.registration.reason}"
         return Step("tracked", reason, np.eye(4), component=self._component, links=links)
 

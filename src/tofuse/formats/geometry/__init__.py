@@ -1,5 +1,7 @@
 """Files of clouds and meshes: PLY and PCD in both directions, the other formats as output.
 
+Meshes of other programs are read as points of their surface (`surface_points`).
+
 All functions take or return a `GeometryRecord`, check its shapes, and replace a file as a whole.
 """
 
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
     from tofuse.formats.geometry.obj import write_obj
     from tofuse.formats.geometry.pcd import Pcd, read_pcd, write_pcd
     from tofuse.formats.geometry.ply import read_ply, write_ply
+    from tofuse.formats.geometry.surfaces import is_surface, read_surface, surface_points
     from tofuse.formats.geometry.usdz import write_usdz
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

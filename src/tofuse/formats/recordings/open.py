@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames import NOISE_MODEL, Frame, Recording, Source
+from tofuse.engine.frames import NOISE_MODEL, CloudFrame, Frame, Recording, Source
 from tofuse.engine.parts import discover, name_of, registered
 from tofuse.formats.cameras import read_noise
 from tofuse.formats.files import reading
+from tofuse.formats.geometry import is_surface, read_surface, surface_points
 from tofuse.formats.poses import TimedPoses, read_poses
 from tofuse.formats.recordings.joined import JoinedSource, LimitedSource
 from tofuse.formats.recordings.still import average_still
@@ -453,6 +454,8 @@ def open_view(
 ) -> SingleView:
     """Read the view called `name`; for the options see `open_recording`.
 
+    Of a mesh (.ply, .obj, .stl, .glb; m) it is points spread evenly over its area.
+
     Raises
     ------
     InputError
@@ -460,6 +463,9 @@ def open_view(
         frame can't be read or has fewer than ten points.
     """
     path, index = split_name(name)
+    if format is None and index is None and is_surface(Path(path)):
+        points = surface_points(read_surface(Path(path)), path)
+        return _checked(SingleView(name, path, "mesh", 0, CloudFrame.of(points)))
     recording = open_recording(path, format=format, camera=camera, topic=topic)
     count = len(recording)
     if index is None and count > 1:
@@ -472,14 +478,20 @@ def open_view(
     if index >= count:
         available = "its only frame is 0" if count == 1 else f"its frames are 0 to {count - 1}"
         raise InputError(f"has no frame {index}", where=path, remedy=available)
-    frame = recording[index]
-    if len(frame) < MIN_POINTS:
+    view = SingleView(
+        name, path, recording.format, index, recording[index], tuple(recording.warnings)
+    )
+    return _checked(view)
+
+
+def _checked(view: SingleView) -> SingleView:
+    if len(view.frame) < MIN_POINTS:
         raise InputError(
-            f"has {len(frame)} valid points",
-            where=name,
+            f"has {len(view.frame)} valid points",
+            where=view.name,
             remedy=f"use a view with {MIN_POINTS} or more",
         )
-    return SingleView(name, path, recording.format, index, frame, tuple(recording.warnings))
+    return view
 
 
 def split_name(name: str) -> tuple[str, int | None]:

@@ -1,0 +1,90 @@
+"""What people register, as views: frames, results, meshes, clouds, arrays, and files of these."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tofuse.apps.results import folders, read_cloud
+from tofuse.engine.arrays import Float64
+from tofuse.engine.clouds import MIN_POINTS
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
+from tofuse.engine.fusion import Cloud, Mesh
+from tofuse.engine.geometry import se3
+from tofuse.engine.results import Reconstruction
+from tofuse.formats.geometry import surface_points
+from tofuse.formats.recordings import SingleView, open_view
+
+View: TypeAlias = Frame | Reconstruction | Mesh | Cloud | ArrayLike | str | os.PathLike[str]
+
+
+def view_of(view: View, name: str) -> Frame:
+    """Return what has points as a view.
+
+    Parameters
+    ----------
+    view
+        See `register`.
+    name
+        Of the argument, for errors.
+
+    Raises
+    ------
+    InputError
+        If it has fewer than ten finite points, or is nothing of that kind.
+    """
+    if isinstance(view, RangeFrame | CloudFrame):
+        return view
+    if isinstance(view, str | os.PathLike):
+        return named_view(os.fspath(view)).frame
+    if isinstance(view, Reconstruction):
+        return CloudFrame.of(_checked(view.cloud.points + view.shift, name))
+    if isinstance(view, Mesh):
+        return CloudFrame.of(_checked(surface_points(view.record(), name), name))
+    return CloudFrame.of(_checked(view.points if isinstance(view, Cloud) else view, name))
+
+
+def named_view(
+    name: str,
+    *,
+    format: str | None = None,  # noqa: A002
+    camera: Path | None = None,
+    topic: str | None = None,
+) -> SingleView:
+    """Read the view called `name`: the cloud of a result, or see `open_view`."""
+    folder = Path(name)
+    if format is None and folders.is_result(folder):
+        cloud = read_cloud(folder)
+        frame = CloudFrame.of(_checked(cloud.points, name))
+        return SingleView(name, name, "result", 0, frame)
+    return open_view(name, format=format, camera=camera, topic=topic)
+
+
+def _checked(points: ArrayLike, name: str) -> Float64:
+    """Return the finite points of an array (n, 3)."""
+    try:
+        array = np.asarray(points)
+    except ValueError as error:
+        raise InputError("is not an array", where=name, remedy="pass (N, 3) numbers") from error
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"is a {type(points).__name__} of shape {array.shape} and type {array.dtype}",
+            where=name,
+            remedy="pass a frame (recording[0]), a result, a mesh, (N, 3) numbers in metres, or "
+            "the path of one of these",
+        )
+    finite = array[np.isfinite(array).all(1)].astype(np.float64)
+    if len(finite) < MIN_POINTS:
+        raise InputError(
+            f"has {len(finite)} finite points", where=name, remedy=f"use {MIN_POINTS} or more"
+        )
+    if np.abs(finite).max() > se3.MAX_COORDINATE_M:
+        raise InputError(
+            f"has coordinates up to {np.abs(finite).max():.0e} m", where=name, remedy="use metres"
+        )
+    return finite

@@ -1,0 +1,169 @@
+"""What `tofuse.register` takes, and the accuracy that it states."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import tofuse
+from cli_calls import call
+from registration_scenes import error, stone, turn
+from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
+from tofuse.engine.geometry import se3
+from tofuse.formats.export import exchange
+from tofuse.formats.geometry import read_ply, write_ply
+from tofuse.lab.world import mesh as meshes
+
+T_TRUE = turn([1, 2, 0.5], 5)
+
+
+def bench(step_m: float = 0.6) -> GeometryRecord:
+    """A bench without symmetry: three boxes, of few large triangles."""
+    made = meshes.joined(
+        [
+            meshes.box((0.9, 0.4, 0.05), (0, 0, 2.0)),
+            meshes.box((0.1, step_m, 0.5), (-0.3, 0.1, 2.25)),
+            meshes.box((0.2, 0.1, 0.3), (0.35, -0.1, 1.85)),
+        ]
+    )
+    return GeometryRecord(made.vertices, made.faces.astype(np.int32))
+
+
+def seen(record: GeometryRecord) -> Mesh:
+    """The mesh in the frame of the source."""
+    moved = se3.transform(se3.inverse(T_TRUE), record.points.astype(float))
+    return Mesh.of(GeometryRecord(moved.astype(np.float32), record.faces))
+
+
+def near(found) -> None:
+    metres, degrees = error(found, T_TRUE)
+    assert metres < 0.005
+    assert degrees < 0.5
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".glb"])
+def test_mesh_files_are_sampled_over_their_area(suffix, tmp_path) -> None:
+    """Of the few vertices of a bench no pose could be estimated."""
+    path = tmp_path / f"target{suffix}"
+    exchange.save(bench(), path, np.eye(3))
+    near(tofuse.register(seen(bench()), path, guess=np.eye(4)))
+    near(tofuse.register(seen(bench()), str(path), guess=np.eye(4)))
+
+
+def test_meshes_clouds_and_frames_are_taken() -> None:
+    mesh = Mesh.of(bench())
+    near(tofuse.register(seen(bench()), mesh, guess=np.eye(4)))
+    source, target = stone(3000, 1), stone(3000, 0)
+    cloud = Cloud(target.astype(np.float32), None, None, np.ones(3000, np.int32))
+    by_array = tofuse.register(source, target)
+    by_cloud = tofuse.register(source, cloud)
+    np.testing.assert_array_equal(by_array.T_target_source, by_cloud.T_target_source)
+
+
+def test_result_is_its_cloud(room_result, capfd) -> None:
+    result = tofuse.load(room_result)
+    T = turn([0, 1, 0], 10) @ se3.exp([0.1, 0, 0, 0, 0, 0])
+    source = se3.transform(se3.inverse(T), result.cloud.points.astype(float))
+    found = tofuse.register(source, result)
+    assert found.believed
+    np.testing.assert_allclose(found.T_target_source, T, atol=2e-3)
+    of_folder = tofuse.register(source, room_result)
+    np.testing.assert_array_equal(of_folder.T_target_source, found.T_target_source)
+    assert call("register", room_result, room_result / "cloud.ply", "--json") == 0
+    data = json.loads(capfd.readouterr().out)
+    assert data["source"]["format"] == "result"
+    np.testing.assert_allclose(data["T_target_source"], np.eye(4), atol=1e-3)
+
+
+@pytest.mark.parametrize("method", ["icp", "ndt"])
+def test_methods_have_names(method, tmp_path, capfd) -> None:
+    for name, seed in (("source", 1), ("target", 0)):
+        write_ply(tmp_path / f"{name}.ply", GeometryRecord(stone(1500, seed)))
+    words = ("register", tmp_path / "source.ply", tmp_path / "target.ply")
+    assert call(*words, "--method", method, "--json") == 3  # can't be verified
+    of_command = json.loads(capfd.readouterr().out)
+    found = tofuse.register(words[1], words[2], method=method)
+    np.testing.assert_array_equal(of_command["T_target_source"], found.T_target_source)
+    assert call(*words, "--method", "ecp") == 2
+    assert "method: is 'ecp'; use one of any-pair, cicp, coarse-to-fine" in capfd.readouterr().err
+    assert call(*words, "--method", "features") == 2
+    assert "method: features takes no cloud views" in capfd.readouterr().err
+
+
+def test_accuracy_is_that_of_the_command(tmp_path, capfd) -> None:
+    """Also in map coordinates, about a point of the source."""
+    source = se3.transform(se3.inverse(T_TRUE), stone(3000, 1, noise=0.002))
+    target, far = stone(3000, 0, noise=0.002), np.array([500_000.0, 4_000_000.0, 100.0])
+    stated = []
+    for shift in (np.zeros(3), far):
+        for name, points in (("source", source), ("target", target)):
+            write_ply(tmp_path / f"{name}.ply", GeometryRecord(points + shift))
+        found = tofuse.register(source + shift, target + shift)
+        words = ("register", tmp_path / "source.ply", tmp_path / "target.ply", "--json")
+        assert call(*words) == 0
+        data = json.loads(capfd.readouterr().out)
+        np.testing.assert_allclose(found.covariance.ravel(), data["covariance"], rtol=1e-6)
+        np.testing.assert_allclose(found.sigma, (data["sigma_m"], data["sigma_rad"]), rtol=1e-6)
+        np.testing.assert_allclose(found.reference_point, data["reference_point_m"])
+        np.testing.assert_allclose(found.covariance @ found.information, np.eye(6), atol=1e-6)
+        stated.append(found.sigma)
+        assert 1e-6 < found.sigma[0] < 0.01
+        assert 1e-6 < found.sigma[1] < 0.01
+    np.testing.assert_allclose(stated[0], stated[1], rtol=10)
+
+
+def test_unbounded_accuracy_is_none() -> None:
+    xy = np.random.default_rng(0).uniform(-1, 1, (2, 4000, 2))
+    walls = [np.column_stack([p, np.full(4000, 2.0)]) for p in xy]
+    found = tofuse.register(*walls, guess=np.eye(4))
+    assert len(found.unobservable) == 3
+    assert found.covariance is None
+    assert 0 < found.sigma[0] < 0.01
+
+
+@pytest.mark.nightly_part
+def test_command_writes_the_scale(tmp_path, capfd) -> None:
+    source, target = stone(3000, 1, 0.001), stone(3000, 0, 0.001)
+    for name, points in (("source", 3 * source), ("target", target)):
+        write_ply(tmp_path / f"{name}.ply", GeometryRecord(points))
+    words = ("register", tmp_path / "source.ply", tmp_path / "target.ply", "--scale")
+    call(*words, "--out", tmp_path / "out")
+    assert re.search(r"scale +0\.333\d* ± ", capfd.readouterr().out)
+    data = json.loads((tmp_path / "out" / "registration.json").read_text())
+    assert data["scale"] == pytest.approx(1 / 3, rel=0.003)
+    assert 0 < data["scale_sigma"] < 0.003
+    similarity = np.loadtxt(tmp_path / "out" / "transform.txt")
+    moved = 3 * source @ similarity[:3, :3].T + similarity[:3, 3]
+    np.testing.assert_allclose(moved, source, atol=0.02)
+    aligned = read_ply(tmp_path / "out" / "aligned.ply").points
+    np.testing.assert_allclose(aligned, moved, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("view", "says"),
+    [
+        ({"a": 1}, "source: is a dict of shape () and type object; pass a frame"),
+        ("none.ply", "none.ply: doesn't exist"),
+        (Mesh.of(GeometryRecord(np.zeros((20, 3)), np.zeros((4, 3), np.int32))), "without area"),
+        (Mesh.of(GeometryRecord(np.eye(3))), "source: has 3 finite points; use 10 or more"),
+    ],
+)
+def test_other_things_are_refused(view, says, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(tofuse.InputError) as raised:
+        tofuse.register(view, stone(1500, 0))
+    assert says in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".glb", ".ply"])
+def test_damaged_meshes_are_refused(suffix, tmp_path) -> None:
+    path = tmp_path / f"bad{suffix}"
+    path.write_bytes(b"ply\nformat ascii 1.0\nelement face 3\nend_header\n" + b"\xff" * 40)
+    with pytest.raises(tofuse.InputError) as raised:
+        tofuse.register(path, stone(1500, 0))
+    assert str(raised.value).startswith(str(path))
+    assert "\n" not in str(raised.value)
