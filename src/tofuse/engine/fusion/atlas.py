@@ -89,7 +89,7 @@ def _in_cells(corners: Float32, columns: int, cell: int) -> Float64:
     lower = np.array([[low, low], [high, low], [low, high]])
     texels = np.where((number % 2 == 0)[:, None, None], lower, cell - 1 - lower) + origin[:, None]
     inverse = np.argsort(order, axis=1)[..., None]  # the corners in the order of the mesh
-    return np.take_along_axis(origin[:, None] + texels, inverse, 1)
+    return np.take_along_axis(texels, inverse, 1)
 
 
 def chart_atlas(faces: Int32, label: Int32, pixels: Float32, size: int) -> Atlas:
