@@ -14,8 +14,8 @@ import pytest
 
 import made_phones as made
 from tofuse.engine.errors import InputError
-from tofuse.formats.recordings.open import open_recording, open_view
 from tofuse.formats.recordings.archives import unzipped
+from tofuse.formats.recordings.open import open_recording, open_view
 
 
 def zipped(folder: Path, path: Path, inside: str = "") -> Path:

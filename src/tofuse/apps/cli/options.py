@@ -806,7 +806,7 @@ class Export(Edited):
     result : DIR
         a result: the --out of `tofuse run`
     formats : FORMAT
-        pcd, las, laz, e57, glb, gltf, obj, stl, kitti, log, nerfstudio, colmap
+        pcd, las, laz, e57, glb, gltf, obj, usdz, stl, kitti, log, nerfstudio, colmap
     out : DIR
         folder for the files (default: that of the result)
     faces : N

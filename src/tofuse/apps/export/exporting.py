@@ -79,8 +79,8 @@ class _Result:
             record, in_world = found
             if in_world:
                 return record
-            points, normals = (v @ self.R_up_world for v in (record.points, record.normals))
-            return replace(record, points=points, normals=normals)
+            normals = None if record.normals is None else record.normals @ self.R_up_world
+            return replace(record, points=record.points @ self.R_up_world, normals=normals)
         max_faces = self.faces or FACES
         n_faces = min(max_faces, len(self.mesh.faces))
         if self.mesh.color is None or not 0 < n_faces <= _MAX_TEXTURED_FACES:

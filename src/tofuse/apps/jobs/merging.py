@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.frames import Recording, Source
+from tofuse.engine.fusion import Textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import Config, Mapper, from_method, reconstructing, texturing
@@ -299,17 +301,19 @@ def merge_files(
             )
         progress.stage("writing")
         with threadpool_limits(1):
-            write_result(result, folder, _report, texture)
+            write_result(result, folder, partial(_report, texture, result), texture)
     return result
 
 
-def _report(result: Reconstruction, folder: Path, texture: Textured | None) -> None:
+def _report(
+    texture: Textured | None, merged: Reconstruction, result: Reconstruction, folder: Path
+) -> None:
     from tofuse.apps.report import ReportExtras, write_report
 
     names = ", ".join(session.name for session in result.sessions)
     extras = ReportExtras(
         title=f"{names} merged" if names else f"{folder.name} of a merged result",
         headline=" ".join(session_words.session_sentences(result)),
-        texture=texture,
+        texture=texture if result is merged else None,
     )
     write_report(result, folder / "report.html", extras)

@@ -54,7 +54,7 @@ def write_report_files(
         reference=reference_in_world(recording, result),
         truth_points=truth,
         clouds=tuple(item for item in clouds if isinstance(item, CloudFrame)),
-        texture=texture,
+        texture=texture if component is None else None,
         share=share and component is None,
     )
     write_report(result, folder / "report.html", extras)

@@ -50,7 +50,9 @@ class ModelOptions:
 
     def applied(self, config: Config) -> Config:
         """Return the configuration with these options."""
-        texture = {None: None, False: 0, True: config.fusion.texture or Fusion.texture}[self.texture]
+        texture = {None: None, False: 0, True: config.fusion.texture or Fusion.texture}[
+            self.texture
+        ]
         options: tuple[tuple[str, object, dict[str, Any]], ...] = (
             ("texture", texture, {"fusion": {"texture": texture}}),
             ("faces", self.faces, {"fusion": {"faces": self.faces}}),

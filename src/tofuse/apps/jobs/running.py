@@ -60,9 +60,7 @@ def run(
     """
     progress = progress or Silent()
     if options.share and options.no_report:
-        raise InputError(
-            "is a part of the report", where="--share", remedy="leave --no-report out"
-        )
+        raise InputError("is a part of the report", where="--share", remedy="leave --no-report out")
     if folder is None:
         folders.check_output(options.out, overwrite=options.overwrite)
     job = _open(inputs, options, progress)
@@ -93,7 +91,11 @@ def run(
             with threadpool_limits(1), timing("writing"):
                 trim_memory()
                 report = partial(
-                    write_report_files, job.recording, job.config, share=options.share
+                    write_report_files,
+                    job.recording,
+                    job.config,
+                    texture=texture,
+                    share=options.share,
                 )
                 write_result(
                     result, out, None if options.no_report else report, texture, options.share

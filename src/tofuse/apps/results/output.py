@@ -29,7 +29,7 @@ CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
 # Of a simplified surface whose texture is made of the colours of its vertices.
 DISPLAY_FACES, _TEXTURE_SIZE = 60_000, 2048
 QUALITY = 90  # of a texture as JPEG
-Report = Callable[[Reconstruction, Path, Textured | None], None]
+Report = Callable[[Reconstruction, Path], None]
 MAX_PLY_POINTS = 4_000_000  # a larger cloud is compressed
 
 
@@ -52,7 +52,7 @@ def write_result(
     folder
         The output folder; existing files are replaced together, when all new ones are complete.
     report
-        Writes the report of a result into a folder, with its texture; None: no report.
+        Writes the report of a result into a folder; None: no report.
     texture
         Texture of the main model, for `mesh.glb`.
     share
@@ -90,7 +90,7 @@ def _write_files(
         write_tum(folder / "trajectory.txt", result.timestamps[posed], poses)
         write_g2o(folder / "pose_graph.g2o", result.graph)
         if report is not None:
-            report(result, folder, texture)
+            report(result, folder)
         model.result()
         # Last, since it shares the report's overview of the surface.
         if result.mesh is not None:
@@ -138,9 +138,7 @@ def _write_changes(result: Reconstruction, path: Path) -> None:
     )
 
 
-def _write_scene(
-    mesh: Mesh, T_up_world: Float64, folder: Path, texture: Textured | None
-) -> None:
+def _write_scene(mesh: Mesh, T_up_world: Float64, folder: Path, texture: Textured | None) -> None:
     """Write `mesh.glb`, made upright by its node: the overview of the surface, or its texture."""
     node: dict[str, Any] = {"generator": f"tofuse {__version__}", "T_scene_node": T_up_world}
     if texture is None:

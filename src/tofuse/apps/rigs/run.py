@@ -309,13 +309,19 @@ def _write(
 ) -> None:
     from tofuse.apps.report import ReportExtras, write_report
 
-    def report(result: Reconstruction, target: Path, texture: Textured | None) -> None:
+    def report(result: Reconstruction, target: Path) -> None:
         source = recording.source
         assert isinstance(source, RigSource)
         cameras = ", ".join(camera.name for camera in source.rig.cameras)
-        extras = ReportExtras(f"rig of {cameras}", rig=rig_result.rig, texture=texture, share=share)
+        is_main = result is rig_result.result
+        extras = ReportExtras(
+            f"rig of {cameras}",
+            rig=rig_result.rig,
+            texture=texture if is_main else None,
+            share=share and is_main,
+        )
         write_report(result, target / "report.html", extras)
-        if result is rig_result.result:
+        if is_main:
             posed = np.isfinite(rig_result.poses[:, 0, 0])
             write_tum(target / TRAJECTORY, rig_result.times[posed], rig_result.poses[posed])
 

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from tofuse.engine.fusion.mesh import Mesh
     from tofuse.engine.fusion.model import Model, ModelBuilder
     from tofuse.engine.fusion.options import Fusion
-    from tofuse.engine.fusion.texture import Textured
     from tofuse.engine.fusion.pose_errors import UNKNOWN_M, with_pose_errors
+    from tofuse.engine.fusion.texture import Textured
     from tofuse.engine.fusion.upright import T_up_world
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.engine.arrays import Float32, Int32, Intp
+from tofuse.engine.arrays import Float32, Float64, Int32, Intp
 from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
 from tofuse.engine.fusion.mesh import Mesh
 
@@ -87,9 +87,9 @@ def _in_cells(corners: Float32, columns: int, cell: int) -> Float64:
     origin = np.stack([number // 2 % columns, number // 2 // columns], -1) * cell
     low, high = 1.0, cell - 4.0
     lower = np.array([[low, low], [high, low], [low, high]])
-    texels = np.where((number % 2 == 0)[:, None, None], lower, cell - 1 - lower)
+    texels = np.where((number % 2 == 0)[:, None, None], lower, cell - 1 - lower) + origin[:, None]
     inverse = np.argsort(order, axis=1)[..., None]  # the corners in the order of the mesh
-    return np.take_along_axis(origin[:, None] + texels, inverse, 1)
+    return np.take_along_axis(texels, inverse, 1)
 
 
 def chart_atlas(faces: Int32, label: Int32, pixels: Float32, size: int) -> Atlas:

@@ -255,8 +255,12 @@ def paint_triangles(
                 u, v, cell, _ = projection_kernels.project_ray(x, y, lookup, frame)
                 if cell < 0:
                     continue
-                _sample(fine, (u + 0.5) * scales[0, 0] - 0.5, (v + 0.5) * scales[0, 1] - 0.5, color[0])
-                _sample(coarse, (u + 0.5) * scales[1, 0] - 0.5, (v + 0.5) * scales[1, 1] - 0.5, color[1])
+                _sample(
+                    fine, (u + 0.5) * scales[0, 0] - 0.5, (v + 0.5) * scales[0, 1] - 0.5, color[0]
+                )
+                _sample(
+                    coarse, (u + 0.5) * scales[1, 0] - 0.5, (v + 0.5) * scales[1, 1] - 0.5, color[1]
+                )
                 total[row, column] += weight
                 leads = weight > best[row, column]
                 if leads:

@@ -24,7 +24,7 @@ NO_COLOR = (142, 142, 142)
 
 def has_color(colors: UInt8) -> Bool:
     """Return which of the colours (N, 3) are known, (N,): neither black nor the neutral grey."""
-    return np.asarray(colors.any(1) & (colors != np.uint8(NO_COLOR)).any(1), np.bool_)
+    return np.asarray(colors.any(1) & (colors != np.array(NO_COLOR, np.uint8)).any(1), np.bool_)
 
 
 def display_colors(colors: UInt8) -> UInt8:

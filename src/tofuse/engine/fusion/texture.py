@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Intp, UInt8
+from tofuse.engine.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
@@ -114,12 +114,12 @@ class TextureView:
         projection = Projection.of(frame.camera, 1)
         if frame.color_image is not None and frame.color_registered:
             image = frame.color_image if image is None else image
-            known = frame.color_image.any(-1)  # else the colour camera didn't see it
+            known = np.asarray(frame.color_image.any(-1), np.bool_)  # else the colour camera didn't see it
             return cls(z, known, np.ascontiguousarray(image), projection)
         light = albedo(frame)
         if light is None:
             return None
-        known = light >= 0
+        known = np.asarray(light >= 0, np.bool_)
         image = np.zeros((*z.shape, 3), np.uint8)
         image[known] = grey_of(light[known].astype(float))
         return cls(z, known, image, projection)
@@ -246,17 +246,16 @@ class _Seen:
         weights = np.zeros((len(views), len(mesh)), np.float32)
         pixels = np.zeros((len(views), len(mesh), 2), np.float32)
         points, normals = (np.ascontiguousarray(v) for v in (mesh.vertices, mesh.normals))
-        for view, T, weight, pixel in zip(views, se3.inverse(poses), weights, pixels, strict=True):
-            lens = view.projection
-            tested = SeenBy(view.z, view.reach, lens.lookup, lens.frame)
+
+        def weigh(k: int, T_camera_world: Float64) -> None:
+            view = views[k]
+            tested = SeenBy(view.z, view.reach, view.projection.lookup, view.projection.frame)
             limits = (_TOLERANCE_M, _TOLERANCE_FRACTION)
-            run_chunks(
-                lambda a, b: weigh_points(
-                    points, normals, tested, T, *limits, weight, pixel, a, b  # noqa: B023
-                ),
-                len(points),
-                _CHUNKS,
-            )
+            scene = (points, normals, tested, T_camera_world, *limits, weights[k], pixels[k])
+            run_chunks(lambda a, b: weigh_points(*scene, a, b), len(points), _CHUNKS)
+
+        for k, T_camera_world in enumerate(se3.inverse(poses)):
+            weigh(k, T_camera_world)
         return cls(views, poses, weights, pixels)
 
     def exposures(self) -> Float64:
@@ -294,7 +293,7 @@ class _Seen:
         return np.where(shown, best, -1).T.astype(np.int32), label.astype(np.int32)
 
     def image_pixels(self, label: Int32, faces: Int32) -> Float32:
-        """Return where the corners (M, 3, 2) of triangles are in the images of their labels (M,)."""
+        """Return where corners (M, 3, 2) are in the images of the triangles' labels (M,)."""
         out = np.zeros((*faces.shape, 2), np.float32)
         for k, view in enumerate(self.views):
             own = label == k
@@ -307,9 +306,7 @@ def _scale(image: NDArray[np.generic], z: Float32) -> Float64:
     return np.array([image.shape[1] / z.shape[1], image.shape[0] / z.shape[0]])
 
 
-def _painted(
-    mesh: Mesh, seen: _Seen, gains: Float64, candidates: Int32, atlas: Atlas
-) -> UInt8:
+def _painted(mesh: Mesh, seen: _Seen, gains: Float64, candidates: Int32, atlas: Atlas) -> UInt8:
     """Return the image (S, S, 3) of a texture."""
     shape = (atlas.size, atlas.size)
     owner, coordinates = atlas.drawn()
@@ -328,14 +325,12 @@ def _painted(
         scales = np.stack([_scale(view.image, view.z), _scale(coarse, view.z)])
         pictures = Pictures(view.image, coarse, scales, gains[k], lens.lookup, lens.frame)
         scene = (corners, faces, points, seen.weights[k], pictures, T_camera_world, canvas)
-        run_chunks(
-            lambda a, b: paint_triangles(triangles, *scene, a, b), len(triangles), _CHUNKS
-        )
+        run_chunks(lambda a, b: paint_triangles(triangles, *scene, a, b), len(triangles), _CHUNKS)
 
     for k, T_camera_world in enumerate(se3.inverse(seen.poses)):
         paint(k, T_camera_world)
     image = np.zeros((*shape, 3), np.uint8)
-    unseen = ~(seen.weights > 0).any(0)
+    unseen = np.asarray(~(seen.weights > 0).any(0), np.bool_)
     base = _base_colors(mesh)
     run_chunks(lambda a, b: finish(canvas, faces, unseen, base, image, a, b), len(image), _CHUNKS)
     return _filled(image, owner != NO_TRIANGLE)
@@ -460,19 +455,20 @@ def _filled(image: UInt8, mask: Bool) -> UInt8:
     """
     if mask.all() or not mask.any():
         return image
-    weights, levels = [], []
-    weight, color = mask.astype(np.float32), image
+    weights: list[Float32] = []
+    levels: list[NDArray[np.floating]] = []
+    weight, color = mask.astype(np.float32), image.astype(np.float32)
     while max(weight.shape) > 1:
         size = [max(1, -(-n // 2)) for n in weight.shape[::-1]]
-        sums = cv2.resize(color, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        weight = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+        sums = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+        weight = np.asarray(cv2.resize(weight, size, interpolation=cv2.INTER_AREA), np.float32)
         levels.append(sums / np.maximum(weight, 1e-6)[..., None])
-        weight = np.minimum(weight * 4, 1)
+        weight = np.minimum(weight * 4, np.float32(1))
         weights.append(weight)
-        color = levels[-1] * weight[..., None]
+        color = np.asarray(levels[-1] * weight[..., None], np.float32)
     fill = levels.pop()
     for level, weight in zip(levels[::-1], weights[-2::-1], strict=True):
-        fill = cv2.resize(fill, weight.shape[::-1]).reshape(level.shape)
+        fill = np.asarray(cv2.resize(fill, weight.shape[::-1]), np.float32).reshape(level.shape)
         fill += weight[..., None] * (level - fill)
     smooth = cv2.resize(np.round(fill.clip(0, 255)).astype(np.uint8), mask.shape[::-1])
     return np.asarray(cv2.copyTo(image, mask.astype(np.uint8), smooth), np.uint8)

@@ -10,6 +10,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.formats.recordings import still
+    from tofuse.formats.recordings.archives import unzipped
     from tofuse.formats.recordings.joined import JoinedSource
     from tofuse.formats.recordings.native import RecordingWriter
     from tofuse.formats.recordings.open import (
@@ -21,6 +22,5 @@ if TYPE_CHECKING:
         open_view,
         read_reference,
     )
-    from tofuse.formats.recordings.archives import unzipped
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -9,7 +9,7 @@ import tempfile
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from tofuse.engine.errors import InputError, output_error
+from tofuse.engine.errors import InputError
 from tofuse.formats.files import reading
 
 _REMEDY = "unpack it yourself, and pass the folder"

@@ -18,9 +18,9 @@ from tofuse.formats.cameras import read_noise
 from tofuse.formats.files import reading
 from tofuse.formats.geometry import is_surface, read_surface, surface_points
 from tofuse.formats.poses import TimedPoses, read_poses
+from tofuse.formats.recordings.archives import unzipped
 from tofuse.formats.recordings.joined import JoinedSource, LimitedSource
 from tofuse.formats.recordings.still import average_still
-from tofuse.formats.recordings.archives import unzipped
 from tofuse.formats.rigs import RigSource, read_rig, recordings_of, rig_file_in
 from tofuse.formats.sources import Reader, ReaderOptions, Sniff
 

@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Frame, RangeFrame, Recording
+from tofuse.engine.frames import Frame, RangeFrame, Recording, Source
 from tofuse.formats.rigs.rig_file import Rig
 
 # Largest time difference within an instant, as a fraction of the frame interval.
