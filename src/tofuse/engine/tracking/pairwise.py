@@ -170,8 +170,8 @@ class Pairwise(Bounded, Odometry):
         Minimum probability of a pose that is not accepted, but kept.
     guess
         Predicted motion: "previous", that of the last views; "odometry", that of an odometry file
-        (the former where it has none); "identity". A probable pose that was searched is accepted
-        if odometry leads to the same; odometry that led to the poses of searches replaces them.
+        (the former where it has none); "identity". The best pose of a search is accepted if
+        odometry leads to the same; odometry that led to the poses of searches replaces them.
     """
 
     registration: AnyPair = field(default_factory=AnyPair)
@@ -281,9 +281,13 @@ class _PairwiseTracker(Tracker):
     def _confirmed_by_odometry(
         self, frame: Frame, searched: _Registered, local: _Registered | None
     ) -> _Registered:
-        """Accept a probable pose of a search if odometry, independent of it, leads there too."""
-        agree = local is not None and local.agrees(searched, frame.points)
-        if not (self._has_odometry and agree and searched.probability >= self._options.probable):
+        """Accept the best pose of a search if odometry, independent of it, leads there too.
+
+        Odometry excludes the rivals of the search: the probability near the guess counts.
+        """
+        if local is None or not self._has_odometry or not local.agrees(searched, frame.points):
+            return searched
+        if local.probability < self._options.probable:
             return searched
         registration = replace(searched.registration, believed=True, reason="", confirmed=True)
         return replace(searched, registration=registration)
