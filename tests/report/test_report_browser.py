@@ -35,7 +35,9 @@ def browser():
 def opened(browser, report, **options):
     """The report with all that is folded shown."""
     with watched(browser, report.as_uri(), ours=report.as_uri(), **options) as seen:
-        seen.page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+        seen.page.evaluate(
+            "document.querySelectorAll('details').forEach((d) => { d.open = true; })"
+        )
         yield seen
 
 
