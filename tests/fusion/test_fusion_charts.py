@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-
 from test_fusion_texture import POSES, look, pattern, sheet
+
 from tofuse.engine.fusion.atlas import chart_atlas
 from tofuse.engine.fusion.cloud import NO_COLOR
 from tofuse.engine.fusion.geometry_record import GeometryRecord

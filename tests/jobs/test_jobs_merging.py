@@ -26,6 +26,7 @@ from tofuse.engine.fusion import texture
 from tofuse.engine.fusion.texture import textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Silent
+from tofuse.formats.geometry import read_textured_glb
 from tofuse.formats.poses.trajectory import read_tum, write_tum
 from tofuse.formats.recordings.native import RecordingWriter
 from written_run_json import change_run, run_json
@@ -154,7 +155,7 @@ def test_command_writes_result(session_results, tmp_path, monkeypatch, capsys) -
     assert main([*words, "--threads", "2", "--texture"]) == 0
     assert "here and there overlap" in capsys.readouterr().out
     assert painted == [2 * N]  # views of both
-    assert (out / "mesh.obj").exists()
+    assert read_textured_glb(out / "mesh.glb") is not None
     times, poses = read_tum(out / "trajectory.txt")
     assert len(poses) == 2 * N
     assert (np.diff(times) > 0).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -30,8 +31,14 @@ def browser():
         yield found
 
 
+@contextmanager
 def opened(browser, report, **options):
-    return watched(browser, report.as_uri(), ours=report.as_uri(), **options)
+    """The report with all that is folded shown."""
+    with watched(browser, report.as_uri(), ours=report.as_uri(), **options) as seen:
+        seen.page.evaluate(
+            "document.querySelectorAll('details').forEach((d) => { d.open = true; })"
+        )
+        yield seen
 
 
 CANVAS = "#viewer .stage canvas"
@@ -71,14 +78,13 @@ def test_model_rotates_and_toggles_switch(browser, report):
             assert changed(was, rested(seen)) > 0.02, name
         page.get_by_role("button", name="Reset").click()
         assert changed(first, rested(seen)) < 0.002
-        page.locator("#viewer summary").click()
         for name, orange in (("before", True), ("after", False)):
             was = seen.pixels(CANVAS)
             page.locator(f"input[name={name}]").click()
             now = rested(seen)
             assert changed(was, now) > 0.0005, name
             # BGR: the cameras before are orange, those after blue.
-            ink = now if orange else was
+            ink = now
             blue, red = ink[..., 0], ink[..., 2]
             strong = (red - blue > 100) if orange else (blue - red > 100)
             assert strong.sum() > 50
@@ -137,6 +143,20 @@ def test_phone_scrolls_past_model(browser, report):
         swipe(0, -160)
         seen.rest()
         assert page.evaluate("scrollY") > 80
+        seen.check()
+
+
+def test_folded_page_is_short_and_links_unfold_it(browser, report):
+    address = report.as_uri()
+    with watched(browser, address, ours=address, viewport={"width": 400, "height": 800}) as seen:
+        page = seen.page
+        ready(seen)
+        assert page.evaluate("document.documentElement.scrollHeight") < 3 * 800
+        plain = page.locator("#summary").inner_text()
+        assert re.search(r"[\d.]+ m wide, [\d.]+ m high and [\d.]+ m deep", plain)
+        assert page.locator("#frames").is_hidden()
+        page.evaluate("document.querySelector('a[href=\"#frames\"]').click()")
+        assert page.locator("#frames").is_visible()
         seen.check()
 
 

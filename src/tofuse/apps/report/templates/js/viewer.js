@@ -125,9 +125,14 @@ async function startViewer(box, scene, bus) {
     cameras.paint(accuracy && shown(accuracy), marked);
   }
 
-  // Frames that are spoken of elsewhere on the page.
+  // Frames that are spoken of elsewhere on the page: their cameras are shown.
+  function reveal() {
+    const input = box.querySelector("[name=after]");
+    if (input) input.checked = true;
+  }
   bus.addEventListener("chosen", (e) => {
     if (!cameras) return;
+    reveal();
     const row = rowOf(e.detail.index), T = cameras.pose(row);
     cameras.choose(row);
     if (view.through && T) view.lookThrough(T); else draw();
@@ -136,6 +141,7 @@ async function startViewer(box, scene, bus) {
   bus.addEventListener("marked", (e) => {
     if (!cameras) return;
     const { ranges } = e.detail;
+    if (ranges.length) reveal();
     marked = ranges.length ? (row) => ranges.some(([a, b]) => frames.index[row] >= a && frames.index[row] <= b) : null;
     recolor();
     const seen = marked ? cameras.centres(marked) : [];
