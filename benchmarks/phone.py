@@ -193,7 +193,7 @@ def simulated_phone(scene: str, seed: int, drift: Drift) -> tuple[Recording, Flo
     planned = plan(scene, seed=seed, effects=Effects.none())
     rng = np.random.default_rng([seed, 5])
     frames = []
-    error = np.zeros(planned.model.camera.shape)
+    error = np.zeros((planned.model.camera.height, planned.model.camera.width))
     for rendered in planned.frames(None):
         error = _next_field(error, rng, first=not frames)
         frames.append(_as_phone(rendered.frame, error))
