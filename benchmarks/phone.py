@@ -37,7 +37,7 @@ from tofuse.engine.mapping.adaptation import Prior, with_prior
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.map_agreement import map_consistency
-from tofuse.engine.quality.trajectory_errors import distances_between, displacement
+from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
@@ -85,7 +85,7 @@ DRIFTS = {
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """SIFT features of frame `k`: rays x/z and y/z (N, 2), descriptors, and focal length, pixels."""
+    """SIFT features of frame `k`: rays x/z and y/z (N, 2), descriptors, focal length in pixels."""
 
     k: int
     rays: Float64
@@ -126,7 +126,7 @@ def color_rotations(recording: Recording) -> list[tuple[int, int, Float64]]:
 def rotation_between(a: Features, b: Features) -> Float64 | None:
     """Return R_a_b by the matches of two images; None if there is no unique solution."""
     matcher = cv2.BFMatcher()
-    back = {m.queryIdx: m.trainIdx for m, in matcher.knnMatch(b.descriptors, a.descriptors, 1)}
+    back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(b.descriptors, a.descriptors, 1)}
     matches = [
         m
         for m, second in matcher.knnMatch(a.descriptors, b.descriptors, 2)

@@ -63,6 +63,7 @@ def sensed(
 ) -> SensorData:
     return SensorData(
         np.arange(N),
+        np.arange(N, dtype=float),
         np.full((N, 4, 4), np.nan) if odometry is None else odometry,
         np.full((N, 4), np.nan) if gravity is None else gravity,
         np.zeros(N, np.intp),
@@ -222,7 +223,7 @@ def test_odometry_verifies_depth_unit(factor, motion, metric):
     shorter = right.copy()
     shorter[:, :3, 3] *= factor
     graph = tracked(shorter, 0 * NODDING)
-    lenient = OdometryEdges(min_m=0.004, relative=0.5, limit=100)
+    lenient = OdometryEdges(drift_m=0.01, relative=0.5, limit=100)
     [record] = measure_all((lenient,), sensed(odometer(right)), graph).records
     assert record.scale is not None
     assert record.metric is metric
@@ -278,6 +279,7 @@ def test_refinement_takes_unconstrained_tilt_from_gravity():
         (GravityEdges(),),
         SensorData(
             np.arange(6),
+            np.arange(6.0),
             np.full((6, 4, 4), np.nan),
             np.concatenate(
                 [np.einsum("kji,j->ki", poses[:, :3, :3], down), np.full((6, 1), 0.01)], 1

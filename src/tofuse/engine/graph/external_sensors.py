@@ -8,7 +8,7 @@ device's poses grow with time, those of a registration don't.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Annotated, ClassVar, Protocol
@@ -32,7 +32,7 @@ _MAX_DEPTH_SCALE = 30.0
 # Number of frames whose motions are compared with those of odometry.
 _COMPARED = 60
 # Degrees of freedom of the t distribution of disagreements: jumps and false registrations are rare.
-_DEGREES = 4.0
+_DEGREES = 30.0
 # Standard deviation of the logarithm of the factors on odometry's errors.
 _SPREAD = np.log(2.0)
 # Odometry that fewer fully constrained registrations were compared with is not verified.
@@ -317,8 +317,8 @@ class _Comparison:
         (K, 4, 4), and (K, 6, 6) as right perturbations.
     odometry, variances
         (K, 4, 4), and (K, 6) by the stated errors.
-    weight
-        (K,) their independent number, the same for each length.
+    spans
+        (K,) number of compared frames from the first to the last.
     verified
         See `SensorPriors`.
     """
@@ -327,7 +327,7 @@ class _Comparison:
     covariances: Float64
     odometry: Float64
     variances: Float64
-    weight: Float64
+    spans: Intp
     verified: bool
 
     def scales(self, limit: float, odometry_limit: float | None = None) -> Float64 | None:
@@ -338,6 +338,7 @@ class _Comparison:
         variances add up along the path.
         """
         misfit = se3.log(se3.inverse(self.tracked) @ self.odometry)
+        weight = 1 / self.spans  # about as many are independent as don't overlap
 
         def cost(logarithms: Float64) -> float:
             C = self._covariances(np.exp(logarithms).reshape(2, 2))
@@ -345,7 +346,7 @@ class _Comparison:
                 _squared(misfit, C) / _DEGREES
             )
             prior = 0.5 * float((logarithms[2:] ** 2).sum()) / _SPREAD**2
-            return float((self.weight * likelihood).sum()) + prior
+            return float((weight * likelihood).sum()) + prior
 
         high = np.log([limit] * 2 + [limit if odometry_limit is None else odometry_limit] * 2)
         starts = np.array([[0.5, 0.5, 0, 0], [0, 0, 0.5, 0.5]]) * high
@@ -354,6 +355,20 @@ class _Comparison:
         found = np.exp(min(fits, key=lambda fit: float(fit.fun)).x).reshape(2, 2)
         median = float(np.median(_squared(misfit, self._covariances(found))))
         return found if median <= 2 * MEDIAN else None
+
+    def by_length(self) -> Iterator[_Comparison]:
+        """Yield those over each number of frames, if there are several."""
+        for span in np.unique(self.spans):
+            of = self.spans == span
+            if of.sum() >= _MIN_FRAMES:
+                yield _Comparison(
+                    self.tracked[of],
+                    self.covariances[of],
+                    self.odometry[of],
+                    self.variances[of],
+                    self.spans[of],
+                    self.verified,
+                )
 
     def _covariances(self, scales: Float64) -> Float64:
         """(K, 6, 6) of the disagreement, by `scales`."""
@@ -408,7 +423,49 @@ def _compare(
         covariances,
         np.asarray(se3.inverse(sensed.odometry[a]) @ sensed.odometry[b], np.float64),
         variance[b] - variance[a],
-        _per_length(j - i, len(frames)),
+        j - i,
+        verified,
+    )
+
+
+def _compare(
+    sensed: SensorData, graph: PoseGraph, variances: Float64, first: Intp
+) -> _Comparison | None:
+    """Compare motions over 1, 2, 4 ... of evenly spaced frames, each with its covariance.
+
+    Motions over degenerate frames are left out if enough remain. None without any.
+    """
+    frames = evenly_spaced(np.arange(len(sensed.ids)), _COMPARED)
+    # Variances add up along the path; a step without odometry breaks it.
+    variance = np.zeros((len(sensed.ids), 6))
+    variance[first + 1] = variances
+    measured = np.zeros(len(sensed.ids), np.intp)
+    measured[first + 1] = 1
+    variance, measured = variance.cumsum(0), measured.cumsum()
+    degenerate = sensed.degenerate.cumsum()
+    spans = 2 ** np.arange(len(frames).bit_length())
+    i = np.concatenate([np.arange(max(len(frames) - span, 0)) for span in spans])
+    j = np.concatenate([np.arange(span, len(frames)) for span in spans])
+    a, b = frames[i], frames[j]
+    compared = measured[b] - measured[a] == b - a
+    constrained = compared & (degenerate[b] == degenerate[a]) & ~sensed.degenerate[a]
+    verified = bool(constrained.sum() >= _MIN_COMPARED)
+    compared = constrained if verified else compared
+    joint = GraphCovariances(graph).joint(frames) if compared.any() else None
+    if joint is None:
+        return None
+    i, j, a, b = i[compared], j[compared], a[compared], b[compared]
+    tracked = se3.inverse(graph.poses[a]) @ graph.poses[b]
+    C = joint.reshape(len(frames), 6, len(frames), 6).swapaxes(1, 2)
+    A = -se3.adjoint(se3.inverse(tracked))
+    At = np.swapaxes(A, 1, 2)
+    covariances = A @ C[i, i] @ At + A @ C[i, j] + C[j, i] @ At + C[j, j]
+    return _Comparison(
+        tracked,
+        covariances,
+        np.asarray(se3.inverse(sensed.odometry[a]) @ sensed.odometry[b], np.float64),
+        variance[b] - variance[a],
+        j - i,
         verified,
     )
 
@@ -441,11 +498,11 @@ def with_depth_scale(measured: SensorPriors, sensed: SensorData, graph: PoseGrap
     information = np.array([step.information for step in measured.steps])
     variances = 1 / np.diagonal(information, axis1=1, axis2=2)
     compared = _compare(sensed, graph, variances, first)
-    scales = None if compared is None else compared.scales(_MAX_DEPTH_SCALE, 1.0)
-    if scales is None:
+    if compared is None:
         return measured
-    translation, rotation = scales[0].tolist()
-    return replace(measured, depth_scale=(translation, rotation))
+    found = [part.scales(_MAX_DEPTH_SCALE, 1.0) for part in compared.by_length()]
+    translation, rotation = np.max([np.ones(2), *(s[0] for s in found if s is not None)], 0)
+    return replace(measured, depth_scale=(float(translation), float(rotation)))
 
 
 def with_sensors(graph: PoseGraph, measured: SensorPriors) -> PoseGraph:

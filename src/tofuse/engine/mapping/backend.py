@@ -181,7 +181,9 @@ class BackEnd:
         """
         graph = closed.optimisation.graph
         self._progress.stage("refining")
-        images = replace(closed.sensors, steps=()) 
+        # Elsewhere images alone: their errors are estimated from the result.
+        steps = self._tracked.steps_at_degenerate(closed.sensors)
+        images = replace(closed.sensors, steps=steps)
         refinement = self._observations.refiner.finish(graph, images)
         if refinement.kept:
             graph = self._tracked.build(closed.loops, refinement, confirmed=closed.confirmed)

@@ -10,7 +10,7 @@ the same system.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -47,13 +47,6 @@ class Priors:
     def none(cls) -> Priors:
         """Return no priors."""
         return cls(np.zeros((0, 2), np.intp), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
-
-    def for_partners(self, count: float) -> Priors:
-        """Return them for views that are compared with `count` others on average.
-
-        All pairs of a view share its errors, so that they count as one.
-        """
-        return replace(self, information=self.information * max(count, 1.0))
 
     def system(self, n: int, ends: Intp) -> sparse.PairSystem:
         """Return the sparse system of n poses, pairs `ends` (m, 2) and those of the priors."""
@@ -282,7 +275,6 @@ def align_views(
     error_changes = [np.inf]
     overlapping = _overlapping(views, poses, options, bodies) if pairs is None else pairs
     state = pair_equations.directed_pairs(views, overlapping, options)
-    priors = priors.for_partners(2 * len(overlapping) / len(views))
     system = _system(state, len(views), priors, bodies)
     motion_since_overlaps = 0.0
     earlier_error_step = np.zeros(kernels.ERRORS)

@@ -342,8 +342,6 @@ def _priors(ids: Sequence[int], measured: external_sensors.SensorPriors) -> Prio
     position = {index: k for k, index in enumerate(ids)}
     steps = measured.between(ids)
     m = len(steps)
-    depth = np.repeat(measured.depth_scale, 3)
-    weight = _CORRELATED_PIXELS * np.outer(depth, depth)
     gravity = measured.gravity_of(ids)
     if gravity is not None:
         gravity = replace(
@@ -354,7 +352,7 @@ def _priors(ids: Sequence[int], measured: external_sensors.SensorPriors) -> Prio
     return Priors(
         np.array([(position[s.i], position[s.j]) for s in steps], np.intp).reshape(m, 2),
         np.array([s.T_i_j for s in steps]).reshape(m, 4, 4),
-        np.array([s.information * weight for s in steps]).reshape(m, 6, 6),
+        np.array([s.information * _CORRELATED_PIXELS for s in steps]).reshape(m, 6, 6),
         gravity,
     )
 
