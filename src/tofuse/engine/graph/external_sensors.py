@@ -2,8 +2,8 @@
 
 They are weighted by their agreement with odometry from images, in units of the errors of both: a
 moving accelerometer measures more than gravity, wheels slip, and a file may belong to another
-camera or use other axes. The errors of both are estimated from their disagreement: those of a
-device's poses grow with time, those of a registration don't.
+camera or use other axes. Tracking's covariances are accurate along short paths, and measure the
+errors of odometry; odometry then measures those of refined pairs, which share errors.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MAX_DEPTH_SCALE = 30.0
 _COMPARED = 60
 # Degrees of freedom of the t distribution of disagreements: jumps and false registrations are rare.
 _DEGREES = 30.0
-# Standard deviation of the logarithm of the factors on odometry's errors.
+# Standard deviation of the logarithm of the factors.
 _SPREAD = np.log(2.0)
 # Odometry that fewer fully constrained registrations were compared with is not verified.
 _MIN_COMPARED = 10
@@ -226,9 +226,9 @@ class GravityEdges(Bounded, ExternalSensor):
 class OdometryEdges(Bounded, ExternalSensor):
     """Connects consecutive frames by the motion between their poses in an odometry file.
 
-    Its errors are random walks over time, length and angle. They and those of registrations are
-    estimated from the disagreement of the two (`_Comparison.scales`); single steps with a far
-    larger one are rejected.
+    Its errors are random walks over time, length and angle. They are scaled until these and the
+    errors of tracking explain the disagreement of the two; single steps with a far larger one are
+    rejected.
 
     Attributes
     ----------
@@ -237,8 +237,7 @@ class OdometryEdges(Bounded, ExternalSensor):
     relative, relative_rad
         Additional standard deviation after one metre, as a fraction; and after one radian.
     limit
-        Largest factor on its errors, and on those of registrations; odometry that needs more is not
-        used.
+        Largest factor on its errors; odometry that needs more is not used.
     gate
         Squared error of a step, in units of the errors of both, beyond which it is rejected.
     """
@@ -260,17 +259,17 @@ class OdometryEdges(Bounded, ExternalSensor):
         measured = se3.inverse(sensed.odometry[first]) @ sensed.odometry[first + 1]
         variances = self._variances(measured, sensed.times[first + 1] - sensed.times[first])
         compared = _compare(sensed, graph, variances, first)
-        scales = np.ones((2, 2)) if compared is None else compared.scales(self.limit)
+        scales = np.ones((2, 2)) if compared is None else compared.scales((1.0, self.limit))
         if scales is None:
             text = (
                 f"the odometry differs from the tracked motion by more than {self.limit:g} times "
-                "the errors of both, so it was not used"
+                "its errors, so it was not used"
             )
             return SensorPriors(records=(SensorRecord("odometry", len(first), 0, None, text),))
-        depth_scale, odometry_scale = scales
+        odometry_scale = scales[1]
         C = (variances * np.repeat(odometry_scale**2, 3))[:, :, None] * np.eye(6)
         tracked = se3.inverse(graph.poses[first]) @ graph.poses[first + 1]
-        tracking_covariance = _scaled(_covariance_to_reference(graph), depth_scale)
+        tracking_covariance = _covariance_to_reference(graph)
         chi2 = _squared(
             se3.log(se3.inverse(tracked) @ measured),
             C + tracking_covariance[first] + tracking_covariance[first + 1],
@@ -291,10 +290,7 @@ class OdometryEdges(Bounded, ExternalSensor):
         metric = compared is not None and compared.lengths_agree(scales)
         record = SensorRecord("odometry", len(first), len(kept), scale, text, metric)
         verified = compared is not None and compared.verified
-        translation, rotation = depth_scale.tolist()
-        return SensorPriors(
-            steps, records=(record,), verified=verified, depth_scale=(translation, rotation)
-        )
+        return SensorPriors(steps, records=(record,), verified=verified)
 
     def _variances(self, steps: Float64, seconds: Float64) -> Float64:
         """(K, 6) of motions (K, 4, 4)."""
@@ -330,12 +326,10 @@ class _Comparison:
     spans: Intp
     verified: bool
 
-    def scales(self, limit: float, odometry_limit: float | None = None) -> Float64 | None:
-        """Most likely factors on the sigmas, from 1 to `limit`: registrations, odometry (2, 2).
+    def scales(self, limits: tuple[float, float]) -> Float64 | None:
+        """Most likely factors on the sigmas, 1 to a limit each: registrations, odometry (2, 2).
 
-        Each of translation and of rotation; None if they don't explain the disagreement. It is
-        split by its growth with time: registrations have their covariances, whereas odometry's
-        variances add up along the path.
+        Each of translation and of rotation; None if they don't explain the disagreement.
         """
         misfit = se3.log(se3.inverse(self.tracked) @ self.odometry)
         weight = 1 / self.spans  # about as many are independent as don't overlap
@@ -348,11 +342,10 @@ class _Comparison:
             prior = 0.5 * float((logarithms[2:] ** 2).sum()) / _SPREAD**2
             return float((weight * likelihood).sum()) + prior
 
-        high = np.log([limit] * 2 + [limit if odometry_limit is None else odometry_limit] * 2)
-        starts = np.array([[0.5, 0.5, 0, 0], [0, 0, 0.5, 0.5]]) * high
+        high = np.log(np.repeat(limits, 2))
         bounds = [(0.0, bound) for bound in high]
-        fits = [minimize(cost, start, method="L-BFGS-B", bounds=bounds) for start in starts]
-        found = np.exp(min(fits, key=lambda fit: float(fit.fun)).x).reshape(2, 2)
+        fit = minimize(cost, 0.3 * high, method="L-BFGS-B", bounds=bounds)
+        found = np.exp(fit.x).reshape(2, 2)
         median = float(np.median(_squared(misfit, self._covariances(found))))
         return found if median <= 2 * MEDIAN else None
 
@@ -407,7 +400,7 @@ def _compare(
     a, b = frames[i], frames[j]
     compared = measured[b] - measured[a] == b - a
     constrained = compared & (degenerate[b] == degenerate[a]) & ~sensed.degenerate[a]
-    verified = bool(constrained.sum() >= _MIN_COMPARED)
+    verified = bool((constrained & (j - i == 1)).sum() >= _MIN_COMPARED)
     compared = constrained if verified else compared
     joint = GraphCovariances(graph).joint(frames) if compared.any() else None
     if joint is None:
@@ -426,54 +419,6 @@ def _compare(
         j - i,
         verified,
     )
-
-
-def _compare(
-    sensed: SensorData, graph: PoseGraph, variances: Float64, first: Intp
-) -> _Comparison | None:
-    """Compare motions over 1, 2, 4 ... of evenly spaced frames, each with its covariance.
-
-    Motions over degenerate frames are left out if enough remain. None without any.
-    """
-    frames = evenly_spaced(np.arange(len(sensed.ids)), _COMPARED)
-    # Variances add up along the path; a step without odometry breaks it.
-    variance = np.zeros((len(sensed.ids), 6))
-    variance[first + 1] = variances
-    measured = np.zeros(len(sensed.ids), np.intp)
-    measured[first + 1] = 1
-    variance, measured = variance.cumsum(0), measured.cumsum()
-    degenerate = sensed.degenerate.cumsum()
-    spans = 2 ** np.arange(len(frames).bit_length())
-    i = np.concatenate([np.arange(max(len(frames) - span, 0)) for span in spans])
-    j = np.concatenate([np.arange(span, len(frames)) for span in spans])
-    a, b = frames[i], frames[j]
-    compared = measured[b] - measured[a] == b - a
-    constrained = compared & (degenerate[b] == degenerate[a]) & ~sensed.degenerate[a]
-    verified = bool(constrained.sum() >= _MIN_COMPARED)
-    compared = constrained if verified else compared
-    joint = GraphCovariances(graph).joint(frames) if compared.any() else None
-    if joint is None:
-        return None
-    i, j, a, b = i[compared], j[compared], a[compared], b[compared]
-    tracked = se3.inverse(graph.poses[a]) @ graph.poses[b]
-    C = joint.reshape(len(frames), 6, len(frames), 6).swapaxes(1, 2)
-    A = -se3.adjoint(se3.inverse(tracked))
-    At = np.swapaxes(A, 1, 2)
-    covariances = A @ C[i, i] @ At + A @ C[i, j] + C[j, i] @ At + C[j, j]
-    return _Comparison(
-        tracked,
-        covariances,
-        np.asarray(se3.inverse(sensed.odometry[a]) @ sensed.odometry[b], np.float64),
-        variance[b] - variance[a],
-        j - i,
-        verified,
-    )
-
-
-def _per_length(lengths: Intp, total: int) -> Float64:
-    """(K,) weights of motions of these lengths, the same sum for each length, `total` in all."""
-    _, inverse, counts = np.unique(lengths, return_inverse=True, return_counts=True)
-    return np.asarray(total / len(counts) / counts[inverse])
 
 
 def measure_all(
@@ -500,7 +445,7 @@ def with_depth_scale(measured: SensorPriors, sensed: SensorData, graph: PoseGrap
     compared = _compare(sensed, graph, variances, first)
     if compared is None:
         return measured
-    found = [part.scales(_MAX_DEPTH_SCALE, 1.0) for part in compared.by_length()]
+    found = [part.scales((_MAX_DEPTH_SCALE, 1.0)) for part in compared.by_length()]
     translation, rotation = np.max([np.ones(2), *(s[0] for s in found if s is not None)], 0)
     return replace(measured, depth_scale=(float(translation), float(rotation)))
 
