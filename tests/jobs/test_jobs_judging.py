@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import tofuse
 from tofuse.apps.cli.program import main
-from tofuse.apps.jobs.judging import device_sentence, poses_for, sentence
+from tofuse.apps.jobs.judging import poses_for, sentence
 from tofuse.apps.results.folders import RESULT
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.pose_accuracy import Accuracy
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.lab.simulation.effects import Effects
@@ -211,25 +207,3 @@ def test_command_refuses(room_recording, tmp_path, capsys) -> None:
     poses = str(room_recording / "groundtruth.txt")
     assert main(["judge", str(room_recording), poses, "--out", str(tmp_path / "mine")]) == 2
     assert "no earlier result" in capsys.readouterr().err
-
-
-@pytest.mark.nightly
-def test_device_poses_are_judged_by_default(recording, truth) -> None:
-    """The stated errors also hold for wrong poses of the phone."""
-    result = tofuse.reconstruct(recording)
-    assert device_sentence(recording, result) == ""  # a simulation has no device
-    phone = phone_of(recording, bent(truth))
-    sentence = device_sentence(phone, result)
-    match = re.fullmatch(r"ARKit's poses: ±(\d+) mm \(95 %\); these: ±([\d.]+) mm\.", sentence)
-    assert match is not None
-    wrong, _ = displacement(truth, bent(truth))
-    assert wrong < float(match[1]) / 1e3 < 1.6 * wrong
-    assert float(match[2]) < 12
-    loose = replace(result.diagnostics, accuracy=Accuracy(assessed=True))
-    sentence = device_sentence(phone, replace(result, diagnostics=loose))
-    assert sentence.startswith("ARKit's poses differ from these by ")
-
-
-def phone_of(recording, poses):
-    source = ArraySource(list(recording), poses, metadata={POSES_BY: "ARKit"})
-    return Recording.of(source, "phone", "frames")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import tofuse
 from report_results import lonely
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
@@ -16,8 +17,9 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.external_sensors import GravityEdges, OdometryEdges
-from tofuse.engine.mapping.adaptation import with_prior
+from tofuse.engine.mapping.adaptation import with_odometry_prior, with_prior
 from tofuse.engine.mapping.config import changed
+from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import device_up, reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
@@ -101,6 +103,22 @@ def test_odometry_file_takes_precedence_over_device_poses(recording) -> None:
     # The odometry of a configuration is kept.
     with_odometry = replace(from_method("default"), priors=(OdometryEdges(relative=0.1),))
     assert with_prior(phone, with_odometry, "device")[1] is with_odometry
+
+
+@pytest.mark.parametrize(("prior", "sensors"), [("auto", ["odometry"]), ("none", [])])
+def test_python_uses_device_poses_as_the_command_line_does(recording, prior, sensors) -> None:
+    phone = by_phone(recording).select(end=6)
+    result = tofuse.reconstruct(phone, COARSE, prior=prior)
+    assert [sensor.sensor for sensor in result.diagnostics.priors] == sensors
+
+
+def test_odometry_of_pushed_frames_is_a_prior(recording) -> None:
+    mapper = Mapper()
+    for k in range(6):
+        mapper.push(recording[k], T_odometry=recording.reference[k])
+    assert [sensor.sensor for sensor in mapper.finish().diagnostics.priors] == ["odometry"]
+    thesis = from_method("thesis")
+    assert with_odometry_prior(thesis) is thesis
 
 
 @pytest.mark.nightly

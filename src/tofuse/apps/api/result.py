@@ -34,6 +34,7 @@ from tofuse.engine.frames import Frame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import Config, adaptation, changed, from_method, reconstructing
+from tofuse.engine.parts import name_of
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction, accuracy_card
 
@@ -240,6 +241,7 @@ def reconstruct(
     seed: int = 0,
     threads: int | None = None,
     loops: Sequence[PriorLoop] = (),
+    prior: adaptation.Prior = "auto",
     progress: Progress | bool | None = None,
 ) -> Result:
     """Reconstruct a recording: trajectory, pose graph, fused cloud and surface, diagnostics.
@@ -260,6 +262,9 @@ def reconstruct(
         Number of threads; None: all cores. The result does not depend on it.
     loops
         Known loop closures, in frame indices.
+    prior
+        Measurements of other sensors to use, as ``--prior`` of `tofuse run`: "auto" uses gravity,
+        and a phone's own poses, "none" the images alone, "device" the recorded odometry too.
     progress
         True: progress bars on the terminal.
 
@@ -277,7 +282,11 @@ def reconstruct(
             remedy="pass tofuse.open(path), or tofuse.from_arrays(depth, K)",
         )
     with _with_terminal(progress) as display:
-        fitted = adaptation.adapted(_configuration(config, recording), recording, threads, display)
+        chosen = _configuration(config, recording)
+        # No sensor measures the motion relative to a moving object.
+        if not {name_of(part) for part in chosen.filters} & {"background", "foreground"}:
+            recording, chosen = adaptation.with_prior(recording, chosen, prior)
+        fitted = adaptation.adapted(chosen, recording, threads, display)
         turning = any(isinstance(part, Foreground) for part in fitted.filters)
         findings = quick_findings(recording, fitted, turning=turning)
         reconstruction = reconstructing.reconstruct(

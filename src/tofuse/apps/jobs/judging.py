@@ -29,7 +29,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import POSES_BY, Recording, evenly_spaced, frame_ranges
+from tofuse.engine.frames import Recording, evenly_spaced, frame_ranges
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Config, adaptation, check_views, from_method, reconstructing
 from tofuse.engine.parts import check_number
@@ -354,24 +354,6 @@ def _agreement(deviation: pose_deviation.Deviation | None) -> str:
     if not np.isfinite(deviation.at_most_m):
         return " Consistent with the depth, as far as that constrains them."
     return f" Consistent with the depth to within {_length(deviation.at_most_m)} (95 %)."
-
-
-def device_sentence(recording: Recording, result: Reconstruction) -> str:
-    """State the accuracy of a phone's own poses; empty if there are none.
-
-    "ARKit's poses: ±31 mm (95 %); these: ±9 mm."
-    """
-    by, poses = recording.metadata.get(POSES_BY), recording.reference
-    if by is None or poses is None:
-        return ""
-    distances = _distances(poses, result.trajectory)
-    distances = distances[np.isfinite(distances)]
-    if len(distances) < 2:
-        return ""
-    rms, bound_m = float(np.sqrt((distances**2).mean())), result.diagnostics.accuracy.position_m
-    if not np.isfinite(bound_m):
-        return f"{by}'s poses differ from these by {_length(rms)} rms."
-    return f"{by}'s poses: ±{_length(rms + bound_m)} (95 %); these: ±{_length(bound_m)}."
 
 
 def _read(path: Path) -> TimedPoses:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.apps.jobs.judging import device_sentence
 from tofuse.apps.results import folders
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.errors import UnreadableFrameError
@@ -49,7 +48,6 @@ def write_report_files(
     clouds = () if result.diagnostics.samples else recording.sample(_DRAWN_CLOUDS)
     extras = ReportExtras(
         title=title,
-        headline=device_sentence(recording, result) if component is None else "",
         filter_steps=_filter_steps(_final_config(config, result), recording, result),
         reference=reference_in_world(recording, result),
         truth_points=truth,

@@ -15,7 +15,6 @@ from threadpoolctl import threadpool_limits
 
 from tofuse._version import __version__
 from tofuse.apps.inspection import Finding, inspect_recording
-from tofuse.apps.jobs.judging import device_sentence
 from tofuse.apps.jobs.report_files import write_report_files
 from tofuse.apps.jobs.run_options import Options, check_guess, check_unwrap, resolve, seed_of
 from tofuse.apps.jobs.tracked_file import TrackedFile
@@ -84,8 +83,6 @@ def run(
             result = with_findings(result, job.findings, turning=options.object)
             opening = job.opening.to_dict()
             result = replace(result, recording={**result.recording, "opening": opening})
-            if device := device_sentence(job.recording, result):
-                progress.note(device)
             progress.stage("writing")
             # BLAS results depend on its number of threads, and idle threads busy-wait.
             with threadpool_limits(1), timing("writing"):

@@ -76,12 +76,18 @@ class Cloud(Exportable):
 
     @property
     def diagonal_m(self) -> float:
-        """Diagonal of the bounding box, m; 0 without points."""
-        return float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self) else 0.0
+        """Diagonal of the box without stray points (`_EXTENT`), m; 0 without points."""
+        return float(np.linalg.norm(_extent(self.points))) if len(self) else 0.0
 
 
 # Percentiles that bound a cloud, whatever stray points it has.
 _EXTENT = (0.5, 99.5)
+
+
+def _extent(points: Float32) -> Float64:
+    """Edges (3,) of the box, m."""
+    low, high = np.percentile(points.astype(float), _EXTENT, axis=0)
+    return np.asarray(high - low)
 
 
 def choose_voxel(frame: CloudFrame) -> float:
@@ -90,8 +96,7 @@ def choose_voxel(frame: CloudFrame) -> float:
     if len(points) == 0:
         return 0.01
     # The spacing of N points on a surface is about the root of the area over N.
-    low, high = np.percentile(points.astype(float), _EXTENT, axis=0)
-    extent = np.sort(high - low)
+    extent = np.sort(_extent(points))
     size = float(np.sqrt(max(extent[2] * extent[1], 1e-6) / len(points)))
     return float(f"{np.clip(size, 0.002, 0.1):.2g}")
 

@@ -2,27 +2,39 @@
 
 They are weighted by their agreement with odometry from images, in units of the errors of both: a
 moving accelerometer measures more than gravity, wheels slip, and a file may belong to another
-camera or use other axes.
+camera or use other axes. Tracking's covariances are accurate along short paths, and measure the
+errors of odometry; odometry then measures those of refined pairs, which share errors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
+from scipy.optimize import minimize
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import Gravity, Measured, PoseGraph
+from tofuse.engine.graph.graph_covariances import GraphCovariances
 from tofuse.engine.graph.robust import MEDIAN
 from tofuse.engine.parts import part
 
 # With fewer measured frames, a moving accelerometer can't be detected.
 _MIN_FRAMES = 3
+# Largest factor on the errors of refined registrations.
+_MAX_DEPTH_SCALE = 30.0
+# Number of frames whose motions are compared with those of odometry.
+_COMPARED = 60
+# Degrees of freedom of the t distribution of disagreements: jumps and false registrations are rare.
+_DEGREES = 30.0
+# Standard deviation of the logarithm of the factors.
+_SPREAD = np.log(2.0)
 # Odometry that fewer fully constrained registrations were compared with is not verified.
 _MIN_COMPARED = 10
 
@@ -35,6 +47,8 @@ class SensorData:
     ----------
     ids
         (N,) indices of the frames, ascending.
+    times
+        (N,) s.
     odometry
         (N, 4, 4) T_odometry_camera, NaN where there is none.
     gravity
@@ -47,6 +61,7 @@ class SensorData:
     """
 
     ids: Intp
+    times: Float64
     odometry: Float64
     gravity: Float64
     parts: Intp
@@ -80,6 +95,8 @@ class SensorPriors:
     verified
         Whether the errors of the steps were measured on enough fully constrained registrations.
         Then the steps bound the errors where images don't constrain the motion.
+    depth_scale
+        Factors on the sigmas of registrations, of translation and of rotation.
     ids
         Frames with a measured direction of gravity.
     gravity
@@ -96,6 +113,7 @@ class SensorPriors:
     gate: float = np.inf
     records: tuple[SensorRecord, ...] = ()
     verified: bool = False
+    depth_scale: tuple[float, float] = (1.0, 1.0)
 
     def __bool__(self) -> bool:
         return bool(self.steps or self.ids)
@@ -110,6 +128,7 @@ class SensorPriors:
             with_gravity.gate,
             (*self.records, *other.records),
             self.verified or other.verified,
+            self.depth_scale if self.steps else other.depth_scale,
         )
 
     def gravity_of(self, ids: Sequence[int]) -> Gravity | None:
@@ -207,26 +226,26 @@ class GravityEdges(Bounded, ExternalSensor):
 class OdometryEdges(Bounded, ExternalSensor):
     """Connects consecutive frames by the motion between their poses in an odometry file.
 
-    Its errors are compared with those of tracking. If the median misfit is larger than the errors
-    of both explain, those of the odometry are scaled until they do; single steps with a far larger
-    misfit are rejected.
+    Its errors are random walks over time, length and angle. They are scaled until these and the
+    errors of tracking explain the disagreement of the two; single steps with a far larger one are
+    rejected.
 
     Attributes
     ----------
+    drift_m, drift_rad
+        Standard deviation after one second.
     relative, relative_rad
-        Standard deviation of a step, as a fraction of its length and of its angle.
-    min_m, min_rad
-        Constant part of it, m and rad.
+        Additional standard deviation after one metre, as a fraction; and after one radian.
     limit
         Largest factor on its errors; odometry that needs more is not used.
     gate
         Squared error of a step, in units of the errors of both, beyond which it is rejected.
     """
 
-    relative: Annotated[float, Bounds(0, 10)] = 0.05
-    relative_rad: Annotated[float, Bounds(0, 10)] = 0.05
-    min_m: Annotated[float, Bounds(1e-6, 10)] = 0.002
-    min_rad: Annotated[float, Bounds(1e-6, 10)] = 0.002
+    drift_m: Annotated[float, Bounds(1e-6, 10)] = 0.005
+    drift_rad: Annotated[float, Bounds(1e-6, 10)] = 0.001
+    relative: Annotated[float, Bounds(0, 10)] = 0.01
+    relative_rad: Annotated[float, Bounds(0, 10)] = 0.003
     limit: Annotated[float, Bounds(1)] = 5.0
     gate: Annotated[float, Bounds(0, exclusive=True)] = 40.0
 
@@ -238,16 +257,17 @@ class OdometryEdges(Bounded, ExternalSensor):
         if not len(first):
             return SensorPriors()
         measured = se3.inverse(sensed.odometry[first]) @ sensed.odometry[first + 1]
-        C = self._covariance(measured)
-        compared = self._compare(sensed, graph, C, first)
-        scale = 1.0 if compared is None else compared.scale(self.limit)
-        if scale is None:
+        variances = self._variances(measured, sensed.times[first + 1] - sensed.times[first])
+        compared = _compare(sensed, graph, variances, first)
+        scales = np.ones((2, 2)) if compared is None else compared.scales((1.0, self.limit))
+        if scales is None:
             text = (
                 f"the odometry differs from the tracked motion by more than {self.limit:g} times "
                 "its errors, so it was not used"
             )
             return SensorPriors(records=(SensorRecord("odometry", len(first), 0, None, text),))
-        C = C * scale**2
+        odometry_scale = scales[1]
+        C = (variances * np.repeat(odometry_scale**2, 3))[:, :, None] * np.eye(6)
         tracked = se3.inverse(graph.poses[first]) @ graph.poses[first + 1]
         tracking_covariance = _covariance_to_reference(graph)
         chi2 = _squared(
@@ -264,48 +284,23 @@ class OdometryEdges(Bounded, ExternalSensor):
             )
             for k in kept
         )
+        scale = float(odometry_scale.max())
         text = f"{len(kept)} of {len(first)} steps of the odometry are used, "
-        text += "with the stated errors" if scale == 1 else f"with {scale:.1f} times its errors"
-        metric = compared is not None and compared.lengths_agree(scale)
+        text += "with the stated errors" if scale < 1.05 else f"with {scale:.1f} times its errors"
+        metric = compared is not None and compared.lengths_agree(scales)
         record = SensorRecord("odometry", len(first), len(kept), scale, text, metric)
         verified = compared is not None and compared.verified
         return SensorPriors(steps, records=(record,), verified=verified)
 
-    def _covariance(self, steps: Float64) -> Float64:
-        """(K, 6, 6) of motions (K, 4, 4)."""
-        sigma = np.empty((len(steps), 6))
+    def _variances(self, steps: Float64, seconds: Float64) -> Float64:
+        """(K, 6) of motions (K, 4, 4)."""
         length, angle = np.linalg.norm(steps[:, :3, 3], axis=1), se3.angle(steps)
-        sigma[:, :3] = (self.min_m + self.relative * length)[:, None]
-        sigma[:, 3:] = (self.min_rad + self.relative_rad * angle)[:, None]
-        return np.asarray(sigma[:, :, None] ** 2 * np.eye(6))
-
-    def _compare(
-        self, sensed: SensorData, graph: PoseGraph, C: Float64, first: Intp
-    ) -> _Comparison | None:
-        """Compare the motions from references to frames with the tracker's registrations.
-
-        Only fully constrained registrations are compared, if there are enough. None without any.
-        """
-        i, j = graph.edges.T
-        # Variances add up along the path; a step without odometry breaks it.
-        step = np.full((len(sensed.ids), 6), np.inf)
-        step[first + 1] = np.diagonal(C, axis1=1, axis2=2)
-        unbroken = [bool(np.isfinite(step[a + 1 : b + 1]).all()) for a, b in graph.edges]
-        compared = np.array(unbroken, bool) & (i < j)
-        constrained = compared & ~(sensed.degenerate[i] | sensed.degenerate[j])
-        verified = bool(constrained.sum() >= _MIN_COMPARED)
-        if verified:
-            compared = constrained
-        if not compared.any():
-            return None
-        i, j = i[compared], j[compared]
-        return _Comparison(
-            graph.measurements[compared],
-            np.asarray(np.linalg.inv(graph.information[compared]), np.float64),
-            np.asarray(se3.inverse(sensed.odometry[i]) @ sensed.odometry[j], np.float64),
-            np.stack([step[a + 1 : b + 1].sum(0) for a, b in zip(i, j, strict=True)]),
-            verified,
-        )
+        seconds = np.maximum(seconds, 1e-6)
+        variance = [
+            self.drift_m**2 * seconds + self.relative**2 * length,
+            self.drift_rad**2 * seconds + self.relative_rad**2 * angle,
+        ]
+        return np.repeat(np.stack(variance, 1), 3, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,6 +313,8 @@ class _Comparison:
         (K, 4, 4), and (K, 6, 6) as right perturbations.
     odometry, variances
         (K, 4, 4), and (K, 6) by the stated errors.
+    spans
+        (K,) number of compared frames from the first to the last.
     verified
         See `SensorPriors`.
     """
@@ -326,42 +323,102 @@ class _Comparison:
     covariances: Float64
     odometry: Float64
     variances: Float64
+    spans: Intp
     verified: bool
 
-    def scale(self, limit: float) -> float | None:
-        """Factor on the stated errors that explains the misfit, from 1 to `limit`, or None."""
-        misfit = se3.log(se3.inverse(self.tracked) @ self.odometry)
+    def scales(self, limits: tuple[float, float]) -> Float64 | None:
+        """Most likely factors on the sigmas, 1 to a limit each: registrations, odometry (2, 2).
 
-        def median(scale: float) -> float:
-            added = scale**2 * self.variances[:, :, None] * np.eye(6)
-            return float(np.median(_squared(misfit, self.covariances + added)))
-
-        if median(1.0) <= MEDIAN:
-            return 1.0
-        if median(limit) > MEDIAN:
-            return None
-        low, high = 1.0, limit
-        for _ in range(30):
-            mid = 0.5 * (low + high)
-            low, high = (mid, high) if median(mid) > MEDIAN else (low, mid)
-        return high
-
-    def lengths_agree(self, scale: float) -> bool:
-        """Whether tracked lengths differ from those of the odometry by less than half (95 %).
-
-        Parameters
-        ----------
-        scale
-            Factor on the stated errors.
+        Each of translation and of rotation; None if they don't explain the disagreement.
         """
+        misfit = se3.log(se3.inverse(self.tracked) @ self.odometry)
+        weight = 1 / self.spans  # about as many are independent as don't overlap
+
+        def cost(logarithms: Float64) -> float:
+            C = self._covariances(np.exp(logarithms).reshape(2, 2))
+            likelihood = 0.5 * np.linalg.slogdet(C)[1] + 0.5 * (_DEGREES + 6) * np.log1p(
+                _squared(misfit, C) / _DEGREES
+            )
+            prior = 0.5 * float((logarithms[2:] ** 2).sum()) / _SPREAD**2
+            return float((weight * likelihood).sum()) + prior
+
+        high = np.log(np.repeat(limits, 2))
+        bounds = [(0.0, bound) for bound in high]
+        fit = minimize(cost, 0.3 * high, method="L-BFGS-B", bounds=bounds)
+        found = np.exp(fit.x).reshape(2, 2)
+        median = float(np.median(_squared(misfit, self._covariances(found))))
+        return found if median <= 2 * MEDIAN else None
+
+    def by_length(self) -> Iterator[_Comparison]:
+        """Yield those over each number of frames, if there are several."""
+        for span in np.unique(self.spans):
+            of = self.spans == span
+            if of.sum() >= _MIN_FRAMES:
+                yield _Comparison(
+                    self.tracked[of],
+                    self.covariances[of],
+                    self.odometry[of],
+                    self.variances[of],
+                    self.spans[of],
+                    self.verified,
+                )
+
+    def _covariances(self, scales: Float64) -> Float64:
+        """(K, 6, 6) of the disagreement, by `scales`."""
+        added = self.variances * np.repeat(scales[1] ** 2, 3)
+        return np.asarray(_scaled(self.covariances, scales[0]) + added[:, :, None] * np.eye(6))
+
+    def lengths_agree(self, scales: Float64) -> bool:
+        """Whether tracked lengths differ from those of the odometry by less than half (95 %)."""
         t, o = self.tracked[:, :3, 3], self.odometry[:, :3, 3]
-        variance = np.trace(self.covariances[:, :3, :3], axis1=1, axis2=2)
-        weight = 3 / (variance + scale**2 * self.variances[:, :3].sum(1))
+        weight = 3 / np.trace(self._covariances(scales)[:, :3, :3], axis1=1, axis2=2)
         information = float((weight * (o * o).sum(1)).sum())
         if information == 0:
             return False
         ratio = float((weight * (t * o).sum(1)).sum()) / information
         return bool(abs(ratio - 1) + 2 / np.sqrt(information) < 0.5)
+
+
+def _compare(
+    sensed: SensorData, graph: PoseGraph, variances: Float64, first: Intp
+) -> _Comparison | None:
+    """Compare motions over 1, 2, 4 ... of evenly spaced frames, each with its covariance.
+
+    Motions over degenerate frames are left out if enough remain. None without any.
+    """
+    frames = evenly_spaced(np.arange(len(sensed.ids)), _COMPARED)
+    # Variances add up along the path; a step without odometry breaks it.
+    variance = np.zeros((len(sensed.ids), 6))
+    variance[first + 1] = variances
+    measured = np.zeros(len(sensed.ids), np.intp)
+    measured[first + 1] = 1
+    variance, measured = variance.cumsum(0), measured.cumsum()
+    degenerate = sensed.degenerate.cumsum()
+    spans = 2 ** np.arange(len(frames).bit_length())
+    i = np.concatenate([np.arange(max(len(frames) - span, 0)) for span in spans])
+    j = np.concatenate([np.arange(span, len(frames)) for span in spans])
+    a, b = frames[i], frames[j]
+    compared = measured[b] - measured[a] == b - a
+    constrained = compared & (degenerate[b] == degenerate[a]) & ~sensed.degenerate[a]
+    verified = bool((constrained & (j - i == 1)).sum() >= _MIN_COMPARED)
+    compared = constrained if verified else compared
+    joint = GraphCovariances(graph).joint(frames) if compared.any() else None
+    if joint is None:
+        return None
+    i, j, a, b = i[compared], j[compared], a[compared], b[compared]
+    tracked = se3.inverse(graph.poses[a]) @ graph.poses[b]
+    C = joint.reshape(len(frames), 6, len(frames), 6).swapaxes(1, 2)
+    A = -se3.adjoint(se3.inverse(tracked))
+    At = np.swapaxes(A, 1, 2)
+    covariances = A @ C[i, i] @ At + A @ C[i, j] + C[j, i] @ At + C[j, j]
+    return _Comparison(
+        tracked,
+        covariances,
+        np.asarray(se3.inverse(sensed.odometry[a]) @ sensed.odometry[b], np.float64),
+        variance[b] - variance[a],
+        j - i,
+        verified,
+    )
 
 
 def measure_all(
@@ -374,13 +431,38 @@ def measure_all(
     return measured
 
 
+def with_depth_scale(measured: SensorPriors, sensed: SensorData, graph: PoseGraph) -> SensorPriors:
+    """Return measurements with the errors of another graph's registrations, given odometry's.
+
+    The pairs of a refined graph agree with each other, as errors of the depth that bend all of them
+    alike are invisible to them: by their number they seem far more accurate than they are. Those of
+    odometry were estimated from single registrations, which claim less.
+    """
+    row = {int(index): k for k, index in enumerate(sensed.ids)}
+    first = np.array([row[step.i] for step in measured.steps], np.intp)
+    information = np.array([step.information for step in measured.steps])
+    variances = 1 / np.diagonal(information, axis1=1, axis2=2)
+    compared = _compare(sensed, graph, variances, first)
+    if compared is None:
+        return measured
+    found = [part.scales((_MAX_DEPTH_SCALE, 1.0)) for part in compared.by_length()]
+    translation, rotation = np.max([np.ones(2), *(s[0] for s in found if s is not None)], 0)
+    return replace(measured, depth_scale=(float(translation), float(rotation)))
+
+
 def with_sensors(graph: PoseGraph, measured: SensorPriors) -> PoseGraph:
-    """Return the graph with the measurements: steps as further edges, and gravity."""
+    """Return the graph with the measurements: steps as further edges, and gravity.
+
+    The covariances of its own edges are scaled by `SensorPriors.depth_scale`.
+    """
     if not measured:
         return graph
     position = {int(index): k for k, index in enumerate(graph.ids)}
     steps = measured.steps
     m = len(steps)
+    own = graph.information
+    if measured.depth_scale != (1.0, 1.0):
+        own = _scaled(own, 1 / np.array(measured.depth_scale))
     pairs = np.array([(position[s.i], position[s.j]) for s in steps], np.intp).reshape(m, 2)
     return replace(
         graph,
@@ -389,7 +471,7 @@ def with_sensors(graph: PoseGraph, measured: SensorPriors) -> PoseGraph:
             [graph.measurements, np.array([s.T_i_j for s in steps]).reshape(m, 4, 4)]
         ),
         information=np.concatenate(
-            [graph.information, np.array([s.information for s in steps]).reshape(m, 6, 6)]
+            [own, np.array([s.information for s in steps]).reshape(m, 6, 6)]
         ),
         loop=np.concatenate([graph.loop, np.zeros(m, bool)]),
         gravity=measured.gravity_of(graph.ids.tolist()),
@@ -401,6 +483,12 @@ def _covariance_to_reference(graph: PoseGraph) -> Float64:
     out = np.zeros((len(graph.ids), 6, 6))
     out[graph.edges[:, 1]] = np.linalg.inv(graph.information)
     return out
+
+
+def _scaled(C: Float64, factors: Float64) -> Float64:
+    """Covariances (K, 6, 6) with factors (2,) on the sigmas of translation and of rotation."""
+    sigma = np.repeat(factors, 3)
+    return np.asarray(C * np.outer(sigma, sigma))
 
 
 def _squared(e: Float64, C: Float64) -> Float64:

@@ -243,11 +243,9 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
         raise InputError(f"is {prior!r}", where="--prior", remedy="use auto, none or device")
     if prior == "none":
         return recording, replace(config, priors=())
-    if any(isinstance(sensor, external_sensors.OdometryEdges) for sensor in config.priors):
+    if _uses(config, external_sensors.OdometryEdges):
         return recording, config
-    uses_gravity = any(
-        isinstance(sensor, external_sensors.GravityEdges) for sensor in config.priors
-    )
+    uses_gravity = _uses(config, external_sensors.GravityEdges)
     poses = recording.reference if POSES_BY in recording.metadata else None
     if prior == "auto" and (not uses_gravity or poses is None):
         return recording, config
@@ -263,6 +261,17 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
     return recording, replace(
         config, priors=(*config.priors, *gravity, external_sensors.OdometryEdges())
     )
+
+
+def with_odometry_prior(config: Config) -> Config:
+    """Return the configuration with odometry as a prior, if it uses external sensors at all."""
+    if not config.priors or _uses(config, external_sensors.OdometryEdges):
+        return config
+    return replace(config, priors=(*config.priors, external_sensors.OdometryEdges()))
+
+
+def _uses(config: Config, sensor: type[external_sensors.ExternalSensor]) -> bool:
+    return any(isinstance(used, sensor) for used in config.priors)
 
 
 @dataclass

@@ -195,7 +195,8 @@ class Assessment:
         if accuracy.unbounded and closed.sensors.verified:
             unbounded = set(accuracy.unbounded)
             bounded = external_sensors.with_sensors(
-                images_only.graph, self._steps_at_degenerate(closed.sensors)
+                images_only.graph,
+                external_sensors.SensorPriors(self.tracked.steps_at_degenerate(closed.sensors)),
             )
             accuracy = pose_accuracy.accuracy_of(
                 graph_covariances.GraphCovariances(bounded), observed, model.cloud.diagonal_m
@@ -228,15 +229,6 @@ class Assessment:
                 ]
         m, rad = np.linalg.norm(errors, axis=0).tolist()
         return m, rad
-
-    def _steps_at_degenerate(
-        self, sensors: external_sensors.SensorPriors
-    ) -> external_sensors.SensorPriors:
-        """Return the odometry steps from and to degenerate frames, and over gaps."""
-        ends = self.tracked.unobservable.keys()
-        gaps = self.tracked.gaps
-        steps = [s for s in sensors.steps if s.i in ends or s.j in ends or (s.i, s.j) in gaps]
-        return external_sensors.SensorPriors(tuple(steps))
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
         """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""

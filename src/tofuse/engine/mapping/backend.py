@@ -83,7 +83,7 @@ class BackEnd:
         """Return the reconstruction."""
         closed = self._close_loops()
         trim_memory()
-        refined = self._refine(closed)
+        closed, refined = self._refine(closed)
         trim_memory()
         model, cloud_before = self._fuse(closed, refined)
         trim_memory()
@@ -105,9 +105,7 @@ class BackEnd:
         sequential = aided = graph.poses
         sensors = external_sensors.SensorPriors()
         if self._config.priors:
-            sensor_data = self._log.sensor_data(graph.ids.tolist())
-            measured_graph = self._tracked.measured(tracked, self._observations.views)
-            sensors = external_sensors.measure_all(self._config.priors, sensor_data, measured_graph)
+            sensors = external_sensors.measure_all(self._config.priors, *self._measured(tracked))
         optimisation = Optimisation(external_sensors.with_sensors(graph, sensors), (), True)
         confirmed: frozenset[int] = frozenset()
         if graph.loop.any() or sensors:
@@ -175,14 +173,39 @@ class BackEnd:
         return loops
 
     @timing("refinement")
-    def _refine(self, closed: Optimised) -> Refined:
+    def _refine(self, closed: Optimised) -> tuple[Optimised, Refined]:
+        """Refine all poses; with odometry, the refined pairs and its steps are optimised again.
+
+        As pairs of one view share its errors, their number says little of their accuracy. The
+        pairs also show how odometry's errors grow over longer times than tracking does.
+        """
         graph = closed.optimisation.graph
         self._progress.stage("refining")
-        refinement = self._observations.refiner.finish(graph, closed.sensors)
+        # Elsewhere images alone: their errors are estimated from the result.
+        steps = self._tracked.steps_at_degenerate(closed.sensors)
+        images = replace(closed.sensors, steps=steps)
+        refinement = self._observations.refiner.finish(graph, images)
         if refinement.kept:
             graph = self._tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
-            graph = external_sensors.with_sensors(graph, closed.sensors)
-        return Refined(graph, refinement)
+            sensors = closed.sensors
+            if sensors.steps:
+                optimisation = self._config.optimiser.optimise(graph)
+                graph = graph_covariances.accepted_only(optimisation).graph
+                sensors = external_sensors.with_depth_scale(
+                    sensors, *self._measured(graph, refinement.non_overlap_edges)
+                )
+                closed = replace(closed, sensors=sensors)
+            graph = external_sensors.with_sensors(graph, sensors)
+            if sensors.steps:
+                graph = self._config.optimiser.optimise(graph).graph
+        return closed, Refined(graph, refinement)
+
+    def _measured(
+        self, graph: PoseGraph, non_overlap_edges: Sequence[tuple[int, int]] = ()
+    ) -> tuple[external_sensors.SensorData, PoseGraph]:
+        """Return what external sensors measure of a graph, and what its registrations do."""
+        sensed = self._log.sensor_data(graph.ids.tolist())
+        return sensed, self._tracked.measured(graph, self._observations.views, non_overlap_edges)
 
     @timing("fusion")
     def _fuse(self, closed: Optimised, refined: Refined) -> tuple[Model, Cloud | None]:

@@ -239,10 +239,11 @@ class FrameLog:
         for row, entry in zip(gravity, entries, strict=True):
             if entry.gravity is not None:
                 row[:] = entry.gravity
+        times = np.array([e.record.timestamp for e in entries])
         parts = np.array([e.recording for e in entries], np.intp)
         degenerate = np.array([len(e.record.unobservable) > 0 for e in entries], bool)
         return external_sensors.SensorData(
-            np.array(ids, np.intp), _odometry(entries), gravity, parts, degenerate
+            np.array(ids, np.intp), times, _odometry(entries), gravity, parts, degenerate
         )
 
 

@@ -14,6 +14,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
+from tofuse.engine.mapping import adaptation
 from tofuse.engine.mapping.assembly import Assembly
 from tofuse.engine.mapping.backend import Job
 from tofuse.engine.mapping.config import Config, check_views, kind_of
@@ -104,7 +105,8 @@ class Mapper:
         frame
             Uncorrected and unfiltered. Its `index` must be larger than those before.
         T_odometry
-            (4, 4) T_world_camera from odometry, in any fixed world frame.
+            (4, 4) T_world_camera from odometry or a phone, in any fixed world frame. It is a
+            prior if the configuration has the part "odometry", or is a name and uses gravity.
         gravity
             (4,) unit vector of gravity in the camera's frame, and its sigma in rad.
         history
@@ -248,6 +250,10 @@ class Mapper:
                 self._observations.finish()
             del self._sequence, self._tracker, self._given_tracker  # the last frame, and keyframes
             trim_memory()
+            if self._method is not None and any(
+                e.T_odometry is not None for e in self._log.entries
+            ):
+                self.config = adaptation.with_odometry_prior(self.config)
             job = Job(self.config, self._observations, self._prior_loops, self._progress)
             result = Assembly(job, self.seed, self.threads).run(self._log)
         diagnostics = replace(

@@ -146,6 +146,11 @@ class TrackedGraph:
         )
         return pose_accuracy.without_degenerate(graph, directions, self.gaps)
 
+    def steps_at_degenerate(self, sensors: external_sensors.SensorPriors) -> tuple[Measured, ...]:
+        """Return the odometry steps from and to degenerate frames, and over gaps."""
+        ends, gaps = self.unobservable.keys(), self.gaps
+        return tuple(s for s in sensors.steps if s.i in ends or s.j in ends or (s.i, s.j) in gaps)
+
     @property
     def gaps(self) -> set[tuple[int, int]]:
         """The frames before and after the gaps that no registration closes."""

@@ -1,0 +1,330 @@
+"""A phone's own poses, those by depth alone, and those by both.
+
+`recorded`: recordings of phones. Pairs of colour images measure relative rotations without depth:
+SIFT, the essential matrix, and a robust fit of the motion to all matches, from six random halves. A
+pair is left out if fewer than 100 matches fit within 2 pixels, or if two fits differ by more than
+1 degree and the worse one costs less than 1.1 times as much (degenerate geometry). Map consistency
+is that of `map_agreement`.
+
+`simulated`: phones with exact ground truth. Their depth is smooth, and its errors are too, over the
+image and over time; there is no amplitude. Their poses are true ones with drift: heading and
+position walk randomly, tilt is bounded; one kind relocalizes halfway, with a jump.
+
+    python benchmarks/phone.py recorded [--names iphone_chair_3dscannerapp]
+    python benchmarks/phone.py simulated [--scenes room rail] [--seeds 2]
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.optimize import least_squares
+
+import sequences
+from tofuse.engine.arrays import Float32, Float64, Intp
+from tofuse.engine.cameras import scaled
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording, evenly_spaced
+from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.adaptation import Prior, with_prior
+from tofuse.engine.mapping.methods import from_method
+from tofuse.engine.mapping.reconstructing import reconstruct
+from tofuse.engine.quality.map_agreement import map_consistency
+from tofuse.engine.quality.trajectory_errors import displacement
+from tofuse.formats.recordings.open import open_recording
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import plan
+
+PHONES = ("iphone_chair_3dscannerapp", "iphone_record3d", "iphone_stray", "iphone_room")
+COLOR_IMAGES = 10  # evenly spaced
+RATIO, STARTS = 0.8, 6
+# A pair is left out with fewer matches within 2 pixels, or if another solution is nearly as good.
+MIN_MATCHES, AMBIGUOUS, SAME_RAD = 100, 1.1, np.radians(1.0)
+# Simulated depth: blur (pixels), and size and correlation of its errors over pixels and frames.
+BLUR, DEPTH_ERROR, WIDTH_PX, FRAMES = 1.5, 0.007, 25.0, 10.0
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Errors of a phone's own poses: random walks per square root of a second, and of scale."""
+
+    heading_rad: float = np.radians(0.1)
+    tilt_rad: float = np.radians(0.1)  # bounded
+    position_m: float = 0.003
+    scale: float = 0.005
+    jump_m: float = 0.0
+    jump_rad: float = 0.0
+
+    def times(self, factor: float) -> Drift:
+        """Return larger errors."""
+        return replace(
+            self,
+            heading_rad=factor * self.heading_rad,
+            tilt_rad=factor * self.tilt_rad,
+            position_m=factor * self.position_m,
+            scale=factor * self.scale,
+        )
+
+
+DRIFTS = {
+    "usual": Drift(),
+    "five times": Drift().times(5),
+    "jump": Drift(jump_m=0.1, jump_rad=np.radians(2)),
+}
+
+
+# ---- Colour --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """SIFT features of frame `k`: rays x/z and y/z (N, 2), descriptors, focal length in pixels."""
+
+    k: int
+    rays: Float64
+    descriptors: Float32
+    focal: float
+
+
+def features_of(recording: Recording) -> Iterator[Features]:
+    """Yield the features of evenly spaced colour images, at full resolution if there is one."""
+    read = getattr(recording.source, "full_resolution_color", lambda index: None)
+    sift = cv2.SIFT_create(8000, contrastThreshold=0.02)
+    images = []
+    for k, index in enumerate(recording.indices.tolist()):
+        frame = recording.image(k)
+        if frame is not None and frame.color_image is not None:
+            images.append((k, index, frame))
+    for c in evenly_spaced(np.arange(len(images)), COLOR_IMAGES):
+        k, index, frame = images[c]
+        full = read(index)
+        color = frame.color_image if full is None else full
+        lens = scaled(frame.camera, color.shape[1], color.shape[0])
+        keypoints, found = sift.detectAndCompute(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), None)
+        pixels = np.array([p.pt for p in keypoints]).reshape(-1, 2)
+        rays = (pixels - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
+        yield Features(k, rays, np.sqrt(found / found.sum(1, keepdims=True)), lens.fx)
+
+
+def color_rotations(recording: Recording) -> list[tuple[int, int, Float64]]:
+    """Return positions i, j and the rotation R_i_j by the colour images alone."""
+    out = []
+    for a, b in combinations(list(features_of(recording)), 2):
+        R = rotation_between(a, b)
+        if R is not None:
+            out.append((a.k, b.k, R))
+    return out
+
+
+def rotation_between(a: Features, b: Features) -> Float64 | None:
+    """Return R_a_b by the matches of two images; None if there is no unique solution."""
+    matcher = cv2.BFMatcher()
+    back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(b.descriptors, a.descriptors, 1)}
+    matches = [
+        m
+        for m, second in matcher.knnMatch(a.descriptors, b.descriptors, 2)
+        if m.distance < RATIO * second.distance and back[m.trainIdx] == m.queryIdx
+    ]
+    if len(matches) < MIN_MATCHES:
+        return None
+    x_a = a.rays[[m.queryIdx for m in matches]]
+    x_b = b.rays[[m.trainIdx for m in matches]]
+    rng = np.random.default_rng(0)
+    found = [_fit(x_a, x_b, rng.permutation(len(x_a))[::2], a.focal) for _ in range(STARTS)]
+    solutions = sorted((s for s in found if s is not None), key=lambda s: s.cost)
+    if not solutions or solutions[0].inliers < MIN_MATCHES:
+        return None
+    best = solutions[0]
+    others = (s for s in solutions if s.cost < AMBIGUOUS * best.cost)
+    if any(se3.angle(s.R.T @ best.R) > SAME_RAD for s in others):
+        return None
+    return best.R
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    R: Float64
+    cost: float
+    inliers: int
+
+
+def _fit(a: Float64, b: Float64, chosen: Intp, focal: float) -> _Solution | None:
+    """Fit an essential matrix to the chosen matches, then the motion to all (Sampson, Cauchy)."""
+    E, mask = cv2.findEssentialMat(
+        a[chosen], b[chosen], np.eye(3), method=cv2.USAC_MAGSAC, prob=0.9999, threshold=2 / focal
+    )
+    if E is None or E.shape != (3, 3):
+        return None
+    _, R, t, _ = cv2.recoverPose(E, a[chosen], b[chosen], np.eye(3), mask=mask)
+    ones = np.ones((len(a), 1))
+    h_a, h_b = np.hstack([a, ones]), np.hstack([b, ones])
+
+    def residuals(x: Float64) -> Float64:
+        E = se3.hat(x[3:] / np.linalg.norm(x[3:])) @ cv2.Rodrigues(x[:3])[0]
+        lines_b, lines_a = h_a @ E.T, h_b @ E
+        scale = np.hypot(*lines_b[:, :2].T) ** 2 + np.hypot(*lines_a[:, :2].T) ** 2
+        return np.asarray((h_b * lines_b).sum(1) / np.sqrt(scale))
+
+    start = np.concatenate([cv2.Rodrigues(R)[0].ravel(), t.ravel()])
+    fit = least_squares(residuals, start, loss="cauchy", f_scale=1 / focal)
+    inliers = int((np.abs(fit.fun) < 2 / focal).sum())
+    return _Solution(cv2.Rodrigues(fit.x[:3])[0].T, fit.cost, inliers)
+
+
+def rotation_errors(poses: Float64, measured: list[tuple[int, int, Float64]]) -> Float64:
+    """Angles (rad) between relative rotations of poses and measured ones."""
+    R = poses[:, :3, :3]
+    pairs = [(i, j, R_i_j) for i, j, R_i_j in measured if np.isfinite(R[[i, j]]).all()]
+    return np.array([float(se3.angle((R[i].T @ R[j]).T @ R_i_j)) for i, j, R_i_j in pairs])
+
+
+# ---- Simulated phones ----------------------------------------------------------------------------
+
+
+def simulated_phone(scene: str, seed: int, drift: Drift) -> tuple[Recording, Float64]:
+    """Return a simulated recording of a phone, and the true poses."""
+    planned = plan(scene, seed=seed, effects=Effects.none())
+    rng = np.random.default_rng([seed, 5])
+    frames = []
+    error = np.zeros((planned.model.camera.height, planned.model.camera.width))
+    for rendered in planned.frames(None):
+        error = _next_field(error, rng, first=not frames)
+        frames.append(_as_phone(rendered.frame, error))
+    times = np.array([frame.timestamp for frame in frames])
+    T_room_first = planned.sequence.T_room_camera(times[0])
+    poses = drifting(planned.poses, times, T_room_first[:3, :3].T @ [0.0, 0.0, 1.0], drift, rng)
+    metadata = {POSES_BY: "a simulated phone", "depth_kind": "z", "depth_unit_m": 0.001}
+    source = ArraySource(frames, poses, metadata=metadata)
+    return Recording.of(source, f"simulated {scene}", "simulated"), planned.poses
+
+
+def _next_field(before: Float64, rng: np.random.Generator, *, first: bool) -> Float64:
+    """Relative error of the depth of the next frame, smooth and correlated in time."""
+    field = gaussian_filter(rng.standard_normal(before.shape), WIDTH_PX, mode="reflect")
+    field *= DEPTH_ERROR / field.std()
+    kept = 0.0 if first else float(np.exp(-1 / FRAMES))
+    return np.asarray(kept * before + np.sqrt(1 - kept**2) * field)
+
+
+def _as_phone(frame: RangeFrame, error: Float64) -> RangeFrame:
+    depth = np.where(frame.valid, frame.depth, 0.0)
+    weight = gaussian_filter(frame.valid.astype(float), BLUR)
+    smooth = gaussian_filter(depth, BLUR) / np.maximum(weight, 1e-6) * (1 + error)
+    smooth = np.where(frame.valid, np.round(smooth, 3), 0.0).astype(np.float32)
+    return RangeFrame(
+        depth=smooth, depth_kind="z", camera=frame.camera, index=frame.index,
+        timestamp=frame.timestamp,
+    )  # fmt: skip
+
+
+def drifting(
+    poses: Float64, times: Float64, up: Float64, drift: Drift, rng: np.random.Generator
+) -> Float64:
+    """Poses (N, 4, 4) with drift in heading, tilt and position, and a jump halfway."""
+    root = np.sqrt(np.diff(times, prepend=times[0]))[:, None]
+    heading = drift.heading_rad * (root * rng.standard_normal((len(times), 1))).cumsum(0)
+    tilt = drift.tilt_rad * gaussian_filter(rng.standard_normal((len(times), 3)), (5, 0)) * 4
+    rotation = heading * up + tilt
+    position = drift.position_m * (root * rng.standard_normal((len(times), 3))).cumsum(0)
+    half = len(times) // 2
+    rotation[half:] += drift.jump_rad * up
+    position[half:] += drift.jump_m * np.array([0.6, 0.8, 0.0])
+    # Errors of motion add up in the frame of the camera's heading at the time.
+    turn = se3.exp(np.concatenate([np.zeros_like(rotation), rotation], 1))[:, :3, :3]
+    step = np.diff(poses[:, :3, 3], axis=0, prepend=poses[:1, :3, 3]) * (1 + drift.scale)
+    out = poses.copy()
+    out[:, :3, :3] = turn @ poses[:, :3, :3]
+    out[:, :3, 3] = (turn @ step[..., None])[..., 0].cumsum(0) + poses[0, :3, 3] + position
+    return out
+
+
+# ---- Rows ----------------------------------------------------------------------------------------
+
+
+def methods(recording: Recording) -> Iterator[tuple[str, Float64]]:
+    """Yield the poses of each method."""
+    if recording.reference is not None:
+        yield "phone alone", recording.reference
+    priors: dict[str, Prior] = {"depth alone": "none", "both": "auto"}
+    for name, prior in priors.items():
+        if prior == "auto" and recording.reference is None:
+            continue
+        source, config = with_prior(recording, from_method("default", "range"), prior)
+        yield name, reconstruct(source, config).trajectory
+
+
+def recorded(data: Path, names: list[str]) -> None:
+    """Print the table of real phones."""
+    print("| recording | poses | rotation, median (90 %), deg | pairs | map rms, mm | inliers |")
+    print("|---|---|---|---|---|---|")
+    for name in names:
+        if not (data / name).is_dir():
+            print(f"| {name} | missing | | | | |")
+            continue
+        recording = open_recording(data / name)
+        measured = color_rotations(recording)
+        for method, poses in methods(recording):
+            angles = np.degrees(rotation_errors(poses, measured))
+            rotation = "-"
+            if len(angles):
+                rotation = f"{np.median(angles):.2f} ({np.quantile(angles, 0.9):.2f})"
+            m = map_consistency(recording, poses)
+            print(
+                f"| {name} | {method} | {rotation} | {len(angles)} | {1000 * m.rms_m:.1f} | "
+                f"{m.inlier_ratio:.1%} |",
+                flush=True,
+            )
+
+
+def simulated(scenes: list[str], seeds: int) -> None:
+    """Print the table of simulated phones."""
+    print("| scene | drift | poses | position rms, mm | rotation rms, deg | map rms, mm |")
+    print("|---|---|---|---|---|---|")
+    for scene in scenes:
+        for title, drift in DRIFTS.items():
+            errors: dict[str, list[tuple[float, float, float]]] = {}
+            for seed in range(seeds):
+                recording, truth = simulated_phone(scene, seed, drift)
+                for method, poses in methods(recording):
+                    errors.setdefault(method, []).append(_errors(recording, poses, truth))
+            for method, found in errors.items():
+                position, rotation, rms = np.sqrt((np.array(found) ** 2).mean(0))
+                print(
+                    f"| {scene} | {title} | {method} | {1000 * position:.1f} | "
+                    f"{np.degrees(rotation):.2f} | {1000 * rms:.1f} |",
+                    flush=True,
+                )
+
+
+def _errors(recording: Recording, poses: Float64, truth: Float64) -> tuple[float, float, float]:
+    posed = np.isfinite(poses).all((1, 2))
+    metres, rad = displacement(poses[posed], truth[posed])
+    return metres, rad, map_consistency(recording, poses).rms_m
+
+
+def main() -> None:
+    """Run the chosen part."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    real = commands.add_parser("recorded")
+    real.add_argument("--data", type=Path, default=sequences.DATA)
+    real.add_argument("--names", nargs="+", default=list(PHONES))
+    made = commands.add_parser("simulated")
+    made.add_argument("--scenes", nargs="+", default=["room", "rail"])
+    made.add_argument("--seeds", type=int, default=2)
+    options = parser.parse_args()
+    if options.command == "recorded":
+        recorded(options.data, options.names)
+    else:
+        simulated(options.scenes, options.seeds)
+
+
+if __name__ == "__main__":
+    main()
