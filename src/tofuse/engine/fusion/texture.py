@@ -114,9 +114,8 @@ class TextureView:
         projection = Projection.of(frame.camera, 1)
         if frame.color_image is not None and frame.color_registered:
             image = frame.color_image if image is None else image
-            known = np.asarray(
-                frame.color_image.any(-1), np.bool_
-            )  # else the colour camera didn't see it
+            # Else the colour camera didn't see it.
+            known = np.asarray(frame.color_image.any(-1), np.bool_)
             return cls(z, known, np.ascontiguousarray(image), projection)
         light = albedo(frame)
         if light is None:
