@@ -87,7 +87,8 @@ def _in_cells(corners: Float32, columns: int, cell: int) -> Float64:
     origin = np.stack([number // 2 % columns, number // 2 // columns], -1) * cell
     low, high = 1.0, cell - 4.0
     lower = np.array([[low, low], [high, low], [low, high]])
-    texels = np.where((number % 2 == 0)[:, None, None], lower, cell - 1 - lower) + origin[:, None]
+    texels: Float64 = np.where((number % 2 == 0)[:, None, None], lower, cell - 1 - lower)
+    texels = texels + origin[:, None]
     inverse = np.argsort(order, axis=1)[..., None]  # the corners in the order of the mesh
     return np.take_along_axis(texels, inverse, 1)
 

@@ -394,7 +394,7 @@ def _compare(
     measured[first + 1] = 1
     variance, measured = variance.cumsum(0), measured.cumsum()
     degenerate = sensed.degenerate.cumsum()
-    spans = 2 ** np.arange(len(frames).bit_length())
+    spans = [2**k for k in range(len(frames).bit_length())]
     i = np.concatenate([np.arange(max(len(frames) - span, 0)) for span in spans])
     j = np.concatenate([np.arange(span, len(frames)) for span in spans])
     a, b = frames[i], frames[j]
