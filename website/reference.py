@@ -299,8 +299,8 @@ def command(name: str) -> str:
             metavar = action.metavar if isinstance(action.metavar, str) else None
             choices = "|".join(map(str, action.choices or ())) or None
             value = "" if action.nargs == 0 else metavar or choices or action.dest.upper()
-            flag = " ".join([*action.option_strings, value]).strip()
-            yield f"`{flag}`", formatter._expand_help(action)
+            flags = [f"`{f'{name} {value}'.strip()}`" for name in action.option_strings or ("",)]
+            yield ", ".join(flags), formatter._expand_help(action)
 
     return rows("Argument|Meaning", lines())
 

@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,9 +49,11 @@ CONFIG = replace(
 def always_stored(monkeypatch: pytest.MonkeyPatch) -> None:
     """Short runs store their tracked frames as long ones do, and write no report."""
     monkeypatch.setattr(tracked_file, "_MIN_TRACKING_S", 0.0)
-    monkeypatch.setattr(
-        run, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
-    )
+
+    def write_report(*args: Any, **_: object) -> None:
+        (args[-1] / "report.html").write_text("report")
+
+    monkeypatch.setattr(run, "write_report_files", write_report)
 
 
 def moving_scene() -> Recording:

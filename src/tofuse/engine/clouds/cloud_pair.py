@@ -481,6 +481,7 @@ def _given_guess(views: _CloudViews, registration: Registration) -> Registration
         pose,
         pose.agreement.score - max(rival.agreement.score, 0.0),
         len(registration.unobservable),
+        rivals,
     )
     if not evidence.rejection_reason():
         return registration
