@@ -123,3 +123,11 @@ def test_files_with_texture_are_read_back(tmp_path) -> None:
     write_usdz(tmp_path / "b.usdz", record)
     assert (tmp_path / "b.usdz").read_bytes() == data
     assert cv2.imdecode(np.frombuffer(record.texture, np.uint8), 1).shape[0] == made.atlas.size
+
+
+def test_exposures_are_compared_at_a_part_of_many_vertices() -> None:
+    """OpenCV samples at most 32,767 pixels at once."""
+    mesh = sheet(190, 180, 0.007)
+    assert len(mesh) > np.iinfo(np.int16).max
+    views = [TextureView.of(look(T, gain)) for T, gain in zip(POSES[:2], (1.0, 0.7), strict=True)]
+    assert textured(mesh, views, POSES[:2], 1024).image.any()

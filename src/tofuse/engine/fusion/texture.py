@@ -266,7 +266,7 @@ class _Seen:
         of a point (Brown and Lowe 2007, section 6). The mean of the logarithms of the factors
         is 0.
         """
-        step = max(1, self.weights.shape[1] // _MAX_SAMPLES)
+        step = max(1, -(-self.weights.shape[1] // _MAX_SAMPLES))
         weights = (self.weights[:, ::step] > 0).astype(float)
         colors = np.zeros((*weights.shape, 3))
         for view, pixels, color in zip(self.views, self.pixels[:, ::step], colors, strict=True):
