@@ -40,7 +40,7 @@ from tofuse.engine.icp import (
     spacing,
     surface_metrics,
 )
-from tofuse.engine.search import pose_probability
+from tofuse.engine.search import pair_agreement, pose_probability
 
 # Maximum number of points of each averaged view.
 _POINTS = 7_000
@@ -476,18 +476,11 @@ def _given_guess(views: _CloudViews, registration: Registration) -> Registration
     ]
     if not rivals:
         return registration
-    rival, pose = max(rivals, key=lambda rival: rival.agreement.score), views.evaluated(T)
-    evidence = views.evidence(
-        pose,
-        pose.agreement.score - max(rival.agreement.score, 0.0),
-        len(registration.unobservable),
-        rivals,
-    )
-    if not evidence.rejection_reason():
+    rival = max(rivals, key=lambda rival: rival.agreement.score)
+    lead = views.evaluated(T).agreement.score - max(rival.agreement.score, 0.0)
+    if lead > pair_agreement.MIN_LEAD:
         return registration
-    return replace(
-        registration, margin=evidence.margin, runner_up=rival.T_target_source, given_guess=True
-    )
+    return replace(registration, margin=lead, runner_up=rival.T_target_source, given_guess=True)
 
 
 def _pose_distance(a: Float64, b: Float64) -> float:
