@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tofuse.apps.export.colmap import write_colmap
 from tofuse.apps.export.nerfstudio import write_nerfstudio
-from tofuse.apps.results import folders, read_cloud, read_mesh, run_json
+from tofuse.apps.results import folders, read_cloud, read_mesh, run_json, textured_record
 from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion import GeometryRecord, Mesh, texture
@@ -88,13 +88,7 @@ class _Result:
         baked = texture.baked(self.mesh, max_faces, _TEXTURE_SIZE)
         rows, faces = baked.atlas.vertices, baked.atlas.faces
         other_bytes = _VERTEX_BYTES * len(rows) + _FACE_BYTES * len(faces) + _OTHER_BYTES
-        return GeometryRecord(
-            baked.mesh.vertices[rows],
-            faces,
-            baked.mesh.normals[rows],
-            uv=baked.atlas.uv,
-            texture=_jpeg(baked.image, other_bytes),
-        )
+        return textured_record(baked, _jpeg(baked.image, other_bytes))
 
 
 def _jpeg(image: UInt8, other_bytes: int) -> bytes:

@@ -164,7 +164,7 @@ def display_record(mesh: Mesh, faces: int = DISPLAY_FACES) -> GeometryRecord:
     return textured_record(texture.baked(mesh, faces, _TEXTURE_SIZE))
 
 
-def textured_record(texture: Textured) -> GeometryRecord:
+def textured_record(texture: Textured, jpeg: bytes | None = None) -> GeometryRecord:
     """Return a surface with its texture as a JPEG, in the world frame."""
     shown = texture.charts
     return GeometryRecord(
@@ -172,5 +172,5 @@ def textured_record(texture: Textured) -> GeometryRecord:
         shown.faces,
         normals=shown.normals,
         uv=texture.atlas.uv,
-        texture=jpeg_bytes(texture.image, QUALITY),
+        texture=jpeg or jpeg_bytes(texture.image, QUALITY),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -139,6 +140,14 @@ class TextureView:
         weight = np.minimum(inner / border, np.maximum(from_edge / border, _AT_EDGE))
         return np.ascontiguousarray(weight.clip(0, 1), np.float32)
 
+    @cached_property
+    def small(self) -> UInt8:
+        """(H, W, 3) the image at the size of z."""
+        if self.image.shape[:2] == self.z.shape:
+            return self.image
+        size = self.z.shape[::-1]
+        return np.asarray(cv2.resize(self.image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
     @property
     def coarse(self) -> Float32:
         """(h, w, 3) the image, blurred and subsampled; unknown pixels do not darken it."""
@@ -146,8 +155,7 @@ class TextureView:
         step = max(height, width) / _COARSE
         size = max(2, round(width / step)), max(2, round(height / step))
         known = self.known.astype(np.float32)
-        small = cv2.resize(self.image, (width, height), interpolation=cv2.INTER_AREA)
-        sums = cv2.resize(small * known[..., None], size, interpolation=cv2.INTER_AREA)
+        sums = cv2.resize(self.small * known[..., None], size, interpolation=cv2.INTER_AREA)
         share = cv2.resize(known, size, interpolation=cv2.INTER_AREA)[..., None]
         mean = sums / np.maximum(share, 1e-3)
         return np.ascontiguousarray(mean, np.float32)
@@ -270,10 +278,8 @@ class _Seen:
         weights = (self.weights[:, ::step] > 0).astype(float)
         colors = np.zeros((*weights.shape, 3))
         for view, pixels, color in zip(self.views, self.pixels[:, ::step], colors, strict=True):
-            height, width = view.z.shape
-            small = cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA)
             u, v = pixels.T[:, None]
-            sampled = cv2.remap(small.astype(np.float32), u, v, cv2.INTER_LINEAR)
+            sampled = cv2.remap(view.small.astype(np.float32), u, v, cv2.INTER_LINEAR)
             color[:] = sampled.reshape(-1, 3)
         weights *= ((colors > _MIN_INTENSITY) & (colors < _MAX_INTENSITY)).all(-1)
         logs = np.log(np.maximum(colors, _MIN_INTENSITY))

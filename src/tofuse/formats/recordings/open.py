@@ -61,9 +61,8 @@ def open_recording(
     ----------
     paths
         Files, folders or .zip files of these; several are joined in the order given. A folder of
-        native or SR4000
-        recordings is joined in name order; if it contains a rig.json, its recordings are the
-        cameras of a rig, one image of each in turn.
+        native or SR4000 recordings is joined in name order; if it contains a rig.json, its
+        recordings are the cameras of a rig, one image of each in turn.
     format
         Name of a reader, instead of detection.
     camera
