@@ -40,7 +40,7 @@ from tofuse.engine.icp import (
     spacing,
     surface_metrics,
 )
-from tofuse.engine.search import pair_agreement, pose_probability
+from tofuse.engine.search import pose_probability
 
 # Maximum number of points of each averaged view.
 _POINTS = 7_000
@@ -462,9 +462,9 @@ def _found_symmetries(view: Frame) -> Float64:
 
 
 def _given_guess(views: _CloudViews, registration: Registration) -> Registration:
-    """Compare an accepted pose with those that fit as well if a view is symmetric.
+    """Compare an accepted pose with those that fit nearly as well if a view is symmetric.
 
-    With such a rival it would not be accepted after a search: it holds given the guess only.
+    With such a rival it holds given the guess only.
     """
     T = registration.T_target_source
     own = (*(T @ S for S in symmetries(views.source)), *(S @ T for S in symmetries(views.target)))
@@ -478,7 +478,7 @@ def _given_guess(views: _CloudViews, registration: Registration) -> Registration
         return registration
     rival = max(rivals, key=lambda rival: rival.agreement.score)
     lead = views.evaluated(T).agreement.score - max(rival.agreement.score, 0.0)
-    if lead > pair_agreement.MIN_LEAD:
+    if lead >= pose_probability.MIN_LEAD:
         return registration
     return replace(registration, margin=lead, runner_up=rival.T_target_source, given_guess=True)
 

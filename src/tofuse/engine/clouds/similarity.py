@@ -24,6 +24,7 @@ from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp import extent, reduced, spacing, surface_metrics
+from tofuse.engine.search import pose_probability
 
 # Scales relative to that of equal extents: a fourth to four times, in steps that matched features
 # and distances between matches tolerate.
@@ -38,8 +39,6 @@ _REACHES = np.geomspace(6.0, 2.0, 25)
 _MIN_NORMAL_COSINE = 0.7
 # Scales that differ by more are distinct hypotheses.
 _DISTINCT = 0.1
-# Lead in support over another scale; as of usual right poses (`pose_probability`).
-_MIN_LEAD = 0.1
 # Blocks along each axis that are left out in turn, for the variance of the scale.
 _BLOCKS = 2
 
@@ -94,7 +93,7 @@ def register_similar(source: Frame, target: Frame, rng: np.random.Generator) -> 
     rivals = [s for s in found if abs(np.log(s.scale / best.scale)) > _DISTINCT]
     at_scale = scaled(source, best.scale)
     registration = register_clouds(at_scale, target, None, rng)
-    if rivals and best.support - rivals[0].support < _MIN_LEAD:
+    if rivals and best.support - rivals[0].support < pose_probability.MIN_LEAD:
         reason = (
             f"the clouds fit nearly as well with the source {rivals[0].scale:.3g} times as large"
         )

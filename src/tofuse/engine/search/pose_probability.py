@@ -28,7 +28,7 @@ CERTAIN = 0.98
 # poses.
 MAX_PROBABILITY = 0.998
 # Usual limits of right poses: minimum support, minimum lead and maximum contradiction.
-_MIN_SUPPORT, _MIN_LEAD, CONTRADICTION = 0.25, 0.1, 0.08
+_MIN_SUPPORT, MIN_LEAD, CONTRADICTION = 0.25, 0.1, 0.08
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class PoseEvidence:
         them would fit as well. Support enters by the lead.
         """
         lead = max(self.margin or 0.0, 0.0)
-        degeneracy = max(1 - lead / _MIN_LEAD, 0.0) if self.degenerate else 0.0
+        degeneracy = max(1 - lead / MIN_LEAD, 0.0) if self.degenerate else 0.0
         return np.array([1, np.sqrt(lead), np.sqrt(self.contradiction), degeneracy])
 
     @property
@@ -147,7 +147,7 @@ class PoseEvidence:
         problems = []
         if self.support < _MIN_SUPPORT:
             problems.append(f"only {self.support:.0%} of the points of both views support the pose")
-        if self.margin is not None and self.margin < _MIN_LEAD:
+        if self.margin is not None and self.margin < MIN_LEAD:
             comparison = "as well or better"
             if self.margin > 0:
                 comparison = (
