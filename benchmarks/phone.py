@@ -10,8 +10,13 @@ is that of `map_agreement`.
 image and over time; there is no amplitude. Their poses are true ones with drift: heading and
 position walk randomly, tilt is bounded; one kind relocalizes halfway, with a jump.
 
+`surface`: the surface of simulated phones at the true poses, as it is fused and as it is displayed
+(`display_surface`), compared with the true one: distance, share beyond 2 and 5 cm, and the share of
+the true surface within 2 cm of it (a camera sees only a part of the scene).
+
     python benchmarks/phone.py recorded [--names iphone_chair_3dscannerapp]
     python benchmarks/phone.py simulated [--scenes room rail] [--seeds 2]
+    python benchmarks/phone.py surface [--scenes room flat] [--seeds 1]
 """
 
 from __future__ import annotations
@@ -28,10 +33,13 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
 import sequences
+from fusion import views_of
 from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.cameras import scaled
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording, evenly_spaced
+from tofuse.engine.fusion import display_surface
+from tofuse.engine.fusion.tsdf import fuse_surface
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.adaptation import Prior, with_prior
 from tofuse.engine.mapping.methods import from_method
@@ -39,6 +47,7 @@ from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.map_agreement import map_consistency
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.formats.recordings.open import open_recording
+from tofuse.lab.experiments.surface_error import Surface, distances
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 
@@ -49,6 +58,8 @@ RATIO, STARTS = 0.8, 6
 MIN_MATCHES, AMBIGUOUS, SAME_RAD = 100, 1.1, np.radians(1.0)
 # Simulated depth: blur (pixels), and size and correlation of its errors over pixels and frames.
 BLUR, DEPTH_ERROR, WIDTH_PX, FRAMES = 1.5, 0.007, 25.0, 10.0
+# Displayed triangles and the views that judge them, as in a run; points on compared surfaces.
+TRIANGLES, WITNESSES, SAMPLES = 100_000, 60, 200_000
 
 
 @dataclass(frozen=True)
@@ -309,6 +320,36 @@ def _errors(recording: Recording, poses: Float64, truth: Float64) -> tuple[float
     return metres, rad, map_consistency(recording, poses).rms_m
 
 
+def surfaces(scenes: list[str], seeds: int) -> None:
+    """Print the table of surfaces."""
+    print("| scene | seed | surface | triangles | mean, mm | > 2 cm | > 5 cm | complete |")
+    print("|---|---|---|---|---|---|---|---|")
+    for scene in scenes:
+        for seed in range(seeds):
+            recording, poses = simulated_phone(scene, seed, DRIFTS["usual"])
+            frames = [f for f in recording if isinstance(f, RangeFrame)]
+            views, _, _ = views_of(frames, from_method("default", "range"))
+            made = plan(scene, seed=seed, effects=Effects.none())
+            vertices, faces = made.scene.truth_mesh()
+            T_world_truth = made.sequence.T_world_truth(made.raw[0] / made.sequence.frame_rate_hz)
+            truth = Surface(se3.transform(T_world_truth, vertices), faces)
+            fused = fuse_surface(views, poses).clustered(TRIANGLES)
+            seen = evenly_spaced(np.arange(len(frames)), WITNESSES)
+            witnesses = [display_surface.Witness.of(frames[k], poses[k]) for k in seen]
+            shown, filled = display_surface.displayed(fused, witnesses)
+            for name, mesh in (("fused", fused), (f"displayed, {filled} in holes", shown)):
+                shape = Surface(mesh.vertices, mesh.faces)
+                error = distances(shape.samples(SAMPLES)[0], truth)
+                missed = distances(truth.samples(SAMPLES)[0], shape)
+                print(
+                    f"| {scene} | {seed} | {name} | {len(mesh.faces)} | "
+                    f"{1000 * error.mean():.1f} | "
+                    f"{(error > 0.02).mean():.2%} | {(error > 0.05).mean():.2%} | "
+                    f"{(missed < 0.02).mean():.2%} |",
+                    flush=True,
+                )
+
+
 def main() -> None:
     """Run the chosen part."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -319,9 +360,14 @@ def main() -> None:
     made = commands.add_parser("simulated")
     made.add_argument("--scenes", nargs="+", default=["room", "rail"])
     made.add_argument("--seeds", type=int, default=2)
+    shown = commands.add_parser("surface")
+    shown.add_argument("--scenes", nargs="+", default=["room", "flat"])
+    shown.add_argument("--seeds", type=int, default=1)
     options = parser.parse_args()
     if options.command == "recorded":
         recorded(options.data, options.names)
+    elif options.command == "surface":
+        surfaces(options.scenes, options.seeds)
     else:
         simulated(options.scenes, options.seeds)
 

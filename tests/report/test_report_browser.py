@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from browser import changed, chromium, watched
 from report_results import make_room
 from tofuse.apps.report.sections import write_report
+from tofuse.engine.fusion.texture import baked
 
 pytestmark = pytest.mark.nightly
 
@@ -120,6 +122,20 @@ def test_two_taps_measure_distance_with_error(browser, report):
         page.keyboard.press("Escape")
         assert caption.is_hidden()
         seen.check()
+
+
+def test_filled_holes_are_not_measured(browser, tmp_path):
+    result, extras = make_room()
+    made = baked(result.mesh, 5000, 512)
+    path = tmp_path / "report.html"
+    for filled, words in ((0, " m"), (len(made.mesh.faces), "No surface there: tap the model")):
+        write_report(result, path, replace(extras, texture=replace(made, filled=filled)))
+        with opened(browser, path, viewport=DESK) as seen:
+            ready(seen)
+            seen.page.get_by_role("button", name="Measure").click()
+            seen.page.mouse.click(*middle(seen.page))
+            assert words in seen.page.locator("#viewer .measured").inner_text()
+            seen.check()
 
 
 def test_phone_scrolls_past_model(browser, report):

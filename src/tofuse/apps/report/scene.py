@@ -242,10 +242,14 @@ def _packed_model(scene: Scene, steps: UInt16) -> dict[str, Any]:
 
 def _packed_texture(texture: Textured | None) -> dict[str, Any]:
     if texture is None:
-        return {"uv": None, "texture": None}
+        return {"uv": None, "texture": None, "filled": 0}
     uv = quantized(texture.atlas.uv.astype(float), np.zeros(2), np.ones(2))
     image = base64.b64encode(jpeg_bytes(texture.image, JPEG_QUALITY)).decode()
-    return {"uv": pack(uv), "texture": f"data:image/jpeg;base64,{image}"}
+    return {
+        "uv": pack(uv),
+        "texture": f"data:image/jpeg;base64,{image}",
+        "filled": texture.filled,
+    }
 
 
 def _display_colors(mesh: Mesh | None) -> Mesh | None:

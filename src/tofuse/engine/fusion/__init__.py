@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.fusion import texture
+    from tofuse.engine.fusion import display_surface, texture
     from tofuse.engine.fusion.cloud import Cloud, as_cloud, display_colors
     from tofuse.engine.fusion.geometry_record import GeometryRecord
     from tofuse.engine.fusion.mesh import Mesh

@@ -67,6 +67,8 @@ class Textured:
         vertices.
     detail
         Pixels of the views per vertex of what they observed.
+    filled
+        Number of the last triangles that fill holes: they look right, but were not measured.
     """
 
     mesh: Mesh
@@ -75,6 +77,7 @@ class Textured:
     gains: Float64
     coverage: float
     detail: float = 0.0
+    filled: int = 0
 
     @property
     def charts(self) -> Mesh:

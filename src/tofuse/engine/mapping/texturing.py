@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -10,7 +12,7 @@ from tofuse.engine.arrays import Bool, UInt8
 from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording, Source
-from tofuse.engine.fusion import texture
+from tofuse.engine.fusion import display_surface, texture
 from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
@@ -56,13 +58,16 @@ def make_texture(
     mesh = result.mesh
     if mesh is None or not len(mesh.faces):
         return None
-    frame_positions = steadiest_frames(result, _colored(recording))
-    most_pixels = _PIXELS // max(len(frame_positions), 1)
+    colored = steadiest_frames(result, _colored(recording))
+    all_frames = steadiest_frames(result) if len(colored) < _VIEWS else []
+    frame_positions = sorted({*colored, *all_frames})
+    most_pixels = _PIXELS // max(len(colored), 1)
     correctors = CameraErrors.made_with(result.config)
     progress = progress or Silent()
     progress.stage("painting", len(frame_positions))
     views: list[texture.TextureView] = []
     poses = []
+    witnesses: list[display_surface.Witness] = []
     for k in frame_positions:
         progress.advance()
         try:
@@ -71,7 +76,10 @@ def make_texture(
             continue
         for corrector in correctors:
             frame = corrector.apply(frame)
-        if not isinstance(frame, RangeFrame) or (frame.color_image is None and not required):
+        if not isinstance(frame, RangeFrame):
+            continue
+        witnesses.append(display_surface.Witness.of(frame, result.trajectory[k]))
+        if frame.color_image is None and not required:
             continue
         view = texture.TextureView.of(frame, full_image(recording, frame, most_pixels))
         if view is not None:
@@ -81,7 +89,8 @@ def make_texture(
         return None
     # BLAS results depend on its number of threads; those of our kernels don't.
     with use_threads(threads), threadpool_limits(1):
-        made = texture.textured(mesh.clustered(_FACES), views, np.array(poses), size)
+        shown, filled = display_surface.displayed(mesh.clustered(_FACES), witnesses)
+        made = replace(texture.textured(shown, views, np.array(poses), size), filled=filled)
     worthwhile = made.coverage >= _MIN_COVERAGE and made.detail >= _MIN_DETAIL
     return made if worthwhile or required else None
 

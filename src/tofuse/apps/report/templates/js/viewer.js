@@ -20,7 +20,7 @@ async function startViewer(box, scene, bus) {
       const faces = await unpack(scene.model.faces, Uint32Array, 3);
       const picture = scene.model.texture ? await painter.picture(scene.model.texture) : null;
       if (picture) Object.assign(shared, { picture, uv: await buffered(scene.model.uv, Uint16Array, 2) });
-      surface = { ...shared, faces: painter.indices(faces), count: faces.length };
+      surface = { ...shared, faces: painter.indices(faces), count: faces.length, measured: faces.length - 3 * scene.model.filled };
       for (const most of COARSE) {
         const fewer = faces.length > 3 * most ? clustered(place, faces, scene.extent, most) : faces;
         // Merged vertices are in other charts of the texture: their own colours are shown.
