@@ -12,6 +12,7 @@ import pytest
 from browser import changed, chromium, watched
 from report_results import make_room
 from tofuse.apps.report.sections import write_report
+from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.texture import baked
 
 pytestmark = pytest.mark.nightly
@@ -124,9 +125,26 @@ def test_two_taps_measure_distance_with_error(browser, report):
         seen.check()
 
 
+def floor_below(cloud) -> Mesh:
+    """A floor under the middle of a cloud, as wide as it; y points down."""
+    x, z = (coordinate.ravel() for coordinate in np.meshgrid(*2 * [np.linspace(-3, 3, 21)]))
+    points = np.stack([x, np.zeros_like(x), z], -1) + np.median(cloud.points, 0)
+    k = (np.arange(20) + 21 * np.arange(20)[:, None]).ravel()
+    faces = np.concatenate([[k, k + 1, k + 21], [k + 1, k + 22, k + 21]], 1).T
+    count = len(points)
+    return Mesh(
+        points.astype(np.float32),
+        faces.astype(np.int32),
+        np.tile(np.float32([0, -1, 0]), (count, 1)),
+        np.full((count, 3), 200, np.uint8),
+        np.full(count, 0.002, np.float32),
+        np.full(count, 5, np.int32),
+    )
+
+
 def test_filled_holes_are_not_measured(browser, tmp_path):
     result, extras = make_room()
-    made = baked(result.mesh, 5000, 512)
+    made = baked(floor_below(result.cloud), 5000, 512)
     path = tmp_path / "report.html"
     for filled, words in ((0, " m"), (len(made.mesh.faces), "No surface there: tap the model")):
         write_report(result, path, replace(extras, texture=replace(made, filled=filled)))

@@ -180,7 +180,7 @@ function makePainter(canvas, scene) {
       if (set.faces) {
         if (peel) gl.enable(gl.CULL_FACE);
         gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, set.faces);
-        gl.drawElements(gl.TRIANGLES, probing && set.measured ? set.measured : set.count, gl.UNSIGNED_INT, 0);
+        gl.drawElements(gl.TRIANGLES, probing ? set.measured ?? set.count : set.count, gl.UNSIGNED_INT, 0);
         gl.disable(gl.CULL_FACE);
       } else gl.drawArrays(gl.POINTS, 0, set.count);
     }
