@@ -15,6 +15,7 @@ from tofuse.apps.results.folders import RESULT
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
+from tofuse.engine.progress import Silent
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.lab.simulation.effects import Effects
@@ -135,6 +136,24 @@ def test_poses_of_another_place_are_contradicted_and_replaced(recording, truth) 
     found = tofuse.judge(recording, away @ np.linalg.inv(truth))
     assert found.verdict == "failed"
     assert "images_disagree" in [r.code for r in found.reasons]
+
+
+class Notes(Silent):
+    def __init__(self):
+        self.texts = []
+
+    def note(self, text):
+        self.texts.append(text)
+
+
+def test_convention_of_inverted_poses_is_named(recording, truth):
+    notes = Notes()
+    tofuse.judge(recording, se3.inverse(truth), progress=notes)
+    (named,) = [text for text in notes.texts if "The poses fit the images if" in text]
+    assert "T_camera_world, the inverse" in named
+    quiet = Notes()
+    tofuse.judge(recording, truth, progress=quiet)
+    assert not [text for text in quiet.texts if "The poses" in text]
 
 
 def test_unusable_poses_are_refused(recording, truth, tmp_path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.inspection import channels, geometry, motion_checks, times, values
+from tofuse.apps.inspection import channels, geometry, motion_checks, pose_convention, times, values
 from tofuse.apps.inspection.finding import SEVERITIES, Finding
 from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.inspection.values import depths_of, valid_fraction
@@ -121,7 +121,9 @@ def inspect_recording(
         raise InputError("no frame can be read", where=recording.path, remedy=notes[-1])
     # BLAS results depend on its number of threads.
     with threadpool_limits(1):
-        findings = [f for check in CHECKS for f in check(sample)]
+        # A run measures poses, and doesn't depend on those that come with the recording.
+        checks = CHECKS if quick else (*CHECKS, pose_convention.check_poses)
+        findings = [f for check in checks for f in check(sample)]
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))
     return Inspection(recording, tuple(findings), tuple(notes), sample.frames)
 

@@ -107,7 +107,7 @@ class Sample:
         images = {
             k: f for k, f in enumerate(self.frames) if isinstance(f, RangeFrame) and f.valid.any()
         }
-        prepared = run_all([partial(prepare_view, image, _VIEW) for image in images.values()])
+        prepared = run_all([partial(prepare, image) for image in images.values()])
         return dict(zip(images, prepared, strict=True))
 
     @cached_property
@@ -149,6 +149,11 @@ class Sample:
             return period
         stated = self.recording.metadata.get("ambiguity_m")
         return float(stated) if isinstance(stated, int | float) and stated > 0 else None
+
+
+def prepare(image: RangeFrame) -> PreparedView:
+    """Return the view of an image with valid pixels, as it is compared."""
+    return prepare_view(image, _VIEW)
 
 
 def part_starts(recording: Recording) -> list[int]:

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from tofuse.apps.inspection import convention_of
 from tofuse.apps.jobs import pose_scale
 from tofuse.apps.results import folders, run_json, write_result
 from tofuse.engine.arrays import Float64
@@ -211,6 +212,8 @@ def judge(
             poses, as_given, estimate = multiplied, as_scaled, replace(estimate, applied=True)
     started = reconstructed(adaptation.with_odometry(recording, poses), given_config)
     best = started
+    if _support(as_given) < _SUPPORTED and (finding := convention_of(recording, poses)):
+        progress.note(str(finding))
     if _support(started[2]) < _SUPPORTED:
         best = max(started, reconstructed(recording, config), key=lambda found: _support(found[2]))
     refined, views, as_refined = best

@@ -1,0 +1,116 @@
+"""Poses in another convention are found by the motion that the images show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.apps.inspection.pose_convention import misread_poses
+from tofuse.apps.inspection.sample import Sample
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import quaternion, se3
+from tofuse.lab.simulation.record import plan
+
+GL = np.diag([1.0, -1, -1, 1])
+BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+def rolled(T, shift):
+    q = np.roll(quaternion.from_matrix(T[:, :3, :3]), shift, -1)
+    out = T.copy()
+    out[:, :3, :3] = quaternion.to_matrix(q)
+    return out
+
+
+def scaled(T, factor):
+    out = T.copy()
+    out[:, :3, 3] *= factor
+    return out
+
+
+def turned(T, quarters):
+    return T @ se3.exp(np.array([0, 0, 0, 0, 0, quarters * np.pi / 2]))
+
+
+MISREAD = {
+    "T_camera_world, the inverse": se3.inverse,
+    "are poses of a camera with the axes of OpenGL": lambda T: T @ GL,
+    "T_camera_world of a camera with the axes of OpenGL": lambda T: se3.inverse(T @ GL),
+    "the axes of a robot": lambda T: T @ BODY,
+    "order w, x, y, z": lambda T: rolled(T, 1),
+    "order x, y, z, w": lambda T: rolled(T, -1),
+    "turned by 90 degrees": lambda T: turned(T, -1),
+    "turned by 180 degrees": lambda T: turned(T, -2),
+    "turned by 270 degrees": lambda T: turned(T, -3),
+    "in mm": lambda T: scaled(T, 1000),
+    "in cm": lambda T: scaled(T, 100),
+    "2.5 times as far apart": lambda T: scaled(T, 2.5),
+    "0.4 times as far apart": lambda T: scaled(T, 0.4),
+}
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """A room seen on a way with turns about all axes."""
+    made = plan("room")
+    camera = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
+    rays = np.insert(camera.rays().reshape(-1, 2).astype(float), 2, 1, -1)
+    rng = np.random.default_rng(4)
+    T = made.sequence.T_room_camera(made.raw[0] / made.sequence.frame_rate_hz)
+    frames, poses = [], []
+    for k in range(9):
+        hits = made.scene.cast(
+            T[:3, 3], (rays / np.linalg.norm(rays, axis=1)[:, None]) @ T[:3, :3].T
+        )
+        z = hits.distance.reshape(60, 80) / np.sqrt((camera.rays() ** 2).sum(-1) + 1)
+        z = np.where(np.isfinite(z), z + rng.normal(0, 0.003, z.shape), 0).astype(np.float32)
+        frames.append(RangeFrame(k, k / 10, camera, z, "z"))
+        poses.append(T)
+        step = np.array([0.05, -0.02, 0.03, 0.04, 0.06, -0.03]) * (1 + 0.5 * rng.standard_normal(6))
+        T = T @ se3.exp(step)
+    return Recording.of(ArraySource(frames, np.array(poses)), "somewhere", "frames")
+
+
+@pytest.fixture(scope="module")
+def sample(recording):
+    return Sample.of(recording, 8)
+
+
+@pytest.mark.parametrize("words", MISREAD)
+def test_convention_is_named(sample, recording, words):
+    # From a start that is not the identity, as where a device began elsewhere.
+    start = se3.exp(np.array([1.0, -2, 0.5, 0.4, 0.9, -0.3]))
+    poses = start @ recording.reference
+    (found,) = misread_poses(sample, MISREAD[words](poses))
+    assert found.code == "poses_misread"
+    assert words in found.text
+    assert all(np.isfinite(value) for value in found.evidence.values())
+
+
+def test_right_poses_are_not_reported(sample, recording):
+    rng = np.random.default_rng(1)
+    drift = se3.exp(np.cumsum(rng.normal(0, [0.003] * 3 + [0.004] * 3, (9, 6)), 0))
+    for poses in (recording.reference, recording.reference @ drift):
+        assert not list(misread_poses(sample, poses))
+
+
+def test_random_poses_are_in_no_convention(sample):
+    for seed in range(20):
+        poses = se3.exp(np.random.default_rng(seed).normal(0, 1, (9, 6)))
+        assert not any("degrees" in f.text for f in misread_poses(sample, poses))
+
+
+def test_missing_poses_are_left_out(sample, recording):
+    poses = recording.reference.copy()
+    poses[2:] = np.nan
+    assert not list(misread_poses(sample, se3.inverse(poses)))
+
+
+def test_inspection_reports_poses_of_recording(recording):
+    frames = list(recording)
+    source = ArraySource(frames, recording.reference @ GL)
+    found = tofuse.inspect(Recording.of(source, "somewhere", "frames"))
+    assert [f.code for f in found.findings if f.severity == "warning"] == ["poses_misread"]
