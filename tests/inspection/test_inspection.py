@@ -264,6 +264,26 @@ def test_faults_are_detected(code, few, turn) -> None:
     assert str(named) in found.warnings
 
 
+def test_swapped_bytes_are_detected() -> None:
+    v, u = np.mgrid[:72, :96]
+    counts = [(1500 + 3 * u + 2 * v + 40 * k).astype(np.uint16) for k in range(4)]
+    right = [
+        RangeFrame(k, k / 10, BROWN, c.astype(np.float32) / 1000) for k, c in enumerate(counts)
+    ]
+    swapped = [
+        replace(f, depth=c.byteswap().astype(np.float32) / 1000)
+        for f, c in zip(right, counts, strict=True)
+    ]
+    found = {f.code: f for f in tofuse.inspect(of(swapped)).findings}
+    assert "bytes" in found["depth_unit"].text
+    assert "depth_unit" not in codes(right)
+    noisy = np.random.default_rng(0).integers(1, 65535, (4, 72, 96))
+    unreadable = [
+        replace(f, depth=n.astype(np.float32) / 1000) for f, n in zip(right, noisy, strict=True)
+    ]
+    assert "bytes" not in str(tofuse.inspect(of(unreadable)).findings)
+
+
 @pytest.mark.nightly_part
 def test_amplitude_that_does_not_change_is_detected(turn) -> None:
     held = [replace(f, amplitude_image=turn[0].amplitude_image) for f in turn]

@@ -29,6 +29,9 @@ _MAX_SEAM_FRACTION = 0.003
 # median, are wrapped.
 _DARK, _NEAR = 0.12, 0.5
 _MAX_DARK_FRACTION = 0.08
+# Largest fraction of a count by which stored depth differs from a whole number; and ratio of the
+# mean differences of neighbours with swapped bytes to those as read, below which they are swapped.
+_MAX_FRACTION, _MIN_SWAPPED_RATIO = 0.05, 0.2
 # Minimum number of edge pixels per image to assess flying pixels.
 _MIN_EDGES = 100
 
@@ -57,6 +60,16 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
             {"valid_fraction": 0.0},
         )
         return
+    unit = float(sample.recording.metadata.get("depth_unit_m", 0.001))
+    if (ratio := _roughness_if_swapped(sample.images, unit)) < _MIN_SWAPPED_RATIO:
+        yield Finding(
+            "depth_unit",
+            "The two bytes of each depth value are swapped: neighbouring pixels differ by "
+            f"{1 / max(ratio, 1e-3):.0f} times as much as they do the other way round.",
+            "Write 16-bit images in the byte order of their format (in Python: image.byteswap()).",
+            {"roughness_if_swapped": ratio},
+        )
+        return
     median = float(np.median(depths))
     period = sample.period_m
     evidence = {"median_m": median, "far_m": float(np.percentile(depths, 99))}
@@ -76,6 +89,25 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
         f"Check depth_unit_m: it may be wrong by a factor of {factor:g}.",
         evidence | {"factor": factor},
     )
+
+
+def _roughness_if_swapped(images: Sequence[RangeFrame], unit_m: float) -> float:
+    """Return by how much smoother 16-bit depth is with swapped bytes: a ratio; 1 if not 16 bits."""
+    ratios = []
+    for image in images:
+        counts = np.rint(image.depth[image.valid] / unit_m)
+        if not len(counts) or counts.max() > np.iinfo(np.uint16).max:
+            return 1.0
+        stored = np.rint(np.where(image.valid, image.depth, 0) / unit_m).astype(np.uint16)
+        if np.abs(image.depth[image.valid] / unit_m - counts).max() > _MAX_FRACTION:
+            return 1.0
+        both = image.valid[:, 1:] & image.valid[:, :-1]
+        as_read, swapped = (
+            np.abs(np.diff(values.astype(float), axis=1))[both].mean() / values.mean()
+            for values in (stored, stored.byteswap())
+        )
+        ratios.append(swapped / max(as_read, 1e-12))
+    return float(np.median(ratios)) if ratios else 1.0
 
 
 def check_valid(sample: Sample) -> Iterator[Finding]:
