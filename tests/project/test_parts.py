@@ -151,3 +151,47 @@ def test_values_outside_declared_bounds_are_refused(wrong, message) -> None:
         _Limits(**wrong)
     with pytest.raises(InputError, match=message):
         parts.from_dict(_Limits, wrong, where="test.toml")
+
+
+def installed(folder, module: str, text: str) -> None:
+    """An installed package with one module, an entry point of `tofuse.parts`."""
+    (folder / f"{module}.py").write_text(text)
+    info = folder / f"{module}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[tofuse.parts]\nmine = {module}\n")
+
+
+PART = """
+from dataclasses import dataclass
+from tofuse.engine.filters import Filter
+from tofuse.engine.parts import part
+
+@part("filter", "of-another-package")
+@dataclass(frozen=True)
+class Mine(Filter):
+    takes = frozenset({"range", "cloud"})
+    amount: int = 3
+
+    def mask(self, frame, history):
+        return frame.valid
+"""
+
+
+def test_config_finds_parts_of_installed_packages(tmp_path, monkeypatch):
+    installed(tmp_path, "package_with_a_part", PART)
+    monkeypatch.syspath_prepend(tmp_path)
+    filters = {"filters": [{"part": "of-another-package", "amount": 5}]}
+    try:
+        config = changed(from_method("default"), filters, where="test")
+        assert config.filters[0].amount == 5
+    finally:
+        parts._registry["filter"].pop("of-another-package", None)
+
+
+def test_broken_package_is_named(tmp_path, monkeypatch):
+    installed(tmp_path, "broken_package", "import a_module_that_is_missing")
+    monkeypatch.syspath_prepend(tmp_path)
+    filters = {"filters": [{"part": "of-a-broken-package"}]}
+    with pytest.raises(InputError, match=r"mine = broken_package: can't be imported"):
+        changed(from_method("default"), filters, where="test")

@@ -59,6 +59,27 @@ def discover(package: str) -> None:
         importlib.import_module(f"{package}.{info.name}")
 
 
+def load_installed() -> None:
+    """Import the modules that installed packages name in the entry point group `tofuse.parts`.
+
+    Raises
+    ------
+    InputError
+        If one of them can't be imported.
+    """
+    from importlib.metadata import entry_points  # slow to import
+
+    for entry in entry_points(group="tofuse.parts"):
+        try:
+            entry.load()
+        except Exception as error:
+            raise InputError(
+                f"can't be imported ({type(error).__name__}: {error})",
+                where=f"part {entry.name} = {entry.value}",
+                remedy="update or uninstall the package that provides it",
+            ) from error
+
+
 def registered(kind: str) -> dict[str, type]:
     """Return the registered parts of a kind, by name."""
     return dict(sorted(_registry.get(kind, {}).items()))
@@ -183,6 +204,9 @@ def _part_from_dict(interface: type, data: Mapping[str, Any], where: str) -> Any
     options = dict(data)
     name = options.pop("part", getattr(interface, "part_name", None))
     choices = registered(kind)
+    if isinstance(name, str) and name not in choices:
+        load_installed()
+        choices = registered(kind)
     if not isinstance(name, str) or name not in choices:
         raise InputError(
             f"there is no {kind} called {name!r}", where=where, remedy=f"use one of {list(choices)}"
