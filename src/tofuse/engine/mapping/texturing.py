@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 from tofuse.engine.arrays import Bool, UInt8
 from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames import RangeFrame, Recording, Source
+from tofuse.engine.frames import RangeFrame, Recording, Source, evenly_spaced
 from tofuse.engine.fusion import display_surface, texture
 from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Progress, Silent
@@ -21,6 +21,8 @@ from tofuse.engine.sensor import CameraErrors
 # Maximum number of views and of textured triangles: more improve little. Images are reduced to at
 # most so many pixels together.
 _VIEWS, _FACES, _PIXELS = 60, 100_000, 60_000_000
+# If none of so many frames that may have colour has it, the recording has none.
+_PROBED = 4
 # Unless a texture is required: minimum fraction of the surface that the images show, and of their
 # pixels per vertex. With less, vertices hold as many colours, and their images show more of it.
 _MIN_COVERAGE, _MIN_DETAIL = 0.5, 2.0
@@ -59,6 +61,9 @@ def make_texture(
     if mesh is None or not len(mesh.faces):
         return None
     colored = steadiest_frames(result, _colored(recording))
+    probed = evenly_spaced(np.array(colored, np.intp), _PROBED)
+    if not required and not any(_has_color(recording, k) for k in probed.tolist()):
+        return None
     all_frames = steadiest_frames(result) if len(colored) < _VIEWS else []
     frame_positions = sorted({*colored, *all_frames})
     most_pixels = _PIXELS // max(len(colored), 1)
@@ -99,6 +104,11 @@ def _colored(recording: Recording) -> Bool:
     """Return which frames (M,) may have colour: phones record it less often than depth."""
     origins = (_origin(recording.source, k) for k in recording.indices.tolist())
     return np.array([getattr(s, "has_color", lambda _: True)(k) for s, k in origins], bool)
+
+
+def _has_color(recording: Recording, k: int) -> bool:
+    frame = recording.image(k)
+    return frame is not None and frame.color_image is not None
 
 
 def _origin(source: Source, index: int) -> tuple[Source, int]:
