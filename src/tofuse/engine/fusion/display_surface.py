@@ -108,12 +108,14 @@ def without_shards(mesh: Mesh, witnesses: Sequence[Witness]) -> Mesh:
     usual one, relative to the number of witnesses that look. Where none does, as witnesses are a
     sample, or the vertex is behind another surface, its number of views decides.
     """
-    looking, seeing = np.zeros(len(mesh)), np.zeros(len(mesh))
+    looking, seeing, hidden = np.zeros(len(mesh)), np.zeros(len(mesh)), np.zeros(len(mesh), bool)
     points, normals = mesh.vertices.astype(float), mesh.normals.astype(float)
     for witness in witnesses:
         inside, behind = witness.looks(points, normals)
         with np.errstate(invalid="ignore"):
-            looking += inside & ~(behind < -1)  # not hidden
+            is_hidden = inside & (behind < -1)
+            hidden |= is_hidden
+            looking += inside & ~is_hidden
             seeing += inside & (np.abs(behind) <= 1)
     is_looked_at = looking > 0
     share = mesh.views[is_looked_at] / looking[is_looked_at]
@@ -121,7 +123,7 @@ def without_shards(mesh: Mesh, witnesses: Sequence[Witness]) -> Mesh:
     few = mesh.views < _SUPPORTED * np.where(is_looked_at, usual * looking, np.median(mesh.views))
     # Those that fused views would let expect, if the surface were not behind another one.
     expected = mesh.views * (np.median(seeing) / max(float(np.median(mesh.views)), 1))
-    unseen = (seeing == 0) & (is_looked_at | (expected >= _EXPECTED))
+    unseen = (seeing == 0) & (is_looked_at | (hidden & (expected >= _EXPECTED)))
     supported = ~few & ~unseen
     return mesh.rows(supported[mesh.faces].sum(1) >= 2)
 
