@@ -23,6 +23,7 @@ from tofuse.engine.tracking.moving_objects import (
     MovingObjects,
     without_pixels,
 )
+from tofuse.engine.tracking.rival_motions import RivalMotions
 from tofuse.engine.views import PreparedView
 
 # Minimum score of a rotated start relative to the unrotated one: a flat wall fits under any.
@@ -52,6 +53,8 @@ class TrackerState:
         Velocity of the camera.
     objects
         Moving objects in the last view and in the keyframes.
+    rivals
+        Motions that would explain the last views as well.
     last
         The last frame of the component; None after an interruption.
     in_sequence
@@ -69,6 +72,7 @@ class TrackerState:
     fit_statistics: verification.FitStatistics
     motion: MotionModel = field(default_factory=MotionModel)
     objects: MovingObjects = field(default_factory=MovingObjects)
+    rivals: RivalMotions = field(default_factory=RivalMotions)
     last: Keyframe | None = None
     in_sequence: bool = False
     component: int = -1
@@ -256,6 +260,20 @@ class Hypotheses:
                 moving = self._moving(static.T_component_camera, keyframe, suspected=suspected)
         objects.update(moving)
         return hypothesis, moving
+
+    def rival_share(self, accepted: Hypothesis) -> float:
+        """Return the share of the last views that follows a rival of the tracked motion."""
+        rivals = {"stands": np.eye(4)}
+        keyframe = accepted.keyframe
+        if self.T_predicted is not None:
+            rivals["goes on"] = se3.inverse(keyframe.T_component_camera) @ self.T_predicted
+        return self.state.rivals.share(
+            self.view,
+            keyframe.view,
+            accepted.T_keyframe_camera,
+            rivals,
+            self.state.objects.typical_scale,
+        )
 
     def _make_references(self) -> list[Reference]:
         """Return the newest keyframe and the last frame, without moved objects."""

@@ -159,6 +159,7 @@ class KeyframeTracker(Tracker):
         else:
             state.motion.interrupt()
         state.objects.reset()
+        state.rivals.reset()
         reason = ""
         if state.component:
             rejection = hypotheses.first_rejection or "nothing comparable was seen before"
@@ -176,6 +177,7 @@ class KeyframeTracker(Tracker):
         view = hypotheses.view
         accepted, moving = hypotheses.segment(hypotheses.converged(selected))
         self._state.fit_statistics.learn(accepted.aligned, view.depth)
+        rival = hypotheses.rival_share(accepted)
         links = self._insert_keyframe(view, accepted)
         status, reason = _status_of(accepted, frame)
         mask = None
@@ -194,6 +196,7 @@ class KeyframeTracker(Tracker):
             doubtful=not accepted.fit.is_usual,
             inflation=_inflation(accepted),
             moving=mask,
+            rival=rival,
         )
 
     def _insert_keyframe(self, view: PreparedView, accepted: Hypothesis) -> tuple[Link, ...]:
