@@ -1,0 +1,185 @@
+"""Rivals of the tracked motion: another one that a large part of the view follows.
+
+A crowd that walks past a camera at rest looks like a crowd at rest that a camera moves past, and a
+person near the camera may fill most of the image. So the motion of each view is compared with
+rivals: that the camera stands still, and that it goes on as before. Parts of the view that both
+explain say nothing. Elsewhere each cell yields a likelihood ratio: of depth, or of the pattern of
+the albedo on surfaces that both motions map onto themselves.
+
+The shares of the view that follow either motion are those of the mixture of both with the largest
+likelihood, over a window of frames. They are counted by solid angle and by area of surface: what is
+near must not win by its size in the image.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
+from tofuse.engine.geometry import se3
+from tofuse.engine.search import pair_agreement
+from tofuse.engine.tracking import moving_object_kernels as kernels
+from tofuse.engine.tracking.moving_objects import compared, stride_of
+from tofuse.engine.views import PreparedView
+
+# Every n-th frame is compared, and the last comparisons count together.
+_EVERY, _WINDOW = 2, 8
+# Motions are the same if they move the view by less than this, in cells.
+_MIN_SHIFT = 1.0
+# Largest log-likelihood ratio of a cell: that of an error of three sigmas.
+_MAX_LLR = 4.5
+_BINS = np.linspace(-_MAX_LLR, _MAX_LLR, 20)
+_CENTRES = 0.5 * (_BINS[1:] + _BINS[:-1])
+# Width of the squares, in cells, beyond which albedo may differ for other reasons than motion, such
+# as the light of the camera.
+_PATTERN = 9
+_LOWER_QUARTILE = 0.3186  # of the absolute values of a normal distribution
+_MIN_RESIDUALS = 50
+# Number of cells that share an error, and the log-likelihood ratio to one motion alone above which
+# the mixture counts.
+_CORRELATED_CELLS, _MIN_EVIDENCE = 100, 3.0
+_ITERATIONS = 100
+
+
+class RivalMotions:
+    """Compares the tracked motion with its rivals, from frame to frame."""
+
+    def __init__(self) -> None:
+        self._windows: dict[str, deque[Float64]] = {}
+
+    def reset(self) -> None:
+        """Forget the last frames."""
+        self._windows.clear()
+
+    def share(
+        self,
+        view: PreparedView,
+        reference: PreparedView,
+        T_reference_view: Float64,
+        rivals: Mapping[str, Float64],
+        scale: float,
+    ) -> float:
+        """Add a view, and return the largest share of the last ones that follows a rival.
+
+        Parameters
+        ----------
+        view, reference
+            The view, and the one it was aligned with.
+        T_reference_view
+            (4, 4) the tracked motion.
+        rivals
+            Other motions (4, 4), by name.
+        scale
+            Factor of the sigmas of depth.
+        """
+        if view.index % _EVERY == 0:
+            for name, T in rivals.items():
+                window = self._windows.setdefault(name, deque(maxlen=_WINDOW))
+                window.append(_histograms(view, reference, T_reference_view, T, scale))
+        return max((_share(np.sum(w, axis=0)) for w in self._windows.values() if w), default=0.0)
+
+
+def _histograms(
+    view: PreparedView, reference: PreparedView, T: Float64, T_rival: Float64, scale: float
+) -> Float64:
+    """Return histograms (2, B) of likelihood ratios: by number of cells, and by area."""
+    total = np.zeros((2, len(_CENTRES)))
+    if _shift(view, se3.inverse(T) @ T_rival) < _MIN_SHIFT:
+        return total
+    for a, b, T_b_a, T_rival_b_a in (
+        (view, reference, T, T_rival),
+        (reference, view, se3.inverse(T), se3.inverse(T_rival)),
+    ):
+        llr, area = _likelihood_ratios(a, b, T_b_a, T_rival_b_a, scale)
+        for row, weights in zip(total, (np.ones_like(area), area), strict=True):
+            row += np.histogram(llr, _BINS, weights=weights)[0]
+    total[1] *= total[0].sum() / max(total[1].sum(), 1e-9)
+    return total
+
+
+def _shift(view: PreparedView, T: Float64) -> float:
+    """Return by how many cells a motion (4, 4) moves the view."""
+    width = float(view.rays[0, -1, 0] - view.rays[0, 0, 0])
+    cell = abs(width) * stride_of(view) / view.z.shape[1]
+    return float((np.linalg.norm(T[:3, 3]) / view.depth + se3.angle(T)) / cell)
+
+
+def _likelihood_ratios(
+    view: PreparedView, other: PreparedView, T: Float64, T_rival: Float64, scale: float
+) -> tuple[Float64, Float64]:
+    """Return log-likelihood ratios (n,), positive for the rival; and areas of the cells (n,)."""
+    outcome, by_rival = (_outcome(view, other, motion, scale) for motion in (T, T_rival))
+    agrees, rival_agrees = outcome == kernels.AGREES, by_rival == kernels.AGREES
+    contradicts, rival_contradicts = _contradicts(outcome), _contradicts(by_rival)
+    llr = _MAX_LLR * (1.0 * (rival_agrees & contradicts) - (agrees & rival_contradicts))
+    if view.has_albedo and other.has_albedo:
+        both = agrees & rival_agrees
+        residuals = [_pattern_residual(view, other, motion, both) for motion in (T, T_rival)]
+        both &= np.isfinite(residuals[0]) & np.isfinite(residuals[1])
+        if np.count_nonzero(both) >= _MIN_RESIDUALS:
+            sigma = min(float(np.quantile(np.abs(r[both]), 0.25)) for r in residuals)
+            sigma = max(sigma / _LOWER_QUARTILE, 1e-6)
+            cost, rival_cost = (np.minimum(0.5 * (r / sigma) ** 2, _MAX_LLR) for r in residuals)
+            llr[both] = (cost - rival_cost)[both]
+    used = (agrees | contradicts) & (rival_agrees | rival_contradicts)
+    stride = stride_of(view)
+    return llr[used], view.z[::stride, ::stride][used].astype(np.float64) ** 2
+
+
+def _outcome(view: PreparedView, other: PreparedView, T: Float64, scale: float) -> UInt8:
+    stride = stride_of(other)
+    still = np.zeros(other.z[::stride, ::stride].shape, np.bool_)
+    return compared(view, other, still, np.ascontiguousarray(T), scale)[0]
+
+
+def _contradicts(outcome: UInt8) -> Bool:
+    return (outcome == kernels.IN_FRONT) | (outcome == kernels.BEHIND)
+
+
+def _pattern_residual(
+    view: PreparedView, other: PreparedView, T: Float64, cells: Bool
+) -> Float32:
+    """Return differences of log albedo of cells (rows, columns), less their local mean, else NaN.
+
+    The other view's albedo is extrapolated from the nearest pixel by its slopes.
+    """
+    stride = stride_of(view)
+    grid = np.s_[::stride, ::stride]
+    z, rays, albedo = view.z[grid][cells], view.rays[grid][cells], view.albedo[grid][cells]
+    points = se3.transform(T, np.column_stack([rays, np.ones(len(z))]) * z[:, None])
+    pixels = pair_agreement.landing_pixels(other, points)
+    inside = ((pixels >= 0) & (pixels < other.z.shape[::-1])).all(1)
+    u, v = np.where(inside[:, None], pixels, 0).T
+    seen = other.albedo[v, u]
+    offset = points[:, :2] / points[:, 2:] - other.rays[v, u]
+    difference = albedo[:, 0] - seen[:, 0] - (seen[:, 1:] * offset).sum(1)
+    residual = np.full(cells.shape, np.nan, np.float32)
+    residual[cells] = np.where(inside, difference, np.nan)
+    known = np.isfinite(residual)
+    sums, counts = (
+        cv2.boxFilter(image, -1, (_PATTERN, _PATTERN), normalize=False,
+                      borderType=cv2.BORDER_CONSTANT)
+        for image in (np.where(known, residual, np.float32(0)), known.astype(np.float32))
+    )  # fmt: skip
+    return np.asarray(residual - sums / np.maximum(counts, 1), np.float32)
+
+
+def _share(histograms: Float64) -> float:
+    """Return the larger share of the rival, by histograms (2, B); 0 without enough evidence."""
+    found = 0.0
+    ratios = np.exp(_CENTRES)
+    for weights in histograms:
+        total = weights.sum()
+        if not total:
+            continue
+        share = 0.5
+        for _ in range(_ITERATIONS):
+            share = float(weights @ (share * ratios / (share * ratios + 1 - share))) / total
+        evidence = weights @ np.log(share * ratios + 1 - share)
+        if evidence / _CORRELATED_CELLS > _MIN_EVIDENCE:
+            found = max(found, share)
+    return found
