@@ -37,6 +37,9 @@ _CENTRES = 0.5 * (_BINS[1:] + _BINS[:-1])
 # Width of the squares, in cells, beyond which albedo may differ for other reasons than motion, such
 # as the light of the camera.
 _PATTERN = 9
+# Width of the squares whose mean likelihood ratio counts: parts of a view are larger than that, and
+# errors of single cells average out.
+_REGION = 5
 _LOWER_QUARTILE = 0.3186  # of the absolute values of a normal distribution
 _MIN_RESIDUALS = 50
 # Number of cells that share an error, and the log-likelihood ratio to one motion alone above which
@@ -126,6 +129,7 @@ def _likelihood_ratios(
             cost, rival_cost = (np.minimum(0.5 * (r / sigma) ** 2, _MAX_LLR) for r in residuals)
             llr[both] = (cost - rival_cost)[both]
     used = (agrees | contradicts) & (rival_agrees | rival_contradicts)
+    llr = _local_mean(np.where(used, llr, np.nan), _REGION)
     stride = stride_of(view)
     return llr[used], view.z[::stride, ::stride][used].astype(np.float64) ** 2
 
@@ -159,13 +163,20 @@ def _pattern_residual(
     difference = albedo[:, 0] - seen[:, 0] - (seen[:, 1:] * offset).sum(1)
     residual = np.full(cells.shape, np.nan, np.float32)
     residual[cells] = np.where(inside, difference, np.nan)
-    known = np.isfinite(residual)
+    return residual - _local_mean(residual, _PATTERN)
+
+
+def _local_mean(image: Float32, width: int) -> Float32:
+    """Return the mean of the known values, not NaN, in a square of some width in cells."""
+    known = np.isfinite(image)
     sums, counts = (
-        cv2.boxFilter(image, -1, (_PATTERN, _PATTERN), normalize=False,
-                      borderType=cv2.BORDER_CONSTANT)
-        for image in (np.where(known, residual, np.float32(0)), known.astype(np.float32))
+        cv2.boxFilter(
+            values.astype(np.float32), -1, (width, width), normalize=False,
+            borderType=cv2.BORDER_CONSTANT,
+        )
+        for values in (np.where(known, image, 0), known)
     )  # fmt: skip
-    return np.asarray(residual - sums / np.maximum(counts, 1), np.float32)
+    return np.asarray(sums / np.maximum(counts, 1), np.float32)
 
 
 def _share(histograms: Float64) -> float:
