@@ -32,6 +32,7 @@ _MIN_ROTATED_SCORE_RATIO = 1.03
 _CONVERGENCE_LEVELS = (projective.Level(4, 8, 0.005, 0.02), projective.Level(2, 8, 0.0, 0.0))
 # Every n-th frame is segmented, and any with an indication of moving objects: an unusual fit, more
 # than this fraction of points in free space, or objects in the frame before.
+_BACKGROUND = 0.9  # quantile of the depths that the farther surfaces of a view have
 _SEGMENT_EVERY, _MAX_IN_FRONT = 4, 0.005
 
 
@@ -285,7 +286,7 @@ class Hypotheses:
             keyframes.append(last)
         references = []
         for keyframe in keyframes:
-            if not verification.comparable(self.view.depth, keyframe.depth):
+            if not _comparable(self.view, keyframe.view):
                 continue
             target, mask = keyframe.target, self.state.objects.reference_mask(keyframe.view)
             if mask.any():
@@ -388,6 +389,18 @@ class Hypotheses:
         return projective.align(
             view, [reference.target], T, options, start=start, usual_scale=scale
         )
+
+
+def _comparable(view: PreparedView, other: PreparedView) -> bool:
+    """Whether views can show the same scene, be it behind something near that fills one of them."""
+    return verification.comparable(view.depth, other.depth) or verification.comparable(
+        _background_depth(view), _background_depth(other)
+    )
+
+
+def _background_depth(view: PreparedView) -> float:
+    valid = view.z[view.z > 0]
+    return float(np.quantile(valid, _BACKGROUND)) if len(valid) else 1.0
 
 
 def _rotation_candidates(view: PreparedView) -> list[Float64]:

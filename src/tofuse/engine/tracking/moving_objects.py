@@ -305,11 +305,13 @@ class MovingObjects:
             reference, view, cells.moving, T_view_reference, clipped_scale
         )
 
-        counts_before = _counts(outcome, cells.moving) + _counts(
-            reference_outcome, reference_cells.moving
-        )
-        reliable = bool(
-            counts_before[0] >= _MIN_AGREEMENT * counts_before.sum() and counts_before[0] > 0
+        pair = ((outcome, cells), (reference_outcome, reference_cells))
+        # What is near fills many cells: its surface is small.
+        counts_before = sum(_counts(seen, c.moving) for seen, c in pair)
+        area_before = sum(_counts(seen, c.moving, c.depth) for seen, c in pair)
+        reliable = any(
+            bool(total[0] >= _MIN_AGREEMENT * total.sum() and total[0] > 0)
+            for total in (counts_before, area_before)
         )
         tracked = cells.tracked
         if reliable:
@@ -545,10 +547,14 @@ def _robust_scale(ratios: Float32) -> float:
     return scale
 
 
-def _counts(outcome: UInt8, mask: Bool) -> Int64:
-    """Return the numbers of comparisons that agree, and of free-space violations, not masked."""
+def _counts(outcome: UInt8, mask: Bool, depth: Float32 | None = None) -> Float64:
+    """Return the numbers of comparisons that agree, and of free-space violations, not masked.
+
+    Given the depth of the cells, they are counted by their area, which grows with its square.
+    """
+    weight = np.ones(mask.shape) if depth is None else depth.astype(np.float64) ** 2
     outcomes = (outcome == kernels.AGREES, outcome == kernels.IN_FRONT)
-    return np.array([np.count_nonzero(selected & ~mask) for selected in outcomes])
+    return np.array([weight[selected & ~mask].sum() for selected in outcomes])
 
 
 def _fraction(mask: Bool, valid: Bool) -> float:
