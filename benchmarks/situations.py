@@ -251,7 +251,7 @@ def _platform(assembly: Assembly, _rng: np.random.Generator, *, pillar: bool) ->
     assembly.add(WALL, meshes.quad((-8, 3.5, -1), (16, 0, 0), (0, 0, 5)))
     assembly.add(GROUND, meshes.quad((-8, -2, 0), (16, 0, 0), (0, 3.2, 0)))
     if pillar:
-        assembly.add(THINGS[1], meshes.box((0.2, 0.2, 3), (0.45, 1.1, 1.5)))
+        assembly.add(THINGS[1], meshes.box((0.35, 0.2, 3), (0.35, 1.1, 1.5)))
 
 
 def _along(x: float, y: float, z: float, speed: float) -> paths.Path:

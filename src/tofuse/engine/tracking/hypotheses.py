@@ -262,19 +262,38 @@ class Hypotheses:
         objects.update(moving)
         return hypothesis, moving
 
-    def rival_share(self, accepted: Hypothesis) -> float:
-        """Return the share of the last views that follows a rival of the tracked motion."""
-        rivals = {"stands": np.eye(4)}
-        keyframe = accepted.keyframe
+    def with_rival(
+        self, accepted: Hypothesis, moving: Moving | None
+    ) -> tuple[Hypothesis, Moving | None, float]:
+        """Compare the accepted motion with its rivals, and adopt the one that most surface follows.
+
+        Returns
+        -------
+        The hypothesis and its segmentation, and the share of the view that follows a rival.
+        """
+        keyframe, state = accepted.keyframe, self.state
+        T_rivals = {"stands": keyframe.T_component_camera}
         if self.T_predicted is not None:
-            rivals["goes on"] = se3.inverse(keyframe.T_component_camera) @ self.T_predicted
-        return self.state.rivals.share(
+            T_rivals["goes on"] = self.T_predicted
+        to_keyframe = se3.inverse(keyframe.T_component_camera)
+        share, winner = state.rivals.compare(
             self.view,
             keyframe.view,
             accepted.T_keyframe_camera,
-            rivals,
-            self.state.objects.typical_scale,
+            {name: to_keyframe @ T for name, T in T_rivals.items()},
+            state.objects.typical_scale,
         )
+        if not winner:
+            return accepted, moving, share
+        T = T_rivals[winner]
+        with_objects = self._moving(T, keyframe, suspected=True)
+        static = self._without_moving(with_objects, T, accepted)
+        if not with_objects.reliable or not static.fit.is_usual:
+            return accepted, moving, share
+        state.objects.update(with_objects)
+        state.rivals.reset()
+        state.motion.rest_at(static.T_component_camera, self.now)
+        return static, with_objects, share
 
     def _make_references(self) -> list[Reference]:
         """Return the newest keyframe and the last frame, without moved objects."""

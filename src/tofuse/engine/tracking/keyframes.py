@@ -176,8 +176,8 @@ class KeyframeTracker(Tracker):
         """Refine the selected hypothesis without moving objects, and take its pose."""
         view = hypotheses.view
         accepted, moving = hypotheses.segment(hypotheses.converged(selected))
+        accepted, moving, rival = hypotheses.with_rival(accepted, moving)
         self._state.fit_statistics.learn(accepted.aligned, view.depth)
-        rival = hypotheses.rival_share(accepted)
         links = self._insert_keyframe(view, accepted)
         status, reason = _status_of(accepted, frame)
         mask = None

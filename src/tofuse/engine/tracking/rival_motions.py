@@ -58,15 +58,18 @@ class RivalMotions:
         """Forget the last frames."""
         self._windows.clear()
 
-    def share(
+    def compare(
         self,
         view: PreparedView,
         reference: PreparedView,
         T_reference_view: Float64,
         rivals: Mapping[str, Float64],
         scale: float,
-    ) -> float:
-        """Add a view, and return the largest share of the last ones that follows a rival.
+    ) -> tuple[float, str]:
+        """Add a view, and judge the last ones.
+
+        Returns the largest share that follows a rival, and the name of the rival that most of the
+        surface follows, or "".
 
         Parameters
         ----------
@@ -83,7 +86,13 @@ class RivalMotions:
             for name, T in rivals.items():
                 window = self._windows.setdefault(name, deque(maxlen=_WINDOW))
                 window.append(_histograms(view, reference, T_reference_view, T, scale))
-        return max((_share(np.sum(w, axis=0)) for w in self._windows.values() if w), default=0.0)
+        largest, winner = 0.0, ""
+        for name, window in self._windows.items():
+            of_cells, of_area = (_share(weights) for weights in np.sum(window, axis=0))
+            largest = max(largest, of_cells, of_area)
+            if of_area > 0.5 and window[-1].any():
+                winner = winner or name
+        return largest, winner
 
 
 def _histograms(
@@ -179,18 +188,12 @@ def _local_mean(image: Float32, width: int) -> Float32:
     return np.asarray(sums / np.maximum(counts, 1), np.float32)
 
 
-def _share(histograms: Float64) -> float:
-    """Return the larger share of the rival, by histograms (2, B); 0 without enough evidence."""
-    found = 0.0
-    ratios = np.exp(_CENTRES)
-    for weights in histograms:
-        total = weights.sum()
-        if not total:
-            continue
-        share = 0.5
-        for _ in range(_ITERATIONS):
-            share = float(weights @ (share * ratios / (share * ratios + 1 - share))) / total
-        evidence = weights @ np.log(share * ratios + 1 - share)
-        if evidence / _CORRELATED_CELLS > _MIN_EVIDENCE:
-            found = max(found, share)
-    return found
+def _share(weights: Float64) -> float:
+    """Return the share of the rival by a histogram (B,); 0 without enough evidence."""
+    total, ratios, share = weights.sum(), np.exp(_CENTRES), 0.5
+    if not total:
+        return 0.0
+    for _ in range(_ITERATIONS):
+        share = float(weights @ (share * ratios / (share * ratios + 1 - share))) / total
+    evidence = weights @ np.log(share * ratios + 1 - share)
+    return share if evidence / _CORRELATED_CELLS > _MIN_EVIDENCE else 0.0
