@@ -225,7 +225,9 @@ def _moving() -> Iterator[tuple[str, Callable[[int], Take]]]:
         yield f"a train passes behind a pillar, {speed:g} m/s", partial(_still, moving=moving)
     yield "a train passes, half of the image", partial(_still, moving=_train(0.3, 1.3))
     for people in (15, 40):
-        yield f"a crowd of {people} walks past", partial(_still, moving=_crowd(people))
+        moving = _crowd(people)
+        yield f"a crowd of {people} walks past", partial(_still, moving=moving)
+        yield f"a crowd of {people}, bare wall", partial(_still, moving=moving, pillar=False)
     yield "a conveyor with boxes", partial(_still, moving=_conveyor(0.2))
 
 

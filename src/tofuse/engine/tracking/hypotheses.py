@@ -23,7 +23,7 @@ from tofuse.engine.tracking.moving_objects import (
     MovingObjects,
     without_pixels,
 )
-from tofuse.engine.tracking.rival_motions import RivalMotions
+from tofuse.engine.tracking.rival_motions import RivalMotions, likelihood_ratios
 from tofuse.engine.views import PreparedView
 
 # Minimum score of a rotated start relative to the unrotated one: a flat wall fits under any.
@@ -286,7 +286,15 @@ class Hypotheses:
         if not winner:
             return accepted, moving, share
         T = T_rivals[winner]
+        ratios = likelihood_ratios(
+            self.view,
+            keyframe.view,
+            accepted.T_keyframe_camera,
+            to_keyframe @ T,
+            state.objects.typical_scale,
+        )
         with_objects = self._moving(T, keyframe, suspected=True)
+        with_objects = state.objects.with_cells(with_objects, ~(ratios >= 0))
         static = self._without_moving(with_objects, T, accepted)
         if not with_objects.reliable or not static.fit.is_usual:
             return accepted, moving, share

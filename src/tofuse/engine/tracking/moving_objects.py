@@ -52,6 +52,8 @@ _DECAY = 0.95
 # Log-odds beyond which a pixel is segmented, and beyond which it is if connected to such a pixel.
 # An isolated pixel needs two frames with full evidence to reach the first.
 _DETECT, _EXTEND = 1.5, -0.5
+# Log-odds of all pixels of a segment.
+_CORE = _DETECT + 0.5 * _MAX_EVIDENCE
 # Fraction of the pixels of a segment that must be beyond `_DETECT`, and the smallest segment, as a
 # fraction of the image.
 _MIN_CORE, _MIN_SIZE = 0.25, 0.004
@@ -350,6 +352,20 @@ class MovingObjects:
             ),
         )
 
+    def with_cells(self, moving: Moving, more: Bool) -> Moving:
+        """Return a segmentation in which more cells (rows, columns) of the view move."""
+        pair, stride = moving.pair_update, stride_of(moving.pair_update.last.view)
+        view, cells = pair.last.view, pair.last.cells
+        odds = np.where(more, np.maximum(cells.odds, np.float32(_CORE)), cells.odds)
+        cells = cells._replace(odds=odds, moving=cells.moving | more)
+        mask, valid = _pixels(cells.moving, view.z.shape, stride), view.z > 0
+        return replace(
+            moving,
+            view=mask,
+            fraction=_fraction(mask & valid, valid),
+            pair_update=replace(pair, last=replace(pair.last, cells=cells)),
+        )
+
     def update(self, moving: Moving) -> None:
         """Update the state with the result of `compare` for the accepted pose."""
         pair = moving.pair_update
@@ -447,8 +463,7 @@ class MovingObjects:
             return unsegmented, 0
         moving = self._completed(kept[labels], depth)
         # All of a segment moves as likely as its core, unless this frame shows that it is static.
-        core_odds = np.float32(_DETECT + 0.5 * _MAX_EVIDENCE)
-        odds = np.where(moving & (evidence >= 0), np.maximum(odds, core_odds), odds)
+        odds = np.where(moving & (evidence >= 0), np.maximum(odds, np.float32(_CORE)), odds)
         # Comparisons at the outline are inconclusive. One more cell mixes both surfaces; the next
         # is the object's if it is at the same depth.
         near_depth = cv2.dilate(np.where(moving, depth, np.float32(0)), _NEIGHBOURS, iterations=2)

@@ -106,7 +106,9 @@ def _histograms(
         (view, reference, T, T_rival),
         (reference, view, se3.inverse(T), se3.inverse(T_rival)),
     ):
-        llr, area = _likelihood_ratios(a, b, T_b_a, T_rival_b_a, scale)
+        ratios = likelihood_ratios(a, b, T_b_a, T_rival_b_a, scale)
+        used, stride = np.isfinite(ratios), stride_of(a)
+        llr, area = ratios[used], a.z[::stride, ::stride][used].astype(np.float64) ** 2
         for row, weights in zip(total, (np.ones_like(area), area), strict=True):
             row += np.histogram(llr, _BINS, weights=weights)[0]
     total[1] *= total[0].sum() / max(total[1].sum(), 1e-9)
@@ -120,10 +122,20 @@ def _shift(view: PreparedView, T: Float64) -> float:
     return float((np.linalg.norm(T[:3, 3]) / view.depth + se3.angle(T)) / cell)
 
 
-def _likelihood_ratios(
+def likelihood_ratios(
     view: PreparedView, other: PreparedView, T: Float64, T_rival: Float64, scale: float
-) -> tuple[Float64, Float64]:
-    """Return log-likelihood ratios (n,), positive for the rival; and areas of the cells (n,)."""
+) -> Float32:
+    """Return log-likelihood ratios of the cells of a view, positive for a rival, else NaN.
+
+    Parameters
+    ----------
+    view, other
+        The view, and the one it is compared with.
+    T, T_rival
+        (4, 4) T_other_view of both motions.
+    scale
+        Factor of the sigmas of depth.
+    """
     outcome, by_rival = (_outcome(view, other, motion, scale) for motion in (T, T_rival))
     agrees, rival_agrees = outcome == kernels.AGREES, by_rival == kernels.AGREES
     contradicts, rival_contradicts = _contradicts(outcome), _contradicts(by_rival)
@@ -138,9 +150,8 @@ def _likelihood_ratios(
             cost, rival_cost = (np.minimum(0.5 * (r / sigma) ** 2, _MAX_LLR) for r in residuals)
             llr[both] = (cost - rival_cost)[both]
     used = (agrees | contradicts) & (rival_agrees | rival_contradicts)
-    llr = _local_mean(np.where(used, llr, np.nan), _REGION)
-    stride = stride_of(view)
-    return llr[used], view.z[::stride, ::stride][used].astype(np.float64) ** 2
+    mean = _local_mean(np.where(used, llr, np.nan), _REGION)
+    return np.where(used, mean, np.float32(np.nan))
 
 
 def _outcome(view: PreparedView, other: PreparedView, T: Float64, scale: float) -> UInt8:
