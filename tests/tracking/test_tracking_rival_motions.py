@@ -23,7 +23,9 @@ def relief(metres: float, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[:HEIGHT, : 2 * WIDTH]
     waves = [
-        np.sin(2 * np.pi * (u * np.cos(a) + v * np.sin(a)) / rng.uniform(35, 60) + rng.uniform(0, 6))
+        np.sin(
+            2 * np.pi * (u * np.cos(a) + v * np.sin(a)) / rng.uniform(35, 60) + rng.uniform(0, 6)
+        )
         for a in rng.uniform(0, np.pi, 4)
     ]
     return metres * (1 + 0.03 * np.sum(waves, axis=0))

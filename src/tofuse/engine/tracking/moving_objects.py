@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from tofuse.engine.arrays import Bool, Float32, Float64, Int64, UInt8
+from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.compute import median, run_chunks
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3

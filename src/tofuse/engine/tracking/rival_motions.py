@@ -164,9 +164,7 @@ def _contradicts(outcome: UInt8) -> Bool:
     return (outcome == kernels.IN_FRONT) | (outcome == kernels.BEHIND)
 
 
-def _pattern_residual(
-    view: PreparedView, other: PreparedView, T: Float64, cells: Bool
-) -> Float32:
+def _pattern_residual(view: PreparedView, other: PreparedView, T: Float64, cells: Bool) -> Float32:
     """Return differences of log albedo of cells (rows, columns), less their local mean, else NaN.
 
     The other view's albedo is extrapolated from the nearest pixel by its slopes.
@@ -205,6 +203,6 @@ def _share(weights: Float64) -> float:
     if not total:
         return 0.0
     for _ in range(_ITERATIONS):
-        share = float(weights @ (share * ratios / (share * ratios + 1 - share))) / total
+        share = float(weights @ (share * ratios / (share * ratios + 1 - share)) / total)
     evidence = weights @ np.log(share * ratios + 1 - share)
     return share if evidence / _CORRELATED_CELLS > _MIN_EVIDENCE else 0.0
