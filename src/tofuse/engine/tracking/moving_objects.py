@@ -309,8 +309,8 @@ class MovingObjects:
 
         pair = ((outcome, cells), (reference_outcome, reference_cells))
         # What is near fills many cells: its surface is small.
-        counts_before = sum(_counts(seen, c.moving) for seen, c in pair)
-        area_before = sum(_counts(seen, c.moving, c.depth) for seen, c in pair)
+        counts_before = np.sum([_counts(seen, c.moving) for seen, c in pair], axis=0)
+        area_before = np.sum([_counts(seen, c.moving, c.depth) for seen, c in pair], axis=0)
         reliable = any(
             bool(total[0] >= _MIN_AGREEMENT * total.sum() and total[0] > 0)
             for total in (counts_before, area_before)

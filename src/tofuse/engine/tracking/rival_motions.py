@@ -45,7 +45,7 @@ _MIN_RESIDUALS = 50
 # Number of cells that share an error, and the log-likelihood ratio to one motion alone above which
 # the mixture counts.
 _CORRELATED_CELLS, _MIN_EVIDENCE = 100, 3.0
-_ITERATIONS = 100
+_ITERATIONS = 50
 
 
 class RivalMotions:
@@ -53,10 +53,12 @@ class RivalMotions:
 
     def __init__(self) -> None:
         self._windows: dict[str, deque[Float64]] = {}
+        self._share, self._views = 0.0, 0
 
     def reset(self) -> None:
         """Forget the last frames."""
         self._windows.clear()
+        self._share = 0.0
 
     def compare(
         self,
@@ -66,10 +68,10 @@ class RivalMotions:
         rivals: Mapping[str, Float64],
         scale: float,
     ) -> tuple[float, str]:
-        """Add a view, and judge the last ones.
+        """Compare a view if it is one of every second, and judge the last ones.
 
         Returns the largest share that follows a rival, and the name of the rival that most of the
-        surface follows, or "".
+        surface follows, or "". A rival that is not given is not judged.
 
         Parameters
         ----------
@@ -82,17 +84,18 @@ class RivalMotions:
         scale
             Factor of the sigmas of depth.
         """
-        if view.index % _EVERY == 0:
-            for name, T in rivals.items():
-                window = self._windows.setdefault(name, deque(maxlen=_WINDOW))
-                window.append(_histograms(view, reference, T_reference_view, T, scale))
-        largest, winner = 0.0, ""
-        for name, window in self._windows.items():
+        self._views += 1
+        if self._views % _EVERY == 0:
+            return self._share, ""
+        self._share, winner = 0.0, ""
+        for name, T in rivals.items():
+            window = self._windows.setdefault(name, deque(maxlen=_WINDOW))
+            window.append(_histograms(view, reference, T_reference_view, T, scale))
             of_cells, of_area = (_share(weights) for weights in np.sum(window, axis=0))
-            largest = max(largest, of_cells, of_area)
+            self._share = max(self._share, of_cells, of_area)
             if of_area > 0.5 and window[-1].any():
                 winner = winner or name
-        return largest, winner
+        return self._share, winner
 
 
 def _histograms(
@@ -174,7 +177,8 @@ def _pattern_residual(view: PreparedView, other: PreparedView, T: Float64, cells
     z, rays, albedo = view.z[grid][cells], view.rays[grid][cells], view.albedo[grid][cells]
     points = se3.transform(T, np.column_stack([rays, np.ones(len(z))]) * z[:, None])
     pixels = pair_agreement.landing_pixels(other, points)
-    inside = ((pixels >= 0) & (pixels < other.z.shape[::-1])).all(1)
+    size = np.array(other.z.shape[::-1])
+    inside = np.all((pixels >= 0) & (pixels < size), axis=1)
     u, v = np.where(inside[:, None], pixels, 0).T
     seen = other.albedo[v, u]
     offset = points[:, :2] / points[:, 2:] - other.rays[v, u]
