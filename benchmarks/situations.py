@@ -29,9 +29,12 @@ FRAMES = 48
 CAMERA = unusual.pinhole("ifm-o3r", 80, 60, 60)
 
 # Mechanisms that would detect these are still missing.
-OPEN = frozenset({"range that changes", "part that moves with the camera", "majority that moves"})
-# Depth alone can't show these: the scene may as well be of another size, or the mirrored one.
-ASSUMED = frozenset({"constant scale", "mirrored"})
+OPEN = frozenset({"range that changes"})
+# Images alone can't show these: the scene may as well be of another size, or the mirrored one, or
+# what fills the view may as well stand still.
+ASSUMED = frozenset({"constant scale", "mirrored", "nothing else in view"})
+# Here a violated bound is as bad as a wrong result that is called good.
+BOUNDED = frozenset({"part that moves with the camera", "majority that moves", "somebody near"})
 
 
 @dataclass(frozen=True)
@@ -218,29 +221,39 @@ def _with_part(seed: int, fraction: float, side: str, *, smooth: bool = False) -
 
 def _moving() -> Iterator[tuple[str, Callable[[int], Take]]]:
     for speed in (0.15, 0.4):
-        yield f"a train passes, {speed:g} m/s", partial(_still, moving=_train(speed, 3.0))
+        moving = _train(speed, 3.0)
+        yield f"a train passes behind a pillar, {speed:g} m/s", partial(_still, moving=moving)
     yield "a train passes, half of the image", partial(_still, moving=_train(0.3, 1.3))
     for people in (15, 40):
-        yield f"a crowd of {people} walks past", partial(_still, moving=_crowd(people))
+        moving = _crowd(people)
+        yield f"a crowd of {people} walks past", partial(_still, moving=moving)
+        yield f"a crowd of {people}, bare wall", partial(_still, moving=moving, pillar=False)
     yield "a conveyor with boxes", partial(_still, moving=_conveyor(0.2))
+
+
+def _filled() -> Iterator[tuple[str, Callable[[int], Take]]]:
+    for speed in (0.15, 0.4):
+        moving = _train(speed, 3.0)
+        yield f"a train fills the view, {speed:g} m/s", partial(_still, moving=moving, pillar=False)
 
 
 Moving = tuple[tuple[unusual.Material, meshes.Mesh, paths.Path], ...]
 
 
-def _still(seed: int, moving: Moving) -> Take:
+def _still(seed: int, moving: Moving, *, pillar: bool = True) -> Take:
     """A still camera before a wall and a pillar, with something that moves along the wall."""
     eye = paths.look_at((0, 0, 1.5), (0, 1, 1.4))
-    scene = unusual.built("platform", _platform)
+    scene = unusual.built("platform", partial(_platform, pillar=pillar))
     return _simulated(
         Unusual(scene, lambda _: paths.still(eye), CAMERA, FRAMES, moving=moving), seed
     )
 
 
-def _platform(assembly: Assembly, _rng: np.random.Generator) -> None:
+def _platform(assembly: Assembly, _rng: np.random.Generator, *, pillar: bool) -> None:
     assembly.add(WALL, meshes.quad((-8, 3.5, -1), (16, 0, 0), (0, 0, 5)))
     assembly.add(GROUND, meshes.quad((-8, -2, 0), (16, 0, 0), (0, 3.2, 0)))
-    assembly.add(THINGS[1], meshes.box((0.2, 0.2, 3), (1.1, 1.1, 1.5)))
+    if pillar:
+        assembly.add(THINGS[1], meshes.box((0.35, 0.2, 3), (0.35, 1.1, 1.5)))
 
 
 def _along(x: float, y: float, z: float, speed: float) -> paths.Path:
@@ -281,6 +294,69 @@ def _conveyor(speed: float) -> Moving:
         boxes.append(meshes.box(size, (x, rng.uniform(-0.3, 0.3), 0.75 + size[2] / 2)))
     path = _along(0.0, 1.7, 0.0, speed)
     return tuple((THINGS[k % 5], box, path) for k, box in enumerate(boxes))
+
+
+# ---- Somebody near -------------------------------------------------------------------------------
+
+_ENTERS_S, _LEAVES_S, _STEP_S = 1.1, 2.4, 0.4
+
+
+def _near() -> Iterator[tuple[str, Callable[[int], Take]]]:
+    for furnished in (False, True):
+        for moves in (False, True):
+            for metres in (0.4, 0.6, 0.9, 1.3):
+                yield (
+                    f"at {metres:g} m before a {'room' if furnished else 'bare wall'}, camera "
+                    f"{'moves' if moves else 'stands'}",
+                    partial(_somebody, metres=metres, furnished=furnished, moves=moves),
+                )
+
+
+def _somebody(seed: int, metres: float, furnished: bool, moves: bool) -> Take:
+    """Somebody enters the view, sways and turns there, and leaves."""
+    one = replace(UNUSUAL["80 x 60 pixels"], camera=CAMERA, frames=FRAMES)
+    path = one.path(seed)
+    if not furnished:
+        scene = unusual.built("corner", _corner)
+        eye = paths.look_at((0, 0, 1.4), (0.4, 2, 1.2))
+        one = replace(one, scene=scene)
+        path = unusual.straight(eye, (0.12, 0.05, 0.02))
+    start = path(0.0)
+    camera = path if moves else paths.still(start)
+    rng = np.random.default_rng([seed, 12])
+    side, phase = rng.choice((-1, 1)), rng.uniform(0, 6)
+
+    def body(t: float, lag: float = 0.0) -> np.ndarray:
+        T = camera(t)
+        shown = paths.smooth_step((t - _ENTERS_S) / _STEP_S) - paths.smooth_step(
+            (t - _LEAVES_S) / _STEP_S
+        )
+        heading = np.arctan2(T[1, 2], T[0, 2]) + 1.2 * side * (1 - shown)
+        ahead = metres * (1 + 0.1 * np.sin(2.5 * t + phase)) * np.array(
+            [np.cos(heading), np.sin(heading), 0]
+        )  # fmt: skip
+        out = paths.rotation([0, 0, heading + 0.5 * np.sin(1.5 * t + phase + lag)])
+        out[:3, 3] = T[:3, 3] + ahead - (0, 0, 1.25)
+        if shown <= 0:
+            out[2, 3] = -100
+        return out
+
+    trunk = meshes.superellipsoid((0.25, 0.42, 0.62), (0.6, 0.8)).translated(0, 0, 1.2)
+    head = meshes.superellipsoid((0.2, 0.17, 0.25)).translated(0, 0, 1.64)
+    arm = meshes.rod((0.05, 0.26, 1.43), (0.3, 0.2, 1.15), 0.05)
+    moving = (
+        (THINGS[1], meshes.joined([trunk, head]), body),
+        (THINGS[3], arm, partial(body, lag=0.8)),
+    )
+    return _simulated(replace(one, path=lambda _: camera, moving=moving), seed)
+
+
+def _corner(assembly: Assembly, _rng: np.random.Generator) -> None:
+    """A bare wall that ends at a doorway."""
+    assembly.add(WALL, meshes.quad((-5, 2.2, 0), (6.2, 0, 0), (0, 0, 3)))
+    assembly.add(WALL, meshes.quad((1.2, 2.2, 0), (0, 3, 0), (0, 0, 3)))
+    assembly.add(WALL, meshes.quad((-5, 5.2, 0), (12, 0, 0), (0, 0, 3)))
+    assembly.add(GROUND, meshes.quad((-5, -2, 0), (12, 0, 0), (0, 8, 0)))
 
 
 # ---- Scenes that look alike after one step -------------------------------------------------------
@@ -492,6 +568,8 @@ _FAMILIES = {
     "range that changes": _changing,
     "part that moves with the camera": _carried,
     "majority that moves": _moving,
+    "nothing else in view": _filled,
+    "somebody near": _near,
     "aliasing": _aliasing,
     "amplitude": _amplitude,
     "rolling shutter": _shutter,

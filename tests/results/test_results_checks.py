@@ -242,6 +242,14 @@ def test_each_reason_comes_from_its_own_evidence(code) -> None:
     assert {r.code for r in reasons} - {code} <= follows.get(code, set())
 
 
+def test_rival_motion_leaves_the_choice_open() -> None:
+    (reason,) = judge(replace(evidence(), rivals=((3, 0.1), (5, 0.4))))[1]
+    assert (reason.code, reason.frames) == ("open_motion", (5, 5))
+    assert "either may be the room" in reason.text
+    assert "40 %" in reason.text
+    assert not judge(replace(evidence(), rivals=((3, 0.2),)))[1]
+
+
 def test_frozen_images_are_told_from_single_repetitions() -> None:
     assert checks.frozen(((3, 3), (6, 8)))
     assert not checks.frozen(((3, 3), (5, 5)))

@@ -32,7 +32,7 @@ _MIN_TRACKING_S = 10.0
 # Attributes of steps that are stored, and those of registrations that are arrays.
 _STORED = (
     *("status", "reason", "T_component_camera", "registration", "links", "reference"),
-    *("component", "doubtful", "inflation"),
+    *("component", "doubtful", "inflation", "rival"),
 )
 _ARRAYS = ("T_target_source", "information", "unobservable", "runner_up")
 _MOVING = "moving-"  # prefix of the masks, by frame index

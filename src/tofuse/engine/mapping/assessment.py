@@ -102,10 +102,15 @@ class Assessment:
         moving = tuple(
             (e.record.index, e.moving_fraction) for e in self.tracked.posed if e.moving_fraction > 0
         )
+        rivals = tuple(
+            (e.record.index, e.step.rival)
+            for e in self.tracked.posed
+            if e.step is not None and e.step.rival > 0
+        )
         ambiguous = self._ambiguous(graph)
         indices = [e.record.index for e in self.log.entries]
         repeated = frame_ranges.runs_of(indices, self.log.repeated)
-        if ambiguous or checks.open_motion(moving) or checks.frozen(repeated):
+        if ambiguous or checks.open_motion([*moving, *rivals]) or checks.frozen(repeated):
             accuracy = accuracy.without_bound()
         if observations.has_covariances:
             model = self._with_pose_errors(model, graph, covariances)
@@ -136,6 +141,7 @@ class Assessment:
             priors=closed.sensors.records,
             components=components,
             moving=moving,
+            rivals=rivals,
             doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
             single_link_frames=single_link_frames(self.tracked, loops),
             ambiguous=ambiguous,

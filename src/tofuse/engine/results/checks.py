@@ -96,6 +96,8 @@ class Evidence:
         As in `Reconstruction`; empty if all frames are in one.
     moving
         (frame index, fraction of the image) of frames with moving objects.
+    rivals
+        (frame index, share of the view) of frames of which a share follows a rival motion.
     doubtful
         Indices of the frames that fit worse than usual for this camera.
     single_link_frames
@@ -124,6 +126,7 @@ class Evidence:
     priors: tuple[external_sensors.SensorRecord, ...] = ()
     components: tuple[Component, ...] = ()
     moving: tuple[tuple[int, float], ...] = ()
+    rivals: tuple[tuple[int, float], ...] = ()
     doubtful: tuple[int, ...] = ()
     single_link_frames: tuple[int, ...] = ()
     ambiguous: tuple[int, ...] = ()
@@ -404,12 +407,13 @@ def _scene(e: Evidence) -> Iterator[Reason]:
             f"{frame_ranges.in_words(where)}; they are excluded from tracking and from the model."
         )
         yield Reason("moving_objects", where, text)
-    if open_frames := open_motion(e.moving):
-        where = e.runs_of(open_frames)
+    parts = [*e.moving, *e.rivals]
+    if where := e.runs_of(open_motion(parts)):
         text = (
-            f"Moving objects cover more than {_percent(MAX_MOVING)} of the image in "
-            f"{frame_ranges.in_words(where)}: the camera may have moved with them instead, so no "
-            "bound on the pose errors is stated."
+            f"Two parts of the view move differently in {frame_ranges.in_words(where)}, and either "
+            f"may be the room: the one that the camera was not tracked by has up to "
+            f"{_percent(max(share for _, share in parts))}. So no bound on the pose errors is "
+            "stated."
         )
         yield Reason("open_motion", where, text)
     doubtful = e.runs_of(e.doubtful)
@@ -424,7 +428,7 @@ def _scene(e: Evidence) -> Iterator[Reason]:
 
 
 def open_motion(moving: Sequence[tuple[int, float]]) -> set[int]:
-    """Return the frames in which what moves, (frame index, fraction of the image), is too much."""
+    """Return the frames in which what moves, (frame index, share of the view), is too much."""
     return {frame for frame, fraction in moving if fraction > MAX_MOVING}
 
 

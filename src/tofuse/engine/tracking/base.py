@@ -48,6 +48,8 @@ class Step:
         Factor by which the standard deviations of the registration were enlarged for that reason.
     moving
         (H, W) mask of the frame's pixels on moving objects; None without any.
+    rival
+        Share of the last views that follows a rival of the tracked motion, see `RivalMotions`.
     """
 
     status: Status
@@ -61,6 +63,7 @@ class Step:
     doubtful: bool = False
     inflation: float = 1.0
     moving: Bool | None = None
+    rival: float = 0.0
 
 
 class Tracker(Protocol):

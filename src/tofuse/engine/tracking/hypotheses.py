@@ -23,6 +23,7 @@ from tofuse.engine.tracking.moving_objects import (
     MovingObjects,
     without_pixels,
 )
+from tofuse.engine.tracking.rival_motions import RivalMotions, likelihood_ratios
 from tofuse.engine.views import PreparedView
 
 # Minimum score of a rotated start relative to the unrotated one: a flat wall fits under any.
@@ -31,6 +32,7 @@ _MIN_ROTATED_SCORE_RATIO = 1.03
 _CONVERGENCE_LEVELS = (projective.Level(4, 8, 0.005, 0.02), projective.Level(2, 8, 0.0, 0.0))
 # Every n-th frame is segmented, and any with an indication of moving objects: an unusual fit, more
 # than this fraction of points in free space, or objects in the frame before.
+_BACKGROUND = 0.9  # quantile of the depths that the farther surfaces of a view have
 _SEGMENT_EVERY, _MAX_IN_FRONT = 4, 0.005
 
 
@@ -52,6 +54,8 @@ class TrackerState:
         Velocity of the camera.
     objects
         Moving objects in the last view and in the keyframes.
+    rivals
+        Motions that would explain the last views as well.
     last
         The last frame of the component; None after an interruption.
     in_sequence
@@ -69,6 +73,7 @@ class TrackerState:
     fit_statistics: verification.FitStatistics
     motion: MotionModel = field(default_factory=MotionModel)
     objects: MovingObjects = field(default_factory=MovingObjects)
+    rivals: RivalMotions = field(default_factory=RivalMotions)
     last: Keyframe | None = None
     in_sequence: bool = False
     component: int = -1
@@ -257,6 +262,47 @@ class Hypotheses:
         objects.update(moving)
         return hypothesis, moving
 
+    def with_rival(
+        self, accepted: Hypothesis, moving: Moving | None
+    ) -> tuple[Hypothesis, Moving | None, float]:
+        """Compare the accepted motion with its rivals, and adopt the one that most surface follows.
+
+        Returns
+        -------
+        The hypothesis and its segmentation, and the share of the view that follows a rival.
+        """
+        keyframe, state = accepted.keyframe, self.state
+        T_rivals = {"stands": keyframe.T_component_camera}
+        if self.T_predicted is not None:
+            T_rivals["goes on"] = self.T_predicted
+        to_keyframe = se3.inverse(keyframe.T_component_camera)
+        share, winner = state.rivals.compare(
+            self.view,
+            keyframe.view,
+            accepted.T_keyframe_camera,
+            {name: to_keyframe @ T for name, T in T_rivals.items()},
+            state.objects.typical_scale,
+        )
+        if not winner:
+            return accepted, moving, share
+        T = T_rivals[winner]
+        ratios = likelihood_ratios(
+            self.view,
+            keyframe.view,
+            accepted.T_keyframe_camera,
+            to_keyframe @ T,
+            state.objects.typical_scale,
+        )
+        with_objects = self._moving(T, keyframe, suspected=True)
+        with_objects = state.objects.with_cells(with_objects, ~(ratios >= 0))
+        static = self._without_moving(with_objects, T, accepted)
+        if not with_objects.reliable or not static.fit.is_usual:
+            return accepted, moving, share
+        state.objects.update(with_objects)
+        state.rivals.reset()
+        state.motion.rest_at(static.T_component_camera, self.now)
+        return static, with_objects, share
+
     def _make_references(self) -> list[Reference]:
         """Return the newest keyframe and the last frame, without moved objects."""
         last = self.state.last
@@ -267,7 +313,7 @@ class Hypotheses:
             keyframes.append(last)
         references = []
         for keyframe in keyframes:
-            if not verification.comparable(self.view.depth, keyframe.depth):
+            if not _comparable(self.view, keyframe.view):
                 continue
             target, mask = keyframe.target, self.state.objects.reference_mask(keyframe.view)
             if mask.any():
@@ -370,6 +416,18 @@ class Hypotheses:
         return projective.align(
             view, [reference.target], T, options, start=start, usual_scale=scale
         )
+
+
+def _comparable(view: PreparedView, other: PreparedView) -> bool:
+    """Whether views can show the same scene, be it behind something near that fills one of them."""
+    return verification.comparable(view.depth, other.depth) or verification.comparable(
+        _background_depth(view), _background_depth(other)
+    )
+
+
+def _background_depth(view: PreparedView) -> float:
+    valid = view.z[view.z > 0]
+    return float(np.quantile(valid, _BACKGROUND)) if len(valid) else 1.0
 
 
 def _rotation_candidates(view: PreparedView) -> list[Float64]:

@@ -159,6 +159,7 @@ class KeyframeTracker(Tracker):
         else:
             state.motion.interrupt()
         state.objects.reset()
+        state.rivals.reset()
         reason = ""
         if state.component:
             rejection = hypotheses.first_rejection or "nothing comparable was seen before"
@@ -175,6 +176,7 @@ class KeyframeTracker(Tracker):
         """Refine the selected hypothesis without moving objects, and take its pose."""
         view = hypotheses.view
         accepted, moving = hypotheses.segment(hypotheses.converged(selected))
+        accepted, moving, rival = hypotheses.with_rival(accepted, moving)
         self._state.fit_statistics.learn(accepted.aligned, view.depth)
         links = self._insert_keyframe(view, accepted)
         status, reason = _status_of(accepted, frame)
@@ -194,6 +196,7 @@ class KeyframeTracker(Tracker):
             doubtful=not accepted.fit.is_usual,
             inflation=_inflation(accepted),
             moving=mask,
+            rival=rival,
         )
 
     def _insert_keyframe(self, view: PreparedView, accepted: Hypothesis) -> tuple[Link, ...]:

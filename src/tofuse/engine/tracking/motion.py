@@ -236,6 +236,12 @@ class MotionModel:
         self._T_last, self._last_time = T, now
         self._T_odometry_before, self._T_odometry_now = self._T_odometry_now, None
 
+    def rest_at(self, T: Float64, now: FrameTime) -> None:
+        """Expect the next pose at T (4, 4): the motion before was that of something else."""
+        self.interrupt()
+        self._T_last, self._last_time = T, now
+        self._velocity = self._mean_velocity = np.zeros(6)
+
     def change_frame(self) -> None:
         """Expect the next pose in another frame of reference.
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from tofuse.engine.arrays import Bool, Float32, Float64, Int64, UInt8
+from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.compute import median, run_chunks
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
@@ -52,6 +52,8 @@ _DECAY = 0.95
 # Log-odds beyond which a pixel is segmented, and beyond which it is if connected to such a pixel.
 # An isolated pixel needs two frames with full evidence to reach the first.
 _DETECT, _EXTEND = 1.5, -0.5
+# Log-odds of all pixels of a segment.
+_CORE = _DETECT + 0.5 * _MAX_EVIDENCE
 # Fraction of the pixels of a segment that must be beyond `_DETECT`, and the smallest segment, as a
 # fraction of the image.
 _MIN_CORE, _MIN_SIZE = 0.25, 0.004
@@ -225,6 +227,11 @@ class MovingObjects:
         self._references: OrderedDict[int, kernels.Cells] = OrderedDict()
         self._scales: deque[float] = deque(maxlen=_SCALE_WINDOW)
 
+    @property
+    def typical_scale(self) -> float:
+        """Typical scale of the residuals of recent pairs, in sigmas; at least 1."""
+        return max(median(np.array(self._scales)), 1.0) if self._scales else 1.0
+
     def reset(self) -> None:
         """Forget the last view, as the camera was lost after it; references are kept."""
         self._last, self.in_last_view = None, False
@@ -246,7 +253,7 @@ class MovingObjects:
         shape = view.z.shape
         if last is None or not last.cells.moving.any():
             return np.zeros(shape, np.bool_)
-        stride = _stride(view)
+        stride = stride_of(view)
         moving = np.empty(_cell_shape(shape, stride), np.bool_)
         T = np.ascontiguousarray(se3.inverse(last.T_world_camera) @ T_world_camera_predicted)
         kernels.predict(
@@ -262,7 +269,7 @@ class MovingObjects:
 
     def reference_mask(self, reference: PreparedView) -> Bool:
         """Return the (H, W) pixels of a keyframe whose surface has moved."""
-        return _pixels(self._reference(reference).moving, reference.z.shape, _stride(reference))
+        return _pixels(self._reference(reference).moving, reference.z.shape, stride_of(reference))
 
     def compare(
         self,
@@ -292,19 +299,21 @@ class MovingObjects:
         typical_scale = median(np.array(self._scales)) if self._scales else scale
         # The noise may be underestimated, but not overestimated.
         clipped_scale = max(1.0, min(scale, _MAX_SCALE_RATIO * max(typical_scale, 1.0)))
-        outcome, evidence = self._compare(
+        outcome, evidence = compared(
             view, reference, reference_cells.moving, T_reference_view, clipped_scale
         )
         T_view_reference = np.ascontiguousarray(se3.inverse(T_reference_view))
-        reference_outcome, reference_evidence = self._compare(
+        reference_outcome, reference_evidence = compared(
             reference, view, cells.moving, T_view_reference, clipped_scale
         )
 
-        counts_before = _counts(outcome, cells.moving) + _counts(
-            reference_outcome, reference_cells.moving
-        )
-        reliable = bool(
-            counts_before[0] >= _MIN_AGREEMENT * counts_before.sum() and counts_before[0] > 0
+        pair = ((outcome, cells), (reference_outcome, reference_cells))
+        # What is near fills many cells: its surface is small.
+        counts_before = np.sum([_counts(seen, c.moving) for seen, c in pair], axis=0)
+        area_before = np.sum([_counts(seen, c.moving, c.depth) for seen, c in pair], axis=0)
+        reliable = any(
+            bool(total[0] >= _MIN_AGREEMENT * total.sum() and total[0] > 0)
+            for total in (counts_before, area_before)
         )
         tracked = cells.tracked
         if reliable:
@@ -324,11 +333,11 @@ class MovingObjects:
         cells, segments = self._segmented(cells._replace(tracked=tracked), evidence, detect)
         reference_cells, _ = self._segmented(reference_cells, reference_evidence, detect)
         counts = _counts(outcome, cells.moving) + _counts(reference_outcome, reference_cells.moving)
-        mask = _pixels(cells.moving, view.z.shape, _stride(view))
+        mask = _pixels(cells.moving, view.z.shape, stride_of(view))
         valid = view.z > 0
         return Moving(
             view=mask,
-            reference=_pixels(reference_cells.moving, reference.z.shape, _stride(reference)),
+            reference=_pixels(reference_cells.moving, reference.z.shape, stride_of(reference)),
             fraction=_fraction(mask & valid, valid),
             compared=int(counts.sum()),
             agreement=float(counts[0] / max(counts.sum(), 1)),
@@ -343,6 +352,20 @@ class MovingObjects:
             ),
         )
 
+    def with_cells(self, moving: Moving, more: Bool) -> Moving:
+        """Return a segmentation in which more cells (rows, columns) of the view move."""
+        pair, stride = moving.pair_update, stride_of(moving.pair_update.last.view)
+        view, cells = pair.last.view, pair.last.cells
+        odds = np.where(more, np.maximum(cells.odds, np.float32(_CORE)), cells.odds)
+        cells = cells._replace(odds=odds, moving=cells.moving | more)
+        mask, valid = _pixels(cells.moving, view.z.shape, stride), view.z > 0
+        return replace(
+            moving,
+            view=mask,
+            fraction=_fraction(mask & valid, valid),
+            pair_update=replace(pair, last=replace(pair.last, cells=cells)),
+        )
+
     def update(self, moving: Moving) -> None:
         """Update the state with the result of `compare` for the accepted pose."""
         pair = moving.pair_update
@@ -353,12 +376,12 @@ class MovingObjects:
 
     def _reference(self, reference: PreparedView) -> kernels.Cells:
         """Return the cells of a reference so far."""
-        shape = _cell_shape(reference.z.shape, _stride(reference))
+        shape = _cell_shape(reference.z.shape, stride_of(reference))
         cells = self._references.get(reference.index)
         if cells is None and self._last is not None and self._last.view.index == reference.index:
             cells = self._last.cells
         if cells is None or cells.odds.shape != shape:
-            stride = _stride(reference)
+            stride = stride_of(reference)
             depth = np.ascontiguousarray(reference.z[::stride, ::stride])
             odds = np.full(shape, _PRIOR_ODDS, np.float32)
             cells = kernels.Cells(depth, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8))
@@ -374,7 +397,7 @@ class MovingObjects:
         self, view: PreparedView, T_world_camera: Float64
     ) -> tuple[kernels.Cells, Bool]:
         """Propagate the cells of the last view to this one; and return which surfaces are new."""
-        last, stride = self._last, _stride(view)
+        last, stride = self._last, stride_of(view)
         shape = _cell_shape(view.z.shape, stride)
         depth, odds = np.empty(shape, np.float32), np.empty(shape, np.float32)
         tracked, arrived = np.empty(shape, np.uint8), np.empty(shape, np.bool_)
@@ -410,28 +433,6 @@ class MovingObjects:
         )
         return _robust_scale(ratios)
 
-    def _compare(
-        self,
-        view: PreparedView,
-        other: PreparedView,
-        other_moving: Bool,
-        T_other_view: Float64,
-        scale: float,
-    ) -> tuple[UInt8, Float32]:
-        """Return outcomes and log-likelihood ratios of the cells of a view, against another one."""
-        shape = _cell_shape(view.z.shape, _stride(view))
-        sampled, sampled_other = _sampled(view), _sampled(other)
-        outcome, llr = np.empty(shape, np.uint8), np.empty(shape, np.float32)
-
-        def work(a: int, b: int) -> None:
-            kernels.compare(
-                sampled, sampled_other, other_moving, T_other_view, scale, _LIMITS,
-                outcome, llr, a, b,
-            )  # fmt: skip
-
-        run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
-        return outcome, llr
-
     def _updated(self, cells: kernels.Cells, evidence: Float32) -> kernels.Cells:
         """Add the evidence of a pair of views."""
         prior = np.float32(_PRIOR_ODDS)
@@ -462,8 +463,7 @@ class MovingObjects:
             return unsegmented, 0
         moving = self._completed(kept[labels], depth)
         # All of a segment moves as likely as its core, unless this frame shows that it is static.
-        core_odds = np.float32(_DETECT + 0.5 * _MAX_EVIDENCE)
-        odds = np.where(moving & (evidence >= 0), np.maximum(odds, core_odds), odds)
+        odds = np.where(moving & (evidence >= 0), np.maximum(odds, np.float32(_CORE)), odds)
         # Comparisons at the outline are inconclusive. One more cell mixes both surfaces; the next
         # is the object's if it is at the same depth.
         near_depth = cv2.dilate(np.where(moving, depth, np.float32(0)), _NEIGHBOURS, iterations=2)
@@ -491,7 +491,42 @@ class MovingObjects:
         return np.asarray(moving | majority[labels], np.bool_)
 
 
-def _stride(view: PreparedView) -> int:
+def compared(
+    view: PreparedView,
+    other: PreparedView,
+    other_moving: Bool,
+    T_other_view: Float64,
+    scale: float,
+) -> tuple[UInt8, Float32]:
+    """Return outcomes and log-likelihood ratios of the cells of a view, against another one.
+
+    Parameters
+    ----------
+    view, other
+        The view, and the one it is compared with.
+    other_moving
+        Cells of the other view that are known to move.
+    T_other_view
+        (4, 4).
+    scale
+        Factor of the sigmas.
+    """
+    shape = _cell_shape(view.z.shape, stride_of(view))
+    sampled, sampled_other = _sampled(view), _sampled(other)
+    outcome, llr = np.empty(shape, np.uint8), np.empty(shape, np.float32)
+
+    def work(a: int, b: int) -> None:
+        kernels.compare(
+            sampled, sampled_other, other_moving, T_other_view, scale, _LIMITS,
+            outcome, llr, a, b,
+        )  # fmt: skip
+
+    run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
+    return outcome, llr
+
+
+def stride_of(view: PreparedView) -> int:
+    """Return the number of pixels from one cell to the next."""
     return -(-view.z.shape[1] // _COLUMNS)
 
 
@@ -499,7 +534,7 @@ def _sampled(view: PreparedView) -> kernels.View:
     grid = view.projection
     return kernels.View(
         view.rays, view.z, view.sigma, view.planes, view.plane_variance,
-        grid.lookup, grid.frame, _stride(view),
+        grid.lookup, grid.frame, stride_of(view),
     )  # fmt: skip
 
 
@@ -527,10 +562,14 @@ def _robust_scale(ratios: Float32) -> float:
     return scale
 
 
-def _counts(outcome: UInt8, mask: Bool) -> Int64:
-    """Return the numbers of comparisons that agree, and of free-space violations, not masked."""
+def _counts(outcome: UInt8, mask: Bool, depth: Float32 | None = None) -> Float64:
+    """Return the numbers of comparisons that agree, and of free-space violations, not masked.
+
+    Given the depth of the cells, they are counted by their area, which grows with its square.
+    """
+    weight = np.ones(mask.shape) if depth is None else depth.astype(np.float64) ** 2
     outcomes = (outcome == kernels.AGREES, outcome == kernels.IN_FRONT)
-    return np.array([np.count_nonzero(selected & ~mask) for selected in outcomes])
+    return np.array([weight[selected & ~mask].sum() for selected in outcomes])
 
 
 def _fraction(mask: Bool, valid: Bool) -> float:

@@ -1,0 +1,212 @@
+"""Rivals of the tracked motion: another one that a large part of the view follows.
+
+A crowd that walks past a camera at rest looks like a crowd at rest that a camera moves past, and a
+person near the camera may fill most of the image. So the motion of each view is compared with
+rivals: that the camera stands still, and that it goes on as before. Parts of the view that both
+explain say nothing. Elsewhere each cell yields a likelihood ratio: of depth, or of the pattern of
+the albedo on surfaces that both motions map onto themselves.
+
+The shares of the view that follow either motion are those of the mixture of both with the largest
+likelihood, over a window of frames. They are counted by solid angle and by area of surface: what is
+near must not win by its size in the image.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
+from tofuse.engine.geometry import se3
+from tofuse.engine.search import pair_agreement
+from tofuse.engine.tracking import moving_object_kernels as kernels
+from tofuse.engine.tracking.moving_objects import compared, stride_of
+from tofuse.engine.views import PreparedView
+
+# Every n-th frame is compared, and the last comparisons count together.
+_EVERY, _WINDOW = 2, 8
+# Motions are the same if they move the view by less than this, in cells.
+_MIN_SHIFT = 1.0
+# Largest log-likelihood ratio of a cell: that of an error of three sigmas.
+_MAX_LLR = 4.5
+_BINS = np.linspace(-_MAX_LLR, _MAX_LLR, 20)
+_CENTRES = 0.5 * (_BINS[1:] + _BINS[:-1])
+# Width of the squares, in cells, beyond which albedo may differ for other reasons than motion, such
+# as the light of the camera.
+_PATTERN = 9
+# Width of the squares whose mean likelihood ratio counts: parts of a view are larger than that, and
+# errors of single cells average out.
+_REGION = 5
+_LOWER_QUARTILE = 0.3186  # of the absolute values of a normal distribution
+_MIN_RESIDUALS = 50
+# Number of cells that share an error, and the log-likelihood ratio to one motion alone above which
+# the mixture counts.
+_CORRELATED_CELLS, _MIN_EVIDENCE = 100, 3.0
+_ITERATIONS = 50
+
+
+class RivalMotions:
+    """Compares the tracked motion with its rivals, from frame to frame."""
+
+    def __init__(self) -> None:
+        self._windows: dict[str, deque[Float64]] = {}
+        self._share, self._views = 0.0, 0
+
+    def reset(self) -> None:
+        """Forget the last frames."""
+        self._windows.clear()
+        self._share = 0.0
+
+    def compare(
+        self,
+        view: PreparedView,
+        reference: PreparedView,
+        T_reference_view: Float64,
+        rivals: Mapping[str, Float64],
+        scale: float,
+    ) -> tuple[float, str]:
+        """Compare a view if it is one of every second, and judge the last ones.
+
+        Returns the largest share that follows a rival, and the name of the rival that most of the
+        surface follows, or "". A rival that is not given is not judged.
+
+        Parameters
+        ----------
+        view, reference
+            The view, and the one it was aligned with.
+        T_reference_view
+            (4, 4) the tracked motion.
+        rivals
+            Other motions (4, 4), by name.
+        scale
+            Factor of the sigmas of depth.
+        """
+        self._views += 1
+        if self._views % _EVERY == 0:
+            return self._share, ""
+        self._share, winner = 0.0, ""
+        for name, T in rivals.items():
+            window = self._windows.setdefault(name, deque(maxlen=_WINDOW))
+            window.append(_histograms(view, reference, T_reference_view, T, scale))
+            of_cells, of_area = (_share(weights) for weights in np.sum(window, axis=0))
+            self._share = max(self._share, of_cells, of_area)
+            if of_area > 0.5 and window[-1].any():
+                winner = winner or name
+        return self._share, winner
+
+
+def _histograms(
+    view: PreparedView, reference: PreparedView, T: Float64, T_rival: Float64, scale: float
+) -> Float64:
+    """Return histograms (2, B) of likelihood ratios: by number of cells, and by area."""
+    total = np.zeros((2, len(_CENTRES)))
+    if _shift(view, se3.inverse(T) @ T_rival) < _MIN_SHIFT:
+        return total
+    for a, b, T_b_a, T_rival_b_a in (
+        (view, reference, T, T_rival),
+        (reference, view, se3.inverse(T), se3.inverse(T_rival)),
+    ):
+        ratios = likelihood_ratios(a, b, T_b_a, T_rival_b_a, scale)
+        used, stride = np.isfinite(ratios), stride_of(a)
+        llr, area = ratios[used], a.z[::stride, ::stride][used].astype(np.float64) ** 2
+        for row, weights in zip(total, (np.ones_like(area), area), strict=True):
+            row += np.histogram(llr, _BINS, weights=weights)[0]
+    total[1] *= total[0].sum() / max(total[1].sum(), 1e-9)
+    return total
+
+
+def _shift(view: PreparedView, T: Float64) -> float:
+    """Return by how many cells a motion (4, 4) moves the view."""
+    width = float(view.rays[0, -1, 0] - view.rays[0, 0, 0])
+    cell = abs(width) * stride_of(view) / view.z.shape[1]
+    return float((np.linalg.norm(T[:3, 3]) / view.depth + se3.angle(T)) / cell)
+
+
+def likelihood_ratios(
+    view: PreparedView, other: PreparedView, T: Float64, T_rival: Float64, scale: float
+) -> Float32:
+    """Return log-likelihood ratios of the cells of a view, positive for a rival, else NaN.
+
+    Parameters
+    ----------
+    view, other
+        The view, and the one it is compared with.
+    T, T_rival
+        (4, 4) T_other_view of both motions.
+    scale
+        Factor of the sigmas of depth.
+    """
+    outcome, by_rival = (_outcome(view, other, motion, scale) for motion in (T, T_rival))
+    agrees, rival_agrees = outcome == kernels.AGREES, by_rival == kernels.AGREES
+    contradicts, rival_contradicts = _contradicts(outcome), _contradicts(by_rival)
+    llr = _MAX_LLR * (1.0 * (rival_agrees & contradicts) - (agrees & rival_contradicts))
+    if view.has_albedo and other.has_albedo:
+        both = agrees & rival_agrees
+        residuals = [_pattern_residual(view, other, motion, both) for motion in (T, T_rival)]
+        both &= np.isfinite(residuals[0]) & np.isfinite(residuals[1])
+        if np.count_nonzero(both) >= _MIN_RESIDUALS:
+            sigma = min(float(np.quantile(np.abs(r[both]), 0.25)) for r in residuals)
+            sigma = max(sigma / _LOWER_QUARTILE, 1e-6)
+            cost, rival_cost = (np.minimum(0.5 * (r / sigma) ** 2, _MAX_LLR) for r in residuals)
+            llr[both] = (cost - rival_cost)[both]
+    used = (agrees | contradicts) & (rival_agrees | rival_contradicts)
+    mean = _local_mean(np.where(used, llr, np.nan), _REGION)
+    return np.where(used, mean, np.float32(np.nan))
+
+
+def _outcome(view: PreparedView, other: PreparedView, T: Float64, scale: float) -> UInt8:
+    stride = stride_of(other)
+    still = np.zeros(other.z[::stride, ::stride].shape, np.bool_)
+    return compared(view, other, still, np.ascontiguousarray(T), scale)[0]
+
+
+def _contradicts(outcome: UInt8) -> Bool:
+    return (outcome == kernels.IN_FRONT) | (outcome == kernels.BEHIND)
+
+
+def _pattern_residual(view: PreparedView, other: PreparedView, T: Float64, cells: Bool) -> Float32:
+    """Return differences of log albedo of cells (rows, columns), less their local mean, else NaN.
+
+    The other view's albedo is extrapolated from the nearest pixel by its slopes.
+    """
+    stride = stride_of(view)
+    grid = np.s_[::stride, ::stride]
+    z, rays, albedo = view.z[grid][cells], view.rays[grid][cells], view.albedo[grid][cells]
+    points = se3.transform(T, np.column_stack([rays, np.ones(len(z))]) * z[:, None])
+    pixels = pair_agreement.landing_pixels(other, points)
+    size = np.array(other.z.shape[::-1])
+    inside = np.all((pixels >= 0) & (pixels < size), axis=1)
+    u, v = np.where(inside[:, None], pixels, 0).T
+    seen = other.albedo[v, u]
+    offset = points[:, :2] / points[:, 2:] - other.rays[v, u]
+    difference = albedo[:, 0] - seen[:, 0] - (seen[:, 1:] * offset).sum(1)
+    residual = np.full(cells.shape, np.nan, np.float32)
+    residual[cells] = np.where(inside, difference, np.nan)
+    return residual - _local_mean(residual, _PATTERN)
+
+
+def _local_mean(image: Float32, width: int) -> Float32:
+    """Return the mean of the known values, not NaN, in a square of some width in cells."""
+    known = np.isfinite(image)
+    sums, counts = (
+        cv2.boxFilter(
+            values.astype(np.float32), -1, (width, width), normalize=False,
+            borderType=cv2.BORDER_CONSTANT,
+        )
+        for values in (np.where(known, image, 0), known)
+    )  # fmt: skip
+    return np.asarray(sums / np.maximum(counts, 1), np.float32)
+
+
+def _share(weights: Float64) -> float:
+    """Return the share of the rival by a histogram (B,); 0 without enough evidence."""
+    total, ratios, share = weights.sum(), np.exp(_CENTRES), 0.5
+    if not total:
+        return 0.0
+    for _ in range(_ITERATIONS):
+        share = float(weights @ (share * ratios / (share * ratios + 1 - share)) / total)
+    evidence = weights @ np.log(share * ratios + 1 - share)
+    return share if evidence / _CORRELATED_CELLS > _MIN_EVIDENCE else 0.0

@@ -1,0 +1,83 @@
+"""What is near must not win by its size in the image, and an open choice must be noticed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry import se3
+from tofuse.engine.tracking.keyframes import Keyframes
+from tofuse.engine.tracking.rival_motions import RivalMotions
+from tofuse.engine.views.prepared_view import prepare_view
+from tofuse.engine.views.view_planes import SurfaceOptions
+
+WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
+CAMERA = Pinhole(WIDTH, HEIGHT, FOCAL, FOCAL, 79.5, 59.5)
+NEAR_M, FAR_M, SHIFT = 0.8, 1.6, 16
+
+
+def relief(metres: float, seed: int) -> np.ndarray:
+    """A wavy surface, wider than the image."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[:HEIGHT, : 2 * WIDTH]
+    waves = [
+        np.sin(
+            2 * np.pi * (u * np.cos(a) + v * np.sin(a)) / rng.uniform(35, 60) + rng.uniform(0, 6)
+        )
+        for a in rng.uniform(0, np.pi, 4)
+    ]
+    return metres * (1 + 0.03 * np.sum(waves, axis=0))
+
+
+def image(index: int, columns: int, shift: int = 0) -> RangeFrame:
+    """A near surface in the first columns, which has moved by some pixels, before a far one."""
+    depth = relief(FAR_M, 1)[:, :WIDTH]
+    depth[:, :columns] = relief(NEAR_M, 2)[:, 40 - shift : 40 - shift + columns]
+    depth += np.random.default_rng([3, index]).normal(0, 0.002, depth.shape) * depth
+    return RangeFrame(index, index / 15, CAMERA, depth.astype(np.float32))
+
+
+def compared(columns: int, T: np.ndarray, rivals: dict[str, np.ndarray]) -> tuple[float, str]:
+    """Compare a tracked motion with its rivals, where the near surface moved in between."""
+    before = prepare_view(image(0, columns), SurfaceOptions())
+    now = prepare_view(image(2, columns, SHIFT), SurfaceOptions())
+    return RivalMotions().compare(now, before, T, rivals, 1.0)
+
+
+WITH_NEAR = se3.translation((-SHIFT * NEAR_M / FOCAL, 0.0, 0.0))
+
+
+def test_camera_that_follows_near_surface_is_noticed() -> None:
+    share, winner = compared(110, WITH_NEAR, {"stands": np.eye(4)})
+    assert share > 0.5
+    assert winner == "stands"
+
+
+def test_near_surface_does_not_win_by_its_size() -> None:
+    share, winner = compared(110, np.eye(4), {"goes on": WITH_NEAR})
+    assert share > 0.25
+    assert winner == ""
+
+
+def test_small_near_surface_leaves_nothing_open() -> None:
+    share, winner = compared(16, np.eye(4), {"goes on": WITH_NEAR})
+    assert share < 0.25
+    assert winner == ""
+
+
+def test_equal_motions_are_no_rivals() -> None:
+    assert compared(110, np.eye(4), {"stands": np.eye(4)}) == (0.0, "")
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_somebody_near_does_not_take_the_camera_along(columns: int) -> None:
+    tracker = Keyframes().start(0)
+    steps = []
+    for k in range(24):
+        near = columns if 8 <= k < 18 else 0
+        steps.append(tracker.push(image(k, near, 2 * (k - 8))))
+    assert {step.component for step in steps} == {0}
+    for step in steps:
+        assert np.linalg.norm(step.T_component_camera[:3, 3]) < 0.02
