@@ -347,7 +347,9 @@ def _registered(
             names.append(f"{_motion_words(motion)} it fits as well")
     slides = _slides(reference, T, found.unobservable)
     if slides:
-        frames = [SingleView(n, n, "", 0, CloudFrame.of(p)) for n, p in (("", points), ("", target))]
+        frames = [
+            SingleView(n, n, "", 0, CloudFrame.of(p)) for n, p in (("", points), ("", target))
+        ]
         pair = PairResult(frames[0], frames[1], found)
         names.append(f"{pair_words.unobservable(pair)} is not determined")
     given = "; ".join(names)
@@ -377,7 +379,10 @@ def _slides(reference: Reference, T: Float64, directions: Float64) -> bool:
         return False
     size = reference.diagonal
     motions = [
-        T @ se3.exp(_SLIDE * size * d / max(np.linalg.norm(d[:3]) + size * np.linalg.norm(d[3:]), 1e-9))
+        T
+        @ se3.exp(
+            _SLIDE * size * d / max(np.linalg.norm(d[:3]) + size * np.linalg.norm(d[3:]), 1e-9)
+        )
         for d in directions
     ]
     return all(_is_symmetry(reference, moved @ se3.inverse(T)) for moved in motions)

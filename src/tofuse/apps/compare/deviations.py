@@ -8,7 +8,7 @@ it does not; P is the projection that the fit applies to both.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,8 +21,8 @@ from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.normal import SIGMA_OF_MEDIAN, robust_sigma
 
-# Points of the fit and of the map, and iterations.
-_FIT_POINTS, _MAX_POINTS, _ITERATIONS = 20_000, 250_000, 40
+# Points of the fit, first of a sample, and of the map; and iterations.
+_FIT_POINTS, _MAX_POINTS, _ITERATIONS = (4000, 100_000), 250_000, (30, 5)
 # Reach of a comparison: fraction of the diagonal, tolerances, and spacings of the points.
 _REACH_FRACTION, _REACH_TOLERANCES, _REACH_SPACINGS = 0.03, 5.0, 6.0
 # Deviations beyond this many tolerances and standard deviations are not fitted.
@@ -36,6 +36,8 @@ _FEWEST, _MOST, _MEAN_NOISE = 12, 400, 0.1
 # Without a tolerance a place is this fraction of the diagonal; never larger than the second.
 _PLACE_FRACTION, _MAX_PLACE_FRACTION = 0.025, 0.05
 _MAX_PLACES = 1000
+# Points farther from the centre of a place, in its edges, are in none.
+_MAX_REMOTE = 1.5
 # Correlation length of shared errors, as a fraction of the diagonal: short, so that the fit does
 # not absorb them.
 _SHARED_LENGTH = 0.15
@@ -168,10 +170,24 @@ def fitted(
 
     Least squares over the points; directions that are not determined keep the start.
     """
-    chosen = scene.random_subset(len(measured.points), _FIT_POINTS)
-    points, normals = measured.points[chosen], measured.normals[chosen]
     free = 6
-    for _ in range(_ITERATIONS):
+    for count, iterations in zip(_FIT_POINTS, _ITERATIONS, strict=True):
+        chosen = scene.random_subset(len(measured.points), count)
+        subset = replace(measured, points=measured.points[chosen], normals=measured.normals[chosen])
+        T, free = _iterated(subset, reference, T, reach, tolerance_m, iterations)
+    return T, free
+
+
+def _iterated(
+    measured: Surface,
+    reference: Reference,
+    T: Float64,
+    reach: float,
+    tolerance_m: float | None,
+    iterations: int,
+) -> tuple[Float64, int]:
+    points, normals, free = measured.points, measured.normals, 6
+    for _ in range(iterations):
         moved = se3.transform(T, points)
         found = reference.distances(moved, normals @ T[:3, :3].T, reach, oriented=measured.oriented)
         used = found.compared
@@ -314,11 +330,12 @@ def _no_places(size: float) -> Places:
 
 def _seen(reference: Reference, found: Distances, spacing: float) -> Bool:
     """(M,) whether a point lies opposite each triangle of the reference."""
-    feet = found.feet[found.compared]
+    feet, region = found.feet[found.compared], reference.region[found.element[found.compared]]
     if not len(feet):
         return np.zeros(len(reference.triangles), bool)
     near = max(reference.size, 2 * spacing)
-    return np.asarray(KdTree(feet).nearest(reference.centres, near)[0] >= 0)
+    centres = reference.centres
+    return np.asarray(_nearest_centre(centres, reference.region, feet, region, near) >= 0)
 
 
 def _noise(feet: Float64, deviation: Float64, stated: Float64 | None, rows: Intp) -> float:
@@ -392,24 +409,23 @@ def _grouped(feet: Float64, region: Intp, size: float) -> tuple[Intp, int]:
     centres = sums.mean3(feet)[large]
     owner = np.zeros(len(count), np.intp)
     owner[label] = region
-    made = _nearest_centre(feet, region, centres, owner[large], size)
+    made = _nearest_centre(feet, region, centres, owner[large], _MAX_REMOTE * size)
     return made, int(large.sum())
 
 
 def _nearest_centre(
-    feet: Float64, region: Intp, centres: Float64, owner: Intp, size: float
+    points: Float64, region: Intp, centres: Float64, owner: Intp, limit: float
 ) -> Intp:
-    """Return the nearest centre (n,) of the same region for each point; -1 if it is far away."""
-    apart = 100 * (float(np.ptp(feet, axis=0).max()) + size)
-    shift = np.array([1.0, 0, 0]) * apart
-    index = KdTree(centres + owner[:, None] * shift).nearest(
-        feet + region[:, None] * shift, 1.5 * size
-    )[0]
-    return np.asarray(index, np.intp)
+    """Return the nearest centre (n,) of the same region for each point; -1 beyond the limit."""
+    # One kd-tree for all: regions are shifted apart.
+    shift = np.array([2.0, 0, 0]) * (float(np.ptp(centres, axis=0).max()) + limit)
+    found = KdTree(centres + owner[:, None] * shift)
+    return np.asarray(found.nearest(points + region[:, None] * shift, limit)[0], np.intp)
 
 
 def _assigned(feet: Float64, region: Intp, places: Places) -> Intp:
-    return _nearest_centre(feet, region, places.centres, places.region, places.size)
+    limit = _MAX_REMOTE * places.size
+    return _nearest_centre(feet, region, places.centres, places.region, limit)
 
 
 def _covariance(
@@ -427,4 +443,3 @@ def _covariance(
     A = _inverse(J.T @ weighted)[0] @ weighted.T
     half = J @ (A @ V)  # P is 1 - J A
     return np.asarray(V - half - half.T + J @ (A @ V @ A.T) @ J.T)
-

@@ -296,4 +296,3 @@ def measured_points(surface: Surface, reference: Reference) -> Surface:
     normals = unit_vectors(np.cross(b - a, c - a))
     sigma = None if surface.sigma is None else surface.sigma[surface.faces].mean(1)[source]
     return replace(surface, points=triangles.mean(1), normals=normals, faces=None, sigma=sigma)
-
