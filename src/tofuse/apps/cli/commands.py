@@ -250,6 +250,7 @@ def register(arguments: cli.Register) -> int:
 
 
 def out_json(out: Path | None) -> str | None:
+    """Return an optional output folder for --json."""
     return None if out is None else str(out)
 
 

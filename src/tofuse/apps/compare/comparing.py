@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from tofuse._version import __version__
 from tofuse.apps.compare.deviations import COVERAGE, DeviationMap, fitted, mapped, reach_of
 from tofuse.apps.compare.nearest import Reference, measured_points
-from tofuse.apps.compare.surface import Comparable, Surface, in_metres, surface_of
+from tofuse.apps.compare.surface import Comparable, Surface, in_metres, spacing_of, surface_of
 from tofuse.apps.pairs import PairResult, pair_words, register
 from tofuse.apps.report import scene, words
 from tofuse.apps.results import run_json
@@ -46,8 +46,8 @@ class Region:
     area_m2, seen
         Its area, and the fraction of it that was measured.
     verdict
-        "pass" or "fail" as ISO 14253-1 defines them, "undecided", or "not seen"; without a tolerance
-        "undecided".
+        "pass" or "fail" as ISO 14253-1 defines them, "undecided", as always without a tolerance, or
+        "not seen".
     places, outside, changed
         Number of places, of those outside the tolerance, and of significant deviations.
     mean_m, mean_sigma_m
@@ -131,21 +131,22 @@ class Comparison:
         """The places that deviate most, of each region."""
         places = self.deviations.places
         verdicts = places.verdicts(self.tolerance_m or np.inf)
-        rows = []
+        rows: list[dict[str, Any]] = []
         for k, region in enumerate(self.regions):
             of = np.flatnonzero(places.region == k)
-            for i in of[np.argsort(-np.abs(places.deviation[of]), kind="stable")][:WORST].tolist():
-                rows.append(
-                    {
-                        "region": region.name,
-                        **dict(zip("xyz", places.centres[i].tolist(), strict=True)),
-                        "deviation_m": float(places.deviation[i]),
-                        "sigma_m": float(places.sigma[i]),
-                        "expanded_m": COVERAGE * float(places.sigma[i]),
-                        "points": int(places.points[i]),
-                        "verdict": _word(int(verdicts[i])) if self.tolerance_m else "",
-                    }
-                )
+            order = np.argsort(-np.abs(places.deviation[of]), kind="stable")
+            rows += [
+                {
+                    "region": region.name,
+                    **dict(zip("xyz", places.centres[i].tolist(), strict=True)),
+                    "deviation_m": float(places.deviation[i]),
+                    "sigma_m": float(places.sigma[i]),
+                    "expanded_m": COVERAGE * float(places.sigma[i]),
+                    "points": int(places.points[i]),
+                    "verdict": _word(int(verdicts[i])) if self.tolerance_m else "",
+                }
+                for i in of[order][:WORST].tolist()
+            ]
         return rows
 
     @property
@@ -170,9 +171,9 @@ class Comparison:
             counts = places.verdicts(self.tolerance_m)
             head = {
                 "pass": f"Pass: every place seen is within {limit}",
-                "fail": f"Fail: {(counts < 0).sum()} of {len(counts)} places are outside {limit}",
-                "undecided": f"Undecided: {(counts == 0).sum()} of {len(counts)} places are too "
-                f"close to {limit} for their uncertainty",
+                "fail": f"Fail: {_places(counts < 0)} outside {limit}",
+                "undecided": f"Undecided: {_places(counts == 0)} too close to {limit} for "
+                f"{'its' if (counts == 0).sum() == 1 else 'their'} uncertainty",
             }
             found = f"{head[str(self.verdict)]}; the largest deviation is {largest}"
         if self.given:
@@ -214,6 +215,11 @@ class Comparison:
             }
         )
         return data
+
+
+def _places(chosen: Bool) -> str:
+    count = int(chosen.sum())
+    return f"{count} of {len(chosen)} places {'is' if count == 1 else 'are'}"
 
 
 def _word(verdict: int) -> Verdict:
@@ -283,7 +289,7 @@ def compared(
 ) -> Comparison:
     """Compare two surfaces in m; see `compare`. Without a search they are near the guess."""
     measured = measured_points(measured, reference)
-    reach = reach_of(reference, scene.spacing_of(measured.points), tolerance_m)
+    reach = reach_of(reference, spacing_of(measured.points), tolerance_m)
     registration, given, reason = None, "", ""
     T = np.eye(4) if guess is None else guess
     if searched:
@@ -393,7 +399,8 @@ def _motion_words(motion: Float64) -> str:
     if angle < 1:
         return f"moved by {words.length(float(np.linalg.norm(motion[:3, 3])))}"
     axis = se3.so3_log(motion[:3, :3])
-    return f"turned by {angle:.0f}\N{DEGREE SIGN} about {pair_words.vector(axis / np.linalg.norm(axis), 2)}"
+    about = pair_words.vector(axis / np.linalg.norm(axis), 2)
+    return f"turned by {angle:.0f}\N{DEGREE SIGN} about {about}"
 
 
 def _regions(

@@ -15,14 +15,14 @@ import numpy as np
 from scipy.stats import norm
 
 from tofuse.apps.compare.nearest import Distances, Reference
-from tofuse.apps.compare.surface import Surface, unit_vectors
+from tofuse.apps.compare.surface import Surface, spacing_of, unit_vectors
 from tofuse.apps.report import scene
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.normal import SIGMA_OF_MEDIAN, robust_sigma
 
 # Points of the fit, first of a sample, and of the map; and iterations.
-_FIT_POINTS, _MAX_POINTS, _ITERATIONS = (4000, 100_000), 250_000, (30, 5)
+_FIT_POINTS, _MAX_POINTS, _ITERATIONS = (4000, 100_000), 250_000, (30, 3)
 # Reach of a comparison: fraction of the diagonal, tolerances, and spacings of the points.
 _REACH_FRACTION, _REACH_TOLERANCES, _REACH_SPACINGS = 0.03, 5.0, 6.0
 # Deviations beyond this many tolerances and standard deviations are not fitted.
@@ -203,7 +203,7 @@ def _iterated(
         step = -unit * (inverse @ (J.T @ r[near]))
         about = se3.translation(centre) @ se3.exp(step) @ se3.translation(-centre)
         T = se3.orthonormalise(about @ T)
-        if np.linalg.norm(step / unit) < 1e-4 * max(scale, 1e-9):
+        if np.linalg.norm(step / unit) < 1e-3 * max(scale, 1e-9):
             break
     return T, free
 
@@ -257,7 +257,7 @@ def mapped(
     normals = measured.normals[chosen] @ T[:3, :3].T
     found = reference.distances(points, normals, reach, oriented=measured.oriented)
     deviation = found.signed.copy()
-    spacing = scene.spacing_of(points)
+    spacing = spacing_of(points)
     left_out = 0.0
     if len(reference.edges):
         left_out = _EDGE_SPACINGS * spacing
@@ -356,7 +356,7 @@ def _neighbour_sigma(feet: Float64, deviation: Float64) -> float:
 def _point_noise(
     feet: Float64, scatter: Float64, stated: Float64 | None, rows: Intp, label: Intp
 ) -> tuple[Float64, float, float]:
-    """Return the sigma (n,) of points, the factor on the stated one, and points per independent one.
+    """Return sigma (n,) of points, the factor on the stated one, and points per independent one.
 
     The scatter in a place shows noise that the views don't state; that of neighbours its
     correlation.

@@ -9,17 +9,16 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tofuse.apps.compare.surface import Surface, unit_vectors
-from tofuse.apps.report import scene
+from tofuse.apps.compare.surface import Surface, spacing_of, unit_vectors
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import KdTree
 
 # Longest edge of a triangle after its division, as a fraction of the diagonal, and with which there
 # are at most this many triangles.
-_EDGE_FRACTION, _MAX_TRIANGLES = 0.01, 300_000
+_EDGE_FRACTION, _MAX_TRIANGLES = 0.015, 300_000
 # Nearest triangles by their centres of which the nearest one is taken, and points at a time.
-_CANDIDATES, _CHUNK = 8, 50_000
+_CANDIDATES, _CHUNK = 6, 50_000
 # Surfaces facing further apart are different ones, as the two sides of a sheet.
 _MIN_COSINE = 0.5
 # An edge between faces is sharp beyond this angle, rad.
@@ -98,7 +97,7 @@ class Reference:
     def of(cls, surface: Surface) -> Reference:
         """Divide a surface."""
         if surface.faces is None:
-            size = scene.spacing_of(surface.points)
+            size = spacing_of(surface.points)
             points = np.repeat(surface.points[:, None], 3, axis=1)
             area = np.full(len(points), size**2)
             region = _cells(surface.points, surface.normals)

@@ -137,7 +137,7 @@ def _scene(comparison: Comparison) -> tuple[scene.Scene, fields.Field]:
 def _histogram(comparison: Comparison) -> dict[str, object]:
     limit = 2 * limit_of(comparison)
     d = np.clip(comparison.deviations.places.deviation, -limit, limit)
-    step = max(int(round(2e6 * limit / _BINS)), 1)
+    step = max(round(2e6 * limit / _BINS), 1)
     edges = step * (np.arange(_BINS + 1) - _BINS / 2)
     counts = np.histogram(1e6 * d, edges, weights=comparison.deviations.places.points)[0]
     share = 100 * counts / max(counts.sum(), 1)

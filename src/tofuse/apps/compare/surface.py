@@ -15,6 +15,7 @@ from tofuse.engine.arrays import Float64, Int32
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
+from tofuse.engine.geometry import KdTree
 from tofuse.engine.icp import extent, surface_shape
 from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.results import Reconstruction
@@ -24,6 +25,8 @@ UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 # Files in mm and models in m differ by 1000 in extent; a part and the room around it by less.
 _MIN_MM_RATIO = 30.0
 _MIN_POINTS = 50
+# Points at which the density is measured, and neighbours that it is measured by.
+_DENSITY_POINTS, _DENSITY_NEIGHBOURS = 3000, 12
 Comparable: TypeAlias = Reconstruction | Mesh | Cloud | str | os.PathLike[str]
 
 
@@ -196,3 +199,13 @@ def in_metres(
         measured = measured.in_unit("mm")
         said = f"{measured.name} is taken to be in mm: it would be {1 / ratio:.0f} times as large"
     return measured, reference, said
+
+
+def spacing_of(points: Float64) -> float:
+    """Return the edge of the square of surface that each of some points (N, 3) has, m."""
+    sampled = points[:: max(1, len(points) // _DENSITY_POINTS)]
+    k = min(_DENSITY_NEIGHBOURS, len(points) - 1)
+    if k < 1:
+        return 1e-6
+    radius2 = np.median(KdTree(points).neighbours(sampled, k + 1)[1][:, k])
+    return max(float(np.sqrt(np.pi * radius2 / k)), 1e-6)
