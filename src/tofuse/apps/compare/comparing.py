@@ -32,6 +32,8 @@ WORST = 5  # places that are listed of each region
 _MAX_POINTS = 100_000  # that are registered
 # A reference is symmetric if this fraction of it, moved, lies within this fraction of its diagonal.
 _SYMMETRIC_SHARE, _SYMMETRIC_DISTANCE, _SYMMETRIC_POINTS = 0.9, 2e-3, 4000
+_MAX_RIVAL = 0.9  # fraction of the points of a pose that a rival may explain, to be excluded
+_MAX_FITTED = 0.3  # by which a fit changes a symmetry, as a fraction of it
 _SLIDE = 0.02  # along a direction that is not determined, as a fraction of the diagonal
 
 
@@ -345,12 +347,22 @@ def _registered(
             where=measured.name,
             remedy="check the units (--unit), or pass --guess",
         ) from error
+    if not found.believed and found.runner_up is not None:
+        # All points tell poses apart that the registration, by fewer, can't.
+        near = register(points, target, guess=found.T_target_source)
+        worse = _explained(measured, reference, found.runner_up)
+        if near.believed and worse < _MAX_RIVAL * _explained(measured, reference, near.T_target_source):
+            found = near
     T, rival = found.T_target_source, found.runner_up
     names = []
     if rival is not None and (found.given_guess or not found.believed):
         motion = rival @ se3.inverse(T)
         if _is_symmetry(reference, motion):
             names.append(f"{_motion_words(motion)} it fits as well")
+        elif found.given_guess and guess is not None:
+            names.append("another pose fits as well")
+        elif found.given_guess:
+            found = replace(found, believed=False, reason="another pose fits as well")
     slides = _slides(reference, T, found.unobservable)
     if slides:
         frames = [
@@ -364,15 +376,32 @@ def _registered(
     return found, "", f"the registration is not accepted: {found.reason or 'it is not verified'}"
 
 
-def _is_symmetry(reference: Reference, motion: Float64) -> bool:
-    """Whether the reference, moved, is nearly the same surface."""
+def _explained(measured: Surface, reference: Reference, T: Float64) -> float:
+    """Return the fraction of points near the reference at a pose, after its fit."""
+    reach = reach_of(reference, spacing_of(measured.points), None)
+    T, _ = fitted(measured, reference, T, reach, None)
+    chosen = scene.random_subset(len(measured.points), _SYMMETRIC_POINTS)
+    points, normals = se3.transform(T, measured.points[chosen]), measured.normals[chosen]
+    found = reference.distances(points, normals @ T[:3, :3].T, reach, oriented=measured.oriented)
+    return float((np.abs(found.signed) < _SYMMETRIC_DISTANCE * reference.diagonal).mean())
+
+
+def _is_symmetry(reference: Reference, motion: Float64, *, exact: bool = False) -> bool:
+    """Whether the reference, moved, is nearly the same surface; an inexact motion is fitted."""
     chosen = scene.random_subset(len(reference.centres), _SYMMETRIC_POINTS)
     itself = Surface("", reference.centres[chosen], reference.normals[chosen])
+    points = itself.points
     reach = reach_of(reference, reference.size, None)
-    moved, _ = fitted(itself, reference, motion, reach, None)
-    found = reference.distances(
-        se3.transform(moved, itself.points), itself.normals @ moved[:3, :3].T, reach
-    )
+    T = motion if exact else fitted(itself, reference, motion, reach, None)[0]
+
+    def apart(a: Float64, b: Float64) -> float:
+        between = se3.transform(a, points) - se3.transform(b, points)
+        return float(np.sqrt((between**2).sum(1).mean()))
+
+    if apart(T, motion) > _MAX_FITTED * apart(motion, np.eye(4)):
+        return False  # it is no motion of its own
+    normals = itself.normals @ T[:3, :3].T
+    found = reference.distances(se3.transform(T, points), normals, reach)
     close: Bool = np.abs(np.nan_to_num(found.signed, nan=np.inf)) < (
         _SYMMETRIC_DISTANCE * reference.diagonal
     )
@@ -391,7 +420,7 @@ def _slides(reference: Reference, T: Float64, directions: Float64) -> bool:
         )
         for d in directions
     ]
-    return all(_is_symmetry(reference, moved @ se3.inverse(T)) for moved in motions)
+    return all(_is_symmetry(reference, m @ se3.inverse(T), exact=True) for m in motions)
 
 
 def _motion_words(motion: Float64) -> str:
