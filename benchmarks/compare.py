@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.apps.compare.comparing import Comparison, compared
-from tofuse.apps.compare.nearest import Reference
+from tofuse.apps.compare.nearest import Reach, Reference
 from tofuse.apps.compare.repeating import Session, repeated
 from tofuse.apps.compare.surface import Surface
 from tofuse.engine.arrays import Float64
@@ -68,7 +68,9 @@ class Part:
             shape = np.exp(-((points - centre) ** 2).sum(1) / rng.uniform(0.015, 0.03) ** 2)
         elif kind == "shifted face":
             faces = np.unique(reference.region)[:8]
-            region = reference.region[reference.distances(points, normals, 1e-3).element]
+            region = reference.region[
+                reference.distances(points, normals, Reach(1e-3, 1e-3)).element
+            ]
             shape = 1.0 * (region == rng.choice(faces))
         elif kind == "bent":
             shape = 2 * normals[:, 2] * (points[:, 0] / extent[0]) ** 2 * 2

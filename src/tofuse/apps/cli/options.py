@@ -449,7 +449,7 @@ class Locate(Json, Threads, Edited, Selection):
     overwrite: bool = False
 
 
-class Compare(Json, Threads):
+class Compare(Json, Threads, Edited):
     """Compare a result with a CAD model, a mesh, a cloud or another result.
 
     Both are registered, and the result's deviation from the reference's surface is mapped, with its
@@ -494,7 +494,7 @@ class Compare(Json, Threads):
     overwrite: bool = False
 
 
-class Repeat(Json, Threads):
+class Repeat(Json, Threads, Edited):
     """Compare results of the same place: repeatability, and whether their bounds hold.
 
     Results in the same folder are of one session.

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse._version import __version__
-from tofuse.apps.compare.deviations import COVERAGE, DeviationMap, fitted, mapped, reach_of
-from tofuse.apps.compare.nearest import Reference, measured_points
+from tofuse.apps.compare.deviations import COVERAGE, DeviationMap, fitted, mapped
+from tofuse.apps.compare.nearest import Reach, Reference, measured_points
 from tofuse.apps.compare.surface import Comparable, Surface, in_metres, spacing_of, surface_of
 from tofuse.apps.pairs import PairResult, pair_words, register
 from tofuse.apps.report import scene, words
@@ -91,7 +91,7 @@ class Comparison:
     registration
         The initial registration; None if the surfaces were given in the same coordinates.
     given
-        What the pose takes for granted: the symmetry, or the free motion; empty for nothing.
+        What the pose takes for granted by symmetries and free motions, in words; may be empty.
     reason
         Why nothing can be decided; empty otherwise.
     shared_m
@@ -179,7 +179,7 @@ class Comparison:
             }
             found = f"{head[str(self.verdict)]}; the largest deviation is {largest}"
         if self.given:
-            found += f" (given the guess: {self.given})"
+            found += f" ({self.given})"
         return f"{found}. {words.percent(1 - self.seen)} of the reference was not seen."
 
     def to_dict(self) -> dict[str, Any]:
@@ -291,7 +291,7 @@ def compared(
 ) -> Comparison:
     """Compare two surfaces in m; see `compare`. Without a search they are near the guess."""
     measured = measured_points(measured, reference)
-    reach = reach_of(reference, spacing_of(measured.points), tolerance_m)
+    reach = Reach.of(reference, spacing_of(measured.points), tolerance_m)
     registration, given, reason = None, "", ""
     T = np.eye(4) if guess is None else guess
     if searched:
@@ -303,7 +303,7 @@ def compared(
     deviations = mapped(measured, reference, T, reach, tolerance_m, shared_m, free)
     if not len(deviations.places.deviation):
         raise InputError(
-            f"has no surface within {words.length(reach)} of {reference.surface.name}"
+            f"has no surface within {words.length(reach.along)} of {reference.surface.name}"
             + (f" ({reason})" if reason else ""),
             where=measured.name,
             remedy="check the units (--unit), or pass --guess",
@@ -351,7 +351,9 @@ def _registered(
         # All points tell poses apart that the registration, by fewer, can't.
         near = register(points, target, guess=found.T_target_source)
         worse = _explained(measured, reference, found.runner_up)
-        if near.believed and worse < _MAX_RIVAL * _explained(measured, reference, near.T_target_source):
+        if near.believed and worse < _MAX_RIVAL * _explained(
+            measured, reference, near.T_target_source
+        ):
             found = near
     T, rival = found.T_target_source, found.runner_up
     names = []
@@ -370,7 +372,8 @@ def _registered(
         ]
         pair = PairResult(frames[0], frames[1], found)
         names.append(f"{pair_words.unobservable(pair)} is not determined")
-    given = "; ".join(names)
+    start = "this pose" if guess is None else "the guess"
+    given = f"given {start}: {'; '.join(names)}" if names else ""
     if found.believed or given:
         return found, given, ""
     return found, "", f"the registration is not accepted: {found.reason or 'it is not verified'}"
@@ -378,7 +381,7 @@ def _registered(
 
 def _explained(measured: Surface, reference: Reference, T: Float64) -> float:
     """Return the fraction of points near the reference at a pose, after its fit."""
-    reach = reach_of(reference, spacing_of(measured.points), None)
+    reach = Reach.of(reference, spacing_of(measured.points))
     T, _ = fitted(measured, reference, T, reach, None)
     chosen = scene.random_subset(len(measured.points), _SYMMETRIC_POINTS)
     points, normals = se3.transform(T, measured.points[chosen]), measured.normals[chosen]
@@ -391,7 +394,7 @@ def _is_symmetry(reference: Reference, motion: Float64, *, exact: bool = False) 
     chosen = scene.random_subset(len(reference.centres), _SYMMETRIC_POINTS)
     itself = Surface("", reference.centres[chosen], reference.normals[chosen])
     points = itself.points
-    reach = reach_of(reference, reference.size, None)
+    reach = Reach.of(reference, reference.size)
     T = motion if exact else fitted(itself, reference, motion, reach, None)[0]
 
     def apart(a: Float64, b: Float64) -> float:

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from scipy.stats import norm
 
-from tofuse.apps.compare.nearest import Distances, Reference
+from tofuse.apps.compare.nearest import Distances, Reach, Reference
 from tofuse.apps.compare.surface import Surface, spacing_of, unit_vectors
 from tofuse.apps.report import scene
 from tofuse.engine.arrays import Bool, Float64, Intp
@@ -23,8 +23,6 @@ from tofuse.engine.normal import SIGMA_OF_MEDIAN, robust_sigma
 
 # Points of the fit, first of a sample, and of the map; and iterations.
 _FIT_POINTS, _MAX_POINTS, _ITERATIONS = (4000, 100_000), 250_000, (30, 3)
-# Reach of a comparison: fraction of the diagonal, tolerances, and spacings of the points.
-_REACH_FRACTION, _REACH_TOLERANCES, _REACH_SPACINGS = 0.03, 5.0, 6.0
 # Deviations beyond this many tolerances and standard deviations are not fitted.
 _CUT_TOLERANCES, _CUT_SIGMAS = 3.0, 4.0
 # A direction with less information, relative to the best one, keeps the guess.
@@ -154,17 +152,8 @@ class DeviationMap:
     noise_scale: float
 
 
-def reach_of(reference: Reference, spacing: float, tolerance_m: float | None) -> float:
-    """Return the largest distance at which surfaces are compared, m."""
-    return max(
-        _REACH_FRACTION * reference.diagonal,
-        _REACH_TOLERANCES * (tolerance_m or 0.0),
-        _REACH_SPACINGS * spacing,
-    )
-
-
 def fitted(
-    measured: Surface, reference: Reference, T: Float64, reach: float, tolerance_m: float | None
+    measured: Surface, reference: Reference, T: Float64, reach: Reach, tolerance_m: float | None
 ) -> tuple[Float64, int]:
     """Return the best fit T_reference_measured (4, 4) from a start, and the undetermined motions.
 
@@ -182,7 +171,7 @@ def _iterated(
     measured: Surface,
     reference: Reference,
     T: Float64,
-    reach: float,
+    reach: Reach,
     tolerance_m: float | None,
     iterations: int,
 ) -> tuple[Float64, int]:
@@ -227,7 +216,7 @@ def mapped(
     measured: Surface,
     reference: Reference,
     T: Float64,
-    reach: float,
+    reach: Reach,
     tolerance_m: float | None = None,
     shared_m: float = 0.0,
     free: int = 0,
@@ -242,7 +231,7 @@ def mapped(
     T
         (4, 4) T_reference_measured; see `fitted`.
     reach
-        See `reach_of`.
+        How far surfaces are compared.
     tolerance_m
         Determines the size of places.
     shared_m

@@ -21,6 +21,10 @@ _EDGE_FRACTION, _MAX_TRIANGLES = 0.015, 300_000
 _CANDIDATES, _CHUNK = 6, 50_000
 # Surfaces facing further apart are different ones, as the two sides of a sheet.
 _MIN_COSINE = 0.5
+# Reach of a comparison: fraction of the diagonal, tolerances, and spacings of the points; beside a
+# border, as a fraction of the distance, and in spacings.
+_REACH_FRACTION, _REACH_TOLERANCES, _REACH_SPACINGS = 0.03, 5.0, 6.0
+_BESIDE, _BESIDE_SPACINGS = 0.2, 2.0
 # An edge between faces is sharp beyond this angle, rad.
 _SHARP_RAD = 0.44
 # A mesh with faces of this fraction of its area each, which cover most of it, has faces as a CAD
@@ -32,6 +36,24 @@ _COARSE = 5000
 _REGION_FRACTION = 0.25
 # Axes of the directions by which curved faces are divided; oblique, so that flat ones are not.
 _AXES = np.linalg.qr(np.array([[1.0, 0.13, 0.29], [-0.17, 1.0, 0.21], [-0.23, -0.19, 1.0]]))[0]
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far surfaces are compared, m: `along` the normal and `beside` a border or edge."""
+
+    along: float
+    beside: float
+
+    @classmethod
+    def of(cls, reference: Reference, spacing: float, tolerance_m: float | None = None) -> Reach:
+        """Return the reach for points of a spacing, m."""
+        limits = (
+            _REACH_FRACTION * reference.diagonal,
+            _REACH_TOLERANCES * (tolerance_m or 0.0),
+            _REACH_SPACINGS * spacing,
+        )
+        return cls(max(limits), _BESIDE_SPACINGS * spacing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,9 +181,9 @@ class Reference:
         return replace(self, normals=-self.normals)
 
     def distances(
-        self, points: Float64, normals: Float64, reach: float, *, oriented: bool = True
+        self, points: Float64, normals: Float64, reach: Reach, *, oriented: bool = True
     ) -> Distances:
-        """Return the distances of points (n, 3) with normals (n, 3), up to `reach`.
+        """Return the distances of points (n, 3) with normals (n, 3), within reach.
 
         A surface that faces elsewhere is another one. Beyond a border there is none.
         """
@@ -174,8 +196,11 @@ class Reference:
         offset = points - feet
         along = (offset * n).sum(1)
         beside = np.sqrt(np.maximum((offset**2).sum(1) - along**2, 0.0))
-        allowed = np.maximum(np.abs(along), self.size if self.surface.faces is None else 0.0)
-        outside = (beside > allowed + 1e-9) | (np.abs(along) > reach)
+        # Noise moves points beside convex edges, and coarse facets are at angles.
+        allowed = np.maximum(np.minimum(np.abs(along), reach.beside), _BESIDE * np.abs(along))
+        if self.surface.faces is None:
+            allowed = np.maximum(allowed, self.size)
+        outside = (beside > allowed + 1e-9) | (np.abs(along) > reach.along)
         outside |= ~self._facing(n, normals, oriented)
         return Distances(np.where(outside, np.nan, along), feet, n, element)
 

@@ -19,8 +19,8 @@ from scipy.stats import beta
 
 from tofuse._version import __version__
 from tofuse.apps.compare.comparing import compared
-from tofuse.apps.compare.deviations import Places, mapped, reach_of
-from tofuse.apps.compare.nearest import Reference, measured_points
+from tofuse.apps.compare.deviations import Places, mapped
+from tofuse.apps.compare.nearest import Reach, Reference, measured_points
 from tofuse.apps.compare.surface import Surface, spacing_of, surface_of
 from tofuse.apps.report import scene
 from tofuse.apps.results import folders, load_result, run_json
@@ -182,7 +182,7 @@ def repeated(sessions: Sequence[Session], *, searched: bool = True) -> Repetitio
     """
     first = sessions[0].surface
     reference = Reference.of(first)
-    reach = reach_of(reference, spacing_of(first.points), None)
+    reach = Reach.of(reference, spacing_of(first.points))
     own = mapped(measured_points(first, reference), reference, np.eye(4), reach)
     places = own.places
     poses, deviation, sigma, seen = [], [], [], []
