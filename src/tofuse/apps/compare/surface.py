@@ -135,6 +135,8 @@ def _of_record(record: GeometryRecord, name: str) -> Surface:
         points = points[finite]
         sigma = None if sigma is None else sigma[finite]
         normals = None if record.normals is None else record.normals[finite].astype(float)
+    if sigma is not None and not sigma.any():
+        sigma = None
     if len(points) < (_MIN_POINTS if faces is None else 3):
         raise InputError(
             f"has {len(points)} points and no triangles",
