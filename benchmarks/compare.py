@@ -158,7 +158,7 @@ def detection(parts: int) -> None:
         J = np.concatenate([part.normals, np.cross(part.points, part.normals)], axis=1)
         kept = near - J @ np.linalg.lstsq(J, 1.0 * near, rcond=None)[0]
         shift = limit / kept[near].mean() * near  # the best fit takes a part of it
-        again, _ = replace(part, displacement=shift).compared(12, [5, k])
+        again, _ = replace(part, displacement=shift).compared(12, [4, k])
         changed = again.deviations.places
         hit = np.linalg.norm(changed.centres - places.centres[at], axis=1) < 1.5 * places.size
         found += bool((changed.changed & hit).any())
@@ -218,7 +218,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parts", type=int, default=300)
     parts = parser.parse_args().parts
-    repetitions(max(parts // 50, 1))
+    repetitions(max(parts // 100, 1))
     detection(max(parts // 3, 1))
     verdicts(parts)
 

@@ -46,7 +46,7 @@ def test_distances_are_exact_and_signed(part) -> None:
     np.testing.assert_allclose(found.signed, heights, atol=1e-9)
     # Another side of the body, or nothing beside the border.
     assert not surface.distances(points, -up, reach).compared.any()
-    beside = points + [0.2, 0, 0.005]
+    beside = points + np.array([0.2, 0, 0.005])
     assert not surface.distances(beside, up, reach).compared.any()
 
 
@@ -58,7 +58,9 @@ def test_faces_of_a_cad_model_are_regions(part) -> None:
     np.testing.assert_allclose(areas[0], 0.2 * 0.14, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("bump", "verdict"), [(0.0, "pass"), (0.0024, "undecided"), (0.006, "fail")])
+@pytest.mark.parametrize(
+    ("bump", "verdict"), [(0.0, "pass"), (0.0024, "undecided"), (0.006, "fail")]
+)
 def test_a_bump_decides_the_verdict(part, bump, verdict) -> None:
     found = compared(scan(part, bump=bump), part, 0.002, searched=False)
     assert found.verdict == verdict

@@ -28,7 +28,11 @@ def drawn(*blocks: meshes.Mesh) -> Surface:
 
 
 def scan(
-    reference: Reference, seed: int = 0, count: int = 15_000, shared: float | None = 0.0001, bump=0.0
+    reference: Reference,
+    seed: int = 0,
+    count: int = 15_000,
+    shared: float | None = 0.0001,
+    bump=0.0,
 ) -> Surface:
     """Points seen from above, with noise; a bump in the middle of the plate has a height, m."""
     rng = np.random.default_rng(seed)

@@ -144,6 +144,7 @@ class Comparison:
                     "deviation_m": float(places.deviation[i]),
                     "sigma_m": float(places.sigma[i]),
                     "expanded_m": COVERAGE * float(places.sigma[i]),
+                    "uneven_m": float(places.uneven[i]),
                     "points": int(places.points[i]),
                     "verdict": _word(int(verdicts[i])) if self.tolerance_m else "",
                 }

@@ -59,6 +59,8 @@ class Places:
         (K,) mean signed distance of its points, m.
     covariance
         (K, K) of the deviations, m^2.
+    uneven
+        (K,) standard deviation of the surface within a place, beyond noise, m.
     size
         Typical edge, m.
     """
@@ -69,6 +71,7 @@ class Places:
     points: Intp
     deviation: Float64
     covariance: Float64
+    uneven: Float64
     size: float
 
     @cached_property
@@ -84,11 +87,12 @@ class Places:
     def verdicts(self, tolerance_m: float) -> Intp:
         """Return 1 where a place is within the tolerance, -1 where it is not, 0 where undecided.
 
-        That it is within is tested at each place. That it is not is tested with the multiplicity
-        of all, as one in twenty would seem to fail by chance.
+        That it is within is tested at each place, and includes what the place averages over: an
+        uneven one is not within the tolerance as its mean is. That it is not is tested with the
+        multiplicity of all, as one in twenty would seem to fail by chance.
         """
         size = np.abs(self.deviation)
-        passed = size + COVERAGE * self.sigma <= tolerance_m
+        passed = size + COVERAGE * np.hypot(self.sigma, self.uneven) <= tolerance_m
         failed = size - self.coverage_of_all * self.sigma > tolerance_m
         return passed.astype(np.intp) - failed
 
@@ -276,15 +280,16 @@ def mapped(
     scatter = d - mean[np.maximum(label, 0)]
     sigma, scale, correlation = _point_noise(feet, scatter, stated, compared, label)
     n = sums.count
-    noise_variance = sums.mean(sigma**2) / np.maximum(n / correlation, 1.0)
     # What a place averages over, beyond noise: a place that is bent or stepped is not flat.
-    expected = sums.mean(sigma**2) * (1 + 2 * np.sqrt(2 * correlation / np.maximum(n, 1)))
+    variance = sums.mean(sigma**2)
+    expected = variance * (1 + 2 * np.sqrt(2 * correlation / np.maximum(n, 1)))
     uneven = np.maximum(sums.mean(scatter**2) - expected, 0.0)
+    variance_of_mean = (variance + uneven) / np.maximum(n / correlation, 1.0)
     p, normal = sums.mean3(feet), unit_vectors(sums.mean3(found.normals[compared]))
-    covariance = _covariance(p, normal, n, noise_variance + uneven, shared_m, reference.diagonal)
+    covariance = _covariance(p, normal, n, variance_of_mean, shared_m, reference.diagonal)
     region_of = np.zeros(count, np.intp)
     region_of[label[label >= 0]] = region[label >= 0]
-    places = Places(p, normal, region_of, n, mean, covariance, size)
+    places = Places(p, normal, region_of, n, mean, covariance, np.sqrt(uneven), size)
     of_points = np.full(len(points), np.nan)
     row = np.maximum(label, 0)
     of_points[compared] = np.where(
@@ -314,7 +319,7 @@ class _Sums:
 def _no_places(size: float) -> Places:
     none, zeros = np.zeros((0, 3)), np.zeros(0)
     index = np.zeros(0, np.intp)
-    return Places(none, none, index, index, zeros, np.zeros((0, 0)), size)
+    return Places(none, none, index, index, zeros, np.zeros((0, 0)), zeros, size)
 
 
 def _seen(reference: Reference, found: Distances, spacing: float) -> Bool:

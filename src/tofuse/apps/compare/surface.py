@@ -143,6 +143,8 @@ def _of_record(record: GeometryRecord, name: str) -> Surface:
             where=name,
             remedy=f"use a mesh, or {_MIN_POINTS} points or more",
         )
+    if not np.ptp(points, axis=0).any():
+        raise InputError("has points at one place only", where=name)
     oriented = normals is not None
     if normals is None:
         view = CloudFrame.of(points)
