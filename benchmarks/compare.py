@@ -1,6 +1,6 @@
 """Verdicts of `tofuse compare` and components of `tofuse repeat`, on parts with known deviations.
 
-    python benchmarks/compare.py [--parts 300]
+    python benchmarks/compare.py [--parts 300] [--picture docs/images/compare.png]
 
 Each part is a plate with two blocks of random sizes, sampled as a fused scan is: from a number of
 views around it, each with noise and with an error of its pose, so that the surface has errors that
@@ -13,13 +13,17 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from tofuse.apps.compare.comparing import Comparison, compared
 from tofuse.apps.compare.nearest import Reach, Reference
+from tofuse.apps.compare.page import compare_scene
 from tofuse.apps.compare.repeating import Session, repeated
 from tofuse.apps.compare.surface import Surface
+from tofuse.apps.report import scene
 from tofuse.engine.arrays import Float64
 from tofuse.lab.world import mesh as meshes
 
@@ -56,10 +60,10 @@ class Part:
     displacement: Float64
 
     @classmethod
-    def made(cls, rng: np.random.Generator, kind: str, size_m: float) -> Part:
+    def made(cls, rng: np.random.Generator, kind: str, size_m: float, count: int = _POINTS) -> Part:
         """Make a part that deviates by about a size."""
         reference = Reference.of(drawn(rng))
-        points, normals = sampled(reference, _POINTS, rng)
+        points, normals = sampled(reference, count, rng)
         top = points[(normals[:, 2] > 0.9)]
         extent = np.ptp(points, axis=0)
         shape = np.zeros(len(points))
@@ -214,10 +218,24 @@ def smooth(part: Part, rng: np.random.Generator, waves: int = 40) -> Float64:
     return field / float(np.sqrt((field**2).mean()))
 
 
+def draw(path: Path) -> None:
+    """Write a picture of a part with a bump."""
+    rng = np.random.default_rng([1, 6])
+    part = Part.made(rng, "bump", 0.006, count=60_000)
+    drawn, _ = compare_scene(part.compared(24, [0])[0])
+    image = scene.render(drawn, (720, 450), yaw=scene.opening_yaw(drawn))
+    cv2.imwrite(str(path), image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parts", type=int, default=300)
-    parts = parser.parse_args().parts
+    parser.add_argument("--picture", type=Path, help="only write this picture")
+    arguments = parser.parse_args()
+    parts = arguments.parts
+    if arguments.picture is not None:
+        draw(arguments.picture)
+        return
     repetitions(max(parts // 100, 1))
     detection(max(parts // 3, 1))
     verdicts(parts)

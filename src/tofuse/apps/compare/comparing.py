@@ -254,7 +254,7 @@ def compare(
     Parameters
     ----------
     result
-        A result, mesh or cloud, or the path of one.
+        A result, mesh or cloud, the path of one, or (N, 3) points in m.
     reference
         The same, such as a CAD model in STL.
     tolerance_m

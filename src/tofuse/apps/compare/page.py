@@ -43,7 +43,7 @@ def write_compare_report(comparison: Comparison, path: Path) -> None:
     OutputError
         If the file can't be written; an earlier one is unchanged then.
     """
-    drawn, field = _scene(comparison)
+    drawn, field = compare_scene(comparison)
     limit = limit_of(comparison)
     names = [
         Path(n).name or n for n in (comparison.measured.name, comparison.reference.surface.name)
@@ -104,7 +104,7 @@ def _signed(metres: float) -> str:
     return ("+" if metres >= 0 else "\N{MINUS SIGN}") + millimetres(abs(metres))
 
 
-def _scene(comparison: Comparison) -> tuple[scene.Scene, fields.Field]:
+def compare_scene(comparison: Comparison) -> tuple[scene.Scene, fields.Field]:
     """Return the coloured points and what was not seen, y down, and their sigma."""
     found, reference = comparison.deviations, comparison.reference
     rows = np.flatnonzero(np.isfinite(found.deviation))

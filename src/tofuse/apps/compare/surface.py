@@ -27,7 +27,7 @@ _MIN_MM_RATIO = 30.0
 _MIN_POINTS = 50
 # Points at which the density is measured, and neighbours that it is measured by.
 _DENSITY_POINTS, _DENSITY_NEIGHBOURS = 3000, 12
-Comparable: TypeAlias = Reconstruction | Mesh | Cloud | str | os.PathLike[str]
+Comparable: TypeAlias = Reconstruction | Mesh | Cloud | Float64 | str | os.PathLike[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +88,9 @@ def surface_of(given: Comparable, name: str = "") -> Surface:
         return _of_result(given, name or "result")
     if isinstance(given, Mesh | Cloud):
         return _of_record(given.record(), name or type(given).__name__.lower())
+    if isinstance(given, np.ndarray):
+        CloudFrame.of(given)  # checks them
+        return _of_record(GeometryRecord(given), name or "points")
     path = Path(os.fspath(given))
     if folders.is_result(path):
         return _of_result(load_result(path), str(path))
