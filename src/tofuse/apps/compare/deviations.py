@@ -292,9 +292,7 @@ def mapped(
     places = Places(p, normal, region_of, n, mean, covariance, np.sqrt(uneven), size)
     of_points = np.full(len(points), np.nan)
     row = np.maximum(label, 0)
-    of_points[compared] = np.where(
-        label < 0, np.nan, np.hypot(sigma, np.sqrt(np.diag(covariance))[row])
-    )
+    of_points[compared] = np.where(label < 0, np.nan, np.hypot(sigma, places.sigma[row]))
     deviation[compared[label < 0]] = np.nan
     return DeviationMap(
         T, points, normals, deviation, of_points, place, places, seen, left_out, free, scale

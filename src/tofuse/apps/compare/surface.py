@@ -128,6 +128,7 @@ def _of_record(record: GeometryRecord, name: str) -> Surface:
     points = record.points.astype(np.float64)
     faces = record.faces if record.faces is not None and len(record.faces) else None
     sigma = record.scalars.get("sigma")
+    normals: Float64 | None
     if faces is not None:
         record.check(name)
         if not np.isfinite(points).all():
@@ -173,7 +174,7 @@ def vertex_normals(points: Float64, faces: Int32) -> Float64:
         ],
         axis=1,
     )
-    return unit_vectors(normals)
+    return unit_vectors(normals.astype(np.float64))
 
 
 def unit_vectors(vectors: Float64) -> Float64:
