@@ -145,6 +145,7 @@ class Comparison:
                     "sigma_m": float(places.sigma[i]),
                     "expanded_m": COVERAGE * float(places.sigma[i]),
                     "uneven_m": float(places.uneven[i]),
+                    "slope_m": float(places.slope[i]),
                     "points": int(places.points[i]),
                     "verdict": _word(int(verdicts[i])) if self.tolerance_m else "",
                 }

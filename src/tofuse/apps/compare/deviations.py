@@ -34,6 +34,8 @@ _FEWEST, _MOST, _MEAN_NOISE = 12, 400, 0.1
 # Without a tolerance a place is this fraction of the diagonal; never larger than the second.
 _PLACE_FRACTION, _MAX_PLACE_FRACTION = 0.025, 0.05
 _MAX_PLACES = 1000
+# Neighbouring places by which the slope of the deviations is estimated.
+_NEIGHBOURS = 8
 # Points farther from the centre of a place, in its edges, are in none.
 _MAX_REMOTE = 1.5
 # Correlation length of shared errors, as a fraction of the diagonal: short, so that the fit does
@@ -61,6 +63,8 @@ class Places:
         (K, K) of the deviations, m^2.
     uneven
         (K,) standard deviation of the surface within a place, beyond noise, m.
+    slope
+        (K,) by how much the deviation changes from the centre of a place to its border, m.
     size
         Typical edge, m.
     """
@@ -72,6 +76,7 @@ class Places:
     deviation: Float64
     covariance: Float64
     uneven: Float64
+    slope: Float64
     size: float
 
     @cached_property
@@ -88,11 +93,12 @@ class Places:
         """Return 1 where a place is within the tolerance, -1 where it is not, 0 where undecided.
 
         That it is within is tested at each place, and includes what the place averages over: an
-        uneven one is not within the tolerance as its mean is. That it is not is tested with the
-        multiplicity of all, as one in twenty would seem to fail by chance.
+        uneven or sloping one is not within the tolerance as its mean is. That it is not is tested
+        with the multiplicity of all, as one in twenty would seem to fail by chance.
         """
         size = np.abs(self.deviation)
-        passed = size + COVERAGE * np.hypot(self.sigma, self.uneven) <= tolerance_m
+        expanded = COVERAGE * np.hypot(self.sigma, self.uneven) + self.slope
+        passed = size + expanded <= tolerance_m
         failed = size - self.coverage_of_all * self.sigma > tolerance_m
         return passed.astype(np.intp) - failed
 
@@ -289,7 +295,11 @@ def mapped(
     covariance = _covariance(p, normal, n, variance_of_mean, shared_m, reference.diagonal)
     region_of = np.zeros(count, np.intp)
     region_of[label[label >= 0]] = region[label >= 0]
-    places = Places(p, normal, region_of, n, mean, covariance, np.sqrt(uneven), size)
+    radius = np.zeros(count)
+    used = label >= 0
+    np.maximum.at(radius, label[used], np.linalg.norm(feet[used] - p[label[used]], axis=1))
+    slope = radius * _gradients(p, region_of, mean, size)
+    places = Places(p, normal, region_of, n, mean, covariance, np.sqrt(uneven), slope, size)
     of_points = np.full(len(points), np.nan)
     row = np.maximum(label, 0)
     of_points[compared] = np.where(label < 0, np.nan, np.hypot(sigma, places.sigma[row]))
@@ -297,6 +307,18 @@ def mapped(
     return DeviationMap(
         T, points, normals, deviation, of_points, place, places, seen, left_out, free, scale
     )
+
+
+def _gradients(p: Float64, region: Intp, deviation: Float64, size: float) -> Float64:
+    """Return the length (K,) of the gradient of deviations, by neighbouring places of a region."""
+    k = min(_NEIGHBOURS, len(p))
+    apart = _apart(p, region, 2 * (float(np.ptp(p, axis=0).max()) + size))
+    index = KdTree(apart).neighbours(apart, k)[0]
+    offset = p[index] - p[:, None]
+    near = (region[index] == region[:, None]) & (np.linalg.norm(offset, axis=2) < 2 * size)
+    rise = np.where(near, deviation[index] - deviation[:, None], 0.0)
+    inverse = np.linalg.pinv(np.where(near[..., None], offset, 0.0), rcond=0.3)
+    return np.asarray(np.linalg.norm(np.einsum("kij,kj->ki", inverse, rise), axis=1))
 
 
 class _Sums:
@@ -317,7 +339,7 @@ class _Sums:
 def _no_places(size: float) -> Places:
     none, zeros = np.zeros((0, 3)), np.zeros(0)
     index = np.zeros(0, np.intp)
-    return Places(none, none, index, index, zeros, np.zeros((0, 0)), zeros, size)
+    return Places(none, none, index, index, zeros, np.zeros((0, 0)), zeros, zeros, size)
 
 
 def _seen(reference: Reference, found: Distances, spacing: float) -> Bool:
@@ -390,7 +412,13 @@ def _grouped(feet: Float64, region: Intp, size: float) -> tuple[Intp, int]:
     """
     if not len(feet):
         return np.zeros(0, np.intp), 0
-    cell = np.floor((feet - feet.min(0)) / size).astype(np.int64)
+    # Cells fill the box of their region, so that none is a sliver at its border.
+    low, high = np.full((2, region.max() + 1, 3), [[[np.inf]], [[-np.inf]]])
+    np.minimum.at(low, region, feet)
+    np.maximum.at(high, region, feet)
+    extent = np.maximum(high - low, 1e-9)[region]
+    number = np.maximum(np.round(extent / size), 1)
+    cell = np.minimum(np.floor((feet - low[region]) / extent * number), number - 1)
     key = np.column_stack([region, cell])
     _, label, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
     label = label.ravel()
@@ -409,10 +437,14 @@ def _nearest_centre(
     points: Float64, region: Intp, centres: Float64, owner: Intp, limit: float
 ) -> Intp:
     """Return the nearest centre (n,) of the same region for each point; -1 beyond the limit."""
-    # One kd-tree for all: regions are shifted apart.
-    shift = np.array([2.0, 0, 0]) * (float(np.ptp(centres, axis=0).max()) + limit)
-    found = KdTree(centres + owner[:, None] * shift)
-    return np.asarray(found.nearest(points + region[:, None] * shift, limit)[0], np.intp)
+    distance = 2 * (float(np.ptp(centres, axis=0).max()) + limit)
+    found = KdTree(_apart(centres, owner, distance))
+    return np.asarray(found.nearest(_apart(points, region, distance), limit)[0], np.intp)
+
+
+def _apart(points: Float64, region: Intp, distance: float) -> Float64:
+    """Return points with regions shifted apart, for one kd-tree of all of them."""
+    return points + region[:, None] * np.array([distance, 0, 0])
 
 
 def _assigned(feet: Float64, region: Intp, places: Places) -> Intp:

@@ -86,15 +86,12 @@ def _facts(comparison: Comparison) -> list[tuple[str, str]]:
         ("Tolerance", f"±{1e3 * comparison.tolerance_m:g} mm")
     ]  # fmt: skip
     finite = np.isfinite(places.sigma)
-    sigma = COVERAGE * float(np.median(places.sigma[finite])) if finite.any() else np.inf
-    facts += [
-        ("Seen", words.percent(comparison.seen)),
-        ("Places", f"{len(places.deviation):,}"),
-        ("Uncertainty", f"{millimetres(sigma)} mm" if finite.any() else "unbounded"),
-    ]
-    limits = [r.detectable_m for r in comparison.regions if np.isfinite(r.detectable_m)]
-    if limits:
-        facts.append(("Detection limit", f"{millimetres(np.median(limits))} mm"))
+    sigma = COVERAGE * float(np.median(places.sigma))
+    facts += [("Seen", words.percent(comparison.seen)), ("Places", f"{len(places.deviation):,}")]
+    if finite.any():
+        limit = float(np.median(places.detectable))
+        facts.append(("Typical uncertainty", f"{millimetres(sigma)} mm"))
+        facts.append(("Typical detection limit", f"{millimetres(limit)} mm"))
     return facts
 
 
@@ -118,7 +115,8 @@ def compare_scene(comparison: Comparison) -> tuple[scene.Scene, fields.Field]:
     missing = np.full(len(unseen), np.nan)
     shown = np.concatenate([found.deviation[rows], missing])
     axes = np.eye(4)
-    if not reference.surface.is_result:  # CAD models are z up
+    # CAD models are z up; seen from above only if what was measured faces there.
+    if not reference.surface.is_result and found.normals[:, 2].sum() > 0:
         axes[1:3, 1:3] = [[0, -1], [1, 0]]
     drawn = scene.Scene(
         points @ axes[:3, :3].T,
