@@ -81,6 +81,7 @@ def test_a_pose_is_found_without_a_guess(part) -> None:
     assert se3.angle(gap) < 1e-3
 
 
+@pytest.mark.nightly_part
 def test_a_symmetry_is_named() -> None:
     box = Reference.of(drawn(meshes.box([0.2, 0.14, 0.05])))
     found = compared(moved(scan(box)), box, 0.002)
@@ -128,6 +129,7 @@ def test_the_unit_of_a_file_is_recognised() -> None:
     assert in_metres(nominal, nominal)[2] == ""
 
 
+@pytest.mark.nightly_part
 def test_python_compares_meshes_and_clouds(part) -> None:
     surface = part.surface
     mesh = Mesh.of(GeometryRecord(surface.points, surface.faces))

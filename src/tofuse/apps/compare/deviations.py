@@ -298,7 +298,7 @@ def mapped(
     radius = np.zeros(count)
     used = label >= 0
     np.maximum.at(radius, label[used], np.linalg.norm(feet[used] - p[label[used]], axis=1))
-    slope = radius * _gradients(p, region_of, mean, size)
+    slope = radius * _gradients(p, region_of, mean, np.diag(covariance), size)
     places = Places(p, normal, region_of, n, mean, covariance, np.sqrt(uneven), slope, size)
     of_points = np.full(len(points), np.nan)
     row = np.maximum(label, 0)
@@ -309,8 +309,13 @@ def mapped(
     )
 
 
-def _gradients(p: Float64, region: Intp, deviation: Float64, size: float) -> Float64:
-    """Return the length (K,) of the gradient of deviations, by neighbouring places of a region."""
+def _gradients(
+    p: Float64, region: Intp, deviation: Float64, variance: Float64, size: float
+) -> Float64:
+    """Return the length (K,) of the gradient of deviations, by neighbouring places of a region.
+
+    It is that in excess of noise.
+    """
     k = min(_NEIGHBOURS, len(p))
     apart = _apart(p, region, 2 * (float(np.ptp(p, axis=0).max()) + size))
     index = KdTree(apart).neighbours(apart, k)[0]
@@ -318,7 +323,9 @@ def _gradients(p: Float64, region: Intp, deviation: Float64, size: float) -> Flo
     near = (region[index] == region[:, None]) & (np.linalg.norm(offset, axis=2) < 2 * size)
     rise = np.where(near, deviation[index] - deviation[:, None], 0.0)
     inverse = np.linalg.pinv(np.where(near[..., None], offset, 0.0), rcond=0.3)
-    return np.asarray(np.linalg.norm(np.einsum("kij,kj->ki", inverse, rise), axis=1))
+    square = (np.einsum("kij,kj->ki", inverse, rise) ** 2).sum(1)
+    noise = 2 * variance * (inverse**2).sum((1, 2))
+    return np.asarray(np.sqrt(np.maximum(square - noise, 0.0)))
 
 
 class _Sums:
