@@ -1,6 +1,6 @@
 """Verdicts of `tofuse compare` and components of `tofuse repeat`, on parts with known deviations.
 
-    python benchmarks/compare.py [--parts 300] [--picture docs/images/compare.png]
+    python benchmarks/compare.py [--parts 200] [--picture docs/images/compare.png]
 
 Each part is a plate with two blocks of random sizes, sampled as a fused scan is: from a number of
 views around it, each with noise and with an error of its pose, so that the surface has errors that
@@ -229,7 +229,7 @@ def draw(path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parts", type=int, default=300)
+    parser.add_argument("--parts", type=int, default=200)
     parser.add_argument("--picture", type=Path, help="only write this picture")
     arguments = parser.parse_args()
     parts = arguments.parts
@@ -237,7 +237,7 @@ def main() -> None:
         draw(arguments.picture)
         return
     repetitions(max(parts // 100, 1))
-    detection(max(parts // 3, 1))
+    detection(max(parts // 4, 1))
     verdicts(parts)
 
 
