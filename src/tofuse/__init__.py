@@ -6,6 +6,7 @@
 >>> result.save("result")
 >>> result.mesh.save("model.glb")
 >>> T = tofuse.register(source, target).T_target_source
+>>> tofuse.compare("result", "part.stl", tolerance_m=0.002).verdict
 
 Names are imported on first use, so that ``import tofuse`` is fast.
 """
@@ -19,6 +20,7 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse._version import __version__
     from tofuse.apps.api.result import Result, load, merge, reconstruct
+    from tofuse.apps.compare.comparing import Comparison, compare
     from tofuse.apps.inspection.inspect import inspect_recording as inspect
     from tofuse.apps.jobs.evaluating import Evaluation, evaluate
     from tofuse.apps.jobs.judging import Judgement, judge

@@ -225,7 +225,7 @@ def register(arguments: cli.Register) -> int:
         register_files,
     )
 
-    _check_overwrite(arguments)
+    check_overwrite(arguments)
     options = from_arguments(PairOptions, arguments)
     with progress_unless_json(arguments) as progress:
         result = register_files(arguments.source, arguments.target, options, progress)
@@ -236,7 +236,7 @@ def register(arguments: cli.Register) -> int:
     width = max(_NAME_WIDTH, *(len(name) for name, _ in found))
     return show(
         arguments,
-        {**data, "out": _out_json(options.out)},
+        {**data, "out": out_json(options.out)},
         f"[bold {color}]{head.lower()}[/]" + (f": {escaped(tail)}" if tail else ""),
         *(
             escaped(f"{title:<{width}}  {row}".rstrip())
@@ -249,7 +249,8 @@ def register(arguments: cli.Register) -> int:
     )
 
 
-def _out_json(out: Path | None) -> str | None:
+def out_json(out: Path | None) -> str | None:
+    """Return an optional output folder for --json."""
     return None if out is None else str(out)
 
 
@@ -263,7 +264,7 @@ def judge(arguments: cli.Judge) -> int:
     from tofuse.apps.jobs import judging
     from tofuse.apps.results import run_json
 
-    _check_overwrite(arguments)
+    check_overwrite(arguments)
     options = from_arguments(judging.JudgeOptions, arguments)
     with progress_unless_json(arguments) as progress:
         judgement = judging.judge_files(
@@ -277,7 +278,7 @@ def judge(arguments: cli.Judge) -> int:
     ]
     return show(
         arguments,
-        {**run_json.plain(judgement.to_dict()), "out": _out_json(options.out)},
+        {**run_json.plain(judgement.to_dict()), "out": out_json(options.out)},
         *_verdict_lines(judgement.verdict, judgement.reasons),
         escaped(judging.sentence(judgement, arguments.trajectory.name)),
         *([f"map consistency: {'; '.join(texts)}"] if texts else []),
@@ -300,7 +301,7 @@ def locate(arguments: cli.Locate) -> int:
     """``tofuse locate``."""
     from tofuse.apps.jobs import locating
 
-    _check_overwrite(arguments)
+    check_overwrite(arguments)
     options = from_arguments(locating.LocateOptions, arguments)
     with progress_unless_json(arguments) as progress:
         located = locating.locate_files(arguments.result, arguments.input, options, progress)
@@ -314,13 +315,15 @@ def locate(arguments: cli.Locate) -> int:
         lines.append(escaped(f"see {options.out}"))
     return show(
         arguments,
-        {**data, "out": _out_json(options.out)},
+        {**data, "out": out_json(options.out)},
         *lines,
         status=0 if data["accepted"] == len(located) else 3,
     )
 
 
-def _check_overwrite(arguments: cli.Register | cli.Judge | cli.Locate) -> None:
+def check_overwrite(
+    arguments: cli.Register | cli.Judge | cli.Locate | cli.Compare | cli.Repeat,
+) -> None:
     """Refuse --overwrite without --out, where that is optional."""
 
     if arguments.overwrite and arguments.out is None:

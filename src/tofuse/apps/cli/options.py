@@ -449,6 +449,78 @@ class Locate(Json, Threads, Edited, Selection):
     overwrite: bool = False
 
 
+class Compare(Json, Threads, Edited):
+    """Compare a result with a CAD model, a mesh, a cloud or another result.
+
+    Both are registered, and the result's deviation from the reference's surface is mapped, with its
+    uncertainty. A tolerance is decided as ISO 14253-1 says.
+
+    Attributes
+    ----------
+    result : RESULT
+        a result, or a mesh or cloud (PLY, STL, OBJ, GLB, E57, ...)
+    reference : REFERENCE
+        what it should be: the same
+    tolerance : LENGTH
+        largest deviation allowed, to either side, e.g. 2mm (none)
+    accuracy : LENGTH
+        95 % bound on errors that neighbouring points share (default: as the result states)
+    guess : FILE
+        initial guess of T_reference_result (none)
+    unit
+        unit of the reference's file (default: m or mm, by its extent)
+    out : DIR
+        folder for the map of deviations and the report (none)
+    overwrite
+        replace an existing one in --out
+
+    Exit status
+    -----------
+    0  all that was seen is within the tolerance, or there is none
+    3  something is not
+    4  undecided: too close to the tolerance, or the registration is not accepted
+    2  nothing was written: one line on stderr states the reason
+    """
+
+    home = "tofuse.apps.cli.comparing"
+
+    result: str
+    reference: str
+    tolerance: Length | None = None
+    accuracy: Length | None = None
+    guess: Path | None = None
+    unit: Literal["mm", "cm", "m"] | None = None
+    out: Path | None = None
+    overwrite: bool = False
+
+
+class Repeat(Json, Threads, Edited):
+    """Compare results of the same place: repeatability, and whether their bounds hold.
+
+    Results in the same folder are of one session.
+
+    Attributes
+    ----------
+    results : RESULT
+        two or more results; the first one is the reference
+    out : DIR
+        folder for the tables (none)
+    overwrite
+        replace an existing one in --out
+
+    Exit status
+    -----------
+    0  the results were compared
+    2  nothing was written: one line on stderr states the reason
+    """
+
+    home = "tofuse.apps.cli.comparing"
+
+    results: list[Path]
+    out: Path | None = None
+    overwrite: bool = False
+
+
 class RigOptions(Json, Threads):
     """Options of the commands of rigs.
 
@@ -864,6 +936,6 @@ class View(Page, Edited):
 
 
 COMMANDS: tuple[type[Command], ...] = (
-    *(Run, Batch, Register, Judge, Merge, Locate, Rig, Demo, Simulate, Inspect, Convert, Record),
-    *(Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
+    *(Run, Batch, Register, Judge, Merge, Locate, Compare, Repeat, Rig, Demo, Simulate, Inspect),
+    *(Convert, Record, Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
 )

@@ -12,6 +12,8 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.apps.pairs import pair_words
     from tofuse.apps.pairs.job import PairOptions, pair_exit_status, register_files
-    from tofuse.apps.pairs.result import pair_json
+    from tofuse.apps.pairs.registering import register
+    from tofuse.apps.pairs.result import PairResult, pair_json
+    from tofuse.apps.pairs.views import named_view
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

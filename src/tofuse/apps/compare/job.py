@@ -1,0 +1,172 @@
+"""`tofuse compare` and `tofuse repeat` with files: read, compare, write."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from tofuse.apps.compare.comparing import Comparison, compare
+from tofuse.apps.compare.page import colors, limit_of, write_compare_report
+from tofuse.apps.compare.repeating import Repetition, read_sessions, repeated
+from tofuse.apps.results import folders
+from tofuse.engine.compute import threads
+from tofuse.engine.fusion import GeometryRecord
+from tofuse.engine.progress import Progress, Silent
+from tofuse.formats.files import atomic
+from tofuse.formats.geometry import write_ply
+from tofuse.formats.poses import read_pose
+
+COMPARED, REPEATED = "compare.json", "repeat.json"
+_STATUS = {None: 0, "pass": 0, "fail": 3, "undecided": 4}
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """The options of ``tofuse compare``; see its ``--help``."""
+
+    tolerance: float | None = None
+    guess: Path | None = None
+    accuracy: float | None = None
+    unit: Literal["mm", "cm", "m"] | None = None
+    out: Path | None = None
+    overwrite: bool = False
+    threads: int | None = None
+
+
+@dataclass(frozen=True)
+class RepeatOptions:
+    """The options of ``tofuse repeat``; see its ``--help``."""
+
+    out: Path | None = None
+    overwrite: bool = False
+    threads: int | None = None
+
+
+def compare_files(
+    result: str, reference: str, options: CompareOptions | None = None,
+    progress: Progress | None = None,
+) -> Comparison:  # fmt: skip
+    """Compare two files or folders, and write the result; see `compare` for errors.
+
+    Raises
+    ------
+    OutputError
+        If the result can't be written; existing files are then unchanged.
+    """
+    options, progress = options or CompareOptions(), progress or Silent()
+
+    def work() -> Comparison:
+        progress.stage("comparing")
+        return compare(
+            result,
+            reference,
+            tolerance_m=options.tolerance,
+            guess=None if options.guess is None else read_pose(options.guess),
+            accuracy_m=options.accuracy,
+            unit=options.unit,
+        )
+
+    with threads(options.threads), threadpool_limits(1):
+        if options.out is None:
+            return work()
+        with folders.OutputFolder(
+            options.out, overwrite=options.overwrite, contract=COMPARE_CONTRACT
+        ) as folder:
+            comparison = work()
+            progress.stage("writing")
+            with folder.staging() as staging:
+                write_comparison(comparison, staging)
+    return comparison
+
+
+def compare_exit_status(comparison: Comparison) -> int:
+    """Return 0 if all that was seen passes, or without a tolerance; 3 if not; 4 if undecided."""
+    undecided = comparison.verdict is None and comparison.reason
+    return _STATUS["undecided" if undecided else comparison.verdict]
+
+
+def write_comparison(comparison: Comparison, folder: Path) -> None:
+    """Write the files of a comparison."""
+    found = comparison.deviations
+    rows = comparison.worst
+    atomic.write_text(folder / "deviations.csv", _table(rows))
+    faces = comparison.measured.faces
+    whole = faces is not None and len(found.points) == len(comparison.measured.points)
+    kept = np.ones(len(found.points), bool) if whole else np.isfinite(found.deviation)
+    write_ply(
+        folder / "deviations.ply",
+        GeometryRecord(
+            found.points[kept],
+            faces if whole else None,
+            normals=found.normals[kept].astype(np.float32),
+            color=colors(found.deviation[kept], limit_of(comparison)),
+            scalars={
+                "deviation": found.deviation[kept].astype(np.float32),
+                "sigma": found.sigma[kept].astype(np.float32),
+            },
+        ),
+    )
+    write_compare_report(comparison, folder / "report.html")
+    _write_json(comparison.to_dict(), folder / COMPARED)
+
+
+def repeat_files(
+    results: Sequence[Path], options: RepeatOptions | None = None, progress: Progress | None = None
+) -> Repetition:
+    """Compare results of the same place, and write what was found; see `repeated` for errors."""
+    options, progress = options or RepeatOptions(), progress or Silent()
+
+    def work() -> Repetition:
+        progress.stage("reading", len(results))
+        sessions = read_sessions(results, progress)
+        progress.stage("comparing")
+        return repeated(sessions)
+
+    with threads(options.threads), threadpool_limits(1):
+        if options.out is None:
+            return work()
+        with folders.OutputFolder(
+            options.out, overwrite=options.overwrite, contract=REPEAT_CONTRACT
+        ) as folder:
+            repetition = work()
+            with folder.staging() as staging:
+                rows = [vars(component) for component in repetition.components]
+                atomic.write_text(staging / "repeat.csv", _table(rows))
+                _write_json(repetition.to_dict(), staging / REPEATED)
+    return repetition
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    text = io.StringIO()
+    if rows:
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    return text.getvalue()
+
+
+def _write_json(data: Mapping[str, Any], path: Path) -> None:
+    atomic.write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+
+def _contract(marker: str, files: Iterable[str], *fields: str) -> folders.Contract:
+    def is_ours(folder: Path) -> bool:
+        data = folders.read_json_object(folder / marker)
+        return data is not None and {"schema", "version", *fields} <= set(data)
+
+    return folders.Contract(re.compile("|".join(map(re.escape, (marker, *files)))), marker, is_ours)
+
+
+COMPARE_CONTRACT = _contract(
+    COMPARED, ("deviations.csv", "deviations.ply", "report.html"), "regions", "tolerance_m"
+)
+REPEAT_CONTRACT = _contract(REPEATED, ("repeat.csv",), "components", "bounds")

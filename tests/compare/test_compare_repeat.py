@@ -1,0 +1,69 @@
+"""Repeated results: variance components and whether the stated bounds hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from measured_parts import NOISE, drawn, scan
+from tofuse.apps.compare.nearest import Reference
+from tofuse.apps.compare.repeating import Session, components, read_sessions, repeated
+from tofuse.engine.errors import InputError
+from tofuse.engine.progress import Silent
+
+
+def test_components_are_those_of_the_model() -> None:
+    rng = np.random.default_rng(0)
+    group = np.repeat(np.arange(4), 3)
+    values = rng.normal(0, 0.003, (2000, 4))[:, group] + rng.normal(0, 0.002, (2000, 12))
+    values += rng.normal(0, 1, (2000, 1))  # of the places themselves
+    found = components("surface", "m", values, group)
+    assert found.repeatability == pytest.approx(0.002, rel=0.05)
+    assert found.reproducibility == pytest.approx(0.003, rel=0.05)
+    assert found.total == pytest.approx(np.hypot(0.002, 0.003), rel=0.05)
+    assert (found.within, found.between) == (8, 3)
+
+
+def test_components_that_are_not_determined_are_none() -> None:
+    values = np.random.default_rng(1).normal(size=(50, 3))
+    one = components("surface", "m", values, np.zeros(3, np.intp))
+    assert one.reproducibility is None
+    assert one.repeatability == pytest.approx(1, rel=0.2)
+    single = components("surface", "m", values, np.arange(3))
+    assert single.repeatability is None
+    assert single.total == single.reproducibility == pytest.approx(1, rel=0.2)
+
+
+def sessions(stated: float, shared: float) -> list[Session]:
+    """Two sessions of two scans; the surface of the second session is farther out at one side."""
+    part = Reference.of(drawn())
+    found = []
+    for k in range(4):
+        surface = scan(part, k, 8000, stated)
+        d = shared * np.cos(30 * surface.points[:, 0]) * (k // 2)
+        points = surface.points + d[:, None] * surface.normals
+        found.append(Session(str(k), f"day {k // 2}", None, replace(surface, points=points)))
+    return found
+
+
+def test_differences_between_sessions_are_separated() -> None:
+    found = repeated(sessions(0.0002, 0.001), searched=False)
+    surface = found.components[0]
+    assert surface.repeatability is not None
+    assert surface.reproducibility is not None
+    assert surface.repeatability < 0.7 * NOISE  # of means of points
+    assert surface.reproducibility > 3 * surface.repeatability
+    assert found.components[1].name == "dimension"
+    assert found.held[0].share < 0.9  # of bounds that are too small
+    assert any("poses are not compared" in text for text in found.warnings)
+    honest = repeated(sessions(0.0005, 0.0), searched=False).held[0]
+    assert honest.share > 0.95
+    assert honest.low < honest.share <= honest.high
+    assert found.to_dict()["components"][0]["unit"] == "m"
+
+
+def test_a_single_result_is_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match="two or more"):
+        read_sessions([tmp_path], Silent())

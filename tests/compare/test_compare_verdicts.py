@@ -1,0 +1,147 @@
+"""Deviations, their uncertainty, and the verdicts that follow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tofuse
+from measured_parts import NOISE, drawn, scan
+from tofuse.apps.compare.comparing import compared
+from tofuse.apps.compare.deviations import COVERAGE
+from tofuse.apps.compare.nearest import Reach, Reference
+from tofuse.apps.compare.surface import Surface, in_metres
+from tofuse.engine.errors import InputError
+from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.geometry import se3
+from tofuse.lab.world import mesh as meshes
+
+T = se3.exp([0.3, 0.1, -0.2, 0.4, 1.0, -0.3])
+
+
+@pytest.fixture(scope="module")
+def part() -> Reference:
+    return Reference.of(drawn())
+
+
+def moved(surface: Surface, pose=T) -> Surface:
+    return replace(
+        surface,
+        points=se3.transform(pose, surface.points),
+        normals=surface.normals @ pose[:3, :3].T,
+    )
+
+
+def test_distances_are_exact_and_signed(part) -> None:
+    rng = np.random.default_rng(3)
+    surface = Reference.of(drawn(meshes.box([0.2, 0.2, 0.2])))
+    points = np.column_stack([rng.uniform(-0.08, 0.08, (200, 2)), np.full(200, 0.1)])
+    heights = rng.uniform(-0.01, 0.01, 200)
+    up = np.tile([0.0, 0, 1], (200, 1))
+    reach = Reach(0.02, 0.002)
+    found = surface.distances(points + heights[:, None] * up, up, reach)
+    np.testing.assert_allclose(found.signed, heights, atol=1e-9)
+    # Another side of the body, or nothing beside the border.
+    assert not surface.distances(points, -up, reach).compared.any()
+    beside = points + np.array([0.2, 0, 0.005])
+    assert not surface.distances(beside, up, reach).compared.any()
+
+
+def test_faces_of_a_cad_model_are_regions(part) -> None:
+    assert part.has_faces
+    assert part.region.max() + 1 == 18
+    areas = np.bincount(part.region, part.area)
+    assert (np.diff(areas) <= 1e-9).all()
+    np.testing.assert_allclose(areas[0], 0.2 * 0.14, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("bump", "verdict"), [(0.0, "pass"), (0.0024, "undecided"), (0.006, "fail")]
+)
+def test_a_bump_decides_the_verdict(part, bump, verdict) -> None:
+    found = compared(scan(part, bump=bump), part, 0.002, searched=False)
+    assert found.verdict == verdict
+    assert found.sentence.startswith(verdict.capitalize())
+    assert {"not seen"} < {region.verdict for region in found.regions}
+    assert 0.6 < found.seen < 0.8
+    if verdict == "fail":
+        worst = max(found.worst, key=lambda row: abs(row["deviation_m"]))
+        assert np.linalg.norm([worst["x"] + 0.03, worst["y"] - 0.03]) < 0.015
+        assert worst["verdict"] == "fail"
+
+
+def test_a_pose_is_found_without_a_guess(part) -> None:
+    found = compared(moved(scan(part)), part, 0.002)
+    assert found.verdict == "pass"
+    gap = found.deviations.T_reference_measured @ T
+    assert np.linalg.norm(gap[:3, 3]) < 2e-4
+    assert se3.angle(gap) < 1e-3
+
+
+@pytest.mark.nightly_part
+def test_a_symmetry_is_named() -> None:
+    box = Reference.of(drawn(meshes.box([0.2, 0.14, 0.05])))
+    found = compared(moved(scan(box)), box, 0.002)
+    assert found.verdict == "pass"
+    assert "turned by 180" in found.given
+    assert found.given in found.sentence
+
+
+def test_sigma_is_that_of_repeated_scans(part) -> None:
+    """Means of places scatter as stated; averaging does not reduce shared errors."""
+    found = [compared(scan(part, k, shared=0.0), part, 0.002, searched=False) for k in range(6)]
+    z = np.concatenate([c.deviations.places.deviation / c.deviations.places.sigma for c in found])
+    assert 0.8 < z.std() < 1.1
+    shared = compared(scan(part, shared=0.0005), part, 0.002, searched=False).deviations.places
+    assert np.median(found[0].deviations.places.sigma) < 0.5 * NOISE
+    assert 0.0003 < np.median(shared.sigma) < 0.0006
+
+
+def test_errors_without_bound_leave_all_undecided(part) -> None:
+    found = compared(scan(part, shared=np.inf, bump=0.006), part, 0.002, searched=False)
+    assert found.verdict == "undecided"
+    assert "not bounded" in found.sentence
+    assert {r.verdict for r in found.regions} == {"undecided", "not seen"}
+
+
+def test_changes_are_significant_from_the_detection_limit(part) -> None:
+    calm = compared(scan(part), part, searched=False)
+    assert calm.verdict is None
+    assert calm.changed == 0
+    assert calm.sentence.startswith("No place differs significantly")
+    limit = next(r.detectable_m for r in calm.regions if r.places)
+    assert COVERAGE * 0.0001 < limit < 0.002
+    assert compared(scan(part, 1, bump=3 * limit), part, searched=False).changed > 0
+
+
+def test_the_unit_of_a_file_is_recognised() -> None:
+    nominal = drawn()
+    in_mm = replace(nominal, points=1000 * nominal.points)
+    _, reference, said = in_metres(nominal, in_mm)
+    np.testing.assert_allclose(reference.points, nominal.points)
+    assert "in mm" in said
+    _, reference, said = in_metres(nominal, in_mm, "mm")
+    np.testing.assert_allclose(reference.points, nominal.points)
+    assert said == ""
+    assert in_metres(nominal, nominal)[2] == ""
+
+
+@pytest.mark.nightly_part
+def test_python_compares_meshes_and_clouds(part) -> None:
+    surface = part.surface
+    mesh = Mesh.of(GeometryRecord(surface.points, surface.faces))
+    found = tofuse.compare(mesh, mesh, tolerance_m=0.001, accuracy_m=0.0002)
+    assert found.verdict == "pass"
+    assert "Comparison: Pass" in repr(found)
+    for wrong in ({"tolerance_m": -1.0}, {"accuracy_m": 0.0}):
+        with pytest.raises(InputError, match="positive length"):
+            tofuse.compare(mesh, mesh, **wrong)
+
+
+def test_surfaces_that_don_t_overlap_are_refused(part) -> None:
+    far = moved(scan(part), se3.translation(np.array([0, 0, 5.0])))
+    with pytest.raises(InputError, match="no surface within"):
+        compared(far, part, 0.002, searched=False)
