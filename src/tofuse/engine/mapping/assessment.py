@@ -16,7 +16,6 @@ from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph
-from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.parts import name_of
 from tofuse.engine.quality import (
     ambiguous_frames,
@@ -211,21 +210,27 @@ class Assessment:
     def _calibration_error(
         self, check: calibration_check.CalibrationCheck | None
     ) -> tuple[float, float]:
-        """Return the 95 % bound of the pose errors (m, rad) due to the calibration.
+        """Return the rms of the pose errors (m, rad) due to the calibration.
 
-        It is the change of the poses under the estimated calibration, or the gap of a loop that a
-        better calibration would close, if larger; plus the uncertainty of corrections.
+        The poses change with an estimated calibration, which multipath causes too: only if the
+        views clearly show a large error it counts in full. Where they don't determine the focal
+        length, its error may be that of usual cameras. Added are the uncertainty of corrections and
+        the gap of a loop that a better calibration would close.
         """
         if check is None:
             return 0.0, 0.0
-        gap = check.gap.before if check.alarm and check.gap is not None else (0.0, 0.0)
-        errors = [np.maximum(check.moved, gap)]
+        unknown = np.sqrt(pose_accuracy.UNKNOWN_FRACTION)
+        is_shown = check.improves and check.large
+        errors = [(1.0 if is_shown else unknown) * np.array(check.moved)]
+        if check.undetermined:
+            usual = calibration_check.TOLERANCES["focal"]
+            errors.append(unknown * usual * np.array(check.motion["focal"]))
+        if check.alarm and check.gap is not None:
+            errors.append(np.array(check.gap.before))
         for part in self.config.corrections:
             if isinstance(part, CameraErrors):
-                sigmas = part.sigmas
                 errors += [
-                    OF_95_PERCENT * sigmas[name] * np.array(motion)
-                    for name, motion in check.motion.items()
+                    part.sigmas[name] * np.array(motion) for name, motion in check.motion.items()
                 ]
         m, rad = np.linalg.norm(errors, axis=0).tolist()
         return m, rad

@@ -529,11 +529,11 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
     if check.undetermined:
         text = (
             "The recording does not determine the camera's focal length: the stated accuracy "
-            "assumes that the calibration is right."
+            "allows for an error of 1%."
         )
         motion = length(0.01 * check.motion["focal"][0])
         if motion != length(0.0):  # else the views give no estimate
-            text += f" An error of 1% would move the poses by {motion}."
+            text += f" It would move the poses by {motion}."
     elif check.unconfirmed:
         correction = calibration_check.proposal(check.unconfirmed, check.best)
         qualifier = (
