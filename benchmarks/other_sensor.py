@@ -88,6 +88,11 @@ class Sensor:
     stray: float = 0.0
     amplitude: bool = True
 
+    @property
+    def has_indirect(self) -> bool:
+        """Whether indirect light changes its depth."""
+        return self.modulation_m is not None
+
 
 SENSORS = {
     "azure": Sensor(

@@ -12,7 +12,7 @@ poses or not, and counts in part. The quantile allows for the sum being an estim
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -36,12 +36,12 @@ _UNMEASURED_SIGMA = np.array([30.0] * 3 + [10.0] * 3)
 _UNMEASURED_FRACTION = 0.05
 # Mean square of a fraction of which nothing is known: uniform between none and all.
 UNKNOWN_FRACTION = 1 / 3
-# The mean square error is known as well as from that many errors: in simulated recordings it is
-# often twice as large as estimated, or half, by errors that all views of a place share.
-_VARIANCE_DOF = 10.0
-# With covariances that are larger by this factor, 95 % of such errors (6,) are in the ellipsoid of
-# 95 % of a normal distribution.
-COVARIANCE_FACTOR = 1.53
+# The mean square error is known as well as from that many errors: by the covariance alone, whose
+# model is that of another camera, and if halves of the images measured it.
+_MODEL_DOF, _MEASURED_DOF = 5.0, 10.0
+# With covariances larger by these factors, 95 % of such errors (6,) are in the ellipsoid of 95 % of
+# a normal distribution.
+_MODEL_FACTOR, COVARIANCE_FACTOR = 2.36, 1.53
 # Directions of two frames are distinct above this fraction of the strongest.
 _DISTINCT = 0.1
 _NO_DIRECTIONS = np.zeros((0, 6))
@@ -87,9 +87,9 @@ class Accuracy:
         Indices of the frames whose pose is unbounded in some direction.
     by_odometry
         Indices of the frames whose pose would be unbounded without the recorded odometry.
-    limited_by
-        The cause of most of the bound of the positions, a key of `ObservedErrors.mean_squares`;
-        empty if they are not bounded.
+    causes_m
+        Rms error of the positions by its cause, see `ObservedErrors.mean_squares`; empty if they
+        are not bounded.
     """
 
     position_m: float = np.inf
@@ -99,7 +99,12 @@ class Accuracy:
     worst: WorstFrame | None = None
     unbounded: tuple[int, ...] = ()
     by_odometry: tuple[int, ...] = ()
-    limited_by: str = ""
+    causes_m: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def limited_by(self) -> str:
+        """The cause of most of the bound of the positions; empty if they are not bounded."""
+        return max(self.causes_m, key=self.causes_m.__getitem__, default="")
 
     def without_bound(self) -> Accuracy:
         """Return the accuracy where an error is known that its evidence does not cover."""
@@ -109,7 +114,7 @@ class Accuracy:
             rotation_rad=np.inf,
             relative=np.inf,
             worst=None,
-            limited_by="",
+            causes_m={},
         )
 
 
@@ -137,6 +142,11 @@ class ObservedErrors:
     split_m: float = 0.0
     split_rad: float = 0.0
 
+    @property
+    def is_measured(self) -> Bool:
+        """(2,) whether halves of the images measured errors of positions and of rotations."""
+        return np.array([self.split_m, self.split_rad]) > 0
+
     def mean_squares(self, by_covariance: Float64) -> dict[str, Float64]:
         """Return the mean squares (2,) of the errors, m^2 and rad^2, by their cause.
 
@@ -149,7 +159,7 @@ class ObservedErrors:
         # If halves show less, neither is wrong for certain: their mean.
         measured = np.maximum(split, 0.5 * (split + by_covariance))
         return {
-            "noise": np.where(split > 0, measured, by_covariance),
+            "noise": np.where(self.is_measured, measured, by_covariance),
             "refinement": UNKNOWN_FRACTION * np.array([self.moved_m, self.moved_rad]) ** 2,
             "disagreement": UNKNOWN_FRACTION * np.array([self.excess_m, 0.0]) ** 2,
             "calibration": np.array([self.calibration_m, self.calibration_rad]) ** 2,
@@ -373,14 +383,16 @@ def accuracy_of(
         return Accuracy(assessed=True, worst=worst_frame, unbounded=unbounded_frames)
     causes = observed.mean_squares(by_covariance.squares)
     total = np.sum([*causes.values()], axis=0)
-    rms_bounds = _bounds(total, by_covariance.degrees)
+    scale_degrees = np.where(observed.is_measured, _MEASURED_DOF, _MODEL_DOF)
+    rms_bounds = _bounds(total, by_covariance.degrees, scale_degrees)
     noise = causes["noise"]
     pose_squares = by_covariance.single_squares * _ratio(noise, by_covariance.squares)
-    pose_bounds = _bounds(pose_squares + total - noise, by_covariance.single_degrees)
+    pose_squares += total - noise
+    pose_bounds = _bounds(pose_squares, by_covariance.single_degrees, scale_degrees)
     pose_bounds = np.where(unbounded[by_covariance.positions], np.inf, pose_bounds)
     worst_row = int(np.argmax((pose_bounds / limits).max(1)))
     position, rotation = np.where(unbounded.any(0), np.inf, rms_bounds).tolist()
-    limited_by = max(causes, key=lambda cause: causes[cause][0]) if np.isfinite(position) else ""
+    causes_m = {cause: float(np.sqrt(squares[0])) for cause, squares in causes.items()}
     return Accuracy(
         position,
         rotation,
@@ -390,7 +402,7 @@ def accuracy_of(
             int(graph.ids[by_covariance.positions[worst_row]]), *pose_bounds[worst_row].tolist()
         ),
         unbounded_frames,
-        limited_by=limited_by,
+        causes_m=causes_m if np.isfinite(position) else {},
     )
 
 
@@ -407,12 +419,13 @@ def covariances_of(
     causes = observed.mean_squares(squares)
     noise = causes.pop("noise")
     more = np.sum([*causes.values()], axis=0)
-    C = covariances.of_poses.copy()
-    if by_covariance is not None:  # halves of the images say little about single poses
-        scale = np.repeat(np.sqrt(np.maximum(_ratio(noise, squares), 1.0)), 3)
-        C *= np.outer(scale, scale)
+    # Halves of the images say little about single poses: these are not reduced.
+    scale = np.repeat(np.sqrt(np.maximum(_ratio(noise, squares), 1.0)), 3)
+    C = covariances.of_poses * np.outer(scale, scale)
     C[1:] += np.diag(np.repeat(more / 3, 3))
-    return COVARIANCE_FACTOR * C
+    factor = np.where(observed.is_measured, COVARIANCE_FACTOR, _MODEL_FACTOR)
+    factor = np.repeat(np.sqrt(factor), 3)
+    return np.asarray(C * np.outer(factor, factor), np.float64)
 
 
 def _ratio(noise: Float64, by_covariance: Float64) -> Float64:
@@ -483,12 +496,13 @@ def _remove_motion(C: Float64, motion: Float64, chosen: Bool) -> Float64:
     return np.asarray(projector @ C @ projector.T, np.float64)
 
 
-def _bounds(squares: Float64, degrees: Float64) -> Float64:
+def _bounds(squares: Float64, degrees: Float64, scale_degrees: Float64) -> Float64:
     """95 % bounds on rms errors with these expected mean squares.
 
-    Ratios of two estimated mean squares follow Fisher's F-distribution.
+    The ratio of the mean square of errors with some degrees of freedom to an estimate of it with
+    `scale_degrees` follows Fisher's F-distribution.
     """
-    return np.asarray(np.sqrt(squares * fdtri(degrees, _VARIANCE_DOF, _LEVEL)), np.float64)
+    return np.asarray(np.sqrt(squares * fdtri(degrees, scale_degrees, _LEVEL)), np.float64)
 
 
 def _of_chosen(C: Float64, chosen: Bool) -> tuple[float, float]:

@@ -51,6 +51,15 @@ MAX_LISTED = 6
 MIN_SUPPORT, AGREEMENT_RATIO = 0.5, 0.9
 
 
+# What a bound is mostly due to, and what would narrow it.
+_CAUSES = {
+    "noise": "noise: more views of the same places would average it",
+    "refinement": "the correction by the refinement: a return to the start would confirm it",
+    "disagreement": "surfaces that differ between views, by multipath or changes of the scene",
+    "calibration": "the camera's calibration: a better one would remove it",
+}
+
+
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """The evidence of a run.
@@ -477,6 +486,8 @@ def accuracy_reasons(
         if a.position_m <= tolerance_m:
             error, allowed = _angle(a.rotation_rad), _angle(TOLERANCE_RAD)
         text = f"Pose errors may reach {error} rms (95 % bound); the tolerance is {allowed}."
+        if a.limited_by and a.position_m > tolerance_m:
+            text += f" Most of it is due to {_CAUSES[a.limited_by]}."
         if a.worst is not None:
             text += f" Frame {a.worst.frame} is the least certain: {length(a.worst.position_m)}."
         yield Reason("uncertain_poses", ((frames[0], frames[-1]),), text)
