@@ -68,7 +68,7 @@ def test_coverage_of_error_bounds(loops) -> None:
 
 
 @pytest.mark.parametrize(
-    ("degrees", "factor"), [(5, accuracy._MODEL_FACTOR), (10, accuracy.COVARIANCE_FACTOR)]
+    ("degrees", "factor"), [(5, accuracy._MODEL_FACTOR), (15, accuracy.COVARIANCE_FACTOR)]
 )
 def test_covariances_cover_errors_as_normal_ones_would(degrees, factor) -> None:
     """A user takes quantiles of a normal distribution of them."""

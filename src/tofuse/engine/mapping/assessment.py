@@ -212,16 +212,16 @@ class Assessment:
     ) -> tuple[float, float]:
         """Return the rms of the pose errors (m, rad) due to the calibration.
 
-        The poses change with an estimated calibration, which multipath causes too: only if the
-        views clearly show a large error it counts in full. Where they don't determine the focal
-        length, its error may be that of usual cameras. Added are the uncertainty of corrections and
-        the gap of a loop that a better calibration would close.
+        The poses change with an estimated calibration, which multipath causes too: only an error
+        that may well be true counts in full. Where the views don't determine the focal length, its
+        error may be that of usual cameras. Added are the uncertainty of corrections and the gap of
+        a loop that a better calibration would close.
         """
         if check is None:
             return 0.0, 0.0
         unknown = np.sqrt(pose_accuracy.UNKNOWN_FRACTION)
-        is_shown = check.improves and check.large
-        errors = [(1.0 if is_shown else unknown) * np.array(check.moved)]
+        is_likely = check.unconfirmed or (check.improves and check.large)
+        errors = [(1.0 if is_likely else unknown) * np.array(check.moved)]
         if check.undetermined:
             usual = calibration_check.TOLERANCES["focal"]
             errors.append(unknown * usual * np.array(check.motion["focal"]))

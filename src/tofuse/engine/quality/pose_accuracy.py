@@ -38,10 +38,10 @@ _UNMEASURED_FRACTION = 0.05
 UNKNOWN_FRACTION = 1 / 3
 # The mean square error is known as well as from that many errors: by the covariance alone, whose
 # model is that of another camera, and if halves of the images measured it.
-_MODEL_DOF, _MEASURED_DOF = 5.0, 10.0
+_MODEL_DOF, _MEASURED_DOF = 5.0, 15.0
 # With covariances larger by these factors, 95 % of such errors (6,) are in the ellipsoid of 95 % of
 # a normal distribution.
-_MODEL_FACTOR, COVARIANCE_FACTOR = 2.36, 1.53
+_MODEL_FACTOR, COVARIANCE_FACTOR = 2.36, 1.33
 # Directions of two frames are distinct above this fraction of the strongest.
 _DISTINCT = 0.1
 _NO_DIRECTIONS = np.zeros((0, 6))
