@@ -10,7 +10,7 @@ another.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -39,34 +39,24 @@ class Sensor:
 
     Attributes
     ----------
-    width, height, degrees
-        Size of the image and horizontal field of view.
+    degrees
+        Horizontal field of view.
     noise_m, noise_power
         Standard deviation of the depth at 1 m on a white surface, and how it grows with depth.
-    by_light
-        Whether noise decreases with the light that returns.
-    grain
-        Pixels over which noise is correlated.
+    by_light, grain
+        Whether noise decreases with the light; pixels over which it is correlated.
     calibration
         Standard deviation of the errors of focal length and principal point, relative.
-    warp
-        Relative depth error towards the corners of the image.
+    warp, fixed_m
+        Relative depth error towards the corners; standard deviation of that of each pixel.
     wiggle_m, period_m
         Amplitude and period of a periodic error of the range.
     warm_up_m
         Change of the depth from the first frame to the last.
-    fixed_m
-        Standard deviation of a constant error of each pixel.
-    step_m
-        Step of the depth at 1 m; it grows with the square of the depth if noise does.
-    smoothing
-        Size of the window that the maker smooths the depth with, pixels.
-    modulation_m
-        Range after which the phase of the fastest modulation repeats; None if none is measured.
-    stray
-        Fraction of the light that the lens spreads over the image.
-    amplitude
-        Whether there is an amplitude image.
+    step_m, smoothing
+        Step of the depth at 1 m; size of the window that the maker smooths with, pixels.
+    modulation_m, stray
+        Period of the range of the fastest modulation, if any; light that the lens spreads.
     """
 
     width: int
@@ -269,14 +259,9 @@ class _Images:
         s = self.sensor
         self.fixed = s.fixed_m * self.rng.standard_normal((s.height, s.width))
         # Four rays for each pixel: those at an edge see two surfaces.
-        fine = replace(
-            self.camera,
-            width=2 * s.width,
-            height=2 * s.height,
-            fx=2 * self.camera.fx,
-            fy=2 * self.camera.fy,
-            cx=2 * self.camera.cx + 0.5,
-            cy=2 * self.camera.cy + 0.5,
+        c = self.camera
+        fine = Pinhole(
+            2 * s.width, 2 * s.height, 2 * c.fx, 2 * c.fy, 2 * c.cx + 0.5, 2 * c.cy + 0.5
         )
         rays = np.concatenate([fine.rays(), np.ones((*fine.rays().shape[:2], 1))], 2)
         self.z_of_range = 1 / np.linalg.norm(rays, axis=2)
