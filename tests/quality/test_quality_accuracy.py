@@ -122,6 +122,8 @@ def test_halves_of_images_measure_errors_of_this_camera() -> None:
     # They may also miss errors: smaller ones count as half of the evidence.
     assert less.position_m == pytest.approx(same.position_m * np.sqrt(0.505))
     assert bound_of(split_m=0.0) == plain  # nothing was measured
+    # Halves share the error of a correction that was estimated from both.
+    assert bound_of(split_m=noise, corrected=True).position_m == pytest.approx(plain.position_m)
     C_plain, C_same, C_more, C_less = (
         covariances_of(GraphCovariances(walk()), ObservedErrors(split_m=k * noise))[5]
         for k in (0, 1, 3, 0.1)

@@ -186,7 +186,12 @@ class Assessment:
         excess_m = 0.0 if cross_view is None else cross_view.excess_m()
         calibration = self._calibration_error(refinement.calibration_check)
         observed = pose_accuracy.ObservedErrors(
-            *refinement_shift, excess_m, *calibration, refinement.split_m, refinement.split_rad
+            *refinement_shift,
+            excess_m,
+            *calibration,
+            refinement.split_m,
+            refinement.split_rad,
+            corrected=bool(self._estimated_corrections),
         )
         covariances = pose_accuracy.covariances_of(full, observed)
         del full  # only one large factor is in memory
@@ -206,6 +211,12 @@ class Assessment:
 
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
         return self.tracked.measured(graph, self.observations.views, refinement.non_overlap_edges)
+
+    @property
+    def _estimated_corrections(self) -> list[CameraErrors]:
+        """The corrections of the camera that were estimated from its own views."""
+        corrections = [c for c in self.config.corrections if isinstance(c, CameraErrors)]
+        return [c for c in corrections if any(c.sigmas.values())]
 
     def _calibration_error(
         self, check: calibration_check.CalibrationCheck | None
@@ -227,11 +238,12 @@ class Assessment:
             errors.append(unknown * usual * np.array(check.motion["focal"]))
         if check.alarm and check.gap is not None:
             errors.append(np.array(check.gap.before))
-        for part in self.config.corrections:
-            if isinstance(part, CameraErrors):
-                errors += [
-                    part.sigmas[name] * np.array(motion) for name, motion in check.motion.items()
-                ]
+        for part in self._estimated_corrections:
+            for name, motion in check.motion.items():
+                errors.append(part.sigmas[name] * np.array(motion))
+                if part.errors[name]:  # as of usual cameras, by what all views have in common
+                    usual = calibration_check.TOLERANCES[name]
+                    errors.append(unknown * usual * np.array(motion))
         m, rad = np.linalg.norm(errors, axis=0).tolist()
         return m, rad
 

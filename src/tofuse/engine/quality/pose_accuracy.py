@@ -132,6 +132,8 @@ class ObservedErrors:
         Rms error of the poses due to the calibration of the camera.
     split_m, split_rad
         Rms errors by halves of the images, see `split_half`: those of the covariance and more.
+    corrected
+        Whether the camera was corrected by its own views: halves share the correction's error.
     """
 
     moved_m: float = 0.0
@@ -141,6 +143,12 @@ class ObservedErrors:
     calibration_rad: float = 0.0
     split_m: float = 0.0
     split_rad: float = 0.0
+    corrected: bool = False
+
+    @property
+    def scale_degrees(self) -> Float64:
+        """(2,) degrees of freedom of the mean squares as estimates."""
+        return np.where(self.is_measured & (not self.corrected), _MEASURED_DOF, _MODEL_DOF)
 
     @property
     def is_measured(self) -> Bool:
@@ -383,12 +391,11 @@ def accuracy_of(
         return Accuracy(assessed=True, worst=worst_frame, unbounded=unbounded_frames)
     causes = observed.mean_squares(by_covariance.squares)
     total = np.sum([*causes.values()], axis=0)
-    scale_degrees = np.where(observed.is_measured, _MEASURED_DOF, _MODEL_DOF)
-    rms_bounds = _bounds(total, by_covariance.degrees, scale_degrees)
+    rms_bounds = _bounds(total, by_covariance.degrees, observed.scale_degrees)
     noise = causes["noise"]
     pose_squares = by_covariance.single_squares * _ratio(noise, by_covariance.squares)
     pose_squares += total - noise
-    pose_bounds = _bounds(pose_squares, by_covariance.single_degrees, scale_degrees)
+    pose_bounds = _bounds(pose_squares, by_covariance.single_degrees, observed.scale_degrees)
     pose_bounds = np.where(unbounded[by_covariance.positions], np.inf, pose_bounds)
     worst_row = int(np.argmax((pose_bounds / limits).max(1)))
     position, rotation = np.where(unbounded.any(0), np.inf, rms_bounds).tolist()
@@ -423,7 +430,8 @@ def covariances_of(
     scale = np.repeat(np.sqrt(np.maximum(_ratio(noise, squares), 1.0)), 3)
     C = covariances.of_poses * np.outer(scale, scale)
     C[1:] += np.diag(np.repeat(more / 3, 3))
-    factor = np.where(observed.is_measured, COVARIANCE_FACTOR, _MODEL_FACTOR)
+    is_measured = observed.scale_degrees > _MODEL_DOF
+    factor = np.where(is_measured, COVARIANCE_FACTOR, _MODEL_FACTOR)
     factor = np.repeat(np.sqrt(factor), 3)
     return np.asarray(C * np.outer(factor, factor), np.float64)
 
