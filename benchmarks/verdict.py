@@ -6,13 +6,14 @@ coverage of the bound, the median ratio of bound to error, and how often right a
 called good; and for each fault of the recordings, how often a reason or finding names it. A run is
 right if its error is within the tolerance (0.5 % of the model's diagonal, at least 1 cm) and at
 least 95 % of its frames have a pose; for real recordings, the uncertainty of the reference is
-added.
+added. Another table has the causes of the bounds, by their size relative to the true error.
 
 Simulated scenes are recorded by several cameras, with and without multipath. Variants of each
 recording have every second or fourth frame, a wrong focal length or principal point, a depth
-offset, or a gap. The family `incidents` has cases of `stress.py`: a person passes through the view,
-the lens is covered, the camera approaches a bare wall, or continues in another place. Real
-recordings are used complete and with every fourth frame.
+offset, or a gap. A second simulator (`other_sensor.py`) has a family for each of its cameras, of
+smaller recordings without variants. The family `incidents` has cases of `stress.py`: a person
+passes through the view, the lens is covered, the camera approaches a bare wall, or continues in
+another place. Real recordings are used complete and with every fourth frame.
 
     python benchmarks/verdict.py [--seeds 10 11] [--families room] [--real] [--json FILE]
 """
@@ -22,11 +23,12 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+import other_sensor
 import sequences
 import stress
 from recorded import RECORDED
@@ -88,6 +90,8 @@ class Run:
         Fraction of the frames with a pose.
     reference_m
         Uncertainty of the reference itself.
+    causes_m
+        See `Accuracy.causes_m`.
     """
 
     family: str
@@ -101,6 +105,7 @@ class Run:
     allowed_m: float
     posed: float
     reference_m: float = 0.0
+    causes_m: dict[str, float] = field(default_factory=dict)
 
     @property
     def right(self) -> bool:
@@ -186,6 +191,7 @@ def judged(
         allowed,
         float(result.has_pose.mean()),
         reference_m,
+        d.accuracy.causes_m,
     )
 
 
@@ -201,6 +207,19 @@ def simulated(seeds: Sequence[int], families: Sequence[str]) -> Iterator[Run]:
                         assert made.reference is not None
                         name = f"{scene}, {camera}{label}, seed {seed}, {what}"
                         yield judged(scene, name, made, [made.reference])
+
+
+def by_other_sensors(seeds: Sequence[int], sensors: Sequence[str]) -> Iterator[Run]:
+    """Yield the runs of recordings by the second simulator, with and without indirect light."""
+    for seed in seeds:
+        for sensor in sensors:
+            for scene in other_sensor.SCENES:
+                for indirect in (True, False)[: 1 + other_sensor.SENSORS[sensor].has_indirect]:
+                    recording = other_sensor.record(scene, sensor, seed, indirect=indirect)
+                    assert recording.reference is not None
+                    label = "" if indirect else ", direct"
+                    name = f"{scene}, {sensor}{label}, seed {seed}"
+                    yield judged(f"other: {sensor}", name, recording, [recording.reference])
 
 
 def real(data: Path) -> Iterator[Run]:
@@ -262,6 +281,20 @@ def table(runs: Sequence[Run]) -> Iterator[str]:
         )
 
 
+def causes(runs: Sequence[Run]) -> Iterator[str]:
+    """Yield the table of the causes of the bounds, as medians relative to the true error."""
+    bounded = [run for run in runs if run.causes_m]
+    names = [*dict.fromkeys(name for run in bounded for name in run.causes_m)]
+    yield f"| family | runs | bound | {' | '.join(names)} |"
+    yield "|---" * (3 + len(names)) + "|"
+    for family in [*dict.fromkeys(run.family for run in bounded), "all"]:
+        own = [run for run in bounded if family in ("all", run.family)]
+        ratios = np.median(
+            [np.array([run.bound_m, *run.causes_m.values()]) / run.error_m for run in own], axis=0
+        )
+        yield f"| {family} | {len(own)} | {' | '.join(f'{ratio:.2f}' for ratio in ratios)} |"
+
+
 def named(runs: Sequence[Run]) -> Iterator[str]:
     """Yield the table of faults, and whether they are named where they have an effect.
 
@@ -293,7 +326,7 @@ def main() -> None:
     parser.add_argument(
         "--seeds", nargs="*", type=int, default=[10, 11], help="seeds of the simulation"
     )
-    families = [*SCENES, INCIDENTS]
+    families = [*SCENES, *other_sensor.SENSORS, INCIDENTS]
     parser.add_argument("--families", nargs="*", default=families, choices=families)
     parser.add_argument("--real", action="store_true", help="also the real recordings")
     parser.add_argument("--data", type=Path, default=sequences.DATA, help="real recordings")
@@ -305,12 +338,15 @@ def main() -> None:
     for run in [
         *([real(options.data)] if options.real else []),
         simulated(options.seeds, [name for name in options.families if name in SCENES]),
+        by_other_sensors(
+            options.seeds, [name for name in options.families if name in other_sensor.SENSORS]
+        ),
         incidents(options.seeds if INCIDENTS in options.families else ()),
     ]:
         for one in run:
             runs.append(one)
             print(line(one), flush=True)
-    for text in [*table(runs), "", *named(runs)]:
+    for text in [*table(runs), "", *causes(runs), "", *named(runs)]:
         print(text)
     if options.json is not None:
         options.json.write_text(json.dumps([asdict(run) for run in runs], indent=1))

@@ -49,17 +49,17 @@ def bounded(graph, unobservable, unmeasured=()) -> PoseGraph:
 @pytest.mark.nightly_part
 @pytest.mark.parametrize("loops", [(), ((0, N - 1), (2, 9))])
 def test_coverage_of_error_bounds(loops) -> None:
-    """With noise alone, which the covariance models completely."""
+    """With noise whose size is known as well as from five errors."""
     rng = np.random.default_rng(11)
     solve = LevenbergMarquardt(robust="none").optimise
     found = np.array(
         [displacement(TRUE, solve(walk(rng, loops=loops)).graph.poses) for _ in range(300)]
     )
+    found = found * np.sqrt(5 / rng.chisquare(5, (len(found), 1)))
     bound = accuracy_of(GraphCovariances(walk(loops=loops)), ObservedErrors(), 2.0)
-    limits = np.array([bound.position_m, bound.rotation_rad]) / accuracy.UNOBSERVED_ERROR_FACTOR
-    for column, limit in zip(found.T, limits, strict=True):
+    for column, limit in zip(found.T, (bound.position_m, bound.rotation_rad), strict=True):
         assert 0.91 < np.mean(column < limit) < 0.985
-        assert limit < 2.5 * np.median(column)
+        assert limit < 3 * np.median(column)
     assert bound.assessed
     assert bound.relative == bound.position_m / 2
     assert bound.worst is not None
@@ -67,40 +67,71 @@ def test_coverage_of_error_bounds(loops) -> None:
     assert bound.unbounded == ()
 
 
-def test_errors_shown_by_recording_are_added() -> None:
-    plain = accuracy_of(GraphCovariances(walk()), ObservedErrors(), 1.0)
-    more = accuracy_of(GraphCovariances(walk()), ObservedErrors(0.03, 0.02, 0.04), 1.0)
-    assert more.position_m > 0.05
-    assert more.position_m == pytest.approx(
-        np.hypot(plain.position_m, accuracy.UNOBSERVED_ERROR_FACTOR * 0.05), rel=1e-6
+@pytest.mark.parametrize(
+    ("degrees", "factor"), [(5, accuracy._MODEL_FACTOR), (15, accuracy.COVARIANCE_FACTOR)]
+)
+def test_covariances_cover_errors_as_normal_ones_would(degrees, factor) -> None:
+    """A user takes quantiles of a normal distribution of them."""
+    rng = np.random.default_rng(5)
+    ratio = np.sqrt(degrees / rng.chisquare(degrees, 20_000))
+    errors = ratio[:, None] * rng.standard_normal((len(ratio), 6))
+    squares = (errors**2).sum(1) / factor
+    assert 0.94 < np.mean(squares < 12.59) < 0.96
+
+
+def bound_of(*errors: float, **named: float) -> Accuracy:
+    return accuracy_of(GraphCovariances(walk()), ObservedErrors(*errors, **named), 1.0)
+
+
+def test_errors_shown_by_recording_are_added_as_variances() -> None:
+    plain = bound_of()
+    assert plain.limited_by == "noise"
+    camera = bound_of(calibration_m=0.2, calibration_rad=0.1)
+    # The quantile of the sum is that of noise alone.
+    assert camera.position_m**2 - plain.position_m**2 == pytest.approx(
+        (plain.position_m * 0.2) ** 2 / noise_m() ** 2
     )
-    assert more.rotation_rad > plain.rotation_rad
-    bent = accuracy_of(
-        GraphCovariances(walk()), ObservedErrors(calibration_m=0.2, calibration_rad=0.1), 1.0
-    )
-    assert bent.position_m > 0.2
-    assert bent.rotation_rad > 0.1
+    assert camera.rotation_rad > plain.rotation_rad
+    assert camera.limited_by == "calibration"
+    # Of what may be an error or not, a third of the square counts.
+    for cause, name in (("refinement", "moved_m"), ("disagreement", "excess_m")):
+        one = bound_of(**{name: 0.2})
+        assert one.position_m == pytest.approx(
+            bound_of(calibration_m=0.2 / np.sqrt(3)).position_m, rel=1e-6
+        )
+        assert one.limited_by == cause
+        assert one.rotation_rad == plain.rotation_rad
+    assert bound_of(moved_rad=0.1).rotation_rad > plain.rotation_rad
     C = covariances_of(GraphCovariances(walk()), ObservedErrors(0.03, 0.02, 0.04))
     np.testing.assert_array_equal(C[0], 0)
-    assert np.trace(C[5, :3, :3]) > 0.05**2
+    assert np.trace(C[5, :3, :3]) > 0.05**2 / 3
 
 
-def test_split_half_errors_replace_too_small_covariance() -> None:
-    plain = accuracy_of(GraphCovariances(walk()), ObservedErrors(), 1.0)
-    stated = plain.position_m / accuracy.UNOBSERVED_ERROR_FACTOR
-    assert accuracy_of(GraphCovariances(walk()), ObservedErrors(split_m=0.3 * stated), 1.0) == plain
-    known = GraphCovariances(walk())
-    one, more = (accuracy_of(known, ObservedErrors(split_m=k * stated), 1.0) for k in (2, 4))
-    # They are rms errors, and a 95 % bound on them is larger.
-    assert one.position_m > 2 * plain.position_m
-    assert more.position_m == pytest.approx(2 * one.position_m)
-    assert more.rotation_rad == plain.rotation_rad
-    C = [
-        covariances_of(GraphCovariances(walk()), ObservedErrors(split_m=m))[5]
-        for m in (0.0, 3 * stated)
-    ]
-    assert np.trace(C[1][:3, :3]) > np.trace(C[0][:3, :3]) + stated**2
-    np.testing.assert_array_equal(C[1][3:, 3:], C[0][3:, 3:])
+def noise_m() -> float:
+    """Rms error by the covariance alone."""
+    return float(np.sqrt(accuracy._CovarianceErrors.of_graph(GraphCovariances(walk())).squares[0]))
+
+
+def test_halves_of_images_measure_errors_of_this_camera() -> None:
+    plain, noise = bound_of(), noise_m()
+    same, twice, four, less = (bound_of(split_m=k * noise) for k in (1, 2, 4, 0.1))
+    assert same.position_m < 0.85 * plain.position_m  # known better
+    assert twice.position_m == pytest.approx(2 * same.position_m)
+    assert four.position_m == pytest.approx(4 * same.position_m)
+    assert four.rotation_rad == plain.rotation_rad
+    # They may also miss errors: smaller ones count as half of the evidence.
+    assert less.position_m == pytest.approx(same.position_m * np.sqrt(0.505))
+    assert bound_of(split_m=0.0) == plain  # nothing was measured
+    # Halves share the error of a correction that was estimated from both.
+    assert bound_of(split_m=noise, corrected=True).position_m == pytest.approx(plain.position_m)
+    C_plain, C_same, C_more, C_less = (
+        covariances_of(GraphCovariances(walk()), ObservedErrors(split_m=k * noise))[5]
+        for k in (0, 1, 3, 0.1)
+    )
+    assert np.trace(C_same[:3, :3]) < np.trace(C_plain[:3, :3])
+    np.testing.assert_allclose(C_more[:3, :3], 9 * C_same[:3, :3])
+    np.testing.assert_array_equal(C_more[3:, 3:], C_plain[3:, 3:])
+    np.testing.assert_allclose(C_less, C_same)
 
 
 @pytest.mark.parametrize("direction", [X, TURN])

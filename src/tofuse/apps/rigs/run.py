@@ -196,7 +196,7 @@ def _calibration_edges(
     assert isinstance(source, RigSource)
     # The bound on the errors is enlarged for systematic ones, which these covariances include.
     covariances = [
-        c.covariance / pose_accuracy.UNOBSERVED_ERROR_FACTOR**2 + np.diag(_MIN_VARIANCES)
+        c.covariance / pose_accuracy.COVARIANCE_FACTOR + np.diag(_MIN_VARIANCES)
         for c in source.rig.cameras
     ]
     covariances[0] = np.diag(_MIN_VARIANCES)

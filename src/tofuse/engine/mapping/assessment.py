@@ -16,7 +16,6 @@ from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph
-from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.parts import name_of
 from tofuse.engine.quality import (
     ambiguous_frames,
@@ -193,7 +192,12 @@ class Assessment:
         excess_m = 0.0 if cross_view is None else cross_view.excess_m()
         calibration = self._calibration_error(refinement.calibration_check)
         observed = pose_accuracy.ObservedErrors(
-            *refinement_shift, excess_m, *calibration, refinement.split_m, refinement.split_rad
+            *refinement_shift,
+            excess_m,
+            *calibration,
+            refinement.split_m,
+            refinement.split_rad,
+            corrected=bool(self._estimated_corrections),
         )
         covariances = pose_accuracy.covariances_of(full, observed)
         del full  # only one large factor is in memory
@@ -214,25 +218,38 @@ class Assessment:
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
         return self.tracked.measured(graph, self.observations.views, refinement.non_overlap_edges)
 
+    @property
+    def _estimated_corrections(self) -> list[CameraErrors]:
+        """The corrections of the camera that were estimated from its own views."""
+        corrections = [c for c in self.config.corrections if isinstance(c, CameraErrors)]
+        return [c for c in corrections if any(c.sigmas.values())]
+
     def _calibration_error(
         self, check: calibration_check.CalibrationCheck | None
     ) -> tuple[float, float]:
-        """Return the 95 % bound of the pose errors (m, rad) due to the calibration.
+        """Return the rms of the pose errors (m, rad) due to the calibration.
 
-        It is the change of the poses under the estimated calibration, or the gap of a loop that a
-        better calibration would close, if larger; plus the uncertainty of corrections.
+        The poses change with an estimated calibration, which multipath causes too: only an error
+        that may well be true counts in full. Where the views don't determine the focal length, its
+        error may be that of usual cameras. Added are the uncertainty of corrections and the gap of
+        a loop that a better calibration would close.
         """
         if check is None:
             return 0.0, 0.0
-        gap = check.gap.before if check.alarm and check.gap is not None else (0.0, 0.0)
-        errors = [np.maximum(check.moved, gap)]
-        for part in self.config.corrections:
-            if isinstance(part, CameraErrors):
-                sigmas = part.sigmas
-                errors += [
-                    OF_95_PERCENT * sigmas[name] * np.array(motion)
-                    for name, motion in check.motion.items()
-                ]
+        unknown = np.sqrt(pose_accuracy.UNKNOWN_FRACTION)
+        is_likely = check.unconfirmed or (check.improves and check.large)
+        errors = [(1.0 if is_likely else unknown) * np.array(check.moved)]
+        if check.undetermined:
+            usual = calibration_check.TOLERANCES["focal"]
+            errors.append(unknown * usual * np.array(check.motion["focal"]))
+        if check.alarm and check.gap is not None:
+            errors.append(np.array(check.gap.before))
+        for part in self._estimated_corrections:
+            for name, motion in check.motion.items():
+                errors.append(part.sigmas[name] * np.array(motion))
+                if part.errors[name]:  # as of usual cameras, by what all views have in common
+                    usual = calibration_check.TOLERANCES[name]
+                    errors.append(unknown * usual * np.array(motion))
         m, rad = np.linalg.norm(errors, axis=0).tolist()
         return m, rad
 

@@ -1,22 +1,22 @@
 """95 % bounds on the errors of the poses, from the recording itself.
 
-The joint covariance of the poses covers noise and the errors that the patches of a view share.
-Three terms are added. The motion of the trajectory in the refinement measures the correlated errors
-of single registrations, and the remaining error is in proportion to it; if halves of the images
-show more than the covariance and this together, they replace both. If poses are wrong, views far
-apart in time that observe the same surface disagree by more than consecutive ones. And a loop that
-another calibration would close, or views that agree better with it, show that this one bends the
-path. The factor for errors that none of these reveals is derived in `docs/uncertainty.md`.
+All evidence is the mean square of an error, and one quantile is taken of the sum. The joint
+covariance of the poses models noise and the errors that the patches of a view share, of a usual
+camera; halves of the images measure those of this one, but not what both halves share. Added are
+the correction by the refinement, the excess disagreement of views far apart in time, and the
+displacement by errors of the camera that the views indicate. Each of these may be an error of the
+poses or not, and counts in part. The quantile allows for the sum being an estimate itself, see
+`docs/uncertainty.md`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from scipy.special import bdtrc, gammaincinv
+from scipy.special import bdtrc, fdtri
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64, Intp
@@ -34,9 +34,14 @@ _EVENLY_SPACED, _WORST = 50, 10
 _UNMEASURED_SIGMA = np.array([30.0] * 3 + [10.0] * 3)
 # In a large model, errors of this fraction of its diagonal count as unbounded.
 _UNMEASURED_FRACTION = 0.05
-# Ratio of the total error to that in which views differ: errors of the sensor that all views of a
-# place share are invisible.
-UNOBSERVED_ERROR_FACTOR = 1.6
+# Mean square of a fraction of which nothing is known: uniform between none and all.
+UNKNOWN_FRACTION = 1 / 3
+# The mean square error is known as well as from that many errors: by the covariance alone, whose
+# model is that of another camera, and if halves of the images measured it.
+_MODEL_DOF, _MEASURED_DOF = 5.0, 15.0
+# With covariances larger by these factors, 95 % of such errors (6,) are in the ellipsoid of 95 % of
+# a normal distribution.
+_MODEL_FACTOR, COVARIANCE_FACTOR = 2.36, 1.33
 # Directions of two frames are distinct above this fraction of the strongest.
 _DISTINCT = 0.1
 _NO_DIRECTIONS = np.zeros((0, 6))
@@ -82,6 +87,9 @@ class Accuracy:
         Indices of the frames whose pose is unbounded in some direction.
     by_odometry
         Indices of the frames whose pose would be unbounded without the recorded odometry.
+    causes_m
+        Rms error of the positions by its cause, see `ObservedErrors.mean_squares`; empty if they
+        are not bounded.
     """
 
     position_m: float = np.inf
@@ -91,10 +99,23 @@ class Accuracy:
     worst: WorstFrame | None = None
     unbounded: tuple[int, ...] = ()
     by_odometry: tuple[int, ...] = ()
+    causes_m: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def limited_by(self) -> str:
+        """The cause of most of the bound of the positions; empty if they are not bounded."""
+        return max(self.causes_m, key=self.causes_m.__getitem__, default="")
 
     def without_bound(self) -> Accuracy:
         """Return the accuracy where an error is known that its evidence does not cover."""
-        return replace(self, position_m=np.inf, rotation_rad=np.inf, relative=np.inf, worst=None)
+        return replace(
+            self,
+            position_m=np.inf,
+            rotation_rad=np.inf,
+            relative=np.inf,
+            worst=None,
+            causes_m={},
+        )
 
 
 @dataclass(frozen=True)
@@ -108,10 +129,11 @@ class ObservedErrors:
     excess_m
         Rms by which views far apart in time disagree, beyond consecutive ones.
     calibration_m, calibration_rad
-        Error of the poses due to the calibration of the camera, 95 %.
+        Rms error of the poses due to the calibration of the camera.
     split_m, split_rad
-        Rms errors by halves of the images, see `split_half`: those of the covariance and those that
-        `moved` stands for.
+        Rms errors by halves of the images, see `split_half`: those of the covariance and more.
+    corrected
+        Whether the camera was corrected by its own views: halves share the correction's error.
     """
 
     moved_m: float = 0.0
@@ -121,25 +143,35 @@ class ObservedErrors:
     calibration_rad: float = 0.0
     split_m: float = 0.0
     split_rad: float = 0.0
+    corrected: bool = False
 
-    def missing_in(self, by_covariance: _CovarianceErrors | None) -> Float64:
-        """Return the combined errors (2,) in m and rad that are missing in the covariance.
+    @property
+    def scale_degrees(self) -> Float64:
+        """(2,) degrees of freedom of the mean squares as estimates."""
+        return np.where(self.is_measured & (not self.corrected), _MEASURED_DOF, _MODEL_DOF)
+
+    @property
+    def is_measured(self) -> Bool:
+        """(2,) whether halves of the images measured errors of positions and of rotations."""
+        return np.array([self.split_m, self.split_rad]) > 0
+
+    def mean_squares(self, by_covariance: Float64) -> dict[str, Float64]:
+        """Return the mean squares (2,) of the errors, m^2 and rad^2, by their cause.
 
         Parameters
         ----------
         by_covariance
-            Errors by the covariance; None if it bounds nothing.
+            (2,) mean squares by the covariance.
         """
-        correlated = np.array([self.moved_m, self.moved_rad])
-        if by_covariance is not None:
-            # As likely to be exceeded as the bounds are.
-            quantile = by_covariance.bounds / np.maximum(by_covariance.rms, 1e-12)
-            split = np.array([self.split_m, self.split_rad]) * quantile
-            missing = np.sqrt(np.maximum(split**2 - by_covariance.bounds**2, 0.0))
-            correlated = np.maximum(correlated, missing)
-        excess = np.array([self.excess_m, 0.0])
-        calibration = np.array([self.calibration_m, self.calibration_rad])
-        return np.asarray(np.sqrt(correlated**2 + excess**2 + calibration**2))
+        split = np.array([self.split_m, self.split_rad]) ** 2
+        # If halves show less, neither is wrong for certain: their mean.
+        measured = np.maximum(split, 0.5 * (split + by_covariance))
+        return {
+            "noise": np.where(self.is_measured, measured, by_covariance),
+            "refinement": UNKNOWN_FRACTION * np.array([self.moved_m, self.moved_rad]) ** 2,
+            "disagreement": UNKNOWN_FRACTION * np.array([self.excess_m, 0.0]) ** 2,
+            "calibration": np.array([self.calibration_m, self.calibration_rad]) ** 2,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,16 +182,17 @@ class _CovarianceErrors:
     ----------
     positions
         (m,) positions of the evaluated poses.
-    bounds, rms
-        (2,) 95 % bounds on the rms errors of all poses, and expected rms.
-    single
-        (m, 2) 95 % bounds on the errors of these poses.
+    squares, degrees
+        (2,) mean squares of the errors of all poses, and their degrees of freedom.
+    single_squares, single_degrees
+        (m, 2) the same of these poses.
     """
 
     positions: Intp
-    bounds: Float64
-    rms: Float64
-    single: Float64
+    squares: Float64
+    degrees: Float64
+    single_squares: Float64
+    single_degrees: Float64
 
     @classmethod
     def of_graph(
@@ -177,9 +210,10 @@ class _CovarianceErrors:
         if C is None:
             return None
         is_even = np.isin(positions, even)
-        results = [_bounds(part, is_even) for part in _aligned(C, graph.poses[positions], is_even)]
-        bounds, rms, single = zip(*results, strict=True)
-        return cls(positions, np.array(bounds), np.array(rms), np.stack(single, 1))
+        parts = _aligned(C, graph.poses[positions], is_even)
+        squares, degrees = np.stack([_of_chosen(part, is_even) for part in parts], 1)
+        single = np.stack([_of_each(part) for part in parts], 2)
+        return cls(positions, squares, degrees, single[0], single[1])
 
 
 def degenerate_directions(
@@ -355,12 +389,17 @@ def accuracy_of(
             unbounded_frames[0] if unbounded_frames else int(graph.ids[-1]), np.inf, np.inf
         )
         return Accuracy(assessed=True, worst=worst_frame, unbounded=unbounded_frames)
-    extra = observed.missing_in(by_covariance)
-    rms_bounds = UNOBSERVED_ERROR_FACTOR * np.hypot(by_covariance.bounds, extra)
-    pose_bounds = UNOBSERVED_ERROR_FACTOR * np.hypot(by_covariance.single, extra)
+    causes = observed.mean_squares(by_covariance.squares)
+    total = np.sum([*causes.values()], axis=0)
+    rms_bounds = _bounds(total, by_covariance.degrees, observed.scale_degrees)
+    noise = causes["noise"]
+    pose_squares = by_covariance.single_squares * _ratio(noise, by_covariance.squares)
+    pose_squares += total - noise
+    pose_bounds = _bounds(pose_squares, by_covariance.single_degrees, observed.scale_degrees)
     pose_bounds = np.where(unbounded[by_covariance.positions], np.inf, pose_bounds)
     worst_row = int(np.argmax((pose_bounds / limits).max(1)))
     position, rotation = np.where(unbounded.any(0), np.inf, rms_bounds).tolist()
+    causes_m = {cause: float(np.sqrt(squares[0])) for cause, squares in causes.items()}
     return Accuracy(
         position,
         rotation,
@@ -370,6 +409,7 @@ def accuracy_of(
             int(graph.ids[by_covariance.positions[worst_row]]), *pose_bounds[worst_row].tolist()
         ),
         unbounded_frames,
+        causes_m=causes_m if np.isfinite(position) else {},
     )
 
 
@@ -381,12 +421,24 @@ def covariances_of(
     NaN where a pose is not connected to the first. An unbounded direction has a sigma of tens of
     metres.
     """
-    extra_variance = np.repeat(
-        observed.missing_in(_CovarianceErrors.of_graph(covariances)) ** 2 / 3, 3
-    )
-    C = covariances.of_poses.copy()
-    C[1:] += np.diag(extra_variance)
-    return UNOBSERVED_ERROR_FACTOR**2 * C
+    by_covariance = _CovarianceErrors.of_graph(covariances)
+    squares = np.zeros(2) if by_covariance is None else by_covariance.squares
+    causes = observed.mean_squares(squares)
+    noise = causes.pop("noise")
+    more = np.sum([*causes.values()], axis=0)
+    # Halves of the images say little about single poses: these are not reduced.
+    scale = np.repeat(np.sqrt(np.maximum(_ratio(noise, squares), 1.0)), 3)
+    C = covariances.of_poses * np.outer(scale, scale)
+    C[1:] += np.diag(np.repeat(more / 3, 3))
+    is_measured = observed.scale_degrees > _MODEL_DOF
+    factor = np.where(is_measured, COVARIANCE_FACTOR, _MODEL_FACTOR)
+    factor = np.repeat(np.sqrt(factor), 3)
+    return np.asarray(C * np.outer(factor, factor), np.float64)
+
+
+def _ratio(noise: Float64, by_covariance: Float64) -> Float64:
+    """Ratios (2,) of mean squares, 1 where the covariance has none."""
+    return np.divide(noise, by_covariance, out=np.ones(2), where=by_covariance > 0)
 
 
 def _pose_covariances(
@@ -452,28 +504,35 @@ def _remove_motion(C: Float64, motion: Float64, chosen: Bool) -> Float64:
     return np.asarray(projector @ C @ projector.T, np.float64)
 
 
-def _bounds(C: Float64, chosen: Bool) -> tuple[float, float, Float64]:
-    """95 % bound of the rms over the chosen ones, its expectation, and bounds of each (m,)."""
-    m, count = len(chosen), int(chosen.sum())
+def _bounds(squares: Float64, degrees: Float64, scale_degrees: Float64) -> Float64:
+    """95 % bounds on rms errors with these expected mean squares.
+
+    The ratio of the mean square of errors with some degrees of freedom to an estimate of it with
+    `scale_degrees` follows Fisher's F-distribution.
+    """
+    return np.asarray(np.sqrt(squares * fdtri(degrees, scale_degrees, _LEVEL)), np.float64)
+
+
+def _of_chosen(C: Float64, chosen: Bool) -> tuple[float, float]:
+    """Expected mean square of the chosen ones, and its degrees of freedom; C is (3m, 3m)."""
     rows = np.repeat(chosen, 3)
     C_chosen = C[np.ix_(rows, rows)]
+    return float(np.trace(C_chosen)) / int(chosen.sum()), float(_degrees(C_chosen[None])[0])
+
+
+def _of_each(C: Float64) -> tuple[Float64, Float64]:
+    """(m,) expected squares of each, and their degrees of freedom; C is (3m, 3m)."""
+    m = len(C) // 3
     blocks = C.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m), :]
-    return (
-        float(np.sqrt(_quantile(C_chosen) / count)),
-        float(np.sqrt(np.trace(C_chosen) / count)),
-        np.sqrt([_quantile(block) for block in blocks]),
-    )
+    return np.trace(blocks, axis1=1, axis2=2), _degrees(blocks)
 
 
-def _quantile(C: Float64) -> float:
-    """95 % quantile of the squared length of a normal vector with this covariance.
+def _degrees(C: Float64) -> Float64:
+    """Degrees of freedom (K,) of the squared length of normal vectors with covariances (K, n, n).
 
     A sum of squares is distributed nearly as a gamma variable of the same mean and variance
     (Satterthwaite 1946).
     """
-    mean, variance = float(np.trace(C)), 2 * float((C * C).sum())
-    if mean <= 0 or variance <= 0:
-        return 0.0
-    degrees = 2 * mean**2 / variance
-    chi_squared = 2 * gammaincinv(degrees / 2, _LEVEL)  # scipy.stats takes long to import
-    return float(chi_squared * mean / degrees)
+    squares = (C * C).sum((1, 2))
+    mean = np.trace(C, axis1=1, axis2=2)
+    return np.divide(mean**2, squares, out=np.ones(len(C)), where=squares > 0)

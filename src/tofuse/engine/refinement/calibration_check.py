@@ -99,8 +99,8 @@ class CalibrationCheck:
     motion
         Rms motion (m, rad) of the poses, after alignment, that a unit of each error causes.
     moved
-        Rms motion (m, rad) of the poses, after alignment, if the likely errors are corrected
-        together, or by the first estimate of an error that the views determine, if larger.
+        Largest rms motion (m, rad) of the poses, after alignment, if one of the likely errors is
+        corrected, or by the first estimate of one that the views determine.
     significance
         Number of standard deviations that an estimate must exceed to be significant, see
         `significance_of`.
@@ -219,8 +219,9 @@ def check_calibration(
         by_loop = _check_by_loop(views, refined, first, without_error, options)
         if by_loop.alarm:
             return by_loop
-    position, rotation = aligned_motion(refined.poses, joint.poses)
-    joint_motion = (_rms(position), _rms(rotation))
+    # Estimated together, correlated errors may be large and opposite.
+    motions = [aligned_motion(refined.poses, e.poses) for e in estimates.values()]
+    largest = max((_rms(position), _rms(rotation)) for position, rotation in motions)
     return replace(
         without_error,
         alarm=alarm,
@@ -229,7 +230,7 @@ def check_calibration(
         support=(support, with_best),
         gap=gap,
         best=best_name,
-        moved=max(joint_motion, first.largest_motion),
+        moved=max(largest, first.largest_motion),
     )
 
 

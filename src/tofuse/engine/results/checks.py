@@ -51,6 +51,15 @@ MAX_LISTED = 6
 MIN_SUPPORT, AGREEMENT_RATIO = 0.5, 0.9
 
 
+# What a bound is mostly due to, and what would narrow it.
+_CAUSES = {
+    "noise": "noise: more views of the same places would average it",
+    "refinement": "the correction by the refinement: a return to the start would confirm it",
+    "disagreement": "surfaces that differ between views, by multipath or changes of the scene",
+    "calibration": "the camera's calibration: a better one would remove it",
+}
+
+
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """The evidence of a run.
@@ -481,6 +490,8 @@ def accuracy_reasons(
         if a.position_m <= tolerance_m:
             error, allowed = _angle(a.rotation_rad), _angle(TOLERANCE_RAD)
         text = f"Pose errors may reach {error} rms (95 % bound); the tolerance is {allowed}."
+        if a.limited_by and a.position_m > tolerance_m:
+            text += f" Most of it is due to {_CAUSES[a.limited_by]}."
         if a.worst is not None:
             text += f" Frame {a.worst.frame} is the least certain: {length(a.worst.position_m)}."
         yield Reason("uncertain_poses", ((frames[0], frames[-1]),), text)
@@ -533,11 +544,11 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
     if check.undetermined:
         text = (
             "The recording does not determine the camera's focal length: the stated accuracy "
-            "assumes that the calibration is right."
+            "allows for an error of 1%."
         )
         motion = length(0.01 * check.motion["focal"][0])
         if motion != length(0.0):  # else the views give no estimate
-            text += f" An error of 1% would move the poses by {motion}."
+            text += f" It would move the poses by {motion}."
     elif check.unconfirmed:
         correction = calibration_check.proposal(check.unconfirmed, check.best)
         qualifier = (
