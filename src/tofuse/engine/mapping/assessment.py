@@ -105,7 +105,8 @@ class Assessment:
         ambiguous = self._ambiguous(graph)
         indices = [e.record.index for e in self.log.entries]
         repeated = frame_ranges.runs_of(indices, self.log.repeated)
-        if ambiguous or checks.open_motion(moving) or checks.frozen(repeated):
+        changes = refined.refinement.range_change is not None
+        if ambiguous or changes or checks.open_motion(moving) or checks.frozen(repeated):
             accuracy = accuracy.without_bound()
         if observations.has_covariances:
             model = self._with_pose_errors(model, graph, covariances)
