@@ -400,16 +400,21 @@ def _regressed(views: Sequence[_TrialView], poses: Float64) -> tuple[float, floa
             columns = np.r_[6 * i : 6 * i + 6, 6 * j : 6 * j + 6, 6 * n : size]
             A[np.ix_(columns, columns)] += J.T @ (weight[:, None] * J)
             g[columns] += J.T @ (weight * residual)
-        # The first view is fixed; damping fixes unconstrained directions.
-        reduced = A[6:-1, 6:-1]
-        reduced = reduced + np.diag(1e-6 * np.diag(reduced) + 1e-12)
-        solved = np.linalg.solve(reduced, np.stack([g[6:-1], A[6:-1, -1]], 1))
-        poses[1:] = poses[1:] @ se3.exp(-solved[: 6 * n - 6, 0].reshape(-1, 6))
+        # The first view is fixed.
+        step = _solved(A[6 : 6 * n, 6 : 6 * n], g[6 : 6 * n])
+        poses[1:] = poses[1:] @ se3.exp(-step.reshape(-1, 6))
     # The part of the prediction that neither a motion of the views nor another error explains (the
     # Schur complement).
+    solved = _solved(A[6:-1, 6:-1], np.stack([g[6:-1], A[6:-1, -1]], 1))
     predicted = A[-1, -1] - A[-1, 6:-1] @ solved[:, 1]
     explained = -(g[-1] - A[-1, 6:-1] @ solved[:, 0])
     return (float(explained), float(predicted)) if predicted > 0 else None
+
+
+def _solved(matrix: Float64, right: Float64) -> Float64:
+    """Solve normal equations; damping fixes unconstrained directions."""
+    damped = matrix + np.diag(1e-6 * np.diag(matrix) + 1e-12)
+    return np.asarray(np.linalg.solve(damped, right), np.float64)
 
 
 def _compared(
