@@ -275,7 +275,7 @@ class _FirstEstimates:
         sensitivity = linearised.response_to_errors()
         change = likely_change(linearised, views, pairs)
         change_motion = 0.0, 0.0
-        if change is not None:
+        if change is not None and change.is_significant:
             change_motion = _motion(poses, change.scale * change.follow)
         errors, sigmas = sensitivity.estimate(), sensitivity.sigma(pairs, len(views))
         return cls(

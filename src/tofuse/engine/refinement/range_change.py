@@ -24,6 +24,8 @@ from tofuse.engine.stored_views import SampledView, pair_equations
 # Makers specify range errors of up to a percent. Those that depend on the distance, or multipath,
 # look like smaller changes, as later views see other distances.
 TOLERANCE = 0.01
+# Number of standard deviations that makes a full estimate worth its time.
+_LIKELY = 2.5
 # Minimum number of views on either side of a step.
 _MIN_VIEWS = 3
 # A full estimate is made above this fraction of the tolerance, in at most this many steps, until
@@ -57,7 +59,7 @@ class RangeChange:
 
 @dataclass(frozen=True, eq=False)
 class LikelyChange:
-    """First estimate of a significant change.
+    """First estimate of a change.
 
     Attributes
     ----------
@@ -70,6 +72,9 @@ class LikelyChange:
         (N, 6) twists by which the poses follow, per unit of the scale.
     frame
         As in `RangeChange`.
+    limit
+        Number of standard deviations that a significant estimate exceeds; that of a large change
+        may only do so in full.
     """
 
     scale: float
@@ -77,12 +82,18 @@ class LikelyChange:
     profile: Float64
     follow: Float64
     frame: int | None
+    limit: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether this estimate is no chance."""
+        return abs(self.scale) > self.limit * self.sigma
 
 
 def likely_change(
     linearised: Linearised, views: Sequence[SampledView], pairs: Intp
 ) -> LikelyChange | None:
-    """Return the best step or drift over the views; None if it may be chance.
+    """Return the best step or drift over the views; None if it is no more than noise.
 
     Parameters
     ----------
@@ -102,12 +113,14 @@ def likely_change(
     scales, sigmas = found.estimate(), found.sigma(pairs, count)
     ratios = np.abs(scales) / np.maximum(sigmas, 1e-12)
     k = int(np.argmax(ratios))
-    # The views before and after a step are few, and the step is the best of many (Bonferroni).
-    informative = float(found.informative_views(pairs, count)[k])
-    if ratios[k] <= significance_of(informative, tests=1 + len(steps)):
+    if ratios[k] <= _LIKELY:
         return None
+    # The views that determine a step are few, and it is the best of many (Bonferroni).
+    limit = significance_of(float(found.informative_views(pairs, count)[k]), tests=count)
     frame = views[int(first_after[best])].index if k else None
-    return LikelyChange(float(scales[k]), float(sigmas[k]), profiles[k], found.motion[k], frame)
+    return LikelyChange(
+        float(scales[k]), float(sigmas[k]), profiles[k], found.motion[k], frame, limit
+    )
 
 
 def range_change(
@@ -117,7 +130,7 @@ def range_change(
     options: pair_equations.RefineOptions,
     priors: Priors,
 ) -> RangeChange | None:
-    """Estimate a likely change in full; None if it is within the tolerance of usual cameras.
+    """Estimate a likely change in full; None if it is chance, or within usual tolerances.
 
     Parameters
     ----------
@@ -146,4 +159,6 @@ def range_change(
         if abs(step) < _CONVERGED * TOLERANCE:
             break
     change = 1 / (1 + scale) - 1
-    return RangeChange(change, sigma, likely.frame) if abs(change) > TOLERANCE else None
+    if abs(change) <= max(TOLERANCE, likely.limit * sigma):
+        return None
+    return RangeChange(change, sigma, likely.frame)
