@@ -2,7 +2,7 @@
 
     python benchmarks/multipath.py errors [--corridor folder of sr4000_corridor]
     python benchmarks/multipath.py trial [--scenes room rail] [--first-seed 5] [--frames 40]
-        [--no-runs] [--recordings folder ...]
+        [--no-runs] [--recordings folder ...] [--effect with|without|other|both]
 
 `errors`. Simulated scenes: median and 90th percentile of the absolute range error, and median of
 the signed error, over pixels without other gross errors (mixed, wrapped, saturated, smeared). With
@@ -16,7 +16,9 @@ distances of the pixels from the planes of the large surfaces, and the angles be
 `trial`. Simulated recordings with all effects, and with all except multipath: the strength of
 multipath that the trial estimates, with its standard error, and the decision; the decision in five
 parts of the recording (halves, the middle half, and both sets of alternate frames), and the ATE of
-whole runs with and without the compensation. For `--recordings`, real ones, only strength and
+whole runs with and without the compensation. `--effect other`: without multipath, but with errors
+that the simulated camera does not have: distortion, wiggling, and smoothing that grows with the
+range. For `--recordings`, real ones, only strength and
 decision are printed.
 """
 
@@ -27,6 +29,7 @@ import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from tofuse.apps.jobs.run_options import Options, resolve
@@ -34,7 +37,7 @@ from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.cameras.cameras import ray_lengths
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.reconstructing import reconstruct
@@ -266,8 +269,33 @@ def final_error(config: Config, recording: Recording, keep: bool) -> str:
     return f"{ate * 1e3:.1f}{lost}"
 
 
-def tried(scene: str, seed: int, multipath: bool, runs: bool, frames: int | None) -> str:
+def of_other_sensor(frame: RangeFrame) -> RangeFrame:
+    """A frame with errors that are no multipath: distortion, wiggling, and smoothing with range."""
+    rows, columns = np.indices(frame.depth.shape, np.float32)
+    middle = (np.array(frame.depth.shape, np.float32) - 1) / 2
+    down, right = rows - middle[0], columns - middle[1]
+    factor = 1 - 0.02 * (down**2 + right**2) / (middle @ middle)
+    at = (middle[1] + factor * right, middle[0] + factor * down)
+
+    def distorted(image: Float32) -> Float32:
+        return cv2.remap(image.astype(np.float32), *at, cv2.INTER_NEAREST)
+
+    depth = distorted(frame.depth)
+    seen = (depth > 0).astype(np.float32)
+    means = [
+        cv2.boxFilter(depth, -1, (k, k)) / np.maximum(cv2.boxFilter(seen, -1, (k, k)), 1e-6)
+        for k in (1, 3, 5)
+    ]
+    smoothed = np.select([depth < 1.5, depth < 3], means[:2], means[2])
+    wiggled = smoothed + 0.01 * np.sin(2 * np.pi * smoothed / 1.25)
+    amplitude = None if frame.amplitude_image is None else distorted(frame.amplitude_image)
+    wiggled = np.where(depth > 0, wiggled, 0).astype(np.float32)
+    return replace(frame, depth=wiggled, amplitude_image=amplitude)
+
+
+def tried(scene: str, seed: int, effect: str, runs: bool, frames: int | None) -> str:
     """One row of the trial's table."""
+    multipath = effect == "with"
     effects = Effects() if multipath else Effects().without("multipath")
     name, options = PLAIN.get(scene, (scene, {}))
     every = None
@@ -275,9 +303,13 @@ def tried(scene: str, seed: int, multipath: bool, runs: bool, frames: int | None
         made = record.plan(name, seed=seed, **options)
         every = made.sequence.stride * max(1, round(len(made.raw) / frames))
     recording = record.simulate_recording(name, seed=seed, every=every, effects=effects, **options)
+    if effect == "other":
+        changed = [of_other_sensor(frame) for frame in recording]
+        source = ArraySource(changed, metadata=recording.metadata, reference=recording.reference)
+        recording = Recording.of(source, recording.path, recording.format)
     config = resolve(Options(Path("unused"), object=scene in OBJECTS))
     strength, outcome = in_words(after_trial(config, recording))
-    cells = [f"{scene}, seed {seed}", "yes" if multipath else "no", strength, outcome]
+    cells = [f"{scene}, seed {seed}", effect, strength, outcome]
     if runs:
         pieces = parts(recording)
         found = [after_trial(config, piece) for piece in pieces]
@@ -300,7 +332,7 @@ def print_trial(given: argparse.Namespace) -> None:
     more = "| applied in parts | ATE with | ATE without |" if runs else "|"
     print(f"| recording | multipath | strength | compensation {more}")
     print("|---" * (7 if runs else 4) + "|")
-    for there in {"with": [True], "without": [False], "both": [False, True]}[given.effect]:
+    for there in {"both": ["without", "with"]}.get(given.effect, [given.effect]):
         for scene in given.scenes:
             for seed in range(given.first_seed, given.first_seed + given.seeds):
                 print(tried(scene, seed, there, runs, given.frames), flush=True)
@@ -317,7 +349,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0, help="in 'trial'")
     parser.add_argument("--frames", type=int, help="in 'trial': approximate number, evenly spread")
     parser.add_argument("--recordings", nargs="*", type=Path, default=[], help="in 'trial'")
-    parser.add_argument("--effect", choices=["with", "without", "both"], default="both")
+    parser.add_argument("--effect", choices=["with", "without", "other", "both"], default="both")
     parser.add_argument("--no-runs", action="store_true", help="'trial' without the final errors")
     given = parser.parse_args()
     if given.what == "errors":

@@ -6,10 +6,9 @@ are registered; a pose is wrong beyond 5 % of the extent or 4 degrees. One that 
 the guess only says so.
 
 The worst outcome is a verdict "good" with an error outside its bound. Where something large moves,
-any violated bound is as bad. Families marked *open* await
-a mechanism that detects them. In those marked *assumed* the scale, or the handedness, of depth is
-wrong throughout, which depth alone can't show. In the other families such an outcome, a crash, or a
-wrong pose that is accepted, makes the exit status 1.
+any violated bound is as bad. In families marked *assumed* the scale, or the handedness, of depth is
+wrong throughout, or all that is in view moves, which depth alone can't show. In the other families
+such an outcome, a crash, or a wrong pose that is accepted, makes the exit status 1.
 
     python benchmarks/nonsense.py [--only FAMILY] [--limit N] [--seed K] [--journal FILE]
 """
@@ -30,7 +29,7 @@ import made_clouds
 import tofuse
 import variants
 from attacks.journal import Lines
-from situations import ASSUMED, BOUNDED, OPEN, Situation, situations
+from situations import ASSUMED, BOUNDED, Situation, situations
 from tofuse.engine.errors import TofuseError
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory_errors import displacement
@@ -77,8 +76,8 @@ class Row:
 
     @property
     def excused(self) -> bool:
-        """Whether it is known that it can't be detected, or not yet."""
-        return self.family in OPEN | ASSUMED and self.outcome != "CRASHED"
+        """Whether it is known that it can't be detected."""
+        return self.family in ASSUMED and self.outcome != "CRASHED"
 
     def line(self) -> str:
         """Return the row of the situation."""
@@ -166,12 +165,12 @@ def table(found: Sequence[Row], outcomes: Sequence[str]) -> Iterator[str]:
     yield f"|---|---|{'---|' * len(outcomes)}"
     for family in dict.fromkeys(row.family for row in found):
         own = [row.outcome for row in found if row.family == family]
-        mark = ", open" if family in OPEN else ", assumed" if family in ASSUMED else ""
+        mark = ", assumed" if family in ASSUMED else ""
         counts = " | ".join(str(own.count(outcome) or "") for outcome in outcomes)
         yield f"| {family}{mark} | {len(own)} | {counts} |"
     others = [row.outcome for row in found if not row.excused]
     counts = " | ".join(str(others.count(outcome) or "") for outcome in outcomes)
-    yield f"| without open and assumed | {len(others)} | {counts} |"
+    yield f"| without assumed | {len(others)} | {counts} |"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

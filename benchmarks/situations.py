@@ -28,8 +28,6 @@ from variants import Take
 FRAMES = 48
 CAMERA = unusual.pinhole("ifm-o3r", 80, 60, 60)
 
-# Mechanisms that would detect these are still missing.
-OPEN = frozenset({"range that changes"})
 # Images alone can't show these: the scene may as well be of another size, or the mirrored one, or
 # what fills the view may as well stand still.
 ASSUMED = frozenset({"constant scale", "mirrored", "nothing else in view"})
@@ -72,11 +70,13 @@ def _each(change: Callable[[RangeFrame], RangeFrame]) -> Callable[[int], Take]:
     return lambda seed: room(seed).each(change)
 
 
-def _numbered(change: Callable[[RangeFrame, float], RangeFrame]) -> Callable[[int], Take]:
+def _numbered(
+    change: Callable[[RangeFrame, float], RangeFrame], scene: Callable[[int], Take] = room
+) -> Callable[[int], Take]:
     """Change each frame, given its position in the recording: 0 to 1."""
 
     def make(seed: int) -> Take:
-        take = room(seed)
+        take = scene(seed)
         last = len(take) - 1
         return replace(take, frames=tuple(change(f, k / last) for k, f in enumerate(take.frames)))
 
@@ -155,9 +155,12 @@ def _jittered(frame: RangeFrame, pixels: int) -> RangeFrame:
 def _changing() -> Iterator[tuple[str, Callable[[int], Take]]]:
     for factor in (0.9, 0.95, 0.98, 1.02, 1.05, 1.1):
         yield f"depth x {factor:g} in the second half", _numbered(_later(factor, 0.5))
-    yield "depth x 1.05 in the last third", _numbered(_later(1.05, 2 / 3))
+    for start, where in ((2 / 3, "in the last third"), (1 / 4, "after a quarter")):
+        yield f"depth x 1.05 {where}", _numbered(_later(1.05, start))
+        yield f"depth x 1.05 {where}, flat", _numbered(_later(1.05, start), flat)
     for factor in (0.9, 0.95, 1.05, 1.1):
         yield f"depth drifts to x {factor:g}", _numbered(_drifting(factor))
+    yield "depth drifts to x 1.1, flat", _numbered(_drifting(1.1), flat)
     for metres in (0.05, 0.15):
         yield (
             f"range grows by {metres:g} m",

@@ -14,9 +14,8 @@ from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
     check_calibration,
-    significance_of,
 )
-from tofuse.engine.refinement.camera_response import response
+from tofuse.engine.refinement.camera_response import response, significance_of
 from tofuse.engine.refinement.joint_alignment import (
     Priors,
     Refined,

@@ -17,6 +17,7 @@ from tofuse.engine.quality.cross_view_agreement import CrossViewConsistency, Pai
 from tofuse.engine.quality.pose_accuracy import Accuracy, ObservedErrors, accuracy_of
 from tofuse.engine.refinement.calibration_check import CalibrationCheck
 from tofuse.engine.refinement.loop_drift import Gap
+from tofuse.engine.refinement.range_change import RangeChange
 from tofuse.engine.refinement.refinement import Refinement
 from tofuse.engine.results import checks
 from tofuse.engine.results.checks import Evidence, judge
@@ -168,6 +169,15 @@ def in_components(*others, frames=9, lost=()) -> Evidence:
     return replace(e, records=records, sequential=e.sequential[kept], optimisation=optimisation)
 
 
+CHANGED = Refinement(
+    np.zeros((9, 4, 4)),
+    True,
+    9,
+    20,
+    calibration_check=CalibrationCheck(
+        focal_sigma=0.05, motion={"focal": (3.0, 0.2)}, range_change=RangeChange(0.05, 0.001, 4)
+    ),
+)
 UNDETERMINED = CalibrationCheck(focal_sigma=0.05, motion={"focal": (3.0, 0.2)})
 CASES = {
     "few_poses": evidence(("tracked",) + ("lost",) * 7 + ("tracked",)),
@@ -209,6 +219,7 @@ CASES = {
     "moving_objects": evidence(moving=((3, 0.1), (4, 0.234), (6, 0.0))),
     "open_motion": evidence(moving=((3, 0.1), (4, 0.26))),
     "ambiguous_steps": replace(evidence(), ambiguous=(2, 5)),
+    "range_changes": replace(evidence(sigma=(0.0001, 0.0001)), refinement=CHANGED),
     "doubtful_poses": evidence(doubtful=(2, 3, 6)),
 }
 

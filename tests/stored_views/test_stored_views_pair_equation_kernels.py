@@ -37,7 +37,7 @@ def as_measured(frame, kind):
 
 @pytest.mark.parametrize("kind", ["z", "range"])
 @pytest.mark.parametrize(("scale_p", "tolerance"), [(0.0, 0.01), (0.5, 0.1)])
-@pytest.mark.parametrize("error", range(kernels.ERRORS))
+@pytest.mark.parametrize("error", range(kernels.SOURCE_SCALE))
 def test_camera_error_changes_gradient_as_predicted_by_hessian(
     pair, error, scale_p, tolerance, kind
 ):
@@ -61,7 +61,7 @@ def test_camera_error_changes_gradient_as_predicted_by_hessian(
     assert np.abs((slope - column)[chosen] / scale).max() < tolerance
 
 
-@pytest.mark.parametrize("error", range(kernels.ERRORS))
+@pytest.mark.parametrize("error", range(kernels.SOURCE_SCALE))
 def test_large_error_has_no_effect_between_equal_views(error):
     """Its displacements cancel: else the estimate of an error would run away from a large one."""
     view = corner(np.eye(4))
@@ -114,7 +114,7 @@ def test_wrong_intrinsics_are_compensated(pair, kind, error):
 
 
 @pytest.mark.parametrize("kind", ["z", "range"])
-@pytest.mark.parametrize("error", range(kernels.ERRORS))
+@pytest.mark.parametrize("error", range(kernels.SOURCE_SCALE))
 def test_known_errors_are_corrected_as_if_they_were_unknowns(pair, kind, error):
     *_, T = pair
     views = [as_measured(corner(at, waves=0.1), kind) for at in (T, np.eye(4))]

@@ -235,13 +235,13 @@ class Factor:
         """As `step`, with another gradient (free poses x k)."""
         system = self.system
         out = np.zeros((system.n, system.size))
-        x = self._solve(-gradient.reshape(-1, 1))
+        x = self.solve_columns(-gradient.reshape(-1, 1))
         if not np.isfinite(x).all():
             return None
         out[system.free] = x.reshape(-1, system.size)
         return out
 
-    def _solve(self, rhs: Float64) -> Float64:
+    def solve_columns(self, rhs: Float64) -> Float64:
         """Return the solutions of the system for right-hand sides (free poses * k, q)."""
         if self._values is None:
             self._values = self._factorised()
@@ -266,7 +266,7 @@ class Factor:
             columns = rows[k * start : k * (start + batch_size)]
             unit = np.zeros((k * len(system.free), len(columns)))
             unit[columns, np.arange(len(columns))] = 1
-            covariances = self._solve(unit)[rows].reshape(len(free), k, len(batch), k)
+            covariances = self.solve_columns(unit)[rows].reshape(len(free), k, len(batch), k)
             out[free[:, None], :, batch, :] = np.swapaxes(covariances, 1, 2)
         C = out.reshape(len(vertices) * k, -1)
         return (C + C.T) / 2

@@ -161,7 +161,7 @@ def _after_trial(
     uncorrected, corrected = _preparation(others), _preparation(config)
     if _changes(config, recording, uncorrected, corrected):
         result = trial(recording, uncorrected, corrected)
-        tested = item.after_trial(result.is_significant, result.strength, result.error)
+        tested = item.after_trial(result.improves, result.strength, result.error)
         if tested.disabled:
             progress.note(f"correction {name_of(item)} not applied: {result.in_words()}")
     else:

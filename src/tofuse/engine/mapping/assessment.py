@@ -109,7 +109,9 @@ class Assessment:
         ambiguous = self._ambiguous(graph)
         indices = [e.record.index for e in self.log.entries]
         repeated = frame_ranges.runs_of(indices, self.log.repeated)
-        if ambiguous or checks.open_motion([*moving, *rivals]) or checks.frozen(repeated):
+        changes = refined.refinement.range_change is not None
+        is_open = changes or checks.open_motion([*moving, *rivals])
+        if ambiguous or is_open or checks.frozen(repeated):
             accuracy = accuracy.without_bound()
         if observations.has_covariances:
             model = self._with_pose_errors(model, graph, covariances)

@@ -31,6 +31,9 @@ from tofuse.engine.sensor import ERROR_OPTIONS, CameraErrors
 
 # The first estimate uses poses that the error has distorted, the second one does not.
 _ROUNDS = 2
+# Errors with much the same effect: a second correction would share one error out between both, and
+# the standard deviation of each alone does not include that. So it stays an alarm.
+_TRADED = {"focal": "offset", "offset": "focal"}
 
 Reconstruct = Callable[[Config], Reconstruction]
 
@@ -71,7 +74,7 @@ def self_calibrated(
             correction.center_x,
             correction.center_y,
             correction.distortion,
-            {ERROR_OPTIONS[check.best][0]: check.sigmas[check.best]},
+            {ERROR_OPTIONS[name][0]: s for name, s in correction.sigmas.items() if s},
             (_bound(initial), _bound(candidate)),
         )
         diagnostics = _with_calibration(candidate, correction, calibration)
@@ -99,7 +102,7 @@ def _estimated_error(
         return None
     best = check.best
     remaining = check.improves and best in check.unconfirmed and applied.errors[best]
-    if not (check.alarm or remaining):
+    if not (check.alarm or remaining) or applied.errors.get(_TRADED.get(best, "")):
         return None
     error, sigma = ERROR_OPTIONS[best]
     try:

@@ -8,14 +8,22 @@ the correction, jointly with the poses of all views. The noise of the pixels is 
 that it causes no bias, and the spread between runs all over the recording gives the standard error.
 
 The prediction has errors too, which differences between views amplify. So the strength is
-underestimated (regression dilution): 0.2 to 0.5 in simulated rooms with the full error. It shows
-whether there is an error to correct, not its size.
+underestimated (regression dilution): about a third of the true one in simulated rooms. And other
+errors of the camera resemble the predicted one. Two of them, of the focal length and of the range
+offset, are estimated jointly. And a second estimate must agree: poses of consecutive views by the
+left and the right half of the images, and by the upper and the lower, differ by errors that depend
+on the position in the image; the strength is the fraction of the predicted change of these
+differences that is present.
+
+A correction of an error with a strength of more than half the true one leaves less error than it
+removes. So it is applied if both estimates exceed half of what the full error shows, and are
+significant.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -93,9 +101,9 @@ _MAX_STRIDE = 64
 _MIN_INLIERS, _MIN_CONSTRAINED = 0.3, 3
 # Minimum number of runs, and the significance level.
 _MIN_RUNS, _SIGNIFICANCE = 4, 0.05
-# Minimum strength. Other errors cause smaller ones: lens and smoothing affect corners similarly to
-# indirect light. In simulated rooms it is up to 0.12 without indirect light, with it 0.2 or more.
-_MIN_STRENGTH = 0.15
+# Strengths that the full error shows, in distances between surfaces and in poses by halves of the
+# images: means of simulated rooms with indirect light (`benchmarks/multipath.py trial`).
+_FULL_BY_SURFACES, _FULL_BY_HALVES = 0.36, 0.42
 # Every n-th pixel is compared; and the minimum number of points of a pair.
 _STRIDE, _MIN_POINTS = 3, 100
 # Minimum cosine between normals of the same surface.
@@ -109,6 +117,8 @@ _CORRELATION_FACTOR = 10.0
 # Standard deviation of a correction, as a fraction of it.
 _RELATIVE_SIGMA = 0.2
 _ITERATIONS = 3
+# Errors of the camera that are estimated jointly: offset of the range, and focal length.
+_NUISANCES = 2
 _ALIGNMENT = projective.ProjectiveOptions(
     levels=(
         projective.Level(4, 20, 0.15, 0.3),
@@ -120,6 +130,8 @@ _ALIGNMENT = projective.ProjectiveOptions(
     common_tilt=0.0,
     common_slope=0.0,
 )
+# Alignments of halves of an image, from the pose by the whole image.
+_HALVES = replace(_ALIGNMENT, levels=(projective.Level(4, 10, 0.03, 0.1), _ALIGNMENT.levels[-1]))
 _VIEW = SurfaceOptions()
 
 Prepare = Callable[[Frame], Frame]
@@ -135,11 +147,17 @@ class Trial:
         Of each run: the product of the measured disagreement and the predicted one, and the square
         of the predicted one, each as a weighted mean. Their ratio is the run's strength. Runs
         differ by more than noise, and one with bad poses is an outlier, so their strengths are
-        pooled by a robust random-effects model (`pooling`).
+        pooled by a robust random-effects model (`pooled`).
+    full
+        Strength that the full error shows.
+    by_halves
+        The second estimate; None if the first one decides.
     """
 
     explained: tuple[float, ...]
     predicted: tuple[float, ...]
+    full: float = _FULL_BY_SURFACES
+    by_halves: Trial | None = None
 
     @cached_property
     def _pooled(self) -> tuple[float, float]:
@@ -161,20 +179,28 @@ class Trial:
 
     @property
     def is_significant(self) -> bool:
-        """Whether the error is significant, and stronger than the effect of other errors."""
+        """Whether the error is significant, and the correction leaves less than it removes."""
         n = len(self.predicted)
         if n < _MIN_RUNS:
             return False
         # Student's t, as the spread is estimated from few runs.
-        threshold = max(_MIN_STRENGTH, float(stdtrit(n - 1, 1 - _SIGNIFICANCE)) * self.error)
-        return self.strength > threshold
+        limit = float(stdtrit(n - 1, 1 - _SIGNIFICANCE)) * self.error
+        return self.strength > max(0.5 * self.full, limit)
+
+    @property
+    def improves(self) -> bool:
+        """Whether both estimates are in favour of the correction."""
+        other = self.by_halves
+        return self.is_significant and other is not None and other.is_significant
 
     def in_words(self) -> str:
         """Describe the result."""
         if len(self.predicted) < _MIN_RUNS or not np.isfinite(self.strength):
             return "too few views overlap to decide"
         estimate = f"strength {self.strength:.2f}, standard error {self.error:.2f}"
-        if self.is_significant:
+        if self.by_halves is not None:
+            estimate += f"; in poses {self.by_halves.strength:.2f}, {self.by_halves.error:.2f}"
+        if self.improves:
             return f"overlapping views disagree as it predicts ({estimate})"
         return f"overlapping views do not clearly disagree as it predicts ({estimate})"
 
@@ -204,8 +230,17 @@ def trial(recording: Recording, uncorrected: Prepare, corrected: Prepare) -> Tri
         result = _regressed(*views.run(start, stride))
         if result is not None:
             results.append(result)
-    explained, predicted = np.array(results).reshape(-1, 2).T.tolist()
-    return Trial(tuple(explained), tuple(predicted))
+    found = _pairs_of_sums(results, _FULL_BY_SURFACES)
+    if not found.is_significant:
+        return found
+    by_halves = [views.by_halves(start, stride) for start, stride in sorted(visited)]
+    second = _pairs_of_sums([run for run in by_halves if run is not None], _FULL_BY_HALVES)
+    return replace(found, by_halves=second)
+
+
+def _pairs_of_sums(runs: Sequence[tuple[float, float]], full: float) -> Trial:
+    explained, predicted = np.array(runs).reshape(-1, 2).T.tolist()
+    return Trial(tuple(explained), tuple(predicted), full)
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,33 +343,78 @@ class _AlignedViews:
             poses.append(poses[-1] @ step.T_world_source)
         return views, np.array(poses)
 
+    def by_halves(self, start: int, stride: int) -> tuple[float, float] | None:
+        """Return the run's products and squares as in `Trial`, of poses by halves; None if none."""
+        sums = np.zeros(2)
+        for k in range(start, start + (_VIEWS - 1) * stride, stride):
+            step = self._steps.get((k, k + stride))
+            ends = [self._corrected_pair(k), self._corrected_pair(k + stride)]
+            if step is None or ends[0] is None or ends[1] is None:
+                continue
+            (before, variance), (after, _) = (
+                _halves_differ(target, source, step.T_world_source)
+                for target, source in zip(*ends, strict=True)
+            )
+            change = after - before
+            sums += -(before * change / variance).sum(), (change**2 / variance).sum()
+        return (float(sums[0]), float(sums[1])) if sums[1] > 0 else None
+
+
+def _halves_differ(
+    target: RangeFrame, source: RangeFrame, T_target_source: Float64
+) -> tuple[Float64, Float64]:
+    """Return how poses of a view by halves of the image differ: (2, 6) twists and variances.
+
+    Left and right, and upper and lower half; of the source, aligned with the whole target.
+    """
+    onto = [projective.Target(prepare_view(target, _VIEW), np.eye(4))]
+    rows, columns = np.indices(source.depth.shape)
+    weak = np.diag(np.repeat([_HALVES.prior_m, _HALVES.prior_rad], 3) ** -2.0)
+    differences, variances = [], []
+    for first in (2 * columns < source.depth.shape[1], 2 * rows < source.depth.shape[0]):
+        a, b = (
+            projective.align(prepare_view(half, _VIEW), onto, T_target_source, _HALVES)
+            for half in (source.keep(first), source.keep(~first))
+        )
+        differences.append(se3.log(se3.inverse(a.T_world_source) @ b.T_world_source))
+        covariance = sum(np.linalg.inv(x.information + weak) for x in (a, b))
+        variances.append(np.diagonal(covariance))
+    return np.array(differences), np.array(variances)
+
 
 def _regressed(views: Sequence[_TrialView], poses: Float64) -> tuple[float, float] | None:
-    """Regress the disagreement of a run jointly with its poses: see `Trial`."""
+    """Regress the disagreement of a run jointly with its poses and nuisances: see `Trial`."""
     n = len(views)
     if n < 3:  # the relative pose of a pair absorbs nearly all of it
         return None
     poses = poses.copy()
     pairs = [(i, j) for i in range(n) for j in range(n) if i != j]
     for _ in range(_ITERATIONS):
-        A, g = np.zeros((6 * n + 1, 6 * n + 1)), np.zeros(6 * n + 1)
+        size = 6 * n + _NUISANCES + 1
+        A, g = np.zeros((size, size)), np.zeros(size)
         for i, j in pairs:
             equations = _compared(views[i], views[j], se3.inverse(poses[i]) @ poses[j])
             if equations is None:
                 continue
             J, residual, weight = equations
-            columns = np.r_[6 * i : 6 * i + 6, 6 * j : 6 * j + 6, 6 * n]
+            columns = np.r_[6 * i : 6 * i + 6, 6 * j : 6 * j + 6, 6 * n : size]
             A[np.ix_(columns, columns)] += J.T @ (weight[:, None] * J)
             g[columns] += J.T @ (weight * residual)
-        # The first view is fixed; damping fixes unconstrained directions.
-        reduced = A[6:-1, 6:-1]
-        reduced = reduced + np.diag(1e-6 * np.diag(reduced) + 1e-12)
-        solved = np.linalg.solve(reduced, np.stack([g[6:-1], A[6:-1, -1]], 1))
-        poses[1:] = poses[1:] @ se3.exp(-solved[:, 0].reshape(-1, 6))
-    # The part of the prediction that no motion of the views explains (the Schur complement).
+        # The first view is fixed.
+        step = _solved(A[6 : 6 * n, 6 : 6 * n], g[6 : 6 * n])
+        poses[1:] = poses[1:] @ se3.exp(-step.reshape(-1, 6))
+    # The part of the prediction that neither a motion of the views nor another error explains (the
+    # Schur complement).
+    solved = _solved(A[6:-1, 6:-1], np.stack([g[6:-1], A[6:-1, -1]], 1))
     predicted = A[-1, -1] - A[-1, 6:-1] @ solved[:, 1]
     explained = -(g[-1] - A[-1, 6:-1] @ solved[:, 0])
     return (float(explained), float(predicted)) if predicted > 0 else None
+
+
+def _solved(matrix: Float64, right: Float64) -> Float64:
+    """Solve normal equations; damping fixes unconstrained directions."""
+    damped = matrix + np.diag(1e-6 * np.diag(matrix) + 1e-12)
+    return np.asarray(np.linalg.solve(damped, right), np.float64)
 
 
 def _compared(
@@ -349,8 +429,9 @@ def _compared(
 
     Returns
     -------
-    (M, 13) derivatives by the right perturbations of target and source (m, rad), and by the
-    strength of the correction; (M,) distances in m; (M,) weights. None with too few points.
+    (M, 15) derivatives by the right perturbations of target and source (m, rad), by the other
+    errors of the camera, and by the strength of the correction; (M,) distances in m; (M,) weights.
+    None with too few points.
     """
     s, t = source.surface, target.surface
     subset = np.s_[::_STRIDE, ::_STRIDE]
@@ -387,14 +468,17 @@ def _compared(
     target_z = 1 / target_plane[valid, 3]
     target_ray = np.concatenate([t.rays[v, u], np.ones((len(v), 1))], 1).astype(float)
     normal_in_source = normal @ R
+    target_point = target_ray * target_z[:, None]
+    others = _by_other_errors(point, normal_in_source) - _by_other_errors(target_point, normal)
     source_term = np.einsum("ki,ki->k", normal_in_source, point) * change[valid]
-    target_term = -np.einsum("ki,ki->k", normal, target_ray) * target_z * target_change[valid]
+    target_term = -np.einsum("ki,ki->k", normal, target_point) * target_change[valid]
     J = np.concatenate(
         [
             -normal,
             -np.cross(transformed, normal),
             normal_in_source,
             np.cross(point, normal_in_source),
+            others,
             (source_term + target_term)[:, None],
         ],
         axis=1,
@@ -406,6 +490,12 @@ def _compared(
     # Errors of neighbours are correlated: a pair has the same weight for any number of points.
     weight = 1 / (2 * noise + _PLANE_SIGMA_M**2 + prediction_variance) / len(distance)
     return J, distance, weight
+
+
+def _by_other_errors(points: Float64, normals: Float64) -> Float64:
+    """Return how points (M, 3) move along normals by an offset of the range and a focal length."""
+    along = np.einsum("ki,ki->k", normals, points) / np.linalg.norm(points, axis=1)
+    return np.stack([along, (normals[:, :2] * points[:, :2]).sum(1)], 1)
 
 
 def _projected(view: PreparedView, points: Float64) -> tuple[Intp, ...]:

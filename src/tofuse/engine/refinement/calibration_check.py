@@ -8,7 +8,7 @@ exceeds the calibration error of usual cameras, and if it closes a loop that pai
 neighbours leave open.
 
 The focal length stands for other errors too: a constant offset of the depth has much the same
-effect.
+effect. A camera whose range changes has no single calibration: see `range_change`.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.refinement.camera_response import response
+from tofuse.engine.refinement.camera_response import SIGNIFICANT, Linearised, significance_of
 from tofuse.engine.refinement.joint_alignment import (
     AlignedViews,
     Priors,
@@ -32,6 +31,12 @@ from tofuse.engine.refinement.joint_alignment import (
     spread_evenly,
 )
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap, thinned
+from tofuse.engine.refinement.range_change import (
+    LikelyChange,
+    RangeChange,
+    likely_change,
+    range_change,
+)
 from tofuse.engine.refinement.split_half import aligned_motion
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
@@ -47,9 +52,9 @@ TOLERANCES = {
 }
 # Errors that the drift over a loop can reveal; that by the others resembles any drift.
 _REVEALED_BY_LOOP = ("focal", "offset")
-# Significance of an error in standard deviations of a normal distribution, for an alarm and for a
-# full estimate; and the fraction of the tolerance that one Newton step must reach for the latter.
-_SIGNIFICANT, _LIKELY, _MIN_FIRST_STEP = 4.0, 2.5, 0.2
+# Significance of an error in standard deviations that makes a full estimate worth its time, and
+# the fraction of the tolerance that one Newton step must reach.
+_LIKELY, _MIN_FIRST_STEP = 2.5, 0.2
 # Errors with a larger standard deviation, as a fraction of the tolerance, are not reported.
 _MAX_SIGMA = 0.8
 # Change of the views' support that the sampling of points alone explains.
@@ -104,6 +109,8 @@ class CalibrationCheck:
     significance
         Number of standard deviations that an estimate must exceed to be significant, see
         `significance_of`.
+    range_change
+        Change of the range over the views, if there is one; then no error is estimated.
     """
 
     alarm: bool = False
@@ -115,7 +122,8 @@ class CalibrationCheck:
     focal_sigma: float | None = None
     motion: dict[str, tuple[float, float]] = field(default_factory=dict)
     moved: tuple[float, float] = (0.0, 0.0)
-    significance: float = _SIGNIFICANT
+    significance: float = SIGNIFICANT
+    range_change: RangeChange | None = None
 
     @property
     def undetermined(self) -> bool:
@@ -147,15 +155,6 @@ class CalibrationCheck:
 
     def _limit(self, name: str) -> float:
         return self.significance * self.sigmas.get(name, np.inf)
-
-
-def significance_of(view_count: int) -> float:
-    """Return the number of standard deviations that a significant error must exceed.
-
-    The probability of chance is that of four standard deviations of a normal distribution. Few
-    views determine their own scatter poorly, so that the estimate follows Student's t-distribution.
-    """
-    return -float(stdtrit(max(view_count - 1, 1), ndtr(-_SIGNIFICANT)))
 
 
 def _determined(name: str, sigma: float) -> bool:
@@ -190,6 +189,10 @@ def check_calibration(
         moved=first.largest_motion,
         significance=significance,
     )
+    if first.change is not None:
+        changed = range_change(first.change, views, refined, options, priors)
+        if changed is not None:
+            return replace(without_error, range_change=changed)
     likely = [name for name in first.determined if first.is_likely(name)]
     if not likely:
         return _check_by_loop(views, refined, first, without_error, options)
@@ -246,12 +249,18 @@ class _FirstEstimates:
         (N, 6) twists by which the poses follow, per unit of each error.
     motion
         As in `CalibrationCheck`.
+    change
+        Change of the range over the views, if likely.
+    change_motion
+        Rms motion (m, rad) of the poses that it causes.
     """
 
     errors: dict[str, float]
     sigmas: dict[str, float]
     follow: dict[str, Float64]
     motion: dict[str, tuple[float, float]]
+    change: LikelyChange | None
+    change_motion: tuple[float, float]
 
     @classmethod
     def of(
@@ -263,13 +272,20 @@ class _FirstEstimates:
     ) -> _FirstEstimates:
         """Estimate all errors. The parameters are those of `check_calibration`."""
         poses, pairs = refined.poses, refined.pairs
-        sensitivity = response(views, poses, pairs, options, priors=priors)
+        linearised = Linearised.of(views, poses, pairs, options, priors)
+        sensitivity = linearised.response_to_errors()
+        change = likely_change(linearised, views, pairs)
+        change_motion = 0.0, 0.0
+        if change is not None and change.is_significant:
+            change_motion = _motion(poses, change.scale * change.follow)
         errors, sigmas = sensitivity.estimate(), sensitivity.sigma(pairs, len(views))
         return cls(
             {name: float(errors[k]) for name, k in _INDEX.items()},
             {name: float(sigmas[k]) for name, k in _INDEX.items()},
             {name: sensitivity.motion[k] for name, k in _INDEX.items()},
             {name: _motion(poses, sensitivity.motion[k]) for name, k in _INDEX.items()},
+            change,
+            change_motion,
         )
 
     @property
@@ -284,13 +300,13 @@ class _FirstEstimates:
 
     @property
     def largest_motion(self) -> tuple[float, float]:
-        """Largest rms motion (m, rad) of the poses by one of the determined errors."""
+        """Largest rms motion (m, rad) of the poses by a determined error or a likely change."""
         motions = [
             (m * abs(self.errors[name]), rad * abs(self.errors[name]))
             for name, (m, rad) in self.motion.items()
             if name in self.determined
         ]
-        return max(motions, default=(0.0, 0.0))
+        return max(*motions, self.change_motion)
 
 
 class _Estimator:
@@ -341,8 +357,12 @@ def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
     """Combine the checks of the submaps of one recording.
 
     They share the camera, so a true error is detected in most of them. Of the alarms, that with the
-    median error is returned.
+    median error is returned. A change of the range shows only in a submap with views before and
+    after it.
     """
+    changes = [(abs(s.range_change.change), k) for k, s in enumerate(checks) if s.range_change]
+    if changes:
+        return checks[max(changes)[1]]
     alarms = sorted((s for s in checks if s.alarm), key=lambda s: s.errors.get(s.best, 0.0))
     if 2 * len(alarms) > len(checks):
         return alarms[len(alarms) // 2]

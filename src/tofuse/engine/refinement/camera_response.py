@@ -1,31 +1,40 @@
-"""Response of refined views to errors of the camera that all of them share."""
+"""Response of refined views to errors of the camera: shared by all, or with a profile over them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph import sparse
 from tofuse.engine.refinement.joint_alignment import DAMPING, Priors, weak_prior
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
+
+# Significance of an error in standard deviations of a normal distribution.
+SIGNIFICANT = 4.0
+_SHARED = kernels.SOURCE_SCALE  # number of errors that all views share
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
     """Sensitivity of each pair to single errors of the camera, all poses being free to follow.
 
+    The K errors are those that all views share, in the order of `kernels`, or the scale of the
+    depth by K profiles over the views.
+
     Attributes
     ----------
     gradient, information
-        (M, ERRORS) of each pair i < j, both directions together: first and second derivative of its
+        (M, K) of each pair i < j, both directions together: first and second derivative of its
         robust cost (Tukey's biweight) at zero error.
     motion
-        (ERRORS, N, 6) twist by which each pose follows, per unit of the error.
+        (K, N, 6) twist by which each pose follows, per unit of the error.
     """
 
     gradient: Float64
@@ -33,13 +42,13 @@ class Response:
     motion: Float64
 
     def estimate(self) -> Float64:
-        """(ERRORS,) estimate of each error alone, by one Newton step."""
+        """(K,) estimate of each error alone, by one Newton step."""
         return np.asarray(
             -self.gradient.sum(0) / np.maximum(self.information.sum(0), 1e-12), np.float64
         )
 
     def sigma(self, pairs: Intp, view_count: int) -> Float64:
-        """(ERRORS,) standard deviations, from the scatter between views (sandwich estimator).
+        """(K,) standard deviations, from the scatter between views (sandwich estimator).
 
         It includes noise that neighbouring pixels share and errors of single views, but not errors
         that all views have in common.
@@ -52,12 +61,172 @@ class Response:
             Number of views.
         """
         residual_gradient = self.gradient + self.information * self.estimate()
-        view_gradient = np.zeros((view_count, residual_gradient.shape[1]))
-        for ends in pairs.T:
-            np.add.at(view_gradient, ends, residual_gradient)
+        view_gradient = _by_view(residual_gradient, pairs, view_count)
         # One degree of freedom is lost, as the estimate is that of the same views.
         scatter = np.sqrt((view_gradient**2).sum(0) * view_count / max(view_count - 1, 1))
         return np.asarray(scatter / np.maximum(self.information.sum(0), 1e-12), np.float64)
+
+    def informative_views(self, pairs: Intp, view_count: int) -> Float64:
+        """(K,) effective number of views that determine each error; arguments as of `sigma`."""
+        information = np.maximum(_by_view(self.information, pairs, view_count), 0.0)
+        squares = np.maximum((information**2).sum(0), 1e-24)
+        return np.asarray(information.sum(0) ** 2 / squares, np.float64)
+
+
+def _by_view(of_pairs: Float64, pairs: Intp, view_count: int) -> Float64:
+    """Return the sums (N, K) over the pairs of each view, given values (M, K) of pairs (M, 2)."""
+    out = np.zeros((view_count, of_pairs.shape[1]))
+    for ends in pairs.T:
+        np.add.at(out, ends, of_pairs)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Refined views, linearised in their poses and in errors of the camera.
+
+    Attributes
+    ----------
+    state, system, T_i_j
+        Directed pairs (P,), the system of the poses, and its relative poses (P + priors, 4, 4).
+    H, g
+        (P, 6 + ERRORS, 6 + ERRORS) and (P, 6 + ERRORS) normal equations of the pairs.
+    factor
+        Factorised system of the poses.
+    curvature
+        Ratio of the curvature of the robust cost to that with constant weights.
+    """
+
+    state: pair_equations.DirectedPairs
+    system: sparse.PairSystem
+    T_i_j: Float64
+    H: Float64
+    g: Float64
+    factor: sparse.Factor
+    curvature: float
+
+    @classmethod
+    def of(
+        cls,
+        views: Sequence[SampledView],
+        poses: Float64,
+        pairs: Intp,
+        options: pair_equations.RefineOptions,
+        priors: Priors | None = None,
+    ) -> Linearised:
+        """Linearise views at refined poses. The parameters are those of `response`."""
+        priors = priors or Priors.none()
+        zero_errors, estimate_all = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS, np.int64)
+        stage = options.rounds[-1]
+        state = pair_equations.directed_pairs(views, pairs, options)
+        system = priors.system(len(views), np.stack([state.target, state.source], 1))
+        pair_equations.evaluate(
+            views, poses, zero_errors, np.ones_like(estimate_all), state, stage, options
+        )
+        pair_equations.without_exposure(state)
+        pair_equations.rescale(state, stage, options)
+        pair_equations.evaluate(views, poses, zero_errors, estimate_all, state, stage, options)
+        H, g = pair_equations.without_exposure(state)
+        i, j = system.pairs.T
+        T_i_j = se3.inverse(poses[i]) @ poses[j]
+        prior_H, prior_g = priors.equations(T_i_j[len(H) :])
+        matrix, gradient = system.relative(
+            np.concatenate([H[:, :6, :6], prior_H]),
+            np.concatenate([g[:, :6], prior_g]),
+            T_i_j,
+            weak_prior(len(poses)),
+        )
+        factor = system.factor(matrix, gradient, DAMPING)
+        assert factor is not None, "every pose has a prior, so the system is not singular"
+        # Reweighted least squares holds the weights constant, and their curvature exceeds that of
+        # the cost. A single step with it falls short, and a sandwich estimate by it is too small
+        # (Huber 1981, Robust Statistics, section 3.2: the mean of psi').
+        return cls(state, system, T_i_j, H, g, factor, tukey.consistency(options.robust))
+
+    def response_to_errors(self) -> Response:
+        """Return the response to each error that all views share."""
+        count = len(self.H)
+        return self._response([np.eye(kernels.ERRORS)[[k] * count] for k in range(_SHARED)])
+
+    def response_to_scales(self, profiles: Float64) -> Response:
+        """Return the response to the scale of the depth by profiles (K, N) over the views."""
+        columns = np.zeros((len(profiles), len(self.H), kernels.ERRORS))
+        of_target = profiles[:, self.state.target]
+        # The response to the scale of the target is the remainder of that to a common one.
+        columns[..., kernels.SOURCE_SCALE] = profiles[:, self.state.source] - of_target
+        columns[..., kernels.SCALE] = of_target
+        return self._response(columns)
+
+    def _response(self, columns: Iterable[Float64]) -> Response:
+        """Return the response to combinations (P, ERRORS) of the errors of each directed pair."""
+        state, H, g = self.state, self.H, self.g
+        A = se3.adjoint(se3.inverse(self.T_i_j[: len(H)]))
+        prior_rows = np.zeros((len(self.T_i_j) - len(H), 6))
+
+        def relative(step: Float64) -> Float64:
+            return step[state.source] - (A @ step[state.target][..., None])[..., 0]
+
+        initial_step = self.factor.step()
+        assert initial_step is not None, "the system is finite"
+        initial_motion = relative(initial_step)
+        slope = g[:, :6] + (H[:, :6, :6] @ initial_motion[..., None])[..., 0]
+        first, second, motion = [], [], []
+        for column in columns:
+            mixed = (H[:, :6, 6:] @ column[..., None])[..., 0]
+            gradient = self.system.gradient(np.concatenate([mixed, prior_rows]), self.T_i_j)
+            follow = self.factor.solve(gradient)
+            assert follow is not None, "the system is finite"
+            motion.append(follow)
+            relative_motion = relative(follow)
+            first.append(
+                (g[:, 6:] * column).sum(1)
+                + (mixed * initial_motion).sum(1)
+                + (slope * relative_motion).sum(1)
+            )
+            second.append(
+                np.einsum("mi,mij,mj->m", column, H[:, 6:, 6:], column)
+                + 2 * (mixed * relative_motion).sum(1)
+                + np.einsum("mi,mij,mj->m", relative_motion, H[:, :6, :6], relative_motion)
+            )
+        # Both directions of a pair together.
+        by_pair = [np.array(x).reshape(len(x), 2, -1).sum(1).T for x in (first, second)]
+        return Response(by_pair[0], by_pair[1] * self.curvature, np.array(motion))
+
+    def scale_scores(self, profiles: Float64) -> Float64:
+        """Return (K,) how much scales by profiles (K, N) reduce the cost, for many profiles."""
+        count, H, g = profiles.shape[1], self.H, self.g
+        ends = self.state.source, self.state.target
+        At = np.swapaxes(se3.adjoint(se3.inverse(self.T_i_j[: len(H)])), 1, 2)
+        # Equations by the scales of the source and of the target, and their coupling to poses.
+        of_ends = np.zeros((kernels.ERRORS, 2))
+        of_ends[kernels.SOURCE_SCALE] = 1, -1
+        of_ends[kernels.SCALE, 1] = 1
+        second = of_ends.T @ H[:, 6:, 6:] @ of_ends
+        mixed = H[:, :6, 6:] @ of_ends
+        first = g[:, 6:] @ of_ends
+        gradient, information = np.zeros(count), np.zeros((count, count))
+        coupling = np.zeros((count, count, 6))  # of each pose to each scale
+        for a, end in enumerate(ends):
+            np.add.at(gradient, end, first[:, a])
+            np.add.at(coupling, (ends[0], end), mixed[..., a])
+            np.add.at(coupling, (ends[1], end), -(At @ mixed[..., a, None])[..., 0])
+            for b, other in enumerate(ends):
+                np.add.at(information, (end, other), second[:, a, b])
+        columns = np.swapaxes(coupling[self.system.free], 1, 2).reshape(-1, count) @ profiles.T
+        solved = self.factor.solve_columns(columns)
+        slope = profiles @ gradient - self.factor.gradient.ravel() @ solved
+        curvature = ((profiles @ information) * profiles).sum(1) - (columns * solved).sum(0)
+        return np.asarray(slope**2 / np.maximum(curvature, 1e-12), np.float64)
+
+
+def significance_of(view_count: float, tests: int = 1) -> float:
+    """Return the number of standard deviations that a significant error must exceed.
+
+    The probability of chance is that of four standard deviations of a normal distribution. Few
+    views determine their own scatter poorly, so that the estimate follows Student's t-distribution.
+    Of several tests, one of which is picked, each must be less likely (Bonferroni).
+    """
+    return -float(stdtrit(max(view_count - 1, 1), ndtr(-SIGNIFICANT) / tests))
 
 
 def response(
@@ -65,7 +234,6 @@ def response(
     poses: Float64,
     pairs: Intp,
     options: pair_equations.RefineOptions,
-    *,
     priors: Priors | None = None,
 ) -> Response:
     """Compute the sensitivity of refined views to errors of the camera that they share.
@@ -81,57 +249,4 @@ def response(
     priors
         Measurements by other sensors.
     """
-    priors = priors or Priors.none()
-    zero_errors, estimate_all = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS, np.int64)
-    stage = options.rounds[-1]
-    state = pair_equations.directed_pairs(views, pairs, options)
-    system = priors.system(len(views), np.stack([state.target, state.source], 1))
-    pair_equations.evaluate(
-        views, poses, zero_errors, np.ones_like(estimate_all), state, stage, options
-    )
-    pair_equations.without_exposure(state)
-    pair_equations.rescale(state, stage, options)
-    pair_equations.evaluate(views, poses, zero_errors, estimate_all, state, stage, options)
-    H, g = pair_equations.without_exposure(state)
-    prior_count = len(priors.pairs)
-    i, j = system.pairs.T
-    T_i_j = se3.inverse(poses[i]) @ poses[j]
-    prior_H, prior_g = priors.equations(T_i_j[len(H) :])
-    n = len(poses)
-    matrix, gradient = system.relative(
-        np.concatenate([H[:, :6, :6], prior_H]),
-        np.concatenate([g[:, :6], prior_g]),
-        T_i_j,
-        weak_prior(n),
-    )
-    factor = system.factor(matrix, gradient, DAMPING)
-    assert factor is not None, "every pose has a prior, so the system is not singular"
-    A = se3.adjoint(se3.inverse(T_i_j[: len(H)]))
-
-    def relative(step: Float64) -> Float64:
-        return step[state.source] - (A @ step[state.target][..., None])[..., 0]
-
-    initial_step = factor.step()
-    assert initial_step is not None, "the system is finite"
-    initial_motion = relative(initial_step)
-    slope = g[:, :6] + (H[:, :6, :6] @ initial_motion[..., None])[..., 0]
-    first, second = np.empty((len(H), kernels.ERRORS)), np.empty((len(H), kernels.ERRORS))
-    motion = np.empty((kernels.ERRORS, n, 6))
-    for k in range(kernels.ERRORS):
-        mixed = H[:, :6, 6 + k]
-        column = system.gradient(np.concatenate([mixed, np.zeros((prior_count, 6))]), T_i_j)
-        follow = factor.solve(column)
-        assert follow is not None, "the system is finite"
-        motion[k] = follow
-        relative_motion = relative(motion[k])
-        first[:, k] = (
-            g[:, 6 + k] + (mixed * initial_motion).sum(1) + (slope * relative_motion).sum(1)
-        )
-        second[:, k] = H[:, 6 + k, 6 + k] + 2 * (mixed * relative_motion).sum(1)
-        second[:, k] += np.einsum("mi,mij,mj->m", relative_motion, H[:, :6, :6], relative_motion)
-    # Reweighted least squares holds the weights constant, and their curvature exceeds that of the
-    # cost. A single step with it falls short, and a sandwich estimate by it is too small (Huber
-    # 1981, Robust Statistics, section 3.2: the mean of psi').
-    second *= tukey.consistency(options.robust)
-    half = len(pairs)
-    return Response(first[:half] + first[half:], second[:half] + second[half:], motion)
+    return Linearised.of(views, poses, pairs, options, priors).response_to_errors()

@@ -211,8 +211,7 @@ def refine(
     )
     poses, errors, state = aligned.poses, aligned.errors, aligned.state
     fixed_errors = aligned.fixed_errors
-    count = len(state.target) // 2
-    pairs = np.stack([state.target[:count], state.source[:count]], 1)
+    pairs = aligned.pairs
     final_round = options.rounds[-1]
     by_patch = not calibrate and pair_equations.depends_on_patches(state, options)
     after = _support(
@@ -249,6 +248,12 @@ class AlignedViews:
     state: pair_equations.DirectedPairs
     fixed_errors: Int64
     moved: tuple[float, ...]
+
+    @property
+    def pairs(self) -> Intp:
+        """(M, 2) positions of the overlapping views i < j."""
+        count = len(self.state.target) // 2
+        return np.stack([self.state.target[:count], self.state.source[:count]], 1)
 
 
 def align_views(

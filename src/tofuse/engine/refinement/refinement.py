@@ -21,6 +21,7 @@ from tofuse.engine.refinement.calibration_check import (
 )
 from tofuse.engine.refinement.joint_alignment import Priors, Refined, refine, support_fell
 from tofuse.engine.refinement.loop_drift import loop_gap
+from tofuse.engine.refinement.range_change import RangeChange
 from tofuse.engine.refinement.split_half import split_half_errors
 from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps
 from tofuse.engine.stored_views import (
@@ -97,6 +98,11 @@ class Refinement:
     non_overlap_edges: tuple[tuple[int, int], ...] = ()
     split_m: float = 0.0
     split_rad: float = 0.0
+
+    @property
+    def range_change(self) -> RangeChange | None:
+        """Change of the camera's range, if the views show one."""
+        return None if self.calibration_check is None else self.calibration_check.range_change
 
     def accepted(self, positions: Intp, after: Float64) -> Refinement:
         """Return the refinement that keeps the poses `after` of the frames at `positions`."""

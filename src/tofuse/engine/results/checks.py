@@ -458,6 +458,7 @@ def _drift(e: Evidence) -> Iterator[Reason]:
 def _uncertainty(e: Evidence) -> Iterator[Reason]:
     """Uncertainty of the poses and of the calibration, from covariances of registrations."""
     yield from _loop_drift(e)
+    yield from _range_changes(e)
     yield from _calibration_alarm(e)
     yield from _unchecked_calibration(e)
     yield from accuracy_reasons(e.accuracy, e.tolerance, [r.index for r in e.records])
@@ -520,6 +521,18 @@ def _loop_drift(e: Evidence) -> Iterator[Reason]:
     yield Reason("calibration_alarm", ((first, last),), text)
 
 
+def _range_changes(e: Evidence) -> Iterator[Reason]:
+    """A change of the camera's range during the recording."""
+    change = None if e.refinement is None else e.refinement.range_change
+    if change is None:
+        return
+    text = (
+        f"The range of the camera {change.in_words()}, as views of the same surfaces show: the "
+        "model is distorted, and no bound on the pose errors is stated."
+    )
+    yield Reason("range_changes", e.posed_range, text)
+
+
 def _calibration_alarm(e: Evidence) -> Iterator[Reason]:
     """A calibration error that the refined views show."""
     check = None if e.refinement is None else e.refinement.calibration_check
@@ -539,7 +552,7 @@ def _calibration_alarm(e: Evidence) -> Iterator[Reason]:
 def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
     """A calibration that the recording does not determine."""
     check = None if e.refinement is None else e.refinement.calibration_check
-    if check is None or check.alarm:
+    if check is None or check.alarm or check.range_change is not None:
         return
     if check.undetermined:
         text = (

@@ -33,6 +33,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "inconsistent_poses": ("degraded", "Registrations contradict the poses that were given."),
     "uncertain_poses": ("degraded", "Pose errors may exceed the tolerance."),
     "calibration_alarm": ("degraded", "Loop-closure errors are larger than noise explains."),
+    "range_changes": ("degraded", "The range of the camera changes during the recording."),
     "unchecked_drift": ("degraded", "No loop closure checks the accumulated drift."),
     "loop_gap": ("degraded", "Odometry drifted far before a loop was closed."),
     "optimiser_gave_up": ("degraded", "The optimiser stopped before it converged."),
@@ -87,6 +88,7 @@ ADVICE: dict[str, str] = {
     "uncertain_poses": "Return to places seen before, or keep corners and texture in view there.",
     "calibration_alarm": "Check the camera's calibration against a known distance and a right "
     "angle.",
+    "range_changes": "Let the camera warm up and keep its mode; check the unit of all depth files.",
     "unchecked_calibration": "Turn the camera more, and return to the start.",
     "self_calibrated": "Copy the corrected values into camera.json, and check a known distance.",
     "unobserved_motion": "Keep corners, furniture or texture in view there.",

@@ -32,7 +32,8 @@ FOCAL = 2  # relative, to be added to the ray coordinates; measured depth is kep
 CENTER_X = 3  # to be added to the ray coordinate x / z: principal point over focal length
 CENTER_Y = 4  # to be added to y / z
 DISTORTION = 5  # relative, times x^2 + y^2 of the ray coordinates, to be added to these
-ERRORS = 6
+SOURCE_SCALE = 6  # as SCALE, but of the source view alone: to be estimated, not assumed
+ERRORS = 7
 
 EXPOSURE = 6  # index of the exposure among the unknowns
 UNKNOWNS = 7 + ERRORS
@@ -318,6 +319,7 @@ def _respond_to_errors(
             p2
         ) - range_q * along_q / np.sqrt(q2)
         block[(_RESPONSE + SCALE) * residual.LANES + k] = along_p - range_q * along_q
+        block[(_RESPONSE + SOURCE_SCALE) * residual.LANES + k] = along_p
         block[(_RESPONSE + FOCAL) * residual.LANES + k] = focal_p - focal_q
         block[(_RESPONSE + CENTER_X) * residual.LANES + k] = pz * (m0 - px * kept_p) - qz * (
             n0 - qx * kept_q

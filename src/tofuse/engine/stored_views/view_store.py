@@ -58,6 +58,11 @@ class CoarseView:
         coarse = surface.subsampled(_OVERLAP_COLUMNS)
         return cls(sampled, coarse.target, coarse.projection)
 
+    def scaled(self, factor: float) -> CoarseView:
+        """Return the view with its depth scaled."""
+        points, target = _scaled(self.points, self.target, factor)
+        return replace(self, points=points, target=target)
+
     @property
     def centroid(self) -> Float64:
         """(3,) centroid of the points, in the camera's frame."""
@@ -129,6 +134,12 @@ class SampledView:
         """Return the view with a subset of its points."""
         return replace(self, points=np.ascontiguousarray(self.points[which]))
 
+    def scaled(self, factor: float) -> SampledView:
+        """Return the view with its depth scaled."""
+        points, target = _scaled(self.points, self.target, factor)
+        coarse = self.coarse.scaled(factor)
+        return replace(self, depth=self.depth * factor, points=points, target=target, coarse=coarse)
+
     @property
     def target_image(self) -> residual_kernels.TargetImage:
         """The target image and its projection."""
@@ -160,6 +171,16 @@ class SampledView:
             if len(p)
             else 0.01
         )
+
+
+def _scaled(points: Float32, target: Float32, factor: float) -> tuple[Float32, Float32]:
+    """Return points and a target image with their depth scaled."""
+    k, points, target = residual_kernels, points.copy(), target.copy()
+    points[:, k.POINT : k.POINT + 3] *= factor
+    points[:, k.POINT_ALBEDO_SLOPE : k.POINT_ALBEDO_SLOPE + 3] /= factor
+    target[..., k.DISTANCE] *= factor
+    target[..., k.VARIANCE] *= factor**2
+    return points, target
 
 
 def sampled_points(surface: PreparedView, count: int) -> Float32:

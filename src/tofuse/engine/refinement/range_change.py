@@ -1,0 +1,164 @@
+"""A camera whose range changes: from some frame on, or gradually.
+
+Another mode or modulation frequency, or warming up, scales the range of later views, and poses
+follow it. A scale that all views share is invisible in them, but views of the same surfaces before
+and after a change disagree. Refined views give the change by a step at each view, and by a constant
+drift, with all poses free: one Newton step for each. A likely change is estimated in full: the
+views are scaled by it and aligned again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.geometry import se3
+from tofuse.engine.refinement.camera_response import Linearised, significance_of
+from tofuse.engine.refinement.joint_alignment import Priors, Refined, align_views
+from tofuse.engine.refinement.loop_drift import thinned
+from tofuse.engine.stored_views import SampledView, pair_equations
+
+# Makers specify range errors of up to a percent. Those that depend on the distance, or multipath,
+# look like smaller changes, as later views see other distances.
+TOLERANCE = 0.01
+# Number of standard deviations that makes a full estimate worth its time.
+_LIKELY = 2.5
+# Minimum number of views on either side of a step.
+_MIN_VIEWS = 3
+# A full estimate is made above this fraction of the tolerance, in at most this many steps, until
+# one is below the second fraction.
+_MIN_FIRST_STEP, _MAX_STEPS, _CONVERGED = 0.5, 5, 0.1
+
+
+@dataclass(frozen=True)
+class RangeChange:
+    """A change of the measured range beyond the tolerance of usual cameras.
+
+    Attributes
+    ----------
+    change, sigma
+        Relative change of the range of later views, and its standard deviation; of the last view,
+        if the range drifts.
+    frame
+        Index of the first view after the change; None if the range drifts.
+    """
+
+    change: float
+    sigma: float
+    frame: int | None
+
+    def in_words(self) -> str:
+        """Describe the change."""
+        if self.frame is None:
+            return f"drifts by {self.change:+.1%} over the recording"
+        return f"changes by {self.change:+.1%} at about frame {self.frame}"
+
+
+@dataclass(frozen=True, eq=False)
+class LikelyChange:
+    """First estimate of a change.
+
+    Attributes
+    ----------
+    scale, sigma
+        Scale of the depth of the views, per unit of the profile, that corrects the change, and its
+        standard deviation.
+    profile
+        (N,) of the scale over the views.
+    follow
+        (N, 6) twists by which the poses follow, per unit of the scale.
+    frame
+        As in `RangeChange`.
+    limit
+        Number of standard deviations that a significant estimate exceeds; that of a large change
+        may only do so in full.
+    """
+
+    scale: float
+    sigma: float
+    profile: Float64
+    follow: Float64
+    frame: int | None
+    limit: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether this estimate is no chance."""
+        return abs(self.scale) > self.limit * self.sigma
+
+
+def likely_change(
+    linearised: Linearised, views: Sequence[SampledView], pairs: Intp
+) -> LikelyChange | None:
+    """Return the best step or drift over the views; None if it is no more than noise.
+
+    Parameters
+    ----------
+    linearised, pairs
+        N views with pairs (M, 2), linearised at their refined poses.
+    views
+        The views.
+    """
+    count = len(views)
+    index = np.array([view.index for view in views], float)
+    drift = (index - index[0]) / max(float(np.ptp(index)), 1.0)
+    first_after = np.arange(_MIN_VIEWS, count - _MIN_VIEWS + 1)
+    steps = (np.arange(count) >= first_after[:, None]).astype(float)
+    best = int(np.argmax(linearised.scale_scores(steps)))
+    profiles = np.stack([drift, steps[best]])
+    found = linearised.response_to_scales(profiles)
+    scales, sigmas = found.estimate(), found.sigma(pairs, count)
+    ratios = np.abs(scales) / np.maximum(sigmas, 1e-12)
+    k = int(np.argmax(ratios))
+    if ratios[k] <= _LIKELY:
+        return None
+    # The views that determine a step are few, and it is the best of many (Bonferroni).
+    limit = significance_of(float(found.informative_views(pairs, count)[k]), tests=count)
+    frame = views[int(first_after[best])].index if k else None
+    return LikelyChange(
+        float(scales[k]), float(sigmas[k]), profiles[k], found.motion[k], frame, limit
+    )
+
+
+def range_change(
+    likely: LikelyChange,
+    views: Sequence[SampledView],
+    refined: Refined,
+    options: pair_equations.RefineOptions,
+    priors: Priors,
+) -> RangeChange | None:
+    """Estimate a likely change in full; None if it is chance, or within usual tolerances.
+
+    Parameters
+    ----------
+    likely
+        The first estimate.
+    views, refined, options, priors
+        As for `calibration_check.check_calibration`.
+    """
+    if abs(likely.scale) < _MIN_FIRST_STEP * TOLERANCE:
+        return None
+    views, options = thinned(views, len(refined.pairs), options)
+    poses = refined.poses @ se3.exp(likely.scale * likely.follow)
+    scale, sigma = likely.scale, likely.sigma
+    for _ in range(_MAX_STEPS):
+        factors = 1 + scale * likely.profile
+        scaled = [view.scaled(factor) for view, factor in zip(views, factors, strict=True)]
+        aligned = align_views(scaled, poses, options, priors=priors)
+        poses, pairs = aligned.poses, aligned.pairs
+        if not len(pairs):
+            break
+        profile = (likely.profile / factors)[None]
+        linearised = Linearised.of(scaled, poses, pairs, options, priors)
+        found = linearised.response_to_scales(profile)
+        step, sigma = float(found.estimate()[-1]), float(found.sigma(pairs, len(views))[-1])
+        scale += step
+        if abs(step) < _CONVERGED * TOLERANCE:
+            break
+    change = 1 / (1 + scale) - 1
+    if abs(change) <= max(TOLERANCE, likely.limit * sigma):
+        return None
+    return RangeChange(change, sigma, likely.frame)

@@ -1,0 +1,66 @@
+"""Cameras whose range changes, and cameras that don't."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from aligned_surfaces import OPTIONS, path, surfaces
+from tofuse.engine.refinement.calibration_check import (
+    CalibrationCheck,
+    check_calibration,
+    combine_checks,
+)
+from tofuse.engine.refinement.joint_alignment import Priors, refine
+from tofuse.engine.refinement.range_change import RangeChange
+from tofuse.engine.stored_views.view_store import SampledView
+
+VIEWS = 24
+
+
+@pytest.fixture(scope="module")
+def right() -> list[SampledView]:
+    return [SampledView.of(s, 1500) for s in surfaces(path(VIEWS), noise=0.003)]
+
+
+def checked(views: list[SampledView], factors: np.ndarray) -> CalibrationCheck:
+    """Check views whose depth is scaled."""
+    scaled = [view.scaled(factor) for view, factor in zip(views, factors, strict=True)]
+    refined = refine(scaled, path(VIEWS), OPTIONS)
+    return check_calibration(scaled, refined, OPTIONS, Priors.none())
+
+
+@pytest.mark.parametrize(("factor", "start"), [(1.04, 12), (0.97, 15)])
+def test_step_of_range_is_found(right: list[SampledView], factor: float, start: int) -> None:
+    check = checked(right, np.where(np.arange(VIEWS) >= start, factor, 1.0))
+    found = check.range_change
+    assert found is not None
+    assert found.change == pytest.approx(factor - 1, abs=0.003)
+    assert found.frame == start
+    assert found.in_words() == f"changes by {found.change:+.1%} at about frame {start}"
+    # What such views say about the calibration is void.
+    assert not check.alarm
+    assert not check.errors
+
+
+def test_drift_of_range_is_found(right: list[SampledView]) -> None:
+    found = checked(right, np.linspace(1.0, 1.08, VIEWS)).range_change
+    assert found is not None
+    assert found.frame is None
+    assert found.change == pytest.approx(0.08, abs=0.01)
+    assert "drifts" in found.in_words()
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.1])
+def test_constant_scale_is_no_change(right: list[SampledView], factor: float) -> None:
+    scaled = [view.scaled(factor) for view in right]
+    poses = path(VIEWS)
+    poses[:, :3, 3] *= factor
+    refined = refine(scaled, poses, OPTIONS)
+    assert check_calibration(scaled, refined, OPTIONS, Priors.none()).range_change is None
+
+
+def test_change_of_one_submap_is_that_of_the_recording() -> None:
+    small, large = (CalibrationCheck(range_change=RangeChange(c, 0.001, 7)) for c in (0.02, -0.05))
+    assert combine_checks([CalibrationCheck(), small, large]) is large
+    assert combine_checks([CalibrationCheck(), CalibrationCheck()]).range_change is None
