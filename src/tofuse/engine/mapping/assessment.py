@@ -240,7 +240,7 @@ class Assessment:
             return 0.0, 0.0
         unknown = np.sqrt(pose_accuracy.UNKNOWN_FRACTION)
         is_likely = check.unconfirmed or (check.improves and check.large)
-        errors = [(1.0 if is_likely else unknown) * np.array(check.moved)]
+        errors = [(1.0 if is_likely else unknown) * np.array(check.moved), np.array(check.changed)]
         if check.undetermined:
             usual = calibration_check.TOLERANCES["focal"]
             errors.append(unknown * usual * np.array(check.motion["focal"]))

@@ -35,6 +35,7 @@ from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import robust_sigma
+from tofuse.engine.tracking import moving_objects
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Degrees of freedom of Student's t (Lange, Little and Taylor 1989 suggest 4).
@@ -233,7 +234,7 @@ def trial(recording: Recording, uncorrected: Prepare, corrected: Prepare) -> Tri
     found = _pairs_of_sums(results, _FULL_BY_SURFACES)
     if not found.is_significant:
         return found
-    by_halves = [views.by_halves(start, stride) for start, stride in sorted(visited)]
+    by_halves = run_all([partial(views.by_halves, *run) for run in sorted(visited)])
     second = _pairs_of_sums([run for run in by_halves if run is not None], _FULL_BY_HALVES)
     return replace(found, by_halves=second)
 
@@ -249,6 +250,7 @@ class _TrialView:
 
     surface: PreparedView
     change: Float32
+    corrected: RangeFrame
 
     @classmethod
     def of(cls, uncorrected: RangeFrame, corrected: RangeFrame) -> _TrialView:
@@ -257,7 +259,13 @@ class _TrialView:
         change = np.where(valid, corrected.z / np.where(valid, uncorrected.z, 1) - 1, np.nan)
         rows, columns = surface.z.shape
         step = change.shape[1] // columns
-        return cls(surface, change[step // 2 :: step, step // 2 :: step][:rows, :columns])
+        sampled = change[step // 2 :: step, step // 2 :: step][:rows, :columns]
+        return cls(surface, sampled, corrected)
+
+    @cached_property
+    def corrected_surface(self) -> PreparedView:
+        """The view with the correction."""
+        return prepare_view(self.corrected, _VIEW)
 
 
 class _AlignedViews:
@@ -348,12 +356,15 @@ class _AlignedViews:
         sums = np.zeros(2)
         for k in range(start, start + (_VIEWS - 1) * stride, stride):
             step = self._steps.get((k, k + stride))
-            ends = [self._corrected_pair(k), self._corrected_pair(k + stride)]
-            if step is None or ends[0] is None or ends[1] is None:
+            target, source = self._views.get(k), self._views.get(k + stride)
+            if step is None or target is None or source is None:
                 continue
+            pairs = (
+                (target.surface, source.surface),
+                (target.corrected_surface, source.corrected_surface),
+            )
             (before, variance), (after, _) = (
-                _halves_differ(target, source, step.T_world_source)
-                for target, source in zip(*ends, strict=True)
+                _halves_differ(*pair, step.T_world_source) for pair in pairs
             )
             change = after - before
             sums += -(before * change / variance).sum(), (change**2 / variance).sum()
@@ -361,20 +372,22 @@ class _AlignedViews:
 
 
 def _halves_differ(
-    target: RangeFrame, source: RangeFrame, T_target_source: Float64
+    target: PreparedView, source: PreparedView, T_target_source: Float64
 ) -> tuple[Float64, Float64]:
     """Return how poses of a view by halves of the image differ: (2, 6) twists and variances.
 
     Left and right, and upper and lower half; of the source, aligned with the whole target.
     """
-    onto = [projective.Target(prepare_view(target, _VIEW), np.eye(4))]
-    rows, columns = np.indices(source.depth.shape)
+    onto = [projective.Target(target, np.eye(4))]
+    rows, columns = np.indices(source.z.shape)
     weak = np.diag(np.repeat([_HALVES.prior_m, _HALVES.prior_rad], 3) ** -2.0)
     differences, variances = [], []
-    for first in (2 * columns < source.depth.shape[1], 2 * rows < source.depth.shape[0]):
+    for first in (2 * columns < source.z.shape[1], 2 * rows < source.z.shape[0]):
         a, b = (
-            projective.align(prepare_view(half, _VIEW), onto, T_target_source, _HALVES)
-            for half in (source.keep(first), source.keep(~first))
+            projective.align(
+                moving_objects.without_pixels(source, half), onto, T_target_source, _HALVES
+            )
+            for half in (~first, first)
         )
         differences.append(se3.log(se3.inverse(a.T_world_source) @ b.T_world_source))
         covariance = sum(np.linalg.inv(x.information + weak) for x in (a, b))

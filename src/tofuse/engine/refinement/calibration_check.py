@@ -106,6 +106,8 @@ class CalibrationCheck:
     moved
         Largest rms motion (m, rad) of the poses, after alignment, if one of the likely errors is
         corrected, or by the first estimate of one that the views determine.
+    changed
+        Rms motion (m, rad) of the poses by a change of the range, if that is significant.
     significance
         Number of standard deviations that an estimate must exceed to be significant, see
         `significance_of`.
@@ -122,6 +124,7 @@ class CalibrationCheck:
     focal_sigma: float | None = None
     motion: dict[str, tuple[float, float]] = field(default_factory=dict)
     moved: tuple[float, float] = (0.0, 0.0)
+    changed: tuple[float, float] = (0.0, 0.0)
     significance: float = SIGNIFICANT
     range_change: RangeChange | None = None
 
@@ -191,8 +194,12 @@ def check_calibration(
     )
     if first.change is not None:
         changed = range_change(first.change, views, refined, options, priors)
-        if changed is not None:
+        if changed is not None and changed.is_large:
             return replace(without_error, range_change=changed)
+        if (changed or first.change).is_significant:
+            ratio = abs(changed.change / first.change.scale) if changed else 1.0
+            m, rad = first.change_motion
+            without_error = replace(without_error, changed=(ratio * m, ratio * rad))
     likely = [name for name in first.determined if first.is_likely(name)]
     if not likely:
         return _check_by_loop(views, refined, first, without_error, options)
@@ -306,7 +313,7 @@ class _FirstEstimates:
             for name, (m, rad) in self.motion.items()
             if name in self.determined
         ]
-        return max(*motions, self.change_motion)
+        return max([*motions, self.change_motion])
 
 
 class _Estimator:

@@ -28,14 +28,14 @@ TOLERANCE = 0.01
 _LIKELY = 2.5
 # Minimum number of views on either side of a step.
 _MIN_VIEWS = 3
-# A full estimate is made above this fraction of the tolerance, in at most this many steps, until
-# one is below the second fraction.
-_MIN_FIRST_STEP, _MAX_STEPS, _CONVERGED = 0.5, 5, 0.1
+# A full estimate is made above these fractions of the tolerance and of the limit of significance,
+# in at most this many steps, until one is below the last fraction of the tolerance.
+_MIN_FIRST_STEP, _PROMISING, _MAX_STEPS, _CONVERGED = 0.5, 0.5, 5, 0.1
 
 
 @dataclass(frozen=True)
 class RangeChange:
-    """A change of the measured range beyond the tolerance of usual cameras.
+    """A change of the measured range.
 
     Attributes
     ----------
@@ -44,11 +44,24 @@ class RangeChange:
         if the range drifts.
     frame
         Index of the first view after the change; None if the range drifts.
+    limit
+        Number of standard deviations that a significant change exceeds.
     """
 
     change: float
     sigma: float
     frame: int | None
+    limit: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the change is no chance."""
+        return abs(self.change) > self.limit * self.sigma
+
+    @property
+    def is_large(self) -> bool:
+        """Whether it is significant, and beyond the tolerance of usual cameras."""
+        return self.is_significant and abs(self.change) > TOLERANCE
 
     def in_words(self) -> str:
         """Describe the change."""
@@ -130,7 +143,7 @@ def range_change(
     options: pair_equations.RefineOptions,
     priors: Priors,
 ) -> RangeChange | None:
-    """Estimate a likely change in full; None if it is chance, or within usual tolerances.
+    """Estimate a likely change in full; None if it is too small or uncertain for that.
 
     Parameters
     ----------
@@ -139,7 +152,8 @@ def range_change(
     views, refined, options, priors
         As for `calibration_check.check_calibration`.
     """
-    if abs(likely.scale) < _MIN_FIRST_STEP * TOLERANCE:
+    promising = _PROMISING * likely.limit * likely.sigma
+    if abs(likely.scale) < max(_MIN_FIRST_STEP * TOLERANCE, promising):
         return None
     views, options = thinned(views, len(refined.pairs), options)
     poses = refined.poses @ se3.exp(likely.scale * likely.follow)
@@ -158,7 +172,4 @@ def range_change(
         scale += step
         if abs(step) < _CONVERGED * TOLERANCE:
             break
-    change = 1 / (1 + scale) - 1
-    if abs(change) <= max(TOLERANCE, likely.limit * sigma):
-        return None
-    return RangeChange(change, sigma, likely.frame)
+    return RangeChange(1 / (1 + scale) - 1, sigma, likely.frame, likely.limit)

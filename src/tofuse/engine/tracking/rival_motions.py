@@ -46,6 +46,9 @@ _MIN_RESIDUALS = 50
 # the mixture counts.
 _CORRELATED_CELLS, _MIN_EVIDENCE = 100, 3.0
 _ITERATIONS = 50
+# Part of a view, without albedo, that must contradict the tracked motion: a rival matters from a
+# quarter on.
+_MIN_PART = 0.125
 
 
 class RivalMotions:
@@ -85,12 +88,14 @@ class RivalMotions:
             Factor of the sigmas of depth.
         """
         self._views += 1
-        if self._views % _EVERY == 0:
+        if self._views % _EVERY != 1:
             return self._share, ""
         self._share, winner = 0.0, ""
+        settled = _settled(view, reference, T_reference_view, scale) if rivals else 0
         for name, T in rivals.items():
             window = self._windows.setdefault(name, deque(maxlen=_WINDOW))
-            window.append(_histograms(view, reference, T_reference_view, T, scale))
+            motions = T_reference_view, T
+            window.append(_histograms(view, reference, *motions, scale, settled))
             of_cells, of_area = (_share(weights) for weights in np.sum(window, axis=0))
             self._share = max(self._share, of_cells, of_area)
             if of_area > 0.5 and window[-1].any():
@@ -99,11 +104,19 @@ class RivalMotions:
 
 
 def _histograms(
-    view: PreparedView, reference: PreparedView, T: Float64, T_rival: Float64, scale: float
+    view: PreparedView,
+    reference: PreparedView,
+    T: Float64,
+    T_rival: Float64,
+    scale: float,
+    settled: int,
 ) -> Float64:
     """Return histograms (2, B) of likelihood ratios: by number of cells, and by area."""
     total = np.zeros((2, len(_CENTRES)))
     if _shift(view, se3.inverse(T) @ T_rival) < _MIN_SHIFT:
+        return total
+    if settled:
+        total[:, 0] = settled
         return total
     for a, b, T_b_a, T_rival_b_a in (
         (view, reference, T, T_rival),
@@ -116,6 +129,23 @@ def _histograms(
             row += np.histogram(llr, _BINS, weights=weights)[0]
     total[1] *= total[0].sum() / max(total[1].sum(), 1e-9)
     return total
+
+
+def _settled(view: PreparedView, reference: PreparedView, T: Float64, scale: float) -> int:
+    """Return how many cells agree with the tracked motion, if no rival can matter; else 0.
+
+    Depth alone can't be in favour of a rival where it agrees with the tracked motion.
+    """
+    if view.has_albedo and reference.has_albedo:
+        return 0
+    outcome, stride = _outcome(view, reference, T, scale), stride_of(view)
+    agrees, contradicts = outcome == kernels.AGREES, _contradicts(outcome)
+    area = view.z[::stride, ::stride].astype(np.float64) ** 2
+    parts = [
+        weight[contradicts].sum() / max(weight[agrees | contradicts].sum(), 1e-9)
+        for weight in (np.ones_like(area), area)
+    ]
+    return int(np.count_nonzero(agrees)) if max(parts) < _MIN_PART else 0
 
 
 def _shift(view: PreparedView, T: Float64) -> float:
