@@ -165,7 +165,7 @@ def test_outcomes_of_nonsense(monkeypatch, capsys, tmp_path: Path) -> None:
     ):
         assert nonsense._outcome(verdict, error, bound) == outcome
     worst = {"verdict": "good", "outcome": "good OUTSIDE", "error_m": 0.03, "bound_m": 0.02}
-    for family, status in (("lens", 1), ("mirrored", 0), ("majority that moves", 0)):
+    for family, status in (("lens", 1), ("mirrored", 0), ("majority that moves", 1)):
         journal = tmp_path / f"{family}.jsonl"
         row = {"family": family, "name": "a situation", **worst}
         journal.write_text(f'{{"seed": 1}}\n{json.dumps(row)}\n')

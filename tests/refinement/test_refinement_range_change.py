@@ -61,6 +61,8 @@ def test_constant_scale_is_no_change(right: list[SampledView], factor: float) ->
 
 
 def test_change_of_one_submap_is_that_of_the_recording() -> None:
-    small, large = (CalibrationCheck(range_change=RangeChange(c, 0.001, 7, 5.0)) for c in (0.02, -0.05))
+    small, large = (
+        CalibrationCheck(range_change=RangeChange(c, 0.001, 7, 5.0)) for c in (0.02, -0.05)
+    )
     assert combine_checks([CalibrationCheck(), small, large]) is large
     assert combine_checks([CalibrationCheck(), CalibrationCheck()]).range_change is None

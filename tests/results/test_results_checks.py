@@ -175,7 +175,9 @@ CHANGED = Refinement(
     9,
     20,
     calibration_check=CalibrationCheck(
-        focal_sigma=0.05, motion={"focal": (3.0, 0.2)}, range_change=RangeChange(0.05, 0.001, 4, 5.0)
+        focal_sigma=0.05,
+        motion={"focal": (3.0, 0.2)},
+        range_change=RangeChange(0.05, 0.001, 4, 5.0),
     ),
 )
 UNDETERMINED = CalibrationCheck(focal_sigma=0.05, motion={"focal": (3.0, 0.2)})

@@ -32,6 +32,7 @@ _MAX_DARK_FRACTION = 0.08
 # Largest fraction of a count by which stored depth differs from a whole number; and ratio of the
 # mean differences of neighbours with swapped bytes to those as read, below which they are swapped.
 _MAX_FRACTION, _MIN_SWAPPED_RATIO = 0.05, 0.2
+_ROUGH = 0.05  # mean relative difference of neighbours that depth has at most
 # Minimum number of edge pixels per image to assess flying pixels.
 _MIN_EDGES = 100
 
@@ -65,7 +66,7 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
         yield Finding(
             "depth_unit",
             "The two bytes of each depth value are swapped: neighbouring pixels differ by "
-            f"{1 / max(ratio, 1e-3):.0f} times as much as they do the other way round.",
+            f"{1 / ratio:.0f} times as much as they do the other way round.",
             "Write 16-bit images in the byte order of their format (in Python: image.byteswap()).",
             {"roughness_if_swapped": ratio},
         )
@@ -106,7 +107,7 @@ def _roughness_if_swapped(images: Sequence[RangeFrame], unit_m: float) -> float:
             np.abs(np.diff(values.astype(float), axis=1))[both].mean() / values.mean()
             for values in (stored, stored.byteswap())
         )
-        ratios.append(swapped / max(as_read, 1e-12))
+        ratios.append(swapped / as_read if as_read > _ROUGH else 1.0)
     return float(np.median(ratios)) if ratios else 1.0
 
 
