@@ -32,7 +32,7 @@ _MAX_DARK_FRACTION = 0.08
 # Largest fraction of a count by which stored depth differs from a whole number; and ratio of the
 # mean differences of neighbours with swapped bytes to those as read, below which they are swapped.
 _MAX_FRACTION, _MIN_SWAPPED_RATIO = 0.05, 0.2
-_ROUGH = 0.05  # mean relative difference of neighbours that depth has at most
+_ROUGH = 0.01  # mean relative difference of neighbours below which depth is as smooth as any
 # Minimum number of edge pixels per image to assess flying pixels.
 _MIN_EDGES = 100
 
