@@ -318,10 +318,48 @@ def _file(name: str, make: Callable[[Path], object], read: Callable[[Path], obje
 def _results() -> dict[str, Subject]:
     """Output folders."""
     return {
+        "a mesh": _file("mesh.ply", _mesh, _read_mesh),
+        "a textured mesh": _file("mesh.glb", _textured_mesh, _read_textured_mesh),
         "a result": _file("out", _result, _load),
         "a result with images": _file("all", _with_images, _export),
         "a session": _file("out", _session, _load_session),
     }
+
+
+def _tetrahedron(**more: Any) -> Any:
+    from tofuse.engine.fusion import GeometryRecord
+
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+    return GeometryRecord(corners, faces, **more)
+
+
+def _mesh(path: Path) -> None:
+    from tofuse.formats.geometry import write_ply
+
+    write_ply(path, _tetrahedron())
+
+
+def _textured_mesh(path: Path) -> None:
+    from tofuse.formats.geometry import write_glb
+    from tofuse.formats.images import jpeg_bytes
+
+    image = jpeg_bytes(np.full((8, 8, 3), 90, np.uint8), 90)
+    uv = np.zeros((4, 2), np.float32)
+    record = _tetrahedron(normals=np.eye(4, 3, dtype=np.float32), uv=uv, texture=image)
+    write_glb(path, record, generator="attack", T_scene_node=np.eye(4))
+
+
+def _read_textured_mesh(path: Path) -> None:
+    from tofuse.formats.geometry import read_textured_glb
+
+    read_textured_glb(path)
+
+
+def _read_mesh(path: Path) -> None:
+    from tofuse.formats.geometry import read_surface
+
+    read_surface(path)
 
 
 def _result(out: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from measured_parts import NOISE, drawn, scan
 from tofuse.apps.compare.nearest import Reference
-from tofuse.apps.compare.repeating import Session, components, read_sessions, repeated
+from tofuse.apps.compare.repeating import Session, components, loaded_sessions, repeated
 from tofuse.engine.errors import InputError
 from tofuse.engine.progress import Silent
 
@@ -66,4 +66,4 @@ def test_differences_between_sessions_are_separated() -> None:
 
 def test_a_single_result_is_refused(tmp_path) -> None:
     with pytest.raises(InputError, match="two or more"):
-        read_sessions([tmp_path], Silent())
+        loaded_sessions([tmp_path], Silent())

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.apps.compare.comparing import Comparison, compare
 from tofuse.apps.compare.page import colors, limit_of, write_compare_report
-from tofuse.apps.compare.repeating import Repetition, read_sessions, repeated
+from tofuse.apps.compare.repeating import Repetition, loaded_sessions, repeated
 from tofuse.apps.results import folders
 from tofuse.engine.compute import threads
 from tofuse.engine.fusion import GeometryRecord
@@ -127,7 +127,7 @@ def repeat_files(
 
     def work() -> Repetition:
         progress.stage("reading", len(results))
-        sessions = read_sessions(results, progress)
+        sessions = loaded_sessions(results, progress)
         progress.stage("comparing")
         return repeated(sessions)
 

@@ -152,7 +152,7 @@ class Repetition:
         return data
 
 
-def read_sessions(paths: Sequence[Path], progress: Progress) -> list[Session]:
+def loaded_sessions(paths: Sequence[Path], progress: Progress) -> list[Session]:
     """Read results; those in the same folder are of one session.
 
     Raises
