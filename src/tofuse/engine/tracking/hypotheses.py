@@ -30,9 +30,11 @@ from tofuse.engine.views import PreparedView
 _MIN_ROTATED_SCORE_RATIO = 1.03
 # A nearly aligned view needs a few more iterations, at the resolution of tracking.
 _CONVERGENCE_LEVELS = (projective.Level(4, 8, 0.005, 0.02), projective.Level(2, 8, 0.0, 0.0))
+_BACKGROUND = 0.9  # quantile of the depths that the farther surfaces of a view have
+# Between frames that are farther apart, a camera neither stands still nor goes on as before.
+_MAX_STEP_RAD = 0.2
 # Every n-th frame is segmented, and any with an indication of moving objects: an unusual fit, more
 # than this fraction of points in free space, or objects in the frame before.
-_BACKGROUND = 0.9  # quantile of the depths that the farther surfaces of a view have
 _SEGMENT_EVERY, _MAX_IN_FRONT = 4, 0.005
 
 
@@ -272,6 +274,10 @@ class Hypotheses:
         The hypothesis and its segmentation, and the share of the view that follows a rival.
         """
         keyframe, state = accepted.keyframe, self.state
+        if state.last is not None:
+            step = se3.inverse(state.last.T_component_camera) @ accepted.T_component_camera
+            if float(se3.angle(step)) > _MAX_STEP_RAD:
+                return accepted, moving, 0.0
         T_rivals = {"stands": keyframe.T_component_camera}
         if self.T_predicted is not None:
             T_rivals["goes on"] = self.T_predicted
