@@ -6,10 +6,10 @@ import csv
 import io
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -25,6 +25,7 @@ from tofuse.formats.files import atomic
 from tofuse.formats.geometry import write_ply
 from tofuse.formats.poses import read_pose
 
+T = TypeVar("T")
 COMPARED, REPEATED = "compare.json", "repeat.json"
 _STATUS = {None: 0, "pass": 0, "fail": 3, "undecided": 4}
 
@@ -75,17 +76,11 @@ def compare_files(
             unit=options.unit,
         )
 
-    with threads(options.threads), threadpool_limits(1):
-        if options.out is None:
-            return work()
-        with folders.OutputFolder(
-            options.out, overwrite=options.overwrite, contract=COMPARE_CONTRACT
-        ) as folder:
-            comparison = work()
-            progress.stage("writing")
-            with folder.staging() as staging:
-                write_comparison(comparison, staging)
-    return comparison
+    def write(comparison: Comparison, folder: Path) -> None:
+        progress.stage("writing")
+        write_comparison(comparison, folder)
+
+    return _done(work, write, options, COMPARE_CONTRACT)
 
 
 def compare_exit_status(comparison: Comparison) -> int:
@@ -131,18 +126,31 @@ def repeat_files(
         progress.stage("comparing")
         return repeated(sessions)
 
+    def write(repetition: Repetition, folder: Path) -> None:
+        rows = [vars(component) for component in repetition.components]
+        atomic.write_text(folder / "repeat.csv", _table(rows))
+        _write_json(repetition.to_dict(), folder / REPEATED)
+
+    return _done(work, write, options, REPEAT_CONTRACT)
+
+
+def _done(
+    work: Callable[[], T],
+    write: Callable[[T, Path], None],
+    options: CompareOptions | RepeatOptions,
+    contract: folders.Contract,
+) -> T:
+    """Do the work, and write what was found if there is a folder for it, which is checked first."""
     with threads(options.threads), threadpool_limits(1):
         if options.out is None:
             return work()
         with folders.OutputFolder(
-            options.out, overwrite=options.overwrite, contract=REPEAT_CONTRACT
+            options.out, overwrite=options.overwrite, contract=contract
         ) as folder:
-            repetition = work()
+            found = work()
             with folder.staging() as staging:
-                rows = [vars(component) for component in repetition.components]
-                atomic.write_text(staging / "repeat.csv", _table(rows))
-                _write_json(repetition.to_dict(), staging / REPEATED)
-    return repetition
+                write(found, staging)
+    return found
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:

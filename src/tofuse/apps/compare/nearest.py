@@ -13,6 +13,7 @@ from tofuse.apps.compare.surface import Surface, spacing_of, unit_vectors
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import KdTree
+from tofuse.engine.geometry import triangles as triangle_geometry
 
 # Longest edge of a triangle after its division, as a fraction of the diagonal, and with which there
 # are at most this many triangles.
@@ -151,7 +152,7 @@ class Reference:
         sigma = surface.sigma
         if sigma is not None:
             sigma = sigma[surface.faces].mean(1)[kept][source]
-        parts = _area(triangles)
+        parts = triangle_geometry.areas(triangles)
         return cls(
             surface, triangles, normals, parts, region, edges, size, has_faces, sigma
         )._sorted()
@@ -217,17 +218,12 @@ class Reference:
         if self.surface.faces is None:
             feet = self.centres[index]
         else:
-            feet = _closest(points[:, None], self.triangles[index])
+            feet = triangle_geometry.closest_points(points[:, None], self.triangles[index])
         distance = np.linalg.norm(feet - points[:, None], axis=2)
         facing = self._facing(self.normals[index], normals[:, None], oriented)
         best = np.where(facing, distance, distance + 2 * self.diagonal).argmin(1)
         rows = np.arange(len(points))
         return feet[rows, best], index[rows, best]
-
-
-def _area(triangles: Float64) -> Float64:
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
 def _divided(triangles: Float64, size: float) -> tuple[Float64, Intp]:
@@ -246,28 +242,6 @@ def _divided(triangles: Float64, size: float) -> tuple[Float64, Intp]:
         source = np.concatenate([source, source])
     parts, sources = zip(*done, strict=True)
     return np.concatenate(parts), np.concatenate(sources)
-
-
-def _closest(points: Float64, triangles: Float64) -> Float64:
-    """Return the points (..., 3) of triangles (..., 3, 3) that are closest to points (..., 3)."""
-    a, b, c = np.moveaxis(triangles, -2, 0)
-    u, v, w = b - a, c - a, points - a
-    uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
-    wu, wv = (w * u).sum(-1), (w * v).sum(-1)
-    det = np.maximum(uu * vv - uv * uv, 1e-300)
-    s, t = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
-    inside = (s >= 0) & (t >= 0) & (s + t <= 1)
-    best = a + s[..., None] * u + t[..., None] * v
-    least = np.where(inside, -1.0, np.inf)
-    for start, end in ((a, b), (b, c), (c, a)):
-        edge = end - start
-        along = ((points - start) * edge).sum(-1) / np.maximum((edge * edge).sum(-1), 1e-300)
-        foot = start + np.clip(along, 0, 1)[..., None] * edge
-        distance = ((points - foot) ** 2).sum(-1)
-        nearer = distance < least
-        best = np.where(nearer[..., None], foot, best)
-        least = np.where(nearer, distance, least)
-    return np.asarray(best)
 
 
 def _smooth_faces(corners: Float64, normals: Float64) -> tuple[Intp, Float64]:

@@ -55,8 +55,8 @@ _CONVENTIONS: dict[str, Callable[[Float64], Float64]] = {
         lambda poses: np.asarray(se3.inverse(poses) @ OPENGL)
     ),
     "poses of a body with the axes of a robot (x forward, z up)": _times(_ROBOT),
-    "of quaternions in the order w, x, y, z": _reordered(-1),
-    "of quaternions in the order x, y, z, w": _reordered(1),
+    "poses with quaternions in the order w, x, y, z": _reordered(-1),
+    "poses with quaternions in the order x, y, z, w": _reordered(1),
     **{
         f"poses of a camera that is turned by {90 * k} degrees about its viewing axis": (
             _times(se3.exp(np.array([0, 0, 0, 0, 0, k * np.pi / 2])))

@@ -25,12 +25,11 @@ from tofuse.engine.fusion.atlas_kernels import (
     weigh_points,
 )
 from tofuse.engine.fusion.cloud import NO_COLOR, display_colors, grey_of, has_color
+from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.views import Projection
 
-# Depth tolerance of the visibility test: m, plus a fraction of the depth.
-_TOLERANCE_M, _TOLERANCE_FRACTION = 0.02, 0.02
 # Width of the margin in which a view's weight decreases, as a fraction of the image's height; how
 # much of it is left at an edge of depth; and pixels next to unknown colour that are not used.
 _BORDER, _AT_EDGE, _ERODED = 0.08, 0.03, 2
@@ -135,7 +134,7 @@ class TextureView:
         z, border = self.z, max(2.0, _BORDER * len(self.z))
         known = np.pad(self.known, 1).astype(np.uint8)
         inner = cv2.distanceTransform(known, cv2.DIST_L2, 3)[1:-1, 1:-1] - _ERODED
-        limit = _TOLERANCE_M + _TOLERANCE_FRACTION * z
+        limit = TOLERANCE_M + TOLERANCE_FRACTION * z
         smooth = np.ones(z.shape, np.uint8)
         smooth[:, 1:] &= np.abs(z[:, 1:] - z[:, :-1]) < limit[:, 1:]
         smooth[1:] &= np.abs(z[1:] - z[:-1]) < limit[1:]
@@ -262,7 +261,7 @@ class _Seen:
         def weigh(k: int, T_camera_world: Float64) -> None:
             view = views[k]
             tested = SeenBy(view.z, view.reach, view.projection.lookup, view.projection.frame)
-            limits = (_TOLERANCE_M, _TOLERANCE_FRACTION)
+            limits = (TOLERANCE_M, TOLERANCE_FRACTION)
             scene = (points, normals, tested, T_camera_world, *limits, weights[k], pixels[k])
             run_chunks(lambda a, b: weigh_points(*scene, a, b), len(points), _CHUNKS)
 

@@ -2,7 +2,8 @@
 
 `se3` and `quaternion` work on arrays of poses; `compose`, `retract`, `twist_between` and
 `distance_and_angle` do so for one pose inside kernels. `KdTree` finds nearest neighbours, and
-`PlaceCounts` tells how often a camera has been at a place.
+`PlaceCounts` tells how often a camera has been at a place. `triangles` has their areas and
+closest points.
 """
 
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.geometry import quaternion, se3
+    from tofuse.engine.geometry import quaternion, se3, triangles
     from tofuse.engine.geometry.kdtree import KdTree, checked_points
     from tofuse.engine.geometry.places import PlaceCounts
     from tofuse.engine.geometry.rigid_motion_kernels import (

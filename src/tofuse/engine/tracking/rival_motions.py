@@ -15,6 +15,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -91,11 +93,10 @@ class RivalMotions:
         if self._views % _EVERY != 1:
             return self._share, ""
         self._share, winner = 0.0, ""
-        settled = _settled(view, reference, T_reference_view, scale) if rivals else 0
+        tracked = _Tracked(view, reference, T_reference_view, scale)
         for name, T in rivals.items():
             window = self._windows.setdefault(name, deque(maxlen=_WINDOW))
-            motions = T_reference_view, T
-            window.append(_histograms(view, reference, *motions, scale, settled))
+            window.append(tracked.histograms(T))
             of_cells, of_area = (_share(weights) for weights in np.sum(window, axis=0))
             self._share = max(self._share, of_cells, of_area)
             if of_area > 0.5 and window[-1].any():
@@ -103,49 +104,62 @@ class RivalMotions:
         return self._share, winner
 
 
-def _histograms(
-    view: PreparedView,
-    reference: PreparedView,
-    T: Float64,
-    T_rival: Float64,
-    scale: float,
-    settled: int,
-) -> Float64:
-    """Return histograms (2, B) of likelihood ratios: by number of cells, and by area."""
-    total = np.zeros((2, len(_CENTRES)))
-    if _shift(view, se3.inverse(T) @ T_rival) < _MIN_SHIFT:
+@dataclass(frozen=True, eq=False)
+class _Tracked:
+    """A view at the tracked motion (4, 4), to which rivals are compared; `scale` is of sigmas."""
+
+    view: PreparedView
+    reference: PreparedView
+    T_reference_view: Float64
+    scale: float
+
+    @cached_property
+    def _forward(self) -> UInt8:
+        return _outcome(self.view, self.reference, self.T_reference_view, self.scale)
+
+    @cached_property
+    def _backward(self) -> UInt8:
+        T = se3.inverse(self.T_reference_view)
+        return _outcome(self.reference, self.view, T, self.scale)
+
+    def histograms(self, T_rival: Float64) -> Float64:
+        """Return histograms (2, B) of likelihood ratios: by number of cells, and by area."""
+        total = np.zeros((2, len(_CENTRES)))
+        T = self.T_reference_view
+        if _shift(self.view, se3.inverse(T) @ T_rival) < _MIN_SHIFT:
+            return total
+        if self._settled:
+            total[:, 0] = self._settled
+            return total
+        for a, b, motions, outcome in (
+            (self.view, self.reference, (T, T_rival), self._forward),
+            (self.reference, self.view, (se3.inverse(T), se3.inverse(T_rival)), self._backward),
+        ):
+            ratios = likelihood_ratios(a, b, *motions, self.scale, outcome)
+            used, stride = np.isfinite(ratios), stride_of(a)
+            llr, area = ratios[used], a.z[::stride, ::stride][used].astype(np.float64) ** 2
+            for row, weights in zip(total, (np.ones_like(area), area), strict=True):
+                row += np.histogram(llr, _BINS, weights=weights)[0]
+        total[1] *= total[0].sum() / max(total[1].sum(), 1e-9)
         return total
-    if settled:
-        total[:, 0] = settled
-        return total
-    for a, b, T_b_a, T_rival_b_a in (
-        (view, reference, T, T_rival),
-        (reference, view, se3.inverse(T), se3.inverse(T_rival)),
-    ):
-        ratios = likelihood_ratios(a, b, T_b_a, T_rival_b_a, scale)
-        used, stride = np.isfinite(ratios), stride_of(a)
-        llr, area = ratios[used], a.z[::stride, ::stride][used].astype(np.float64) ** 2
-        for row, weights in zip(total, (np.ones_like(area), area), strict=True):
-            row += np.histogram(llr, _BINS, weights=weights)[0]
-    total[1] *= total[0].sum() / max(total[1].sum(), 1e-9)
-    return total
 
+    @cached_property
+    def _settled(self) -> int:
+        """How many cells agree with the tracked motion, if no rival can matter; else 0.
 
-def _settled(view: PreparedView, reference: PreparedView, T: Float64, scale: float) -> int:
-    """Return how many cells agree with the tracked motion, if no rival can matter; else 0.
-
-    Depth alone can't be in favour of a rival where it agrees with the tracked motion.
-    """
-    if view.has_albedo and reference.has_albedo:
-        return 0
-    outcome, stride = _outcome(view, reference, T, scale), stride_of(view)
-    agrees, contradicts = outcome == kernels.AGREES, _contradicts(outcome)
-    area = view.z[::stride, ::stride].astype(np.float64) ** 2
-    parts = [
-        weight[contradicts].sum() / max(weight[agrees | contradicts].sum(), 1e-9)
-        for weight in (np.ones_like(area), area)
-    ]
-    return int(np.count_nonzero(agrees)) if max(parts) < _MIN_PART else 0
+        Depth alone can't be in favour of a rival where it agrees with the tracked motion.
+        """
+        view = self.view
+        if view.has_albedo and self.reference.has_albedo:
+            return 0
+        outcome, stride = self._forward, stride_of(view)
+        agrees, contradicts = outcome == kernels.AGREES, _contradicts(outcome)
+        area = view.z[::stride, ::stride].astype(np.float64) ** 2
+        parts = [
+            weight[contradicts].sum() / max(weight[agrees | contradicts].sum(), 1e-9)
+            for weight in (np.ones_like(area), area)
+        ]
+        return int(np.count_nonzero(agrees)) if max(parts) < _MIN_PART else 0
 
 
 def _shift(view: PreparedView, T: Float64) -> float:
@@ -156,7 +170,12 @@ def _shift(view: PreparedView, T: Float64) -> float:
 
 
 def likelihood_ratios(
-    view: PreparedView, other: PreparedView, T: Float64, T_rival: Float64, scale: float
+    view: PreparedView,
+    other: PreparedView,
+    T: Float64,
+    T_rival: Float64,
+    scale: float,
+    outcome: UInt8 | None = None,
 ) -> Float32:
     """Return log-likelihood ratios of the cells of a view, positive for a rival, else NaN.
 
@@ -168,8 +187,12 @@ def likelihood_ratios(
         (4, 4) T_other_view of both motions.
     scale
         Factor of the sigmas of depth.
+    outcome
+        Of the comparison (rows, columns) at `T`, if it is known.
     """
-    outcome, by_rival = (_outcome(view, other, motion, scale) for motion in (T, T_rival))
+    if outcome is None:
+        outcome = _outcome(view, other, T, scale)
+    by_rival = _outcome(view, other, T_rival, scale)
     agrees, rival_agrees = outcome == kernels.AGREES, by_rival == kernels.AGREES
     contradicts, rival_contradicts = _contradicts(outcome), _contradicts(by_rival)
     llr = _MAX_LLR * (1.0 * (rival_agrees & contradicts) - (agrees & rival_contradicts))

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import KdTree
+from tofuse.engine.geometry import KdTree, triangles
 
 _SAMPLES = 400_000  # points on a mesh
 _CANDIDATES = 4  # nearest samples of a mesh whose triangles are tested
@@ -45,7 +45,7 @@ class Surface:
         """Area of all faces, m^2; 0 for a cloud."""
         if self.faces is None:
             return 0.0
-        return float(_areas(self.points[self.faces]).sum())
+        return float(triangles.areas(self.points[self.faces]).sum())
 
     def samples(self, count: int, seed: int = 0) -> tuple[Float64, Int64]:
         """Return points (K, 3) spread evenly over the faces, and their faces (K,).
@@ -59,7 +59,7 @@ class Surface:
                 points = points[np.sort(rng.permutation(len(points))[:count])]
             return points, np.full(len(points), -1)
         corners = self.points[self.faces]
-        cumulative = np.cumsum(_areas(corners))
+        cumulative = np.cumsum(triangles.areas(corners))
         if not cumulative[-1] > 0:
             return self.points, np.full(len(self.points), -1)
         rng = np.random.default_rng([seed, len(corners)])
@@ -183,32 +183,6 @@ def distances(points: ArrayLike, shape: Surface, samples: int = _SAMPLES) -> Flo
     nearest, _ = tree.neighbours(points, min(_CANDIDATES, len(sampled)))
     best = np.full(len(points), np.inf)
     for column in nearest.T:
-        best = np.minimum(best, _to_triangles(points, corners[face[column]]))
+        foot = triangles.closest_points(points, corners[face[column]])
+        best = np.minimum(best, np.linalg.norm(points - foot, axis=1))
     return best
-
-
-def _to_triangles(p: Float64, corners: Float64) -> Float64:
-    """Distance (K,) of each point (K, 3) to its triangle (K, 3, 3)."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1)
-    best = np.full(len(p), np.inf)
-    inside = length > 0
-    for start, end in ((a, b), (b, c), (c, a)):
-        side = end - start
-        along = _dot(p - start, side) / np.maximum(_dot(side, side), 1e-300)
-        foot = start + np.clip(along, 0, 1)[:, None] * side
-        best = np.minimum(best, np.linalg.norm(p - foot, axis=1))
-        inside &= _dot(np.cross(side, p - start), normal) >= 0
-    above = np.abs(_dot(p - a, normal)) / np.maximum(length, 1e-300)
-    return np.where(inside, above, best)
-
-
-def _dot(a: Float64, b: Float64) -> Float64:
-    return np.einsum("ki,ki->k", a, b)
-
-
-def _areas(corners: Float64) -> Float64:
-    """Areas (M,) of triangles (M, 3, 3)."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return np.linalg.norm(normal, axis=1) / 2
