@@ -35,7 +35,6 @@ from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import robust_sigma
-from tofuse.engine.tracking import moving_objects
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Degrees of freedom of Student's t (Lange, Little and Taylor 1989 suggest 4).
@@ -250,6 +249,7 @@ class _TrialView:
 
     surface: PreparedView
     change: Float32
+    uncorrected: RangeFrame
     corrected: RangeFrame
 
     @classmethod
@@ -260,7 +260,7 @@ class _TrialView:
         rows, columns = surface.z.shape
         step = change.shape[1] // columns
         sampled = change[step // 2 :: step, step // 2 :: step][:rows, :columns]
-        return cls(surface, sampled, corrected)
+        return cls(surface, sampled, uncorrected, corrected)
 
     @cached_property
     def corrected_surface(self) -> PreparedView:
@@ -359,12 +359,12 @@ class _AlignedViews:
             target, source = self._views.get(k), self._views.get(k + stride)
             if step is None or target is None or source is None:
                 continue
-            pairs = (
-                (target.surface, source.surface),
-                (target.corrected_surface, source.corrected_surface),
+            sides = (
+                (target.surface, source.uncorrected),
+                (target.corrected_surface, source.corrected),
             )
             (before, variance), (after, _) = (
-                _halves_differ(*pair, step.T_world_source) for pair in pairs
+                _halves_differ(*side, step.T_world_source) for side in sides
             )
             change = after - before
             sums += -(before * change / variance).sum(), (change**2 / variance).sum()
@@ -372,22 +372,21 @@ class _AlignedViews:
 
 
 def _halves_differ(
-    target: PreparedView, source: PreparedView, T_target_source: Float64
+    target: PreparedView, source: RangeFrame, T_target_source: Float64
 ) -> tuple[Float64, Float64]:
     """Return how poses of a view by halves of the image differ: (2, 6) twists and variances.
 
-    Left and right, and upper and lower half; of the source, aligned with the whole target.
+    Left and right, and upper and lower half; of the source, aligned with the whole target. Each
+    half is prepared as an image of its own: planes across the cut would have errors of both.
     """
     onto = [projective.Target(target, np.eye(4))]
-    rows, columns = np.indices(source.z.shape)
+    rows, columns = np.indices(source.depth.shape)
     weak = np.diag(np.repeat([_HALVES.prior_m, _HALVES.prior_rad], 3) ** -2.0)
     differences, variances = [], []
-    for first in (2 * columns < source.z.shape[1], 2 * rows < source.z.shape[0]):
+    for first in (2 * columns < source.depth.shape[1], 2 * rows < source.depth.shape[0]):
         a, b = (
-            projective.align(
-                moving_objects.without_pixels(source, half), onto, T_target_source, _HALVES
-            )
-            for half in (~first, first)
+            projective.align(prepare_view(half, _VIEW), onto, T_target_source, _HALVES)
+            for half in (source.keep(first), source.keep(~first))
         )
         differences.append(se3.log(se3.inverse(a.T_world_source) @ b.T_world_source))
         covariance = sum(np.linalg.inv(x.information + weak) for x in (a, b))
