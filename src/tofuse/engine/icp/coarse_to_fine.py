@@ -23,6 +23,8 @@ from tofuse.engine.parts import part
 
 # Maximum number of cubes with a unique index in float64.
 _MAX_CELLS = 2.0**52
+# Turn of another grid of cubes, by an angle about an axis that no building or part has.
+_TURN = se3.so3_exp([0.5, 0.3, 0.7])
 
 _SPACING_SAMPLE = 5000
 _MIN_LEVEL_POINTS = 60
@@ -158,20 +160,22 @@ class CoarseToFine(Bounded, Registrar):
         )
 
     def finest(
-        self, source: Frame, target: Frame, size: float
+        self, source: Frame, target: Frame, size: float, *, turned: bool = False
     ) -> tuple[float, CloudFrame, CloudFrame]:
         """Average both views to `size` m, or coarser to limit the number of points and the noise.
+
+        The cubes of the source may be `turned`, so that those of both views are nowhere parallel.
 
         Returns
         -------
         The resolution in m, and both averaged views.
         """
-        size, data, model = reduced(source, target, size, self.points)
+        size, data, model = reduced(source, target, size, self.points, turned=turned)
         # Averaging reduces noise, but not true roughness, which keeps the first size.
         initial = size, data, model
         while max(self._roughness(data), self._roughness(model)) > _MAX_ROUGHNESS:
             size *= _COARSENING
-            data, model = averaged(source, size), averaged(target, size)
+            data, model = averaged(source, size, turned=turned), averaged(target, size)
             if min(len(data), len(model)) < _MIN_LEVEL_POINTS or size * _MIN_EXTENT > extent(
                 model.points
             ):
@@ -220,15 +224,16 @@ def extent(points: Float32 | Float64) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def averaged(view: Frame, size: float) -> CloudFrame:
+def averaged(view: Frame, size: float, *, turned: bool = False) -> CloudFrame:
     """Return a cloud with the mean of the points in each cube with edges of `size` m.
 
-    Its points are in the order of the cubes; amplitude and colour are not kept.
+    Its points are in the order of the cubes, which are parallel to the axes unless `turned`;
+    amplitude and colour are not kept.
     """
     points = view.points.astype(np.float64)
     if len(points) == 0:
         return CloudFrame(view.index, view.timestamp, view.points, origin=view.origin)
-    order, starts = _cells(points, size)
+    order, starts = _cells(points @ _TURN if turned else points, size)
     counts = np.diff(np.r_[starts, len(points)])
     means = np.add.reduceat(points[order], starts, axis=0) / counts[:, None]
     return CloudFrame(
@@ -253,14 +258,15 @@ def _cells(points: Float64, size: float) -> tuple[Intp, Intp]:
 
 
 def reduced(
-    source: Frame, target: Frame, size: float, max_points: int
+    source: Frame, target: Frame, size: float, max_points: int, *, turned: bool = False
 ) -> tuple[float, CloudFrame, CloudFrame]:
     """Return the voxel size in m and both averaged views, with at most `max_points` points each.
 
-    The voxel size is `size` m, or larger if that leaves too many points.
+    The voxel size is `size` m, or larger if that leaves too many points. The cubes of the source
+    may be `turned`.
     """
     while True:
-        data, model = averaged(source, size), averaged(target, size)
+        data, model = averaged(source, size, turned=turned), averaged(target, size)
         count = max(len(data), len(model))
         if count <= max_points:
             return size, data, model
