@@ -1,8 +1,8 @@
 """Folders of bare clouds through `tofuse run`: views registered, errors, wrong poses flagged.
 
 Each case is a folder of PLY files without poses, camera or time. `scoring.py` defines wrong and
-marked poses; here, as in `cloud_pairs.py`, a pose is wrong beyond 0.1 m or 4 degrees. Scans are
-those of `cloud_pairs.py`, with more points.
+marked poses; here, as in `cloud_kinds.py`, a pose is wrong beyond 0.1 m or 4 degrees. Scans are
+those of `cloud_kinds.py`, with more points.
 
     python benchmarks/cloud_folders.py [--data ../shared/data] [--cases kitchen scans]
 """
@@ -22,7 +22,7 @@ from tofuse.engine.arrays import Float32, Float64
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-import cloud_pairs
+import cloud_kinds
 import pairs
 import scoring
 import tofuse
@@ -48,7 +48,7 @@ def every(name: str, step: int) -> Callable[[Path], Views]:
 
 def spheres(name: str, count: int, points: int, seed: int) -> Callable[[Path], Views]:
     """Spherical scans along a path through a simulated scene, with random heading."""
-    return lambda _data: cloud_pairs.scanned(name, count, points, seed)
+    return lambda _data: cloud_kinds.scanned(name, count, points, seed)
 
 
 CASES: dict[str, tuple[str, Callable[[Path], Views]]] = {
@@ -73,7 +73,7 @@ def row(title: str, views: Views) -> str:
         start = time.perf_counter()
         result = tofuse.reconstruct(tofuse.open(folder))
         seconds = time.perf_counter() - start
-    allowed = scoring.Tolerance(cloud_pairs.RIGHT_M, float(np.radians(cloud_pairs.RIGHT_DEG)))
+    allowed = scoring.Tolerance(cloud_kinds.RIGHT_M, float(np.radians(cloud_kinds.RIGHT_DEG)))
     truth = scoring.Truth(np.stack(poses), np.zeros(len(poses), np.intp), allowed)
     score = scoring.score(scoring.parts_of(result, range(len(poses))), truth)
     diagnostics = result.diagnostics

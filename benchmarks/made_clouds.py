@@ -42,9 +42,9 @@ class Pair:
         return not far and se3.angle(se3.inverse(self.T_target_source) @ T) <= MAX_RAD
 
 
-def furnished(points: int = 3000) -> Float64:
-    """(N, 3) points of three walls and of boxes before them, m."""
-    rng = np.random.default_rng(0)
+def furnished(points: int = 3000, rng: np.random.Generator | None = None) -> Float64:
+    """(N, 3) points of three walls and of boxes before them, m; of one room, or of a random one."""
+    rng = rng or np.random.default_rng(0)
     parts = []
     for axis in range(3):
         wall = rng.uniform(0, 1, (points, 3)) * [6, 5, 3]
@@ -144,8 +144,8 @@ def symmetric_pairs() -> Iterator[tuple[str, Callable[[int], Pair]]]:
                 rng = np.random.default_rng([seed, 21])
                 w = np.radians(degrees) * np.eye(3)["xyz".index(axis)]
                 T = se3.exp([0, 0, 0, *w])
-                world = sampled(make(), 3 * POINTS, rng)
-                source, target = seen(world, T, rng), seen(world, np.eye(4), rng)
+                world = sampled(make(), 2 * POINTS, rng)
+                source, target = seen(world[:POINTS], T, rng), seen(world[POINTS:], np.eye(4), rng)
                 return Pair(source, target, T)
 
             yield f"{name}, turned by {degrees:g} degrees about {axis}", pair

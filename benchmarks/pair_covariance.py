@@ -38,7 +38,7 @@ from tofuse.engine.arrays import Float32, Float64
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import tofuse
-from cloud_pairs import Pair, _any_motion
+from cloud_kinds import Pair, any_motion
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
@@ -216,7 +216,7 @@ def _moved(
     true: Float64,
     rng: np.random.Generator,
 ) -> Case:
-    A, B = (_any_motion(rng) for _ in range(2))
+    A, B = (any_motion(rng) for _ in range(2))
     moved = (se3.transform(M, p.astype(float)) for M, p in ((A, source), (B, target)))
     views = [CloudFrame.of(points, index=1 - k) for k, points in enumerate(moved)]
     return Case(family, kind, seed, *views, B @ true @ se3.inverse(A))

@@ -460,14 +460,14 @@ def stacked(rows: list[tuple[Float64, bool, int]]) -> Samples:
     return Samples(np.stack(x), np.array(right, bool), np.array(scene))
 
 
-def fitted(x: Float64, right: Bool) -> Float64:
+def fitted(x: Float64, right: Bool, weight: Float64 | float = 1.0) -> Float64:
     """Coefficients of a logistic model by Newton's method; the first regressor is constant."""
     w = np.zeros(x.shape[1])
     ridge = np.diag([0.0] + [_RIDGE] * (len(w) - 1))
     for _ in range(50):
         p = np.array([logistic(float(v)) for v in x @ w])
-        hessian = x.T @ (x * (p * (1 - p) + 1e-9)[:, None]) + ridge
-        w -= np.linalg.solve(hessian, x.T @ (p - right) + ridge @ w)
+        hessian = x.T @ (x * (weight * p * (1 - p) + 1e-9)[:, None]) + ridge
+        w -= np.linalg.solve(hessian, x.T @ (weight * (p - right)) + ridge @ w)
     return w
 
 
