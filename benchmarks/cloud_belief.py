@@ -44,8 +44,12 @@ _CODE = (
     Path(cloud_kinds.__file__),
     Path(made_clouds.__file__),
 )
-# Numbers of pairs of different places begin here.
-_DECOYS = 1000
+# Number of the pair that stands for the last one of a kind.
+_ALL = -1
+# A pose with an error below that of right poses times this is none of another place.
+_NEAR_MISS = 3.0
+# Numbers of surfaces that are compared, and least probability that counts in a likelihood.
+_FEW, _LEAST = (0.1, 10.0, 20.0, 50.0), 1e-3
 _BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)
 # Of each pair, its probability and whether it is right (n, 2).
 Outcomes = Float64
@@ -53,12 +57,21 @@ Outcomes = Float64
 
 @dataclass(frozen=True)
 class Decision:
-    """Evidence for a pose of a pair of a kind, and whether the pose is right."""
+    """Evidence for a pose of a pair of a kind, and its error relative to that of right poses."""
 
     kind: str
     pair: int
     evidence: CloudEvidence
-    right: bool
+    error: float
+
+    @property
+    def right(self) -> bool:
+        return self.error < 1
+
+    @property
+    def is_near_miss(self) -> bool:
+        """Whether the pose is inaccurate, but not that of another place."""
+        return 1 <= self.error < _NEAR_MISS
 
     @property
     def family(self) -> str:
@@ -71,21 +84,22 @@ class Decision:
 
 
 def collected(names: Sequence[str], data: Path, max_pairs: int) -> list[Decision]:
-    """Decisions on the pairs of some kinds, and on pairs of different places."""
+    """Decisions on the pairs of some kinds."""
     journal = Lines(_file(max_pairs), {})
     done = {(row["kind"], row["pair"]) for row in journal.records}
-    for name, number, pair in _numbered(names, data, max_pairs):
-        if (name, number) not in done:
-            made = [
-                {"right": right, **_as_record(found)} for found, right in _decided(pair, number)
-            ]
-            journal.add({"kind": name, "pair": number, "decisions": made})
-            print(f"{name} {number}", flush=True)
+    for name in (name for name in names if (name, _ALL) not in done):
+        for number, pair in enumerate(cloud_kinds.made(name, data, max_pairs)):
+            if (name, number) not in done:
+                found = _decided(pair, number)
+                made = [{"error": error, **_as_record(evidence)} for evidence, error in found]
+                journal.add({"kind": name, "pair": number, "decisions": made})
+                print(f"{name} {number}", flush=True)
+        journal.add({"kind": name, "pair": _ALL, "decisions": []})
     return [
-        Decision(row["kind"], row["pair"], CloudEvidence(**made), right)
+        Decision(row["kind"], row["pair"], CloudEvidence(**made), error)
         for row in journal.records
         if row["kind"] in names
-        for right, made in ((made.pop("right"), made) for made in map(dict, row["decisions"]))
+        for error, made in ((made.pop("error"), made) for made in map(dict, row["decisions"]))
     ]
 
 
@@ -100,20 +114,12 @@ def _as_record(evidence: CloudEvidence) -> dict[str, Any]:
     return record
 
 
-def _numbered(names: Sequence[str], data: Path, max_pairs: int) -> Iterator[tuple[str, int, Pair]]:
-    for name in names:
-        for k, pair in enumerate(cloud_kinds.made(name, data, max_pairs)):
-            yield name, k, pair
-    for k, (pair, name) in enumerate(cloud_kinds.decoys(names, data, max_pairs)):
-        yield name, _DECOYS + k, pair
-
-
-def _decided(pair: Pair, number: int) -> list[tuple[CloudEvidence, bool]]:
-    """Decisions of the search, and of the alignment from a guess that is off."""
+def _decided(pair: Pair, number: int) -> list[tuple[CloudEvidence, float]]:
+    """Distinct decisions of the search, and of the alignment from a guess that is off."""
     source, target = CloudFrame.of(pair.source, index=1), CloudFrame.of(pair.target)
     guess = np.eye(4) if pair.true is None else pair.true
     guess = guess @ _off(pair.extent, number)
-    found = []
+    found: dict[CloudEvidence, float] = {}
     for is_search in (True, False):
         rng = np.random.default_rng(0)
         try:
@@ -124,8 +130,8 @@ def _decided(pair: Pair, number: int) -> list[tuple[CloudEvidence, bool]]:
                     cloud_pair.follow_clouds(source, target, guess, rng)
         except RegistrationError:
             continue
-        found += [(evidence, pair.is_right(T)) for evidence, T in made]
-    return found
+        found |= {evidence: pair.relative_error(T) for evidence, T in made}
+    return list(found.items())
 
 
 def _off(extent: float, number: int) -> Float64:
@@ -169,8 +175,8 @@ class _Samples:
     @classmethod
     def of(cls, decisions: list[Decision], *, searched: bool) -> _Samples:
         some = [d for d in decisions if d.searched == searched]
-        if not searched:
-            some = [d for d in some if not d.evidence.degenerate]
+        if not searched:  # with degenerate directions the guess is kept, as with a symmetric body
+            some = [d for d in some if not d.evidence.degenerate and d.kind != "symmetric"]
         x = [
             d.evidence.search_regressors if searched else d.evidence.local_regressors for d in some
         ]
@@ -178,8 +184,12 @@ class _Samples:
         return cls(some, np.array(x, float), right, np.array([d.family for d in some]))
 
     def fitted(self, without: str = "") -> Float64:
-        """Coefficients, from all families but one; each counts by the root of its number."""
+        """Coefficients, from all families but one; each counts by the root of its number.
+
+        Near misses are neither right nor wrong here.
+        """
         used = self.family != without
+        used &= ~np.array([decision.is_near_miss for decision in self.decisions])
         _, which, count = np.unique(self.family[used], return_inverse=True, return_counts=True)
         weight = 1 / np.sqrt(count[which])
         return pairs.fitted(self.x[used], self.right[used], weight / weight.mean())
@@ -190,22 +200,34 @@ class _Samples:
 
 
 def print_fit(data: Path, max_pairs: int) -> None:
-    """Print the coefficients of both models, and how kinds fare that were left out of the fit."""
-    fitted = [kind.name for kind in KINDS.values() if kind.fitted]
-    found = collected(fitted, data, max_pairs)
-    for title, searched in (("searched", True), ("followed", False)):
+    """Print fitted coefficients, how kinds fare that were left out, and how those in use fare."""
+    found = collected([kind.name for kind in KINDS.values() if kind.fitted], data, max_pairs)
+    for title, searched, in_use in (
+        ("searched", True, CLOUDS.search),
+        ("aligned from a guess", False, CLOUDS.local),
+    ):
         samples = _Samples.of(found, searched=searched)
-        w = samples.fitted()
         print(f"\n{title}: {len(samples.right)} decisions, {samples.right.sum()} right")
-        print(f"coefficients ({', '.join(f'{v:.2f}' for v in w)})")
-        in_use = CLOUDS.search if searched else CLOUDS.local
-        print(f"in use       ({', '.join(f'{v:.2f}' for v in in_use)})")
-        print("\nleft out of the fit:")
-        rows = {
-            family: _outcomes(samples, samples.fitted(family), family)
-            for family in dict.fromkeys(samples.family)
-        }
-        print_outcomes(rows)
+        print(f"fitted coefficients {np.round(samples.fitted(), 2).tolist()}; kinds left out:")
+        print_outcomes(_left_out(samples))
+        print(f"\ncoefficients in use {list(in_use)}:")
+        families = dict.fromkeys(samples.family)
+        print_outcomes({f: _outcomes(samples, np.array(in_use), f) for f in families})
+    print("\nnumber of surfaces that leads are reduced for, and log-likelihood of the left out")
+    for few in _FEW:
+        with mock.patch.object(pose_probability, "_FEW_SURFACES", few):
+            rows = _left_out(_Samples.of(found, searched=True)).values()
+        p, right = np.concatenate(list(rows)).T
+        likelihood = np.log(np.where(right > 0, p, 1 - p).clip(_LEAST)).mean()
+        print(f"{few:g}: {likelihood:.3f}")
+
+
+def _left_out(samples: _Samples) -> dict[str, Outcomes]:
+    """Outcomes of each family by the coefficients from all others."""
+    return {
+        family: _outcomes(samples, samples.fitted(family), family)
+        for family in dict.fromkeys(samples.family)
+    }
 
 
 def _outcomes(samples: _Samples, w: Float64, family: str) -> Outcomes:

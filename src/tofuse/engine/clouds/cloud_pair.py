@@ -35,6 +35,7 @@ from tofuse.engine.icp import (
     CoarseToFine,
     Icp,
     Remapping,
+    averaged,
     extent,
     icp_parts,
     spacing,
@@ -109,8 +110,8 @@ class _CloudViews:
     @classmethod
     def of(cls, source: Frame, target: Frame, rng: np.random.Generator) -> _CloudViews:
         size = max(_finest(source), _finest(target))
-        pyramid = CoarseToFine(points=_POINTS)
-        size, data, model = pyramid.finest(source, target, size, turned=True)
+        size, _, model = CoarseToFine(points=_POINTS).finest(source, target, size)
+        data = averaged(source, size, turned=True)
         maps = CloudMap.of(data, size, source), CloudMap.of(model, size, target)
         return cls(source, target, *maps, rng)
 

@@ -160,22 +160,20 @@ class CoarseToFine(Bounded, Registrar):
         )
 
     def finest(
-        self, source: Frame, target: Frame, size: float, *, turned: bool = False
+        self, source: Frame, target: Frame, size: float
     ) -> tuple[float, CloudFrame, CloudFrame]:
         """Average both views to `size` m, or coarser to limit the number of points and the noise.
-
-        The cubes of the source may be `turned`, so that those of both views are nowhere parallel.
 
         Returns
         -------
         The resolution in m, and both averaged views.
         """
-        size, data, model = reduced(source, target, size, self.points, turned=turned)
+        size, data, model = reduced(source, target, size, self.points)
         # Averaging reduces noise, but not true roughness, which keeps the first size.
         initial = size, data, model
         while max(self._roughness(data), self._roughness(model)) > _MAX_ROUGHNESS:
             size *= _COARSENING
-            data, model = averaged(source, size, turned=turned), averaged(target, size)
+            data, model = averaged(source, size), averaged(target, size)
             if min(len(data), len(model)) < _MIN_LEVEL_POINTS or size * _MIN_EXTENT > extent(
                 model.points
             ):
@@ -258,15 +256,14 @@ def _cells(points: Float64, size: float) -> tuple[Intp, Intp]:
 
 
 def reduced(
-    source: Frame, target: Frame, size: float, max_points: int, *, turned: bool = False
+    source: Frame, target: Frame, size: float, max_points: int
 ) -> tuple[float, CloudFrame, CloudFrame]:
     """Return the voxel size in m and both averaged views, with at most `max_points` points each.
 
-    The voxel size is `size` m, or larger if that leaves too many points. The cubes of the source
-    may be `turned`.
+    The voxel size is `size` m, or larger if that leaves too many points.
     """
     while True:
-        data, model = averaged(source, size, turned=turned), averaged(target, size)
+        data, model = averaged(source, size), averaged(target, size)
         count = max(len(data), len(model))
         if count <= max_points:
             return size, data, model
