@@ -617,6 +617,7 @@ def export(arguments: cli.Export) -> int:
         faces=arguments.faces,
         every=arguments.every,
         pinhole=arguments.pinhole,
+        voxel_m=arguments.voxel,
         overwrite=arguments.overwrite,
     ):
         print(path)

@@ -878,15 +878,18 @@ class Export(Edited):
     result : DIR
         a result: the --out of `tofuse run`
     formats : FORMAT
-        pcd, las, laz, e57, glb, gltf, obj, usdz, stl, kitti, log, nerfstudio, colmap
+        pcd, las, laz, e57, glb, gltf, obj, usdz, stl, kitti, log, nerfstudio, colmap, rerun,
+        mcap, occupancy, esdf, octomap
     out : DIR
         folder for the files (default: that of the result)
     faces : N
         maximum number of triangles (60000; STL: all)
     every : N
-        every N-th image (nerfstudio, colmap)
+        every N-th frame (nerfstudio, colmap, rerun, mcap, occupancy, esdf, octomap)
     pinhole
         images without distortion (nerfstudio, colmap)
+    voxel : LENGTH
+        voxel size (occupancy, esdf, octomap; default: a 400th of the model's diagonal)
     overwrite
         replace existing files
     """
@@ -897,6 +900,7 @@ class Export(Edited):
     faces: Count | None = None
     every: Count = 1
     pinhole: bool = False
+    voxel: Length | None = None
     overwrite: bool = False
 
 
