@@ -322,7 +322,7 @@ def locate(arguments: cli.Locate) -> int:
 
 
 def check_overwrite(
-    arguments: cli.Register | cli.Judge | cli.Locate | cli.Compare | cli.Repeat,
+    arguments: cli.Register | cli.Judge | cli.Locate | cli.Compare | cli.Repeat | cli.Card,
 ) -> None:
     """Refuse --overwrite without --out, where that is optional."""
 

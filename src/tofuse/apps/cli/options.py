@@ -521,6 +521,32 @@ class Repeat(Json, Threads, Edited):
     overwrite: bool = False
 
 
+class Card(Json, Edited):
+    """Collect what results of one camera say about it, and whether it drifts.
+
+    Attributes
+    ----------
+    results : RESULT
+        results of one camera; their recordings must still be at their paths
+    out : DIR
+        folder for card.html and card.json (none)
+    overwrite
+        replace an existing card in --out
+
+    Exit status
+    -----------
+    0  no quantity changes with time by more than its uncertainty
+    2  nothing was written: one line on stderr states the reason
+    3  a quantity changes with time
+    """
+
+    home = "tofuse.apps.cli.comparing"
+
+    results: list[Path]
+    out: Path | None = None
+    overwrite: bool = False
+
+
 class RigOptions(Json, Threads):
     """Options of the commands of rigs.
 
@@ -940,6 +966,20 @@ class View(Page, Edited):
 
 
 COMMANDS: tuple[type[Command], ...] = (
-    *(Run, Batch, Register, Judge, Merge, Locate, Compare, Repeat, Rig, Demo, Simulate, Inspect),
+    *(
+        Run,
+        Batch,
+        Register,
+        Judge,
+        Merge,
+        Locate,
+        Compare,
+        Repeat,
+        Card,
+        Rig,
+        Demo,
+        Simulate,
+        Inspect,
+    ),
     *(Convert, Record, Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
 )
