@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.apps.card.job import CardOptions, card_exit_status, card_files
-    from tofuse.apps.card.making import QUANTITIES, Card, make_card
+    from tofuse.apps.card.job import CardOptions, card_files
+    from tofuse.apps.card.making import Card, make_card
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

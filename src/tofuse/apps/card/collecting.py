@@ -19,14 +19,6 @@ from tofuse.formats.cameras import pinhole_of
 _FIRST_DATE = 1e9
 # Estimates with a larger sigma, as a fraction of the tolerance, are not determined.
 _MAX_SIGMA = 0.8
-# The correction of a run, in its configuration, of each error that the check estimates.
-_CORRECTIONS = {
-    "focal": "focal",
-    "offset": "offset_m",
-    "center_x": "center_x",
-    "center_y": "center_y",
-    "distortion": "distortion",
-}
 
 
 @dataclass(frozen=True)
@@ -140,20 +132,22 @@ def values_of(
         As its recording states it.
     """
     corrected = corrections.get("camera-errors", {})
-    found = {}
-    for name, key in _CORRECTIONS.items():
-        estimate, sigma = estimates.get(name, (0.0, 0.0))
-        if 0 < sigma < _MAX_SIGMA * calibration_check.TOLERANCES[name]:
-            found[name] = float(corrected.get(key) or 0.0) + estimate, sigma
-    in_units = {
-        "focal": lambda x: camera.fx / (1 + x),
-        "offset": lambda x: -x,  # the correction is added to all ranges
-        "center_x": lambda x: camera.cx - camera.fx * x,
-        "center_y": lambda x: camera.cy - camera.fy * x,
-        "distortion": lambda x: x,
+    # Value without an error, and its change by a unit of it.
+    laws = {
+        "focal": (camera.fx, -camera.fx),
+        "offset": (0.0, -1.0),  # the correction is added to all ranges
+        "center_x": (camera.cx, -camera.fx),
+        "center_y": (camera.cy, -camera.fy),
+        "distortion": (0.0, 1.0),
     }
-    scale = {"focal": camera.fx, "center_x": camera.fx, "center_y": camera.fy}
-    values = {n: (in_units[n](x), scale.get(n, 1.0) * sigma) for n, (x, sigma) in found.items()}
+    values = {}
+    for name, (nominal, factor) in laws.items():
+        estimate, sigma = estimates.get(name, (0.0, 0.0))
+        error = estimate + float(corrected.get("offset_m" if name == "offset" else name) or 0.0)
+        if name == "focal":
+            error /= 1 + error  # the true focal length is 1 / (1 + error) of the stated one
+        if 0 < sigma < _MAX_SIGMA * calibration_check.TOLERANCES[name]:
+            values[name] = nominal + factor * error, abs(factor) * sigma
     strength = corrections.get("multipath", {}).get("strength")
     if strength is not None and strength[1] > 0:
         values["multipath"] = float(strength[0]), float(strength[1])

@@ -51,10 +51,6 @@ class Drift:
         """Probability of the test that counts."""
         return self.p_change if self.change is None else self.p_trend
 
-    def significant(self, level: float) -> bool:
-        """Whether the quantity changes, at a level for all quantities together."""
-        return self.p < level
-
 
 def drift_of(times: Float64, values: Float64, sigmas: Float64, *, trend: bool) -> Drift:
     """Test one quantity.

@@ -45,11 +45,6 @@ def card_files(results: Sequence[Path], options: CardOptions) -> Card:
     return card
 
 
-def card_exit_status(card: Card) -> int:
-    """Return 3 if a quantity changes with time, else 0."""
-    return 3 if card.changed else 0
-
-
 def _is_ours(folder: Path) -> bool:
     data = folders.read_json_object(folder / CARD)
     return data is not None and {"schema", "version", "camera", "quantities"} <= set(data)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,12 +31,10 @@ class Quantity:
     factor: float
     digits: int
 
-    def text(self, value: float | None, *, signed: bool = False, unit: bool = True) -> str:
+    def text(self, value: float | None) -> str:
         """Return a value in SI units as text."""
-        if value is None:
-            return "–"
-        number = f"{self.factor * value:{'+' if signed else ''}.{self.digits}f}"
-        return number.replace("-", "−") + (f" {self.unit}" if unit and self.unit else "")
+        number = "–" if value is None else f"{self.factor * value:.{self.digits}f} {self.unit}"
+        return number.strip().replace("-", "−")
 
 
 QUANTITIES = {
@@ -73,7 +71,7 @@ class Card:
     @property
     def changed(self) -> list[str]:
         """Names of the quantities that drift."""
-        return [name for name, drift in self.drifts.items() if drift.significant(SIGNIFICANCE)]
+        return [name for name, drift in self.drifts.items() if drift.p < SIGNIFICANCE]
 
     @property
     def sentence(self) -> str:
@@ -88,6 +86,21 @@ class Card:
             )
         return "No drift: no quantity changes with time by more than its uncertainty."
 
+    @property
+    def rows(self) -> list[tuple[str, ...]]:
+        """The quantities as text: label, mean, scatter, change over the time, p, "changes"."""
+        rows: list[tuple[str, ...]] = []
+        for name, drift in self.drifts.items():
+            quantity = QUANTITIES[name]
+            mean = f"{quantity.text(drift.mean)} ± {quantity.text(drift.sigma)}"
+            change = "–"
+            if drift.change is not None:
+                change = f"{quantity.text(drift.change)} ± {quantity.text(drift.change_sigma)}"
+            scatter, p = f"{drift.scatter:.1f}", f"{drift.p:.3f}"
+            changes = "changes" if name in self.changed else "–"
+            rows.append((quantity.label, mean, scatter, change, p, changes))
+        return rows
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `card.json`: SI units, pixels, null where unknown."""
         data: dict[str, Any] = run_json.plain(
@@ -96,19 +109,7 @@ class Card:
                 "version": __version__,
                 "camera": vars(self.camera),
                 "significance": SIGNIFICANCE,
-                "sessions": [
-                    {
-                        "name": session.name,
-                        "time": session.time,
-                        "time_by_file": session.by_file,
-                        "values": {
-                            name: {"value": value, "sigma": sigma}
-                            for name, (value, sigma) in session.values.items()
-                        },
-                        "noise": session.noise,
-                    }
-                    for session in self.sessions
-                ],
+                "sessions": [vars(session) for session in self.sessions],
                 "quantities": {name: vars(drift) for name, drift in self.drifts.items()},
                 "changed": self.changed,
                 "warnings": self.warnings,
@@ -153,47 +154,41 @@ def series(sessions: Sequence[Session], name: str) -> tuple[Float64, Float64, Fl
     return times, values, sigmas
 
 
-def _warnings(card: Card) -> list[str]:
-    found = [_words(name, card.drifts[name]) for name in card.changed]
+def _warnings(card: Card) -> Iterator[str]:
+    for name in card.changed:
+        yield _words(name, card.drifts[name])
     if {"focal", "offset"} & set(card.changed):
-        found.append(
-            "Focal length and range offset have similar effects: either may be the one that changes"
-        )
+        yield "Focal length and range offset have similar effects: either may be what changes"
     scattered = [
         QUANTITIES[name].label.lower()
         for name, drift in card.drifts.items()
         if name not in card.changed and drift.p_change < SIGNIFICANCE / len(card.drifts)
     ]
     if scattered:
-        found.append(
-            f"More scatter between results than their sigmas explain: {', '.join(scattered)}; "
-            "scenes differ in multipath and mixed pixels, so repeat one scene to learn more"
+        yield (
+            f"Results scatter by more than their sigmas: {', '.join(scattered)}. Scenes differ in "
+            "multipath and mixed pixels, so repeat one scene to learn more"
         )
     if len(card.sessions) < _MIN_TREND:
-        found.append(
-            f"Fewer than {_MIN_TREND} results: only their stated sigmas tell what is significant"
-        )
+        yield f"Fewer than {_MIN_TREND} results: only their sigmas tell what is significant"
     if any(session.by_file for session in card.sessions):
-        found.append("Some frames have no dates: those of the recordings' files are used")
+        yield "Some frames have no dates: those of the recordings' files are used"
     if not card.camera.serial:
-        found.append(
-            "The recordings state no serial number: another camera of this name would pass"
-        )
+        yield "The recordings state no serial number: another camera of this name would pass"
     silent = sum(not session.values for session in card.sessions)
     if silent:
-        found.append(f"{silent} of {len(card.sessions)} results state no estimates of the camera")
-    return found
+        yield f"{silent} of {len(card.sessions)} results state no estimates of the camera"
 
 
 def _words(name: str, drift: Drift) -> str:
     quantity = QUANTITIES[name]
-    chance = f"by chance once in {1 / max(drift.p, 1e-6):,.0f}"
-    if drift.change is None:
-        return f"{quantity.label}: the results differ by more than their sigmas ({chance})"
-    change = quantity.text(drift.change, signed=True)
-    return (
-        f"{quantity.label}: {change} ± {quantity.text(drift.change_sigma)} over the time ({chance})"
-    )
+    change = "the results differ by more than their sigmas"
+    if drift.change is not None:
+        change = (
+            f"{quantity.text(drift.change)} ± {quantity.text(drift.change_sigma)} over the time"
+        )
+    chance = f"{1 / max(drift.p, 1e-6):,.0f}"
+    return f"{quantity.label}: {change} (by chance once in {chance} cameras)"
 
 
 def dates(card: Card) -> str:

@@ -35,20 +35,17 @@ def write_page(card: Card, path: Path) -> None:
         date=date,
         name=lambda session: "/".join(Path(session.name).parts[-2:]),
         dates=dates(card),
-        facts=_facts(card),
+        facts=[
+            ("Results", str(len(card.sessions))),
+            ("Dates", dates(card)),
+            ("Serial number", card.camera.serial or "–"),
+            ("Image size", "{} x {}".format(*card.camera.size)),
+        ],
         plots=[_plot(card, name) for name in card.drifts],
-        rows=_rows(card),
         noise=_noise(card),
         ranges=[words.length(r) for r in _RANGES_M],
         significance=SIGNIFICANCE,
     )
-
-
-def _facts(card: Card) -> list[tuple[str, str]]:
-    facts = [("Results", str(len(card.sessions))), ("Dates", dates(card))]
-    if card.camera.serial:
-        facts.append(("Serial number", card.camera.serial))
-    return [*facts, ("Image size", "{} x {}".format(*card.camera.size))]
 
 
 def _plot(card: Card, name: str) -> dict[str, Any]:
@@ -72,23 +69,9 @@ def _plot(card: Card, name: str) -> dict[str, Any]:
                            strict=True)),
         "mean": y(drift.mean),
         "band": (y(min(drift.mean + mean_half, high)), y(max(drift.mean - mean_half, low))),
-        "ends": (quantity.text(high, unit=False), quantity.text(low, unit=False)),
+        "ends": [quantity.text(end).removesuffix(f" {quantity.unit}") for end in (high, low)],
         "size": (_WIDTH, _HEIGHT),
     }  # fmt: skip
-
-
-def _rows(card: Card) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = []
-    for name, drift in card.drifts.items():
-        quantity = QUANTITIES[name]
-        change = quantity.text(drift.change, signed=True)
-        if drift.change_sigma is not None:
-            change += f" ± {quantity.text(drift.change_sigma, unit=False)}"
-        mean = f"{quantity.text(drift.mean)} ± {quantity.text(drift.sigma, unit=False)}"
-        verdict = "changes" if name in card.changed else "–"
-        p = "< 0.001" if drift.p < 0.001 else f"{drift.p:.3f}"
-        rows.append((quantity.label, mean, f"{drift.scatter:.1f}", change, p, verdict))
-    return rows
 
 
 def _noise(card: Card) -> list[tuple[str, ...]]:

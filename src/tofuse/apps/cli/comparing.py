@@ -94,20 +94,14 @@ def repeat(arguments: cli.Repeat) -> int:
 
 def card(arguments: cli.Card) -> int:
     """``tofuse card``."""
-    from tofuse.apps.card import QUANTITIES, CardOptions, card_exit_status, card_files
+    from tofuse.apps.card import CardOptions, card_files
 
     check_overwrite(arguments)
     options = from_arguments(CardOptions, arguments)
     found = card_files(arguments.results, options)
-    table = Table.grid(padding=(0, 2))
-    table.add_row("quantity", "mean", "sigma", "change over the time", "p")
-    for name, drift in found.drifts.items():
-        quantity = QUANTITIES[name]
-        change = "-"
-        if drift.change is not None:
-            change = f"{quantity.text(drift.change)} +- {quantity.text(drift.change_sigma)}"
-        mean, sigma = quantity.text(drift.mean), quantity.text(drift.sigma)
-        table.add_row(quantity.label, mean, sigma, change, f"{drift.p:.3f}")
+    table = Table("quantity", "mean", "scatter", "over the time", "p", "", box=None)
+    for row in found.rows:
+        table.add_row(*row)
     return show(
         arguments,
         {**found.to_dict(), "out": out_json(options.out)},
@@ -116,5 +110,5 @@ def card(arguments: cli.Card) -> int:
         table,
         *warning_lines(found.warnings),
         *([] if options.out is None else [escaped(f"see {options.out / 'card.html'}")]),
-        status=card_exit_status(found),
+        status=3 if found.changed else 0,
     )

@@ -966,20 +966,6 @@ class View(Page, Edited):
 
 
 COMMANDS: tuple[type[Command], ...] = (
-    *(
-        Run,
-        Batch,
-        Register,
-        Judge,
-        Merge,
-        Locate,
-        Compare,
-        Repeat,
-        Card,
-        Rig,
-        Demo,
-        Simulate,
-        Inspect,
-    ),
-    *(Convert, Record, Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
+    *(Run, Batch, Register, Judge, Merge, Locate, Compare, Repeat, Card, Rig, Demo, Simulate),
+    *(Inspect, Convert, Record, Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
 )

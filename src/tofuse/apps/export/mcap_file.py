@@ -24,62 +24,18 @@ from tofuse.formats.files import atomic, reading
 from tofuse.formats.images import jpeg_bytes
 
 MAP, WORLD, CAMERA = "map", "world", "camera"  # z up; as in the result; x right, y down, z forward
-_NUMBER, _INTEGER, _TEXT = {"type": "number"}, {"type": "integer"}, {"type": "string"}
-_BYTES = {"type": "string", "contentEncoding": "base64"}
-
-
-def _object(**properties: Any) -> dict[str, Any]:
-    return {"type": "object", "properties": properties}
-
-
-def _list(items: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "array", "items": items}
-
-
-_TIME = _object(sec=_INTEGER, nsec=_INTEGER)
-_VECTOR = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
-_POSE = _object(position=_VECTOR, orientation=_QUATERNION)
-_STAMP = {"timestamp": _TIME, "frame_id": _TEXT}
-_SIZE = {"width": _INTEGER, "height": _INTEGER}
-_NUMBERS = _list(_NUMBER)
-_FIELD = _object(name=_TEXT, offset=_INTEGER, type=_INTEGER)
 # Foxglove's numbers of the types of a point's fields.
 _UINT8, _FLOAT32 = 1, 7
-# The schema of each topic, without the parts that are not used.
-_TOPICS: dict[str, tuple[str, dict[str, Any]]] = {
-    "/tf": (
-        "FrameTransform",
-        _object(
-            timestamp=_TIME,
-            parent_frame_id=_TEXT,
-            child_frame_id=_TEXT,
-            translation=_VECTOR,
-            rotation=_QUATERNION,
-        ),
-    ),
-    "/pose": ("PoseInFrame", _object(**_STAMP, pose=_POSE)),
-    "/trajectory": ("PosesInFrame", _object(**_STAMP, poses=_list(_POSE))),
-    "/cloud": (
-        "PointCloud",
-        _object(**_STAMP, pose=_POSE, point_stride=_INTEGER, fields=_list(_FIELD), data=_BYTES),
-    ),
-    "/depth/calibration": (
-        "CameraCalibration",
-        _object(
-            **_STAMP,
-            **_SIZE,
-            distortion_model=_TEXT,
-            **dict.fromkeys("DKRP", _NUMBERS),
-        ),
-    ),
-    "/depth/image": (
-        "RawImage",
-        _object(**_STAMP, **_SIZE, encoding=_TEXT, step=_INTEGER, data=_BYTES),
-    ),
-    "/color/image": ("CompressedImage", _object(**_STAMP, format=_TEXT, data=_BYTES)),
+_SCHEMAS = {
+    "/tf": "FrameTransform",
+    "/pose": "PoseInFrame",
+    "/trajectory": "PosesInFrame",
+    "/cloud": "PointCloud",
+    "/depth/calibration": "CameraCalibration",
+    "/depth/image": "RawImage",
+    "/color/calibration": "CameraCalibration",
+    "/color/image": "CompressedImage",
 }
-_TOPICS["/color/calibration"] = _TOPICS["/depth/calibration"]
 
 
 def write_mcap(scene: Scene, path: Path) -> None:
@@ -110,19 +66,18 @@ class _Messages:
     def __init__(self, writer: Any, start: float) -> None:
         self._writer, self._start = writer, start
         self._channels: dict[str, int] = {}
-        schemas: dict[str, int] = {}
-        for topic, (name, schema) in _TOPICS.items():
-            if name not in schemas:
-                data = json.dumps({"title": f"foxglove.{name}", **schema}).encode()
-                schemas[name] = writer.register_schema(f"foxglove.{name}", "jsonschema", data)
-            self._channels[topic] = writer.register_channel(topic, "json", schemas[name])
 
     def write(self, topic: str, time: float, **fields: Any) -> None:
         """Write a message with these fields and its time."""
         nanoseconds = round((time - self._start) * 1e9)
         sec, nsec = divmod(nanoseconds, 1_000_000_000)
         message = {"timestamp": {"sec": sec, "nsec": nsec}, **fields}
-        data = json.dumps(message, allow_nan=False).encode()
+        if topic not in self._channels:
+            name = f"foxglove.{_SCHEMAS[topic]}"
+            schema = json.dumps({"title": name, **_schema_of(message)}).encode()
+            number = self._writer.register_schema(name, "jsonschema", schema)
+            self._channels[topic] = self._writer.register_channel(topic, "json", number)
+        data = json.dumps(message, allow_nan=False, default=_base64).encode()
         self._writer.add_message(self._channels[topic], nanoseconds, data, nanoseconds)
 
     def transform(self, time: float, parent: str, child: str, T: Float64) -> None:
@@ -159,7 +114,7 @@ def _write_model(messages: _Messages, scene: Scene) -> None:
         pose=_pose(np.eye(4)),
         point_stride=points.dtype.itemsize,
         fields=fields,
-        data=_base64(points.tobytes()),
+        data=points.tobytes(),
     )
 
 
@@ -193,11 +148,11 @@ def _write_images(messages: _Messages, posed: PosedFrame) -> None:
         height=height,
         encoding="16UC1",
         step=2 * width,
-        data=_base64(depth.astype("<u2").tobytes()),
+        data=depth.astype("<u2").tobytes(),
     )
     if posed.image is not None:
         _write_camera(messages, "/color/calibration", time, posed.image_camera)
-        jpeg = _base64(jpeg_bytes(posed.image))
+        jpeg = jpeg_bytes(posed.image)
         messages.write("/color/image", time, frame_id=CAMERA, format="jpeg", data=jpeg)
 
 
@@ -227,3 +182,15 @@ def _pose(T: Float64) -> dict[str, dict[str, float]]:
 
 def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode()
+
+
+def _schema_of(value: Any) -> dict[str, Any]:
+    """The JSON schema of a message: the fields of Foxglove's that it has."""
+    if isinstance(value, dict):
+        properties = {name: _schema_of(each) for name, each in value.items()}
+        return {"type": "object", "properties": properties}
+    if isinstance(value, list):
+        return {"type": "array", "items": _schema_of(value[0] if value else 0.0)}
+    if isinstance(value, bytes):
+        return {"type": "string", "contentEncoding": "base64"}
+    return {"type": {str: "string", int: "integer", float: "number"}[type(value)]}
