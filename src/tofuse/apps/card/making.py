@@ -31,10 +31,12 @@ class Quantity:
     factor: float
     digits: int
 
-    def text(self, value: float | None) -> str:
-        """Return a value in SI units as text."""
-        number = "–" if value is None else f"{self.factor * value:.{self.digits}f} {self.unit}"
-        return number.strip().replace("-", "−")
+    def text(self, *values: float | None) -> str:
+        """Return a value in SI units as text, or a value and its sigma; a dash for None."""
+        if None in values:
+            return "–"
+        numbers = [f"{self.factor * (v or 0.0):.{self.digits}f}" for v in values]
+        return f"{' ± '.join(numbers)} {self.unit}".strip().replace("-", "−")
 
 
 QUANTITIES = {
@@ -92,10 +94,8 @@ class Card:
         rows: list[tuple[str, ...]] = []
         for name, drift in self.drifts.items():
             quantity = QUANTITIES[name]
-            mean = f"{quantity.text(drift.mean)} ± {quantity.text(drift.sigma)}"
-            change = "–"
-            if drift.change is not None:
-                change = f"{quantity.text(drift.change)} ± {quantity.text(drift.change_sigma)}"
+            mean = quantity.text(drift.mean, drift.sigma)
+            change = quantity.text(drift.change, drift.change_sigma)
             scatter, p = f"{drift.scatter:.1f}", f"{drift.p:.3f}"
             changes = "changes" if name in self.changed else "–"
             rows.append((quantity.label, mean, scatter, change, p, changes))
@@ -184,9 +184,7 @@ def _words(name: str, drift: Drift) -> str:
     quantity = QUANTITIES[name]
     change = "the results differ by more than their sigmas"
     if drift.change is not None:
-        change = (
-            f"{quantity.text(drift.change)} ± {quantity.text(drift.change_sigma)} over the time"
-        )
+        change = f"{quantity.text(drift.change, drift.change_sigma)} over the time"
     chance = f"{1 / max(drift.p, 1e-6):,.0f}"
     return f"{quantity.label}: {change} (by chance once in {chance} cameras)"
 
