@@ -48,9 +48,11 @@ def main() -> None:
             f"| {quantity.label} | {quantity.text(np.median(found[:, 1]))} | {whole.scatter:.1f} |"
         )
     print("\n| sessions | " + " | ".join(CHANGES) + " |\n|---|" + "---|" * len(CHANGES))
-    for size in SIZES:
-        shares = [warned(pool, size, change) for change in CHANGES]
-        print(f"| {size} | " + " | ".join(f"{share:.1%}" for share in shares) + " |")
+    places = {"two places": pool, "the room": pool[::2], "the flat": pool[1::2]}
+    for place, sessions in places.items():
+        for size in (size for size in SIZES if size <= len(sessions)):
+            shares = [f"{warned(sessions, size, change):.1%}" for change in CHANGES]
+            print(f"| {size} in {place} | " + " | ".join(shares) + " |")
 
 
 def pool_of(seeds: int) -> list[dict[str, Values]]:

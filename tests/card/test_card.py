@@ -104,7 +104,7 @@ def test_two_results_are_compared_by_their_sigmas(tmp_path: Path) -> None:
     card = make_card(pair)
     assert card.changed == ["focal"]
     assert card.drifts["focal"].change is None
-    assert any("only their sigmas" in warning for warning in card.warnings)
+    assert any("twice their sigmas" in warning for warning in card.warnings)
 
 
 def test_what_a_run_corrected_belongs_to_the_camera(tmp_path: Path) -> None:

@@ -170,7 +170,7 @@ def _warnings(card: Card) -> Iterator[str]:
             "multipath and mixed pixels, so repeat one scene to learn more"
         )
     if len(card.sessions) < _MIN_TREND:
-        yield f"Fewer than {_MIN_TREND} results: only their sigmas tell what is significant"
+        yield f"Fewer than {_MIN_TREND} results: their scatter is taken to be twice their sigmas"
     if any(session.by_file for session in card.sessions):
         yield "Some frames have no dates: those of the recordings' files are used"
     if not card.camera.serial:
