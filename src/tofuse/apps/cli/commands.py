@@ -322,7 +322,7 @@ def locate(arguments: cli.Locate) -> int:
 
 
 def check_overwrite(
-    arguments: cli.Register | cli.Judge | cli.Locate | cli.Compare | cli.Repeat,
+    arguments: cli.Register | cli.Judge | cli.Locate | cli.Compare | cli.Repeat | cli.Card,
 ) -> None:
     """Refuse --overwrite without --out, where that is optional."""
 
@@ -617,6 +617,7 @@ def export(arguments: cli.Export) -> int:
         faces=arguments.faces,
         every=arguments.every,
         pinhole=arguments.pinhole,
+        voxel_m=arguments.voxel,
         overwrite=arguments.overwrite,
     ):
         print(path)

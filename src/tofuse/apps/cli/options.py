@@ -521,6 +521,32 @@ class Repeat(Json, Threads, Edited):
     overwrite: bool = False
 
 
+class Card(Json, Edited):
+    """Collect what results of one camera say about it, and whether it drifts.
+
+    Attributes
+    ----------
+    results : RESULT
+        results of one camera; their recordings must still be at their paths
+    out : DIR
+        folder for card.html and card.json (none)
+    overwrite
+        replace an existing card in --out
+
+    Exit status
+    -----------
+    0  no quantity changes with time by more than its uncertainty
+    2  nothing was written: one line on stderr states the reason
+    3  a quantity changes with time
+    """
+
+    home = "tofuse.apps.cli.comparing"
+
+    results: list[Path]
+    out: Path | None = None
+    overwrite: bool = False
+
+
 class RigOptions(Json, Threads):
     """Options of the commands of rigs.
 
@@ -878,15 +904,18 @@ class Export(Edited):
     result : DIR
         a result: the --out of `tofuse run`
     formats : FORMAT
-        pcd, las, laz, e57, glb, gltf, obj, usdz, stl, kitti, log, nerfstudio, colmap
+        pcd, las, laz, e57, glb, gltf, obj, usdz, stl, kitti, log, nerfstudio, colmap, rerun,
+        mcap, occupancy, esdf, octomap
     out : DIR
         folder for the files (default: that of the result)
     faces : N
         maximum number of triangles (60000; STL: all)
     every : N
-        every N-th image (nerfstudio, colmap)
+        every N-th frame (nerfstudio, colmap, rerun, mcap, occupancy, esdf, octomap)
     pinhole
         images without distortion (nerfstudio, colmap)
+    voxel : LENGTH
+        voxel size (occupancy, esdf, octomap; default: a 400th of the model's diagonal)
     overwrite
         replace existing files
     """
@@ -897,6 +926,7 @@ class Export(Edited):
     faces: Count | None = None
     every: Count = 1
     pinhole: bool = False
+    voxel: Length | None = None
     overwrite: bool = False
 
 
@@ -936,6 +966,6 @@ class View(Page, Edited):
 
 
 COMMANDS: tuple[type[Command], ...] = (
-    *(Run, Batch, Register, Judge, Merge, Locate, Compare, Repeat, Rig, Demo, Simulate, Inspect),
-    *(Convert, Record, Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
+    *(Run, Batch, Register, Judge, Merge, Locate, Compare, Repeat, Card, Rig, Demo, Simulate),
+    *(Inspect, Convert, Record, Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
 )

@@ -185,6 +185,7 @@ def _suspicion(check: calibration_check.CalibrationCheck | None) -> dict[str, An
         "camera": check.errors,
         "sigma": check.sigmas,
         "focal_sigma": check.focal_sigma,
+        "estimates": check.estimates,
         "focal_motion_m": 0.01 * check.motion["focal"][0] if check.motion else None,
         "support": check.support,
         "loop": gap,

@@ -119,7 +119,7 @@ class Mapper:
         -------
         Current estimate of T_world_camera (4, 4); None if the frame is lost, or in a component that
         is not yet connected to the first one. Loops take effect some frames later; `finish` joins
-        components and optimises all poses again.
+        components and optimises all poses again. Status and covariance are in `last`.
 
         Raises
         ------
@@ -221,6 +221,19 @@ class Mapper:
         if config is not None:
             self._preparation = Preparation(config, self._preparation.counts)
             self._tracker = config.odometry.start(self.seed, config.search)
+
+    @property
+    def last(self) -> FrameRecord | None:
+        """The record of the latest frame: status, reason, residuals, covariance of the pose.
+
+        The covariance is that of tracking alone: it knows neither loops nor systematic errors,
+        which `finish` takes into account. None where a direction is not measured, and for
+        components that began after a gap.
+        """
+        if not self._log.entries:
+            return None
+        record = self._log.entries[-1].record
+        return replace(record, covariance=self._live_poses.covariance(record.index))
 
     @property
     def log(self) -> FrameLog:
