@@ -49,6 +49,34 @@ class Recorder(Silent):
         self.frames.append((frame.index, T_world_camera.copy(), len(self.stages)))
 
 
+@needs_viser
+def test_live_view_shows_advice_until_tracking_ends(room_recording, monkeypatch):
+    from tofuse.apps.viewer import live_view
+    from tofuse.engine.mapping import Mapper
+    from tofuse.formats.recordings import open_recording
+
+    monkeypatch.setattr(live_view, "_ADVICE_PERIOD", 0.0)
+    monkeypatch.setattr(live_view, "_ADVICE_SHARE", 0.0)
+    server = serve()
+    try:
+        live = live_view.LiveView(server)
+        live.stage("tracking", 8)
+        mapper = Mapper(threads=1, progress=live)
+        for frame in open_recording(room_recording):
+            mapper.push(frame)
+        assert live._advice.content.startswith("**Next:** ")
+        live._show_advice("**Next:** turn around", np.diag([-1.0, 1, -1, 1]), np.eye(4))
+        arrow, target = live._advised
+        np.testing.assert_allclose(arrow.points[0, 1], [0, 0, -0.5], atol=1e-6)
+        np.testing.assert_allclose(np.abs(target.wxyz), [0, 0, 1, 0], atol=1e-9)
+        live.stage("closing loops")
+        assert live._advice.content == ""
+        assert not live._advised
+        assert live._so_far is None
+    finally:
+        stop(server)
+
+
 @pytest.mark.nightly
 @needs_viser
 def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser, monkeypatch):
