@@ -684,6 +684,40 @@ class Simulate(Seed, Threads):
     sigma: Metres | None = None
 
 
+class Plan(Json, Seed, Threads, Edited):
+    """Say what cameras would achieve in a place, from a coarse scan of it.
+
+    Each camera is simulated along the path in the scan's model, and what it records is
+    reconstructed.
+
+    Attributes
+    ----------
+    result : RESULT
+        a result of the scan
+    camera : NAME
+        simulated camera; may be repeated (default: all)
+    path : FILE
+        trajectory in the world of the scan (default: its own)
+    tolerance : LENGTH
+        required 95 % bound on the positions of the camera (5mm)
+
+    Exit status
+    -----------
+    0  some camera would do
+    3  none would
+    4  undecided: too close to the tolerance
+    2  nothing was simulated: one line on stderr states the reason
+    """
+
+    home = _LAB
+    reconstructs = True
+
+    result: Path
+    camera: list[str] | None = None
+    path: Path | None = None
+    tolerance: Length = 0.005
+
+
 class Inspect(Json, Source):
     """Show a recording's properties and check it for faults.
 
@@ -936,6 +970,20 @@ class View(Page, Edited):
 
 
 COMMANDS: tuple[type[Command], ...] = (
-    *(Run, Batch, Register, Judge, Merge, Locate, Compare, Repeat, Rig, Demo, Simulate, Inspect),
+    *(
+        Run,
+        Batch,
+        Register,
+        Judge,
+        Merge,
+        Locate,
+        Compare,
+        Repeat,
+        Rig,
+        Demo,
+        Simulate,
+        Plan,
+        Inspect,
+    ),
     *(Convert, Record, Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
 )

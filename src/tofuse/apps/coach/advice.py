@@ -14,14 +14,19 @@ from tofuse.engine.mapping import Mapper
 from tofuse.engine.progress import OnlineMap
 from tofuse.engine.results import Reconstruction
 
-# Turns of the camera at its place, in degrees: to the right, and upwards.
-_TURNS = tuple((yaw, 0) for yaw in (-150, -120, -90, -60, -30, 30, 60, 90, 120, 150, 180)) + tuple(
-    (yaw, pitch) for yaw in (-45, 0, 45) for pitch in (-35, 35)
+# Turns of the camera at its place, in degrees to the right and upwards, each from the one before.
+_TURNS = (
+    *(tuple((side * yaw, 0) for yaw in range(30, 181, 30)) for side in (-1, 1)),
+    *(((yaw, pitch),) for yaw in (-45, 0, 45) for pitch in (-35, 35)),
 )
-# Earlier keyframes to go back to.
-_REVISITS = 20
-# Number of views that a look from there adds: one to two seconds of a moving camera.
-_VIEWS = 8
+# Earlier places to go to: evenly spaced keyframes, and halfway between successive ones that are
+# known worst relative to each other. On the way there is a look after at most this angle (rad) and
+# part of the reach, within limits.
+_REVISITS, _WEAK, _STEP_ANGLE, _STEP, _MAX_LOOKS = 8, 5, 0.6, 0.2, 5
+# A surface so near to the straight way, relative to its length, is in the way.
+_BLOCKED = 0.08
+# Numbers of views from there, one to two seconds of a moving camera, and from each look before.
+_VIEWS = 8.0, 2.0
 # Of candidates whose gain is at least this fraction of the largest, the nearest is advised.
 _NEARLY_BEST = 0.9
 # A keyframe within this fraction of the reach is a turn away.
@@ -94,8 +99,8 @@ def advise_on(so_far: OnlineMap) -> Advice | None:
 
 def best(known: Known, within_s: float = np.inf) -> Advice:
     """Return the best advice by what is known, with places of the last seconds only."""
-    moves = candidates(known, within_s)
-    factors = known.factors_with(np.stack([move.pose for move in moves]), _VIEWS)
+    poses, moves = candidates(known, within_s)
+    factors = known.factors_with(poses, [move.way for move in moves], _VIEWS)
     good = np.flatnonzero(1 - factors >= _NEARLY_BEST * (1 - factors.min()))
     chosen = good[np.argmin([moves[k].effort for k in good])]
     move, bound_m = moves[chosen], known.bound_m
@@ -106,43 +111,75 @@ def best(known: Known, within_s: float = np.inf) -> Advice:
         gain = f"{100 * (1 - factors[chosen]):.0f} % less uncertain"
     if before == after and np.isfinite(bound_m):
         return Advice(bound_m, bound_m, f"go on: no look back would lower the {before} mm")
-    pose = move.pose.copy()
+    pose = poses[move.way[-1]].copy()
     pose[:3, 3] += known.centre
     return Advice(bound_m, expected_m, f"{move.words}: {gain}", pose, move.frame)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Candidate:
-    """A candidate: the pose to take, relative to the centre.
+    """A way: positions in the poses of all candidates.
 
     `effort` grows with the motion: its length relative to the reach, and its angle in rad.
     """
 
-    pose: Float64
+    way: tuple[int, ...]
     words: str
     effort: float
     frame: int | None = None
 
 
-def candidates(known: Known, within_s: float = np.inf) -> list[Candidate]:
-    """Return turns at the latest place, and places of the last seconds."""
+def candidates(known: Known, within_s: float = np.inf) -> tuple[Float64, list[Candidate]]:
+    """Return poses (M, 4, 4) relative to the centre, and turns and ways to earlier places."""
     now, reach = known.poses[-1], known.surfaces.reach_m
-    earlier = evenly_spaced(np.flatnonzero(known.ages_s[:-1] <= within_s), _REVISITS)
-    motions = se3.inverse(now) @ known.poses[earlier]
-    steps, angles = np.linalg.norm(motions[:, :3, 3], axis=1), se3.angle(motions)
+    poses: list[Float64] = []
     moves = []
-    for yaw, pitch in _TURNS:
-        R = se3.exp([0, 0, 0, 0, np.radians(yaw), 0]) @ se3.exp([0, 0, 0, np.radians(pitch), 0, 0])
-        moves.append(Candidate(now @ R, _turn(yaw, pitch), float(se3.angle(R))))
-    for k, motion, step, angle in zip(earlier, motions, steps, angles, strict=True):
+    for turns in _TURNS:
+        first = len(poses)
+        for yaw, pitch in turns:
+            w = np.radians([[0, yaw, 0], [pitch, 0, 0]])
+            R = se3.exp([0, 0, 0, *w[0]]) @ se3.exp([0, 0, 0, *w[1]])
+            poses.append(now @ R)
+            way = tuple(range(first, len(poses)))
+            moves.append(Candidate(way, _turn(yaw, pitch), float(se3.angle(R))))
+    earlier = np.flatnonzero(known.ages_s[:-1] <= within_s)
+    weakest = earlier[np.argsort(-known.step_squares[earlier], kind="stable")[:_WEAK]]
+    halfway = se3.interpolate(
+        known.poses[weakest], known.poses[weakest + 1], np.full(len(weakest), 0.5)
+    )
+    even = evenly_spaced(earlier, _REVISITS)
+    targets = np.concatenate([known.poses[even], halfway])
+    for k, target in zip([*even.tolist(), *weakest.tolist()], targets, strict=True):
+        motion = se3.inverse(now) @ target
+        step, angle = float(np.linalg.norm(motion[:3, 3])), float(se3.angle(motion))
         seconds = f"{known.ages_s[k]:.0f} s ago"
+        looks = int(np.clip(np.ceil(max(angle / _STEP_ANGLE, step / reach / _STEP)), 1, _MAX_LOOKS))
+        way = tuple(range(len(poses), len(poses) + looks))
         if step < _SAME_PLACE * reach:
             words = f"{_turn(*_direction(motion[:3, 2]))}, to what you saw {seconds}"
         else:
-            words = f"go back to where you were {seconds}, {_way(motion[:3, 3])}"
-        effort = float(step) / reach + float(angle)
-        moves.append(Candidate(known.poses[k], words, effort, int(known.frames[k])))
-    return moves
+            words = f"go to where you were {seconds}, {_way(motion[:3, 3])}"
+        if _is_blocked(known, now[:3, 3], target[:3, 3]):
+            words = f"go back the way you came, to where you were {seconds}"
+            back = np.arange(k, len(known.poses) - 1)[::-1]
+            looked = back[np.linspace(0, len(back) - 1, looks).round().astype(np.intp)]
+            poses += [*known.poses[looked[:-1]], target]
+        else:
+            fractions = np.arange(1, looks + 1) / looks
+            poses += [*se3.interpolate(now, target, fractions)]
+        moves.append(Candidate(way, words, step / reach + angle, int(known.frames[k])))
+    return np.stack(poses), moves
+
+
+def _is_blocked(known: Known, start: Float64, end: Float64) -> bool:
+    """Whether a known surface lies on the straight way, apart from its ends."""
+    step = end - start
+    length = max(float(np.linalg.norm(step)), 1e-9)
+    arm = known.surfaces.points - start
+    fraction = arm @ step / length**2
+    distance = np.linalg.norm(arm - fraction[:, None] * step, axis=1)
+    between = (fraction > _BLOCKED) & (fraction < 1 - _BLOCKED)
+    return bool((between & (distance < _BLOCKED * length)).any())
 
 
 def _direction(v: Float64) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from tofuse.apps.coach.surfaces import Seen, Surfaces, pair_information, scales
-from tofuse.engine.arrays import Float32, Float64, Intp
+from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import PoseGraph, graph_covariances
@@ -167,9 +167,8 @@ class Known:
 
     def _with_pairs(self) -> Self:
         """Return it with all pairs of keyframes that overlap, as the refinement will compare."""
-        overlap = np.triu(self.seen.overlap(self.seen), 1)
-        axes = self.poses[:, :3, 2]
-        pairs = np.argwhere((overlap >= _OVERLAP) & (axes @ axes.T > 0))
+        overlapping = self._overlapping(self.seen, self.poses, self.seen, self.poses)
+        pairs = np.argwhere(np.triu(overlapping, 1))
         pairs = joint_alignment.spread_evenly(pairs, _NEIGHBOURS)
         if not len(pairs):
             return self
@@ -177,11 +176,8 @@ class Known:
         i, j = pairs.T
         H = self._information(self.seen.of(i), self.seen.of(j))
         H *= (self.views_each / (0.5 * (partners[i] + partners[j])))[:, None, None]
-        L = np.zeros((len(self.poses), len(self.poses), 6, 6))
-        for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
-            np.add.at(L, (a, b), sign * H)
-        n = 6 * len(self.poses)
-        L = L.swapaxes(1, 2).reshape(n, n)
+        L = _laplacian(len(self.poses), pairs, H)
+        n = len(L)
         C = np.linalg.solve(np.eye(n) + self.covariance @ L, self.covariance)
         known = replace(self, covariance=0.5 * (C + C.T), partners=partners)
         return replace(known, bound_m=known.bound(known.covariance))
@@ -197,52 +193,95 @@ class Known:
         spread = spread.reshape(3 * k, 6 * k)
         return spread - motion @ (np.linalg.pinv(motion, rcond=1e-9) @ spread)
 
+    @property
+    def step_squares(self) -> Float64:
+        """(K - 1,) mean squares of the errors of position from each keyframe to the next."""
+        k = len(self.poses)
+        D = np.kron(np.diff(np.eye(k), axis=0), np.eye(6))
+        blocks = (D @ self.covariance @ D.T).reshape(k - 1, 6, k - 1, 6)
+        C = blocks[np.arange(k - 1), :, np.arange(k - 1), :]
+        J = np.concatenate(
+            [np.broadcast_to(np.eye(3), (k, 3, 3)), -se3.hat(self.poses[:, :3, 3])], 2
+        )
+        return np.asarray(np.einsum("kij,kjl,kil->k", J[1:], C, J[1:]), np.float64)
+
     def bound(self, covariance: Float64) -> float:
         """Return the 95 % bound on the rms error of the positions, by a covariance alone."""
         P = self._to_positions
         return pose_accuracy.bound_by_covariance(P @ covariance @ P.T)
 
-    def factors_with(self, poses: Float64, views: float) -> Float64:
-        """(M,) factors of the bound after scanning from poses (M, 4, 4), relative to the centre.
+    def factors_with(
+        self, poses: Float64, ways: Sequence[Sequence[int]], views: Sequence[float]
+    ) -> Float64:
+        """(W,) factors of the bound after scanning along each of some ways.
 
         Parameters
         ----------
+        poses
+            (M, 4, 4) relative to the centre.
+        ways
+            Positions in `poses` of each way, in its order.
         views
-            Number of views from there.
+            Numbers of views from the target, the last pose of a way, and from each one before.
         """
         seen, P, C = self.surfaces.seen_from(poses), self._to_positions, self.covariance
+        together = np.zeros((len(poses), len(poses)), np.bool_)
+        for way in ways:
+            together[np.ix_(way, way)] = True
+        links = np.argwhere(np.triu(self._overlapping(seen, poses, seen, poses) & together, 1))
+        H_links = self._information(seen.of(links[:, 0]), seen.of(links[:, 1]))
+        pairs = np.argwhere(self._overlapping(self.seen, self.poses, seen, poses))
+        pairs = joint_alignment.spread_evenly(pairs, _NEIGHBOURS)
+        H_pairs = self._information(self.seen.of(pairs[:, 0]), seen.of(pairs[:, 1]))
         PC = P @ C
         before = float((PC * P).sum())
-        squares = np.full(len(poses), before)
-        similar = poses[:, :3, 2] @ self.poses[:, :3, 2].T > 0
-        pairs = np.argwhere((seen.overlap(self.seen) >= _OVERLAP) & similar)
-        pairs = joint_alignment.spread_evenly(pairs[:, ::-1], _NEIGHBOURS)
-        H = self._information(seen.of(pairs[:, 1]), self.seen.of(pairs[:, 0]))
-        for k in np.unique(pairs[:, 1]):
-            partners = np.flatnonzero(pairs[:, 1] == k)
-            rows = pairs[partners, 0]
-            share = views / (0.5 * (len(rows) + self.partners[rows]))
-            L = _without_view(H[partners] * share[:, None, None])
+        squares = np.full(len(ways), before)
+        for k, way in enumerate(ways):
+            to_known, among = np.isin(pairs[:, 1], way), np.isin(links, way).all(1)
+            rows = np.unique(pairs[to_known, 0])
+            if len(rows) < 2:
+                continue
+            number = np.zeros(len(poses), np.intp)
+            number[list(way)] = len(rows) + np.arange(len(way))
+            known = np.searchsorted(rows, pairs[to_known, 0])
+            ends = np.concatenate(
+                [np.stack([known, number[pairs[to_known, 1]]], 1), number[links[among]]]
+            )
+            count = len(rows) + len(way)
+            partners = np.bincount(ends.ravel(), minlength=count).astype(float)
+            partners[: len(rows)] = self.partners[rows]
+            n_views = np.append(np.full(count - 1, views[1]), views[0])
+            n_views[: len(rows)] = np.inf
+            weights = n_views[ends].min(1) / (0.5 * partners[ends].sum(1))
+            H = np.concatenate([H_pairs[to_known], H_links[among]]) * weights[:, None, None]
+            full, q = _laplacian(count, ends, H), 6 * len(rows)
+            solved = np.linalg.pinv(full[q:, q:], rcond=1e-12, hermitian=True) @ full[q:, :q]
+            L = full[:q, :q] - full[:q, q:] @ solved
             which = (6 * rows[:, None] + np.arange(6)).ravel()
-            inner = L @ np.linalg.inv(np.eye(len(which)) + C[np.ix_(which, which)] @ L)
+            inner = L @ np.linalg.inv(np.eye(q) + C[np.ix_(which, which)] @ L)
             squares[k] = before - float(((PC[:, which] @ inner) * PC[:, which]).sum())
         ratio = np.maximum(squares, 0.0) / before if before > 0 else np.ones(len(squares))
         return np.asarray(
             np.sqrt((ratio + self.other_squares) / (1 + self.other_squares)), np.float64
         )
 
+    def _overlapping(self, a: Seen, poses: Float64, b: Seen, others: Float64) -> Bool:
+        """(M, N) whether views at poses are compared with those at others."""
+        similar = poses[:, :3, 2] @ others[:, :3, 2].T > 0
+        return np.asarray((a.overlap(b) >= _OVERLAP) & similar, np.bool_)
+
     def _information(self, a: Seen, b: Seen) -> Float64:
         """(M, 6, 6) information of pairs of views."""
         return np.einsum("k,mkab->mab", self.scales, pair_information(a, b, self.responses))
 
 
-def _without_view(H: Float64) -> Float64:
-    """Information (6q, 6q) of q keyframes by a view with pairs (q, 6, 6), whose pose is unknown."""
-    q = len(H)
-    full = np.zeros((q, 6, q, 6))
-    full[np.arange(q), :, np.arange(q)] = H
-    rows = H.reshape(6 * q, 6)
-    return full.reshape(6 * q, 6 * q) - rows @ np.linalg.pinv(H.sum(0), hermitian=True) @ rows.T
+def _laplacian(count: int, pairs: Intp, H: Float64) -> Float64:
+    """Information (6n, 6n) of the motions of n views by pairs (M, 2) with information (M, 6, 6)."""
+    L = np.zeros((count, count, 6, 6))
+    i, j = pairs.T
+    for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+        np.add.at(L, (a, b), sign * H)
+    return L.swapaxes(1, 2).reshape(6 * count, 6 * count)
 
 
 def _about(centre: Float64, poses: Float64) -> Float64:
