@@ -43,7 +43,7 @@ def circling(
     a = np.radians(300) * t / 10
     at = np.array([centre[0] + radius * np.cos(a), centre[1] + radius * np.sin(a), 1.3])
     d = a + np.pi / 2 - outward
-    return paths.look_at(at, at + [np.cos(d), np.sin(d), -0.15])
+    return paths.look_at(at, at + np.array([np.cos(d), np.sin(d), -0.15]))
 
 
 IN_FLAT = unusual.scenes.build("flat", seed=0)[1].camera_path(3.0)[:2, 3]

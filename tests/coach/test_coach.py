@@ -60,56 +60,70 @@ def test_scales_are_those_of_the_measured_pairs() -> None:
     assert scales(predicted[:, 0], predicted[:, [1, 1]]).min() >= 0
 
 
-def known_turn(angles: list[float]) -> tuple[Known, list[Measured]]:
-    """Keyframes in the box room, each measured relative to the one before."""
-    points, normals = box_room()
-    surfaces = Surfaces(points, normals, 5.0, FIELD)
+def in_world(poses: np.ndarray) -> np.ndarray:
+    """Motions of poses in the world by their right perturbations."""
+    A = np.zeros((6 * len(poses), 6 * len(poses)))
+    for k, T in enumerate(poses):
+        A[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = se3.adjoint(T)
+    return A
+
+
+def known_turn(angles: list[float], weak: int = 0) -> tuple[Known, list[Measured]]:
+    """Keyframes in the box room, each measured relative to the one before, one of them badly."""
+    surfaces = Surfaces(*box_room(), 5.0, FIELD)
     poses = np.stack([turned(a) for a in angles])
     responses, seen = surfaces.responses(), surfaces.seen_from(poses)
     edges = []
     for k in range(1, len(poses)):
         T = se3.inverse(poses[k - 1]) @ poses[k]
-        edges.append(Measured(k - 1, k, T, np.diag([1e5] * 3 + [2e5] * 3)))
+        information = np.diag([1e5] * 3 + [2e5] * 3) / (100 if k == weak else 1)
+        edges.append(Measured(k - 1, k, T, information))
     graph = build_graph([*range(len(poses))], poses, edges)
     C = graph_covariances.GraphCovariances(graph).joint(np.arange(len(poses)))
     assert C is not None
-    A = np.zeros((6 * len(poses), 6 * len(poses)))
-    for k, T in enumerate(poses):
-        A[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = se3.adjoint(T)
-    ages = np.arange(len(poses))[::-1].astype(float)
+    A, n = in_world(poses), len(poses)
     known = Known(
-        surfaces, responses, poses, ages, np.arange(len(poses)), np.zeros(3), seen,
-        A @ C @ A.T, np.array([2e4, 2e3]), np.ones(len(poses)), 1.0, 0.01,
+        surfaces, responses, poses, np.arange(n)[::-1].astype(float), np.arange(n), np.zeros(3),
+        seen, A @ C @ A.T, np.array([2e4, 2e3]), np.ones(n), 1.0, 0.01,
     )  # fmt: skip
     return known, edges
 
 
-def test_predicted_fall_is_that_of_the_graph_with_the_view() -> None:
-    angles = [0.0, 50, 100, 150, 200, 250, 300]
-    known, edges = known_turn(angles)
-    new, views = turned(330), 4.0
-    factor = known.factors_with(new[None], views)[0]
-    # The same by a graph that contains the view, with its pairs as edges.
-    seen = known.surfaces.seen_from(new[None])
-    partners = np.flatnonzero(seen.overlap(known.seen)[0] >= 0.3)
-    assert partners.tolist() == [0, 6], "it sees what the first and the last one see"
-    for k in partners.tolist():
-        kinds = pair_information(seen, known.seen.of([k]), known.responses)[0]
-        H = np.einsum("k,kab->ab", known.scales, kinds) * views / (0.5 * (2 + 1))
-        A = se3.adjoint(new)
-        edges.append(Measured(k, 7, se3.inverse(known.poses[k]) @ new, A.T @ H @ A))
-    graph = build_graph([*range(8)], np.concatenate([known.poses, new[None]]), edges)
+def test_predicted_fall_is_that_of_the_graph_with_the_views() -> None:
+    """A way of two looks from the end of a turn to its beginning, as a graph that contains them."""
+    known, edges = known_turn([0.0, 50, 100, 150, 200, 250, 300])
+    looks = np.stack([turned(325), turned(345)])
+    factor = known.factors_with(looks, [(0, 1)], (4.0, 2.0))[0]
+    seen = known.surfaces.seen_from(looks)
+    pairs = [(k, 7 + n) for n, k in np.argwhere(seen.overlap(known.seen) >= 0.3).tolist()]
+    pairs.append((7, 8))
+    assert {(6, 7), (0, 8)} < {*pairs}, "from what the end sees to what the beginning sees"
+    poses = np.concatenate([known.poses, looks])
+    every = known.surfaces.seen_from(poses)
+    partners = np.append(known.partners, [sum(n in pair for pair in pairs) for n in (7, 8)])
+    for i, j in pairs:
+        kinds = pair_information(every.of([i]), every.of([j]), known.responses)[0]
+        views = 4.0 if (i, j) != (7, 8) and j == 8 else 2.0
+        H = np.einsum("k,kab->ab", known.scales, kinds) * views
+        H /= 0.5 * (partners[i] + partners[j])
+        A = se3.adjoint(poses[j])
+        edges.append(Measured(i, j, se3.inverse(poses[i]) @ poses[j], A.T @ H @ A))
+    graph = build_graph([*range(9)], poses, edges)
     C = graph_covariances.GraphCovariances(graph).joint(np.arange(7))
     assert C is not None
-    A = np.zeros((42, 42))
-    for k, T in enumerate(known.poses):
-        A[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = se3.adjoint(T)
+    A = in_world(known.poses)
     P = known._to_positions
     squares = [np.trace(P @ each @ P.T) for each in (known.covariance, A @ C @ A.T)]
     assert factor == pytest.approx(np.sqrt(squares[1] / squares[0]), rel=1e-4)
     assert factor < 0.95, "the loop is closed"
-    # A view that only the last keyframe overlaps with constrains nothing.
-    assert known.factors_with(turned(280)[None], views)[0] > factor
+    # Another look at what the last two see closes no loop.
+    assert known.factors_with(turned(280)[None], [(0,)], (4.0, 2.0))[0] > 0.95
+
+
+def test_weakest_step_is_found() -> None:
+    known, _ = known_turn([0.0, 40, 80, 120, 160], weak=2)
+    assert np.argmax(known.step_squares) == 1
+    assert known.step_squares[1] == pytest.approx(100 * known.step_squares[0], rel=0.3)
 
 
 def test_advice_closes_the_loop() -> None:
