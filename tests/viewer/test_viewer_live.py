@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from time import sleep
 
 import numpy as np
 import pytest
@@ -75,6 +76,23 @@ def test_live_view_shows_advice_until_tracking_ends(room_recording, monkeypatch)
         assert live._so_far is None
     finally:
         stop(server)
+
+
+def test_live_map_places_the_frames_of_a_camera(room_recording):
+    from tofuse.apps.viewer import LiveMap
+    from tofuse.formats.recordings import open_recording
+
+    recorder = Recorder()
+    frames = list(open_recording(room_recording))[:3]
+    with LiveMap(recorder) as live_map:
+        for k, frame in enumerate(frames):
+            live_map.offer(frame)
+            while len(recorder.frames) <= k:
+                sleep(0.01)
+    assert [index for index, *_ in recorder.frames] == [0, 1, 2]
+    np.testing.assert_array_equal(recorder.frames[0][1], np.eye(4))
+    assert np.linalg.norm(recorder.frames[2][1] - np.eye(4)) > 0.01
+    assert recorder.stages == ["tracking", "recorded"]
 
 
 @pytest.mark.nightly

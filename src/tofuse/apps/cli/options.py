@@ -754,7 +754,7 @@ class Convert(Selection):
     to: Literal["native", "tum", "open3d"] = "native"
 
 
-class Record(Command):
+class Record(Page):
     """Record from a connected camera.
 
     Attributes
@@ -769,6 +769,8 @@ class Record(Command):
         stop after this many frames
     set : NAME=VALUE
         camera option, e.g. serial=1234; may be repeated
+    view
+        map the frames meanwhile, and show the map and where to look next
     """
 
     device: str | None
@@ -776,6 +778,7 @@ class Record(Command):
     seconds: Seconds | None = None
     frames: Count | None = None
     set: list[str] | None = None
+    view: bool = False
 
 
 class Calibrate(Json, Seed, Selection):

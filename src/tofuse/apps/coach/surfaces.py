@@ -170,12 +170,11 @@ def scales(measured: Float64, predicted: Float64) -> Float64:
 
 def _not_negative(A: Float64, b: Float64) -> Float64:
     """Minimiser x >= 0 (2,) of x A x / 2 - b x."""
-    x = np.linalg.lstsq(A, b, rcond=1e-12)[0]
+    x: Float64 = np.linalg.lstsq(A, b, rcond=1e-12)[0]
     if (x >= 0).all():
         return x
     single = np.maximum(b / np.maximum(np.diag(A), 1e-300), 0)
-    gains = single * b
-    return np.where(np.arange(2) == np.argmax(gains), single, 0.0)
+    return np.where(np.arange(2) == np.argmax(single * b), single, 0.0)
 
 
 def _thinned(
