@@ -90,8 +90,10 @@ def main() -> None:
             )
     finite = np.array([r for r in ratios if np.isfinite(r) and r > 0])
     off = np.maximum(finite, 1 / finite)
-    within = int((off <= planning.UNCERTAINTY).sum())
-    print(f"median factor {np.median(off):.2f}; below 1.3: {within} of {len(ratios)}")
+    counts = " and ".join(
+        f"{int((off <= f).sum())} below {f:g}" for f in (1.3, planning.UNCERTAINTY)
+    )
+    print(f"median factor {np.median(off):.2f}; of {len(off)} bounded {counts}")
 
 
 if __name__ == "__main__":

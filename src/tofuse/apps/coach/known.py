@@ -92,17 +92,19 @@ class Known:
     @classmethod
     def of_result(cls, result: Reconstruction, field: Float64 | None) -> Self | None:
         """Return what a result knows, whose camera has a field of view, see `Surfaces`."""
-        graph, model = result.graph, result.mesh or result.cloud
+        graph, mesh, cloud = result.graph, result.mesh, result.cloud
+        points, normals = cloud.points, cloud.normals
+        if mesh is not None and len(mesh.vertices):
+            points, normals = mesh.vertices, mesh.normals
         degree = np.bincount(graph.edges.ravel(), minlength=len(graph.ids))
         core = np.flatnonzero(degree > 1)
-        if len(core) < 2 or model.normals is None or not len(model.normals):
+        if len(core) < 2 or normals is None or not len(normals):
             return None
         positions = core[evenly_spaced(np.arange(len(core)), _KEYFRAMES - 1)]
         centre = graph.poses[positions, :3, 3].mean(0)
         graph = graph.with_poses(_about(centre, graph.poses))
-        points = model.vertices if result.mesh is not None else result.cloud.points
         surfaces = Surfaces.of_points(
-            np.asarray(points - centre, np.float32), model.normals, graph.poses[positions], field
+            np.asarray(points - centre, np.float32), normals, graph.poses[positions], field
         )
         time = {r.index: r.timestamp for r in result.diagnostics.frames}
         times = np.array([time[i] for i in graph.ids.tolist()])
@@ -183,10 +185,15 @@ class Known:
         return replace(known, bound_m=known.bound(known.covariance))
 
     @property
+    def _jacobians(self) -> Float64:
+        """(K, 3, 6) position of each keyframe by its motion."""
+        one = np.broadcast_to(np.eye(3), (len(self.poses), 3, 3))
+        return np.concatenate([one, -se3.hat(self.poses[:, :3, 3])], 2)
+
+    @property
     def _to_positions(self) -> Float64:
         """(3K, 6K) positions by motions, less a rigid motion of all."""
-        k, p = len(self.poses), self.poses[:, :3, 3]
-        J = np.concatenate([np.broadcast_to(np.eye(3), (k, 3, 3)), -se3.hat(p)], 2)
+        J, k = self._jacobians, len(self.poses)
         motion = J.reshape(3 * k, 6)
         spread = np.zeros((k, 3, k, 6))
         spread[np.arange(k), :, np.arange(k)] = J
@@ -200,10 +207,8 @@ class Known:
         D = np.kron(np.diff(np.eye(k), axis=0), np.eye(6))
         blocks = (D @ self.covariance @ D.T).reshape(k - 1, 6, k - 1, 6)
         C = blocks[np.arange(k - 1), :, np.arange(k - 1), :]
-        J = np.concatenate(
-            [np.broadcast_to(np.eye(3), (k, 3, 3)), -se3.hat(self.poses[:, :3, 3])], 2
-        )
-        return np.asarray(np.einsum("kij,kjl,kil->k", J[1:], C, J[1:]), np.float64)
+        J = self._jacobians[1:]
+        return np.asarray(np.einsum("kij,kjl,kil->k", J, C, J), np.float64)
 
     def bound(self, covariance: Float64) -> float:
         """Return the 95 % bound on the rms error of the positions, by a covariance alone."""
