@@ -124,15 +124,19 @@ HEAD = (
 )
 
 
-def numbers(name: str, seed: int, count: int) -> tuple[str, list[float]]:
-    """Compare advice and chance on one walk: the advice, and the columns of the table in mm."""
+def numbers(name: str, seed: int, count: int) -> tuple[str, list[float]] | None:
+    """Compare advice and chance on one walk: the advice, and the columns of the table in mm.
+
+    None if too little is known for advice, as tracking has just begun anew.
+    """
     walk = WALKS[name]
     made = recording(walk, seed, np.zeros((0, 4, 4)))
     config = adapted(from_method("default"), made, 1)
     mapper = Mapper(config, threads=1)
     push_frames(mapper, made, config.window)
     known = Known.of_map(mapper.so_far())
-    assert known is not None
+    if known is None:
+        return None
     before = outcome(made, walk.frames)
     poses, moves = candidates(known)
     advice = best(known)
@@ -163,7 +167,11 @@ def main() -> None:
     print(HEAD, flush=True)
     for name in WALKS:
         for seed in options.seeds if any(part in name for part in options.names) else ():
-            words, row = numbers(name, seed, options.frames)
+            compared = numbers(name, seed, options.frames)
+            if compared is None:
+                print(f"| {name}, {seed} | none: lost | | | | | | | |", flush=True)
+                continue
+            words, row = compared
             found.append(row)
             columns = " | ".join(f"{value:.1f}" for value in row)
             print(f"| {name}, {seed} | {words} | {columns} |", flush=True)

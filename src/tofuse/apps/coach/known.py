@@ -195,9 +195,9 @@ class Known:
         """(3K, 6K) positions by motions, less a rigid motion of all."""
         J, k = self._jacobians, len(self.poses)
         motion = J.reshape(3 * k, 6)
-        spread = np.zeros((k, 3, k, 6))
-        spread[np.arange(k), :, np.arange(k)] = J
-        spread = spread.reshape(3 * k, 6 * k)
+        blocks = np.zeros((k, 3, k, 6))
+        blocks[np.arange(k), :, np.arange(k)] = J
+        spread = blocks.reshape(3 * k, 6 * k)
         return spread - motion @ (np.linalg.pinv(motion, rcond=1e-9) @ spread)
 
     @property

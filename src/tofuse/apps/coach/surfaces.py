@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import PosedView, sampled_points
 from tofuse.engine.views import PreparedView, residual_kernels
@@ -45,7 +45,7 @@ class Seen:
     pixels: Float32
     information: Float32
 
-    def of(self, rows: Sequence[int] | slice) -> Seen:
+    def of(self, rows: Sequence[int] | Intp) -> Seen:
         """Return that of some views."""
         return Seen(self.pixels[rows], self.information[rows])
 
@@ -170,7 +170,7 @@ def scales(measured: Float64, predicted: Float64) -> Float64:
 
 def _not_negative(A: Float64, b: Float64) -> Float64:
     """Minimiser x >= 0 (2,) of x A x / 2 - b x."""
-    x: Float64 = np.linalg.lstsq(A, b, rcond=1e-12)[0]
+    x = np.asarray(np.linalg.lstsq(A, b, rcond=1e-12)[0], np.float64)
     if (x >= 0).all():
         return x
     single = np.maximum(b / np.maximum(np.diag(A), 1e-300), 0)
