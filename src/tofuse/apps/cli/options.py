@@ -710,6 +710,40 @@ class Simulate(Seed, Threads):
     sigma: Metres | None = None
 
 
+class Plan(Json, Seed, Threads, Edited):
+    """Say what cameras would achieve in a place, from a coarse scan of it.
+
+    Each camera is simulated along the path in the scan's model, and what it records is
+    reconstructed.
+
+    Attributes
+    ----------
+    result : RESULT
+        a result of the scan
+    camera : NAME
+        simulated camera; may be repeated (default: all)
+    path : FILE
+        trajectory in the world of the scan (default: its own)
+    tolerance : LENGTH
+        required 95 % bound on the positions of the camera (5mm)
+
+    Exit status
+    -----------
+    0  some camera would do
+    3  none would
+    4  undecided: too close to the tolerance
+    2  nothing was simulated: one line on stderr states the reason
+    """
+
+    home = _LAB
+    reconstructs = True
+
+    result: Path
+    camera: list[str] | None = None
+    path: Path | None = None
+    tolerance: Length = 0.005
+
+
 class Inspect(Json, Source):
     """Show a recording's properties and check it for faults.
 
@@ -746,7 +780,7 @@ class Convert(Selection):
     to: Literal["native", "tum", "open3d"] = "native"
 
 
-class Record(Command):
+class Record(Page):
     """Record from a connected camera.
 
     Attributes
@@ -761,6 +795,8 @@ class Record(Command):
         stop after this many frames
     set : NAME=VALUE
         camera option, e.g. serial=1234; may be repeated
+    view
+        map the frames meanwhile, and show the map and where to look next
     """
 
     device: str | None
@@ -768,6 +804,7 @@ class Record(Command):
     seconds: Seconds | None = None
     frames: Count | None = None
     set: list[str] | None = None
+    view: bool = False
 
 
 class Calibrate(Json, Seed, Selection):
@@ -966,6 +1003,6 @@ class View(Page, Edited):
 
 
 COMMANDS: tuple[type[Command], ...] = (
-    *(Run, Batch, Register, Judge, Merge, Locate, Compare, Repeat, Card, Rig, Demo, Simulate),
+    *(Run, Batch, Register, Judge, Merge, Locate, Compare, Repeat, Card, Rig, Demo, Simulate, Plan),
     *(Inspect, Convert, Record, Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
 )

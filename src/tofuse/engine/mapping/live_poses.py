@@ -13,7 +13,7 @@ from tofuse.engine.alignment import Link
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import job_pool
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Optimiser
+from tofuse.engine.graph import Optimiser, PoseGraph, graph_covariances
 from tofuse.engine.loops import ClosedLoop, Loops
 from tofuse.engine.mapping.frame_log import FrameLog, poses_in_world
 from tofuse.engine.mapping.tracked_graph import TrackedGraph
@@ -114,8 +114,20 @@ class LivePoses:
         if not self._pending or self._n_new < _MIN_NEW_FRACTION * self._n_frames:
             return []
         self._pending, self._n_new = False, 0
-        component_frames = {e.record.index for e in log.of_component(step.component).posed}
-        return [c for c in self._loops.closed if {c.record.i, c.record.j} <= component_frames]
+        return self._closed_among(log.of_component(step.component))
+
+    def _closed_among(self, log: FrameLog) -> list[ClosedLoop]:
+        frames = {e.record.index for e in log.posed}
+        return [c for c in self._loops.closed if {c.record.i, c.record.j} <= frames]
+
+    def graph(self, component: int, log: FrameLog) -> PoseGraph:
+        """Return the graph of a component, given its log, optimised if loops have closed."""
+        loops = self._closed_among(log)
+        poses = poses_in_world(log, {component: np.eye(4)})
+        graph = TrackedGraph(log.posed, poses, ()).build(loops)
+        if not loops:
+            return graph
+        return graph_covariances.accepted_only(self._optimiser.optimise(graph)).graph
 
     def pose(self, step: Step) -> Float64 | None:
         """Return T_world_camera (4, 4); None if lost, or not connected to the first component."""

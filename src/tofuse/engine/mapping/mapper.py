@@ -24,7 +24,7 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.preparation import FilteredFrame, Preparation, Prepared
 from tofuse.engine.parts import check_number
-from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.progress import OnlineMap, Progress, Silent
 from tofuse.engine.results import FrameRecord, Reconstruction
 from tofuse.engine.stopwatch import current, timing
 from tofuse.engine.stored_views import PosedView
@@ -80,6 +80,7 @@ class Mapper:
         self._shift: Float64 = np.zeros(3)
         self._given_tracker = tracker
         self._start_method()
+        self._progress.began(self.so_far)
 
     def _start_method(self) -> None:
         self._preparation = Preparation(self.config)
@@ -244,6 +245,14 @@ class Mapper:
     def views(self) -> Sequence[PosedView[PreparedView]]:
         """Prepared views of frames with a pose, spaced by motion, in the order of their frames."""
         return self._observations.views.views
+
+    def so_far(self) -> OnlineMap:
+        """Return what is known of the component of the latest frame."""
+        log = self._log.of_component(self._component)
+        graph = self._live_poses.graph(self._component, log)
+        times = {e.record.index: e.record.timestamp for e in log.entries}
+        views = [v for v in self.views if v.component == self._component]
+        return OnlineMap(graph, np.array([times[i] for i in graph.ids.tolist()]), views)
 
     def finish(self) -> Reconstruction:
         """Join components, close loops, optimise, refine, fuse and judge.

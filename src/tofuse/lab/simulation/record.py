@@ -80,6 +80,18 @@ class RecordingPlan:
             if progress is not None:
                 progress(k + 1, len(self.raw))
 
+    def recording(self, *, correction: bool = True, progress: Progress | None = None) -> Recording:
+        """Render it in memory, with the true poses as its reference; see `simulate`."""
+        factory_correction = self.correction if correction else None
+        images = [
+            rendered.frame
+            if factory_correction is None
+            else _corrected(factory_correction, rendered.frame)
+            for rendered in self.frames(progress)
+        ]
+        source = ArraySource(images, self.poses, metadata=_metadata(self, correction))
+        return Recording.of(source, f"simulated {self.scene.name}", "simulated")
+
 
 def plan(
     scene: str,
@@ -159,15 +171,7 @@ def simulate_recording(
         axis_offset_m=axis_offset_m,
         passing=passing,
     )
-    factory_correction = planned.correction if correction else None
-    images = [
-        rendered.frame
-        if factory_correction is None
-        else _corrected(factory_correction, rendered.frame)
-        for rendered in planned.frames(progress)
-    ]
-    source = ArraySource(images, planned.poses, metadata=_metadata(planned, correction))
-    return Recording.of(source, f"simulated {scene}", "simulated")
+    return planned.recording(correction=correction, progress=progress)
 
 
 def simulate(
