@@ -1,0 +1,193 @@
+"""Planes of a model, and the regions of a plane through which views measure what is behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from tofuse.apps.mirrors.views import Noise, View
+from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.geometry import se3
+
+# Planes: number of hypotheses and of points that vote, fewest of them on a plane, and the
+# smallest cosine between its normal and those of its points.
+_HYPOTHESES, _VOTERS, _MIN_SHARE, _MIN_COSINE = 300, 6000, 0.01, 0.9
+_MAX_PLANES = 16
+# Rays of a view that are tested, and the smallest cosine between a ray and the plane's normal.
+_RAYS, _MIN_INCIDENCE = 6000, 0.08
+# An opening: minimum number of cells, of rays in a cell, share of an opening's convex hull that it
+# fills, and share of its border where the plane is a surface.
+_MIN_CELLS, _MIN_RAYS, _MIN_CONVEXITY, _MIN_FRAME = 12, 3, 0.7, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A plane ``normal . p = offset`` with (3,) unit normal towards the cameras."""
+
+    normal: Float64
+    offset: float
+
+    def height(self, points: Float64) -> Float64:
+        """Signed distances (N,) of points (N, 3): above 0 in front."""
+        return points @ self.normal - self.offset
+
+    def reflected(self, points: Float64) -> Float64:
+        """Mirror images (N, 3) of points."""
+        return points - 2 * self.height(points)[..., None] * self.normal
+
+    @property
+    def axes(self) -> Float64:
+        """(2, 3) orthonormal axes in the plane."""
+        helper = np.eye(3)[np.argmin(np.abs(self.normal))]
+        first = np.cross(helper, self.normal)
+        first /= np.linalg.norm(first)
+        return np.stack([first, np.cross(self.normal, first)])
+
+    def crossings(self, origin: Float64, rays: Float64) -> Float64:
+        """Distance (N,) along unit rays from a point in front; not finite where they miss it."""
+        slope = -(rays @ self.normal)
+        reached = slope > _MIN_INCIDENCE
+        return np.where(reached, self.height(origin) / np.where(reached, slope, 1), np.inf)
+
+
+def find_planes(
+    points: Float64, normals: Float64, tolerance: float, rng: np.random.Generator
+) -> list[Plane]:
+    """Return the large planes of points (N, 3) with normals, the one with the most points first."""
+    chosen = rng.permutation(len(points))[:_VOTERS]
+    points, normals = points[chosen], normals[chosen]
+    planes: list[Plane] = []
+    while len(planes) < _MAX_PLANES and len(points) > max(3, _MIN_SHARE * len(chosen)):
+        seeds = rng.integers(len(points), size=_HYPOTHESES)
+        n = normals[seeds]
+        d = (n * points[seeds]).sum(1)
+        votes = (np.abs(points @ n.T - d) < tolerance) & (normals @ n.T > _MIN_COSINE)
+        on = votes[:, votes.sum(0).argmax()]
+        if on.sum() < max(3, _MIN_SHARE * len(chosen)):
+            break
+        mean = points[on].mean(0)
+        normal = np.linalg.svd(points[on] - mean, full_matrices=False)[2][2]
+        normal *= np.sign(normal @ normals[on].mean(0)) or 1.0
+        planes.append(Plane(normal, float(normal @ mean)))
+        points, normals = points[~on], normals[~on]
+    return planes
+
+
+@dataclass(frozen=True, eq=False)
+class Opening:
+    """A convex region of a plane through which something is seen.
+
+    Attributes
+    ----------
+    outline
+        (K, 2) corners in the axes of the plane, m.
+    through
+        Share of the rays that reach it which measure something behind it.
+    """
+
+    plane: Plane
+    outline: Float64
+    through: float
+
+    @property
+    def area_m2(self) -> float:
+        """Of the outline."""
+        return float(cv2.contourArea(self.outline.astype(np.float32)))
+
+    @property
+    def corners(self) -> Float64:
+        """(K, 3) the outline in the world."""
+        return self.outline @ self.plane.axes + self.plane.offset * self.plane.normal
+
+    def contains(self, points: Float64) -> Bool:
+        """Whether points (N, 3) of the plane are within the outline."""
+        flat = points @ self.plane.axes.T
+        ahead = np.roll(self.outline, -1, axis=0) - self.outline
+        sides = [
+            e[0] * (flat[:, 1] - p[1]) - e[1] * (flat[:, 0] - p[0])
+            for p, e in zip(self.outline, ahead, strict=True)
+        ]
+        return np.all(np.array(sides) >= 0, axis=0) | np.all(np.array(sides) <= 0, axis=0)
+
+    def behind(self, points: Float64, views: Sequence[View], margin: float) -> Bool:
+        """Whether a view would see each point (N, 3), in the air behind the plane, through it."""
+        out = np.zeros(len(points), bool)
+        rows = np.flatnonzero(self.plane.height(points) < -margin)
+        for view in views:
+            if self.plane.height(view.origin) <= margin or not len(rows):
+                continue
+            rays = points[rows] - view.origin
+            at = self.plane.height(view.origin) / -(rays @ self.plane.normal)
+            out[rows] |= self.contains(view.origin + at[:, None] * rays)
+        return out
+
+
+def find_openings(plane: Plane, views: Sequence[View], noise: Noise) -> list[Opening]:
+    """Return the openings of a plane: regions where more rays pass than end in it."""
+    places, passed, pitches = [], [], []
+    margin = 2 * noise.tolerance_m
+    for view in views:
+        if plane.height(view.origin) < 2 * margin:
+            continue
+        step = max(1, int(np.sqrt(view.ranges.size / _RAYS)))
+        measured = view.ranges[::step, ::step].ravel()
+        xy = view.camera.rays()[::step, ::step].reshape(-1, 2).astype(float)
+        rays = np.c_[xy, np.ones(len(xy))]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = rays @ view.T_world_camera[:3, :3].T
+        reached = plane.crossings(view.origin, rays)
+        depth = (measured - reached) * np.abs(rays @ plane.normal)
+        used = (measured > 0) & np.isfinite(reached) & (depth > -margin)
+        q = view.origin + reached[used, None] * rays[used]
+        places.append(q @ plane.axes.T)
+        passed.append(depth[used] > margin)
+        pitches.append(np.median(reached[used]) if used.any() else np.nan)
+    if not places or not sum(map(len, places)):
+        return []
+    flat, through = np.concatenate(places), np.concatenate(passed)
+    ends = flat[~through]
+    if len(ends) < _MIN_CELLS * _MIN_RAYS or not through.any():
+        return []
+    # What is far beyond the surface in the plane is not an opening in it.
+    low, high = np.quantile(ends, 0.005, axis=0) - 0.1, np.quantile(ends, 0.995, axis=0) + 0.1
+    rays_per_view = len(flat) / len(places)
+    field = np.tan(views[0].corner_rad) * 2 / np.sqrt(2 * min(_RAYS, views[0].ranges.size))
+    cell = float(max(field * np.nanmedian(pitches), (high - low).max() / 1000))
+    del rays_per_view
+    shape = np.ceil((high - low) / cell).astype(int)
+    return _regions(plane, flat, through, low, cell, shape)
+
+
+def _regions(
+    plane: Plane, flat: Float64, through: Bool, low: Float64, cell: float, shape: Float64
+) -> list[Opening]:
+    """Label the cells of a grid in the plane through which rays pass."""
+    edges = [low[k] + cell * np.arange(shape[k] + 1) for k in range(2)]
+    total = np.histogram2d(*flat.T, bins=edges)[0].astype(np.float32)
+    open_ = np.histogram2d(*flat[through].T, bins=edges)[0].astype(np.float32)
+    box = {"ksize": (3, 3), "normalize": False, "borderType": cv2.BORDER_CONSTANT}
+    rays, passing = (cv2.boxFilter(x, -1, **box) for x in (total, open_))
+    is_open = ((rays >= _MIN_RAYS) & (passing > 0.5 * rays)).astype(np.uint8)
+    is_surface = ((rays >= _MIN_RAYS) & (passing < 0.5 * rays)).astype(np.uint8)
+    is_open = cv2.morphologyEx(is_open, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    count, labels = cv2.connectedComponents(is_open)
+    openings = []
+    for label in range(1, count):
+        region = (labels == label).astype(np.uint8)
+        cells = int(region.sum())
+        if cells < _MIN_CELLS:
+            continue
+        rows, columns = np.nonzero(region)
+        square = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
+        places = (np.stack([rows, columns], 1)[:, None] + square).reshape(-1, 2)
+        hull = cv2.convexHull(places.astype(np.float32))[:, 0]
+        border = cv2.dilate(region, np.ones((5, 5), np.uint8)) > region
+        convexity = cells / max(cv2.contourArea(hull), 1e-9)
+        if convexity < _MIN_CONVEXITY or is_surface[border].mean() < _MIN_FRAME:
+            continue
+        share = float(open_[region > 0].sum() / total[region > 0].sum())
+        openings.append(Opening(plane, low + cell * hull.astype(float), share))
+    return openings
