@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from tofuse.apps.mirrors.views import Noise, View
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.geometry import se3
 
 # Planes: number of hypotheses and of points that vote, fewest of them on a plane, and the
 # smallest cosine between its normal and those of its points.
@@ -20,7 +19,9 @@ _MAX_PLANES = 16
 _RAYS, _MIN_INCIDENCE = 6000, 0.08
 # An opening: minimum number of cells, of rays in a cell, share of an opening's convex hull that it
 # fills, and share of its border where the plane is a surface.
-_MIN_CELLS, _MIN_RAYS, _MIN_CONVEXITY, _MIN_FRAME = 12, 3, 0.7, 0.3
+_MIN_CELLS, _MIN_RAYS, _MIN_CONVEXITY, _MIN_FRAME = 12, 3, 0.85, 0.7
+# Glass: smallest share of a cell's rays that end in it.
+_ENDING = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +85,13 @@ class Opening:
     ----------
     outline
         (K, 2) corners in the axes of the plane, m.
-    through
-        Share of the rays that reach it which measure something behind it.
+    mixed
+        Share of it where some rays end in the plane: of glass, which other views measure.
     """
 
     plane: Plane
     outline: Float64
-    through: float
+    mixed: float
 
     @property
     def area_m2(self) -> float:
@@ -112,17 +113,32 @@ class Opening:
         ]
         return np.all(np.array(sides) >= 0, axis=0) | np.all(np.array(sides) <= 0, axis=0)
 
-    def behind(self, points: Float64, views: Sequence[View], margin: float) -> Bool:
-        """Whether a view would see each point (N, 3), in the air behind the plane, through it."""
+    def behind(self, points: Float64, origins: Float64) -> Bool:
+        """Whether each point (N, 3) is seen through the opening from one of the origins (M, 3)."""
         out = np.zeros(len(points), bool)
-        rows = np.flatnonzero(self.plane.height(points) < -margin)
-        for view in views:
-            if self.plane.height(view.origin) <= margin or not len(rows):
-                continue
-            rays = points[rows] - view.origin
-            at = self.plane.height(view.origin) / -(rays @ self.plane.normal)
-            out[rows] |= self.contains(view.origin + at[:, None] * rays)
+        rows = np.flatnonzero(self.plane.height(points) < 0)
+        for origin in origins[self.plane.height(origins) > 0]:
+            rays = points[rows] - origin
+            at = self.plane.height(origin) / -(rays @ self.plane.normal)
+            out[rows] = self.contains(origin + at[:, None] * rays)
+            rows = rows[~out[rows]]
         return out
+
+    def joined(self, other: Opening) -> Opening:
+        """Return the smallest convex opening of both, in this one's plane."""
+        corners = np.concatenate([self.corners, other.corners]) @ self.plane.axes.T
+        return replace(self, outline=_hull(corners))
+
+    def grown(self, margin: float) -> Opening:
+        """Return the opening, larger by `margin` m to all sides."""
+        turn = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+        circle = margin * np.stack([np.cos(turn), np.sin(turn)], -1)
+        return replace(self, outline=_hull((self.outline[:, None] + circle).reshape(-1, 2)))
+
+
+def _hull(points: Float64) -> Float64:
+    """Corners (K, 2) of the convex hull of points (N, 2)."""
+    return np.asarray(cv2.convexHull(points.astype(np.float32))[:, 0], np.float64)
 
 
 def find_openings(plane: Plane, views: Sequence[View], noise: Noise) -> list[Opening]:
@@ -153,10 +169,8 @@ def find_openings(plane: Plane, views: Sequence[View], noise: Noise) -> list[Ope
         return []
     # What is far beyond the surface in the plane is not an opening in it.
     low, high = np.quantile(ends, 0.005, axis=0) - 0.1, np.quantile(ends, 0.995, axis=0) + 0.1
-    rays_per_view = len(flat) / len(places)
     field = np.tan(views[0].corner_rad) * 2 / np.sqrt(2 * min(_RAYS, views[0].ranges.size))
     cell = float(max(field * np.nanmedian(pitches), (high - low).max() / 1000))
-    del rays_per_view
     shape = np.ceil((high - low) / cell).astype(int)
     return _regions(plane, flat, through, low, cell, shape)
 
@@ -183,11 +197,12 @@ def _regions(
         rows, columns = np.nonzero(region)
         square = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
         places = (np.stack([rows, columns], 1)[:, None] + square).reshape(-1, 2)
-        hull = cv2.convexHull(places.astype(np.float32))[:, 0]
+        hull = _hull(places)
         border = cv2.dilate(region, np.ones((5, 5), np.uint8)) > region
-        convexity = cells / max(cv2.contourArea(hull), 1e-9)
-        if convexity < _MIN_CONVEXITY or is_surface[border].mean() < _MIN_FRAME:
+        convexity = cells / max(cv2.contourArea(hull.astype(np.float32)), 1e-9)
+        framed = float(is_surface[border].mean())
+        if convexity < _MIN_CONVEXITY or framed < _MIN_FRAME:
             continue
-        share = float(open_[region > 0].sum() / total[region > 0].sum())
-        openings.append(Opening(plane, low + cell * hull.astype(float), share))
+        mixed = float((passing < (1 - _ENDING) * rays)[region > 0].mean())
+        openings.append(Opening(plane, low + cell * hull, mixed))
     return openings

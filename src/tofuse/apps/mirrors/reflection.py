@@ -9,10 +9,9 @@ two, by their strengths; where one of them is negligible, it is the other one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from tofuse.apps.mirrors.openings import Opening, Plane
 from tofuse.apps.mirrors.views import Noise, View
@@ -21,8 +20,14 @@ from tofuse.engine.arrays import Bool, Float64, Int64
 _REFLECTANCE = 0.9  # of a mirror; the result hardly depends on it
 # Beyond this multiple of the corner's angle, lamps don't shine.
 _LAMP = 1.3
-# Edge of a patch, whose points are one piece of evidence, relative to the extent of the opening.
-_PATCH = 0.15
+# Planes that are compared: wrong by so much.
+_SHIFTS_M, _TILT_RAD = (-0.4, -0.2, 0.2, 0.4), 0.2
+# Edge of a patch of the room, whose points are one piece of evidence, and how many it has.
+_PATCH_M, _MIN_IN_PATCH = 0.3, 5
+# Fewest patches that can decide, and smallest share of agreeing pixels worth a comparison.
+MIN_PATCHES, _MIN_SHARE = 6, 0.5
+# A mirror explains this share of the pixels that chance does not; chance before any comparison.
+_EXPLAINED, _CHANCE = 0.7, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +46,8 @@ class Prediction:
         (N,) 0 where the camera does not illuminate it directly.
     measured
         (N,) m.
+    pixels
+        (N,) numbers of the pixels, through all views.
     """
 
     points: Float64
@@ -48,6 +55,7 @@ class Prediction:
     direct: Float64
     direct_share: Float64
     measured: Float64
+    pixels: Int64
 
     def __len__(self) -> int:
         return len(self.points)
@@ -67,33 +75,41 @@ class Prediction:
 
 
 def predict(
-    opening: Opening, views: Sequence[View], points: Float64, normals: Float64, noise: Noise
+    opening: Opening,
+    mirror: Plane,
+    views: Sequence[View],
+    points: Float64,
+    normals: Float64,
+    noise: Noise,
 ) -> Prediction:
-    """Predict what views see through an opening if there is a mirror in it.
+    """Predict what views see through an opening if there is a mirror behind it.
 
     Parameters
     ----------
+    mirror
+        The plane that reflects: that of the opening, or a wrong one for comparison.
     points, normals
         (N, 3) of the model.
     """
     plane = opening.plane
     in_front = plane.height(points) > 2 * noise.tolerance_m
     points, normals = points[in_front], normals[in_front]
-    phantom = plane.reflected(points)
-    parts = [_empty()]
+    phantom = mirror.reflected(points)
+    none = np.zeros((0, 3))
+    parts = [Prediction(none, none, *np.zeros((3, 0)), np.zeros(0, np.int64))]
+    first = 0
     for view in views:
         if plane.height(view.origin) > 2 * noise.tolerance_m:
-            parts.append(_of_view(opening, view, points, normals, phantom, noise))
-    names = ("points", "origins", "direct", "direct_share", "measured")
+            part = _of_view(opening, mirror, view, points, normals, phantom, noise)
+            parts.append(replace(part, pixels=part.pixels + first))
+        first += view.ranges.size
+    names = [field.name for field in fields(Prediction)]
     return Prediction(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
-
-
-def _empty() -> Prediction:
-    return Prediction(np.zeros((0, 3)), np.zeros((0, 3)), *np.zeros((3, 0)))
 
 
 def _of_view(
     opening: Opening,
+    mirror: Plane,
     view: View,
     points: Float64,
     normals: Float64,
@@ -112,6 +128,7 @@ def _of_view(
         used &= view.at(view.amplitude, pixels) >= noise.weakest
     used[used] = opening.contains(origin + reached[used, None] * rays[used])
     rows, rays, length, measured = rows[used], rays[used], length[used], measured[used]
+    number = np.ravel_multi_index(tuple(pixels[used].T), view.ranges.shape)
     p, n = points[rows], normals[rows]
     in_camera, at, inside = view.project(p)
     distance = np.linalg.norm(in_camera, axis=1)
@@ -120,7 +137,7 @@ def _of_view(
     lit = inside & ((seen <= 0) | (seen > distance - 2 * noise.tolerance_m))
     # Outside of the image, whether it is lit is not known.
     known = inside | (angle > _LAMP * view.corner_rad)
-    reflected = rays - 2 * (rays @ plane.normal)[:, None] * plane.normal
+    reflected = rays - 2 * (rays @ mirror.normal)[:, None] * mirror.normal
     by_mirror = _REFLECTANCE * np.maximum(-(n * reflected).sum(1), 0) / length**2
     toward = (p - origin) / np.maximum(distance, 1e-9)[:, None]
     direct = lit * np.maximum(-(n * toward).sum(1), 0) / np.maximum(distance, 1e-9) ** 2
@@ -131,36 +148,82 @@ def _of_view(
         distance[known],
         share[known],
         measured[known],
+        number[known],
     )
 
 
-def refined(opening: Opening, prediction: Prediction, noise: Noise) -> Opening:
-    """Move the plane of an opening to where the reflection agrees best."""
-    centre = opening.corners.mean(0)
+@dataclass(frozen=True)
+class Evidence:
+    """For or against a mirror in an opening.
 
-    def moved(x: Float64) -> Plane:
-        normal = opening.plane.normal + x[:2] @ opening.plane.axes
+    Attributes
+    ----------
+    share
+        Of the pixels whose ranges agree with the reflection.
+    log_ratio
+        Logarithm of the likelihood ratio of a mirror to chance.
+    patches
+        How many patches of the room should be seen in the mirror: the independent pieces.
+    """
+
+    share: float
+    log_ratio: float
+    patches: int
+
+
+def weigh(
+    opening: Opening,
+    views: Sequence[View],
+    points: Float64,
+    normals: Float64,
+    noise: Noise,
+    *,
+    compare: bool = True,
+) -> Evidence:
+    """Weigh whether an opening is a mirror, or only see how far it agrees.
+
+    The arguments are those of `predict`.
+
+    A pixel tells little if wrong planes predict its range as well: a floor is its own reflection in
+    all walls, and directly illuminated surfaces are seen at nearly the same range in any mirror.
+    """
+    seen = predict(opening, opening.plane, views, points, normals, noise)
+    agrees = seen.coincides(opening.plane, noise)
+    found = patches(seen)
+    share = float(agrees.mean()) if len(seen) else 0.0
+    if not compare or found < MIN_PATCHES or share < _MIN_SHARE:
+        return Evidence(share, 0.0, found)
+    by_chance, compared = np.full(len(seen), _CHANCE), np.ones(len(seen))
+    for plane in wrong_planes(opening):
+        other = predict(opening, plane, views, points, normals, noise)
+        numbers, first = np.unique(other.pixels, return_index=True)
+        if not len(numbers):
+            continue
+        at = np.searchsorted(numbers, seen.pixels).clip(max=len(numbers) - 1)
+        both = numbers[at] == seen.pixels
+        by_chance += both * other.coincides(plane, noise)[first][at]
+        compared += both
+    chance = by_chance / compared
+    ratios = np.where(agrees, (chance + _EXPLAINED * (1 - chance)) / chance, 1 - _EXPLAINED)
+    log_ratio = found * float(np.log(ratios).mean())
+    return Evidence(share, log_ratio, found)
+
+
+def wrong_planes(opening: Opening) -> list[Plane]:
+    """Return planes that would be mirrors by chance only: shifted and tilted ones."""
+    plane, centre = opening.plane, opening.corners.mean(0)
+    shifted = [Plane(plane.normal, plane.offset + s) for s in _SHIFTS_M]
+    tilted = []
+    for axis in (*plane.axes, *-plane.axes):
+        normal = plane.normal + np.tan(_TILT_RAD) * axis
         normal /= np.linalg.norm(normal)
-        return Plane(normal, float(normal @ centre + x[2]))
-
-    found = least_squares(
-        lambda x: prediction.residuals(moved(x)) / noise.tolerance_m,
-        np.zeros(3),
-        loss="cauchy",
-        max_nfev=20,
-    )
-    plane = moved(found.x)
-    corners = opening.corners
-    corners = corners - plane.height(corners)[:, None] * plane.normal
-    return replace(opening, plane=plane, outline=corners @ plane.axes.T)
+        tilted.append(Plane(normal, float(normal @ centre)))
+    return shifted + tilted
 
 
-def agreement(prediction: Prediction, agrees: Bool, patch: float) -> tuple[int, int]:
-    """Return the numbers of patches of the room that are seen, and that are seen in the mirror."""
+def patches(prediction: Prediction) -> int:
+    """Return how many patches of the room should be seen in the mirror."""
     if not len(prediction):
-        return 0, 0
-    cells = np.floor(prediction.points / patch).astype(np.int64)
-    _, patches = np.unique(cells, axis=0, return_inverse=True)
-    count = np.bincount(patches.ravel())
-    hits = np.bincount(patches.ravel(), agrees)
-    return len(count), int((hits > 0.5 * count).sum())
+        return 0
+    cells = np.floor(prediction.points / _PATCH_M).astype(np.int64)
+    return int((np.unique(cells, axis=0, return_counts=True)[1] >= _MIN_IN_PATCH).sum())
