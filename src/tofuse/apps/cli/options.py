@@ -165,6 +165,8 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
         don't draw report.html, which takes up to half of a short run
     share
         write share.html and share.usdz as well: the model alone, to send and to show in a room
+    mirrors
+        find mirrors and glass, and cut the rooms behind mirrors out of the model
     texture
         texture the surface in mesh.glb and in the report, of colour images or else of amplitudes
         (default: if there are enough colour images)
@@ -227,6 +229,7 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     overwrite: bool = False
     no_report: bool = False
     share: bool = False
+    mirrors: bool = False
     texture: bool | None = None
     faces: Count | None = None
     voxel: Length | None = None

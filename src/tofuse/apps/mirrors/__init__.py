@@ -10,6 +10,6 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.apps.mirrors.finding import find_mirrors
+    from tofuse.apps.mirrors.finding import find_mirrors, sentences
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -17,11 +17,11 @@ from tofuse.engine.fusion import Cloud
 from tofuse.engine.results import Mirror, Reconstruction
 
 # A mirror is this much likelier than chance (logarithm), and agrees in this share of its pixels.
-_MIN_LOG_RATIO, _MIN_SHARE = 7.0, 0.6
+_MIN_LOG_RATIO, _MIN_SHARE = 7.0, 0.55
 # Points that predict, views of a first look, and the smallest share there for a second one.
 _POINTS, _FIRST_LOOK, _PROMISING = 30_000, 10, 0.4
 # Glass: most of its cells are measured by some views and passed by others.
-_GLASS = 0.5
+_GLASS, _MIN_GLASS_M2 = 0.5, 0.1
 _ORIGINS = 300  # cameras from which points behind a mirror may be seen
 _MAX_GROWTH = 1.25  # of the area, by joining parts of one mirror
 
@@ -67,7 +67,7 @@ def _weighed(
 ) -> Evidence:
     step = max(1, len(views) // _FIRST_LOOK)
     first = weigh(opening, views[::step], points, normals, noise, compare=False)
-    if step > 1 and first.patches and first.share < _PROMISING:
+    if not opening.whole or (step > 1 and first.patches and first.share < _PROMISING):
         return first
     return weigh(opening, views, points, normals, noise)
 
@@ -84,7 +84,7 @@ def _mirrors_in(weighed: Sequence[tuple[Opening, Evidence]]) -> list[_Found]:
                 accepted[k] = joined, known, kind
                 break
         else:
-            if evidence.log_ratio > _MIN_LOG_RATIO:
+            if opening.whole and evidence.log_ratio > _MIN_LOG_RATIO:
                 accepted.append((opening, evidence, "mirror"))
     return accepted
 
@@ -94,7 +94,8 @@ def _glass_in(weighed: Sequence[tuple[Opening, Evidence]]) -> list[_Found]:
     return [
         (o, e, "glass" if e.patches >= MIN_PATCHES else "glass or mirror")
         for o, e in weighed
-        if o.mixed > _GLASS and not (e.log_ratio > _MIN_LOG_RATIO and e.share > _MIN_SHARE)
+        if o.whole and o.mixed > _GLASS and o.area_m2 > _MIN_GLASS_M2
+        if e.log_ratio < _MIN_LOG_RATIO
     ]
 
 
@@ -172,3 +173,13 @@ def _kept(cloud: Cloud, rows: Bool) -> Cloud:
         cloud.points[rows], of(cloud.normals), of(cloud.color), cloud.views[rows], of(cloud.sigma)
     )
 
+
+def sentences(result: Reconstruction) -> list[str]:
+    """Return a sentence for each mirror and pane of glass."""
+    done = {"mirror": "were cut out of the model", "glass": "are behind the glass"}
+    return [
+        f"{m.kind.capitalize()} of {m.area_m2:.2f} m² at "
+        f"({', '.join(f'{x:.2f}' for x in m.corners.mean(0))}) m: "
+        f"{len(m.points):,} points {done.get(m.kind, 'are behind or in it')}."
+        for m in result.mirrors
+    ]

@@ -18,8 +18,9 @@ _MAX_PLANES = 16
 # Rays of a view that are tested, and the smallest cosine between a ray and the plane's normal.
 _RAYS, _MIN_INCIDENCE = 6000, 0.08
 # An opening: minimum number of cells, of rays in a cell, share of an opening's convex hull that it
-# fills, and share of its border where the plane is a surface.
-_MIN_CELLS, _MIN_RAYS, _MIN_CONVEXITY, _MIN_FRAME = 12, 3, 0.85, 0.7
+# fills, and share of its border where the plane is a surface; the last two also for a whole one.
+_MIN_CELLS, _MIN_RAYS, _MIN_CONVEXITY, _MIN_FRAME = 12, 3, 0.7, 0.3
+_WHOLE_CONVEXITY, _WHOLE_FRAME = 0.85, 0.7
 # Glass: smallest share of a cell's rays that end in it.
 _ENDING = 0.2
 
@@ -87,11 +88,14 @@ class Opening:
         (K, 2) corners in the axes of the plane, m.
     mixed
         Share of it where some rays end in the plane: of glass, which other views measure.
+    whole
+        Whether it is convex and surrounded by surface; else it may be a part of an opening.
     """
 
     plane: Plane
     outline: Float64
     mixed: float
+    whole: bool
 
     @property
     def area_m2(self) -> float:
@@ -203,6 +207,7 @@ def _regions(
         framed = float(is_surface[border].mean())
         if convexity < _MIN_CONVEXITY or framed < _MIN_FRAME:
             continue
+        whole = convexity > _WHOLE_CONVEXITY and framed > _WHOLE_FRAME
         mixed = float((passing < (1 - _ENDING) * rays)[region > 0].mean())
-        openings.append(Opening(plane, low + cell * hull, mixed))
+        openings.append(Opening(plane, low + cell * hull, mixed, whole))
     return openings

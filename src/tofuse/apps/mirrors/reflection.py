@@ -23,11 +23,12 @@ _LAMP = 1.3
 # Planes that are compared: wrong by so much.
 _SHIFTS_M, _TILT_RAD = (-0.4, -0.2, 0.2, 0.4), 0.2
 # Edge of a patch of the room, whose points are one piece of evidence, and how many it has.
-_PATCH_M, _MIN_IN_PATCH = 0.3, 5
+_PATCH_M, _MIN_IN_PATCH = 0.2, 5
 # Fewest patches that can decide, and smallest share of agreeing pixels worth a comparison.
 MIN_PATCHES, _MIN_SHARE = 6, 0.5
-# A mirror explains this share of the pixels that chance does not; chance before any comparison.
-_EXPLAINED, _CHANCE = 0.7, 0.3
+# A mirror explains one of these shares of the pixels that chance does not: weak pixels, which are
+# unwrapped wrongly, are not explained. Chance before any comparison.
+_EXPLAINED, _CHANCE = np.linspace(0.05, 0.95, 10), 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,9 +205,9 @@ def weigh(
         by_chance += both * other.coincides(plane, noise)[first][at]
         compared += both
     chance = by_chance / compared
-    ratios = np.where(agrees, (chance + _EXPLAINED * (1 - chance)) / chance, 1 - _EXPLAINED)
-    log_ratio = found * float(np.log(ratios).mean())
-    return Evidence(share, log_ratio, found)
+    explained = _EXPLAINED[:, None]
+    ratios = np.where(agrees, (chance + explained * (1 - chance)) / chance, 1 - explained)
+    return Evidence(share, found * float(np.log(ratios).mean(1).max()), found)
 
 
 def wrong_planes(opening: Opening) -> list[Plane]:

@@ -71,7 +71,12 @@ def hang_mirror(
         If no visible part of a wall has room for it.
     """
     rng = np.random.default_rng([seed, 5])
-    fx, fy, width, height = model.camera.fx, model.camera.fy, model.camera.width, model.camera.height
+    fx, fy, width, height = (
+        model.camera.fx,
+        model.camera.fy,
+        model.camera.width,
+        model.camera.height,
+    )
     for _ in range(_ATTEMPTS):
         T = sequence.T_room_camera(float(rng.choice(times)))
         ray = np.array([*rng.uniform(-0.2, 0.2, 2) * (width / fx, height / fy), 1.0])
