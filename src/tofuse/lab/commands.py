@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from tofuse.apps.cli import options as cli
 from tofuse.apps.cli import print_result, progress_for
+from tofuse.engine.errors import InputError
 
 
 def demo(arguments: cli.Demo) -> int:
@@ -49,6 +50,7 @@ def simulate(arguments: cli.Simulate) -> int:
             first=arguments.first or 0,
             texture=not arguments.uniform,
             passing=passing,
+            mirror=_size(arguments.mirror),
             without=tuple(w for w in arguments.without.split(",") if w),
             correction=not arguments.no_correction,
             imu=arguments.imu,
@@ -57,6 +59,22 @@ def simulate(arguments: cli.Simulate) -> int:
         )
     print(f"{frames} frames in {arguments.out}")
     return 0
+
+
+def _size(text: str | None) -> tuple[float, float] | None:
+    """Return width and height of a mirror, m."""
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    try:
+        width, height = (float(part) for part in parts)
+    except ValueError:
+        width = height = 0.0
+    if not (0.05 <= width <= 10 and 0.05 <= height <= 10):
+        raise InputError(
+            f"is {text!r}", where="--mirror", remedy="give width x height in m, such as 0.8x1.2"
+        )
+    return width, height
 
 
 def experiments(arguments: cli.Experiments) -> int:

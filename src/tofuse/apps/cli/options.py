@@ -659,6 +659,8 @@ class Simulate(Seed, Threads):
         a person walks through the view, covering this fraction of it, 0 to 1
     with_box : RATIO
         a box slides through the view, covering this fraction of it, 0 to 1
+    mirror : WxH
+        a mirror of this size in m hangs on a wall in view, e.g. 0.8x1.2
     without : EFFECTS
         sensor errors to disable, separated by commas, or `all`
     no_correction
@@ -681,6 +683,7 @@ class Simulate(Seed, Threads):
     uniform: bool = False
     with_person: Ratio | None = None
     with_box: Ratio | None = None
+    mirror: str | None = None
     without: str = ""
     no_correction: bool = False
     imu: bool = False
