@@ -17,6 +17,7 @@ import unusual
 from tofuse.apps.mirrors import find_mirrors
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
+from tofuse.engine.results import Reconstruction
 from tofuse.lab.simulation.mirrors import Mirror, hang_mirror
 from tofuse.lab.world import scene as scenes
 from unusual import Unusual, known
@@ -105,12 +106,31 @@ def _left_behind(points: np.ndarray, mirror: Mirror) -> int:
     return int((inside.all(1) & (p @ mirror.normal < -0.2)).sum())
 
 
+def draw(before: Reconstruction, after: Reconstruction, T: np.ndarray, path: str) -> None:
+    """Draw both models from above, between floor and ceiling, with the mirrors found."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharex=True, sharey=True)
+    for axis, result, title in zip(axes, (before, after), ("without", "with"), strict=True):
+        p = se3.transform(se3.inverse(T), result.cloud.points.astype(float))
+        p = p[(p[:, 2] > 0.3) & (p[:, 2] < 2.2)]
+        axis.plot(p[:, 0], p[:, 1], ",", color="#456", alpha=0.6)
+        for m in after.mirrors:
+            if m.kind == "mirror":
+                line = se3.transform(se3.inverse(T), m.corners)[:, :2]
+                axis.plot(*line.T, color="#e66100", linewidth=2)
+        axis.set(aspect="equal", title=f"{title} --mirrors", xlabel="x, m", ylabel="y, m")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
 def main() -> None:
     """See the module's docstring."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recordings", nargs="*")
     parser.add_argument("--cases", type=int, default=None)
     parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--picture", help="draw one room before and after, and stop")
     arguments = parser.parse_args()
     if arguments.recordings:
         for path in arguments.recordings:
@@ -119,6 +139,11 @@ def main() -> None:
             found = find_mirrors(recording, tofuse.reconstruct(recording, threads=1))
             kinds = [f"{m.kind} of {m.area_m2:.2f} m²" for m in found.mirrors]
             print(f"{path}: {len(recording)} frames: {', '.join(kinds) or 'none'}", flush=True)
+        return
+    if arguments.picture:
+        recording, _, T = simulated("empty-room", "ifm-o3r", 1, mirror=True)
+        result = tofuse.reconstruct(recording, threads=1)
+        draw(result, find_mirrors(recording, result), T, arguments.picture)
         return
     print("| scene | camera | seed | area, m² | found | false | glass | left | ATE, mm | CPU s |")
     print("|---|---|---|---|---|---|---|---|---|---|")
