@@ -120,7 +120,7 @@ def _applied(
             cloud = _kept(cloud, ~behind)
             if mesh is not None:
                 inside = ~_behind(opening, mesh.vertices, views, origins, margin)
-                mesh = mesh.rows(inside[mesh.faces].all(1))
+                mesh = mesh.rows(np.asarray(inside[mesh.faces].all(1), np.bool_))
         mirrors.append(
             Mirror(
                 kind,

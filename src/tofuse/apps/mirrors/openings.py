@@ -184,14 +184,22 @@ def _regions(
 ) -> list[Opening]:
     """Label the cells of a grid in the plane through which rays pass."""
     edges = [low[k] + cell * np.arange(shape[k] + 1) for k in range(2)]
-    total = np.histogram2d(*flat.T, bins=edges)[0].astype(np.float32)
-    open_ = np.histogram2d(*flat[through].T, bins=edges)[0].astype(np.float32)
-    box = {"ksize": (3, 3), "normalize": False, "borderType": cv2.BORDER_CONSTANT}
-    rays, passing = (cv2.boxFilter(x, -1, **box) for x in (total, open_))
+    rays, passing = (
+        cv2.boxFilter(
+            np.histogram2d(p[:, 0], p[:, 1], bins=edges)[0],
+            -1,
+            (3, 3),
+            normalize=False,
+            borderType=cv2.BORDER_CONSTANT,
+        )
+        for p in (flat, flat[through])
+    )
     is_open = ((rays >= _MIN_RAYS) & (passing > 0.5 * rays)).astype(np.uint8)
     is_surface = ((rays >= _MIN_RAYS) & (passing < 0.5 * rays)).astype(np.uint8)
-    is_open = cv2.morphologyEx(is_open, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    count, labels = cv2.connectedComponents(is_open)
+    # Without what is thinner than three cells.
+    count, labels = cv2.connectedComponents(
+        cv2.morphologyEx(is_open, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    )
     openings = []
     for label in range(1, count):
         region = (labels == label).astype(np.uint8)

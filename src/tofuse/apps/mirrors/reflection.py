@@ -96,8 +96,10 @@ def predict(
     in_front = plane.height(points) > 2 * noise.tolerance_m
     points, normals = points[in_front], normals[in_front]
     phantom = mirror.reflected(points)
-    none = np.zeros((0, 3))
-    parts = [Prediction(none, none, *np.zeros((3, 0)), np.zeros(0, np.int64))]
+    points_of_none, none = np.zeros((0, 3)), np.zeros(0)
+    parts = [
+        Prediction(points_of_none, points_of_none, none, none, none, np.zeros(0, np.int64)),
+    ]
     first = 0
     for view in views:
         if plane.height(view.origin) > 2 * noise.tolerance_m:
