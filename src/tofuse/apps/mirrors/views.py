@@ -132,6 +132,8 @@ class Noise:
             ranges.append(distance[valid])
             if view.amplitude is not None:
                 amplitudes.append(view.at(view.amplitude, pixels)[valid])
+        if not sum(map(len, residuals)):
+            return cls(np.inf, 1.0, 0.0)
         return cls(
             float(np.quantile(np.concatenate(residuals), _TOLERANCE_QUANTILE)),
             float(np.median(np.concatenate(ranges))),
