@@ -6,6 +6,7 @@ from math import inf
 
 from tofuse.apps.cli import options as cli
 from tofuse.apps.cli import print_result, progress_for, progress_unless_json, show
+from tofuse.engine.errors import InputError
 
 # Colour and exit status of the decisions of a plan, the best first.
 _DECISIONS = {"enough": ("green", 0), "undecided": ("yellow", 4), "not enough": ("red", 3)}
@@ -54,6 +55,7 @@ def simulate(arguments: cli.Simulate) -> int:
             first=arguments.first or 0,
             texture=not arguments.uniform,
             passing=passing,
+            mirror=_size(arguments.mirror),
             without=tuple(w for w in arguments.without.split(",") if w),
             correction=not arguments.no_correction,
             imu=arguments.imu,
@@ -111,6 +113,22 @@ def plan(arguments: cli.Plan) -> int:
             if any(each.decision == decision for each in expected)
         ),
     )
+
+
+def _size(text: str | None) -> tuple[float, float] | None:
+    """Return width and height of a mirror, m."""
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    try:
+        width, height = (float(part) for part in parts)
+    except ValueError:
+        width = height = 0.0
+    if not (0.05 <= width <= 10 and 0.05 <= height <= 10):
+        raise InputError(
+            f"is {text!r}", where="--mirror", remedy="give width x height in m, such as 0.8x1.2"
+        )
+    return width, height
 
 
 def experiments(arguments: cli.Experiments) -> int:

@@ -42,7 +42,7 @@ _NAME_WIDTH = 14  # width of the column of names
 _STATUS_COLORS = {True: "green", False: "red", None: "yellow"}
 _NOT_WITH_RIG = (
     *("view", "loops", "guess", "object"),
-    *("average_still", "camera", "topic", "no_report", "profile"),
+    *("average_still", "camera", "topic", "no_report", "profile", "mirrors"),
 )
 VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
 

@@ -165,6 +165,8 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
         don't draw report.html, which takes up to half of a short run
     share
         write share.html and share.usdz as well: the model alone, to send and to show in a room
+    mirrors
+        find mirrors and glass, and cut the rooms behind mirrors out of the model
     texture
         texture the surface in mesh.glb and in the report, of colour images or else of amplitudes
         (default: if there are enough colour images)
@@ -227,6 +229,7 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     overwrite: bool = False
     no_report: bool = False
     share: bool = False
+    mirrors: bool = False
     texture: bool | None = None
     faces: Count | None = None
     voxel: Length | None = None
@@ -682,6 +685,8 @@ class Simulate(Seed, Threads):
         a person walks through the view, covering this fraction of it, 0 to 1
     with_box : RATIO
         a box slides through the view, covering this fraction of it, 0 to 1
+    mirror : WxH
+        a mirror of this size in m hangs on a wall in view, e.g. 0.8x1.2
     without : EFFECTS
         sensor errors to disable, separated by commas, or `all`
     no_correction
@@ -704,6 +709,7 @@ class Simulate(Seed, Threads):
     uniform: bool = False
     with_person: Ratio | None = None
     with_box: Ratio | None = None
+    mirror: str | None = None
     without: str = ""
     no_correction: bool = False
     imu: bool = False

@@ -22,6 +22,7 @@ from tofuse.formats.recordings import RecordingWriter
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.accelerometer import accelerations
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.mirrors import hang_mirror
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.passing import Passing, add_distractor
 from tofuse.lab.simulation.peaks import peaks_cameras, peaks_points, peaks_views
@@ -105,6 +106,7 @@ def plan(
     texture: bool = True,
     axis_offset_m: float = 0.0,
     passing: Passing | None = None,
+    mirror: tuple[float, float] | None = None,
 ) -> RecordingPlan:
     """Plan a recording; see `simulate` for the parameters.
 
@@ -125,6 +127,9 @@ def plan(
             f"is {first}", where="first", remedy=f"use one from 0 to {sequence.frames - 1}"
         )
     raw = np.arange(first, sequence.frames, stride)[:frames]
+    if mirror is not None:
+        times = raw / sequence.frame_rate_hz
+        built, _ = hang_mirror(built, sequence, model, mirror, times=times, seed=seed)
     if passing is not None:
         times = raw[[0, -1]] / sequence.frame_rate_hz
         built, sequence = add_distractor(
@@ -147,6 +152,7 @@ def simulate_recording(
     texture: bool = True,
     axis_offset_m: float = 0.0,
     passing: Passing | None = None,
+    mirror: tuple[float, float] | None = None,
     sigma_m: float = 0.05,
     progress: Progress | None = None,
 ) -> Recording:
@@ -170,6 +176,7 @@ def simulate_recording(
         texture=texture,
         axis_offset_m=axis_offset_m,
         passing=passing,
+        mirror=mirror,
     )
     return planned.recording(correction=correction, progress=progress)
 
@@ -188,6 +195,7 @@ def simulate(
     texture: bool = True,
     axis_offset_m: float = 0.0,
     passing: Passing | None = None,
+    mirror: tuple[float, float] | None = None,
     imu: bool = False,
     sigma_m: float = 0.05,
     progress: Progress | None = None,
@@ -221,6 +229,8 @@ def simulate(
     passing
         A distractor that passes through the view; its pixels are flagged in truth/flags. It is not
         part of the surface in truth/.
+    mirror
+        Width and height in m of a mirror on a wall that the camera sees; its pixels are flagged.
     imu
         Whether an accelerometer on the camera is recorded as well.
     sigma_m
@@ -252,6 +262,7 @@ def simulate(
         texture=texture,
         axis_offset_m=axis_offset_m,
         passing=passing,
+        mirror=mirror,
     )
     return write(planned, out, correction=correction, imu=imu, progress=progress)
 
