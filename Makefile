@@ -60,7 +60,7 @@ lock: .venv/.ready          ## pin the newest versions that pyproject.toml allow
 	$(BIN)/python -m pip install --quiet uv
 	$(PIN) --group dev pyproject.toml requirements/build.in -o requirements/dev.txt
 	$(PIN) --group docs -c requirements/dev.txt -o requirements/docs.txt
-	$(PIN) --extra dask --extra hdf5 --extra phones --extra ros --extra scan --extra texture --extra viewer pyproject.toml -c requirements/dev.txt -o requirements/runtime.txt
+	$(PIN) --extra dask --extra hdf5 --extra mcap --extra phones --extra rerun --extra ros --extra scan --extra texture --extra viewer pyproject.toml -c requirements/dev.txt -o requirements/runtime.txt
 	$(PIN) --all-extras pyproject.toml -o requirements/extras.txt
 	$(PIN) --group release -o requirements/release.txt
 

@@ -19,7 +19,8 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse._version import __version__
-    from tofuse.apps.api.result import Result, load, merge, reconstruct
+    from tofuse.apps.api.result import Mapper, Result, load, merge, reconstruct
+    from tofuse.apps.coach.advice import Advice, advise
     from tofuse.apps.compare.comparing import Comparison, compare
     from tofuse.apps.inspection.inspect import inspect_recording as inspect
     from tofuse.apps.jobs.evaluating import Evaluation, evaluate
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from tofuse.engine.fusion.mesh import Mesh
     from tofuse.engine.graph.graph import LoopRecord, PoseGraph
     from tofuse.engine.mapping.config import Config
-    from tofuse.engine.mapping.mapper import Mapper
     from tofuse.engine.quality.change_detection import Change
     from tofuse.engine.quality.pose_accuracy import Accuracy
     from tofuse.engine.results.types import (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -150,14 +151,34 @@ def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
         tofuse.load(tmp_path / "out").evaluate()
 
 
-def test_mapper_output_becomes_result(arrays):
+def test_mapper_states_each_pose_and_its_result_is_saved(arrays, tmp_path):
     recording = tofuse.from_arrays(arrays[0], arrays[1])
     mapper = tofuse.Mapper(threads=1)
+    assert mapper.last is None
+    sigmas = []
     for frame in recording:
-        mapper.push(frame)
-    found = tofuse.Result.of(mapper.finish(), recording)
-    assert isinstance(found, tofuse.Reconstruction)
-    assert "of 6 frames" in found.accuracy
+        pose = mapper.push(frame)
+        last = mapper.last
+        assert (last.index, last.status) == (frame.index, "tracked")
+        assert pose.shape == (4, 4)
+        np.testing.assert_allclose(last.covariance, last.covariance.T, atol=1e-12)
+        sigmas.append(np.sqrt(np.diag(last.covariance)))
+    assert not sigmas[0].any()
+    assert (np.array(sigmas[1:]) > 0).all()
+    # The error of tracking is of the order that it states.
+    error = se3.log(se3.inverse(arrays[2][-1]) @ pose)
+    assert (np.abs(error) < 10 * sigmas[-1]).all()
+    assert np.abs(error[:3]).max() < 0.02
+    blank = replace(recording[5], index=6, depth=np.zeros_like(recording[5].depth))
+    assert mapper.push(blank) is None
+    assert (mapper.last.status, mapper.last.covariance) == ("lost", None)
+    found = mapper.finish()
+    assert "of 7 frames" in found.accuracy
+    found.save(tmp_path / "out")
+    assert (tmp_path / "out" / "report.html").exists()
+    np.testing.assert_allclose(tofuse.load(tmp_path / "out").trajectory, found.trajectory)
+    with pytest.raises(tofuse.InputError, match="has no recording: its frames were pushed"):
+        tofuse.load(tmp_path / "out").locate(recording[0])
 
 
 @pytest.mark.parametrize("kind", ["millimetres", "unit", "list", "camera"])

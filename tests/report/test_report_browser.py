@@ -269,7 +269,8 @@ def test_chart_in_closed_details_is_drawn_on_opening(browser, report, tmp_path):
     folded = rest.replace("</section>", "</details></section>", 1)
     path = tmp_path / "folded.html"
     path.write_text(f"{before}{section}<details><summary>more</summary>{folded}", encoding="utf-8")
-    with opened(browser, path, viewport=DESK) as seen:
+    with watched(browser, path.as_uri(), ours=path.as_uri(), viewport=DESK) as seen:
+        seen.page.evaluate("document.querySelector('#details').open = true")
         details = seen.page.locator("#objective details")
         details.scroll_into_view_if_needed()
         seen.rest()

@@ -218,8 +218,9 @@ CASES = {
     "disconnected": in_components(apart((7, 8))),
     "bridged_gap": in_components(Component(((5, 8),), np.eye(4), "motion")),
     "single_link": replace(evidence(), single_link_frames=(5, 6, 7, 8)),
-    "moving_objects": evidence(moving=((3, 0.1), (4, 0.234), (6, 0.0))),
-    "open_motion": evidence(moving=((3, 0.1), (4, 0.26))),
+    "moving_objects": evidence(moving=((3, 0.1), (4, 0.234), (6, 0.0)), moved=(4,)),
+    "unstable_depth": evidence(moving=((3, 0.1), (4, 0.234), (6, 0.0))),
+    "open_motion": evidence(moving=((3, 0.1), (4, 0.26)), moved=(4,)),
     "ambiguous_steps": replace(evidence(), ambiguous=(2, 5)),
     "range_changes": replace(evidence(sigma=(0.0001, 0.0001)), refinement=CHANGED),
     "doubtful_poses": evidence(doubtful=(2, 3, 6)),
@@ -253,6 +254,15 @@ def test_each_reason_comes_from_its_own_evidence(code) -> None:
     # No other reasons, except those that follow from it.
     follows = {"few_poses": {"lost_frames"}, "open_motion": {"moving_objects"}}
     assert {r.code for r in reasons} - {code} <= follows.get(code, set())
+
+
+def test_moving_objects_and_unstable_depth_are_separate() -> None:
+    both = evidence(moving=((1, 0.05), (2, 0.02), (4, 0.1), (5, 0.234)), moved=(5,))
+    moving, unstable = judge(both)[1]
+    assert (moving.code, moving.frames) == ("moving_objects", (4, 5))
+    assert "up to 23 %" in moving.text
+    assert (unstable.code, unstable.frames) == ("unstable_depth", (1, 2))
+    assert "up to 5 %" in unstable.text
 
 
 def test_rival_motion_leaves_the_choice_open() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from time import sleep
 
 import numpy as np
 import pytest
@@ -47,6 +48,51 @@ class Recorder(Silent):
 
     def placed(self, frame, T_world_camera):
         self.frames.append((frame.index, T_world_camera.copy(), len(self.stages)))
+
+
+@needs_viser
+def test_live_view_shows_advice_until_tracking_ends(room_recording, monkeypatch):
+    from tofuse.apps.viewer import live_view
+    from tofuse.engine.mapping import Mapper
+    from tofuse.formats.recordings import open_recording
+
+    monkeypatch.setattr(live_view, "_ADVICE_PERIOD", 0.0)
+    monkeypatch.setattr(live_view, "_ADVICE_SHARE", 0.0)
+    server = serve()
+    try:
+        live = live_view.LiveView(server)
+        live.stage("tracking", 8)
+        mapper = Mapper(threads=1, progress=live)
+        for frame in open_recording(room_recording):
+            mapper.push(frame)
+        assert live._advice.content.startswith("**Next:** ")
+        live._show_advice("**Next:** turn around", np.diag([-1.0, 1, -1, 1]), np.eye(4))
+        arrow, target = live._advised
+        np.testing.assert_allclose(arrow.points[0, 1], [0, 0, -0.5], atol=1e-6)
+        np.testing.assert_allclose(np.abs(target.wxyz), [0, 0, 1, 0], atol=1e-9)
+        live.stage("closing loops")
+        assert live._advice.content == ""
+        assert not live._advised
+        assert live._so_far is None
+    finally:
+        stop(server)
+
+
+def test_live_map_places_the_frames_of_a_camera(room_recording):
+    from tofuse.apps.viewer import LiveMap
+    from tofuse.formats.recordings import open_recording
+
+    recorder = Recorder()
+    frames = list(open_recording(room_recording))[:3]
+    with LiveMap(recorder) as live_map:
+        for k, frame in enumerate(frames):
+            live_map.offer(frame)
+            while len(recorder.frames) <= k:
+                sleep(0.01)
+    assert [index for index, *_ in recorder.frames] == [0, 1, 2]
+    np.testing.assert_array_equal(recorder.frames[0][1], np.eye(4))
+    assert np.linalg.norm(recorder.frames[2][1] - np.eye(4)) > 0.01
+    assert recorder.stages == ["tracking", "recorded"]
 
 
 @pytest.mark.nightly

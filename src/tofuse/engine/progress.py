@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame
+from tofuse.engine.graph import PoseGraph
 from tofuse.engine.results import FrameRecord
+from tofuse.engine.stored_views import PosedView
+from tofuse.engine.views import PreparedView
+
+
+@dataclass(frozen=True, eq=False)
+class OnlineMap:
+    """What is known between two frames: of the component of the latest one.
+
+    Attributes
+    ----------
+    graph
+        With the loops closed so far, and optimised.
+    timestamps
+        (N,) s, of its vertices.
+    views
+        Prepared views of some of them.
+    """
+
+    graph: PoseGraph
+    timestamps: Float64
+    views: Sequence[PosedView[PreparedView]]
 
 
 class Progress(Protocol):
@@ -27,6 +50,10 @@ class Progress(Protocol):
 
     def placed(self, frame: Frame, T_world_camera: Float64) -> None:
         """Show a frame of the model at its current pose (4, 4)."""
+        return
+
+    def began(self, so_far: Callable[[], OnlineMap]) -> None:
+        """Begin a map; `so_far` tells what is known when a frame has been placed."""
         return
 
 
@@ -60,3 +87,8 @@ class CombinedProgress:
         """See `Progress`."""
         self.first.placed(frame, T_world_camera)
         self.second.placed(frame, T_world_camera)
+
+    def began(self, so_far: Callable[[], OnlineMap]) -> None:
+        """See `Progress`."""
+        self.first.began(so_far)
+        self.second.began(so_far)

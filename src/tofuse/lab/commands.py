@@ -1,9 +1,15 @@
-"""The commands of the laboratory: ``tofuse demo``, ``simulate`` and ``experiments``."""
+"""The commands of the laboratory: ``tofuse demo``, ``simulate``, ``plan`` and ``experiments``."""
 
 from __future__ import annotations
 
+from math import inf
+
 from tofuse.apps.cli import options as cli
-from tofuse.apps.cli import print_result, progress_for
+from tofuse.apps.cli import print_result, progress_for, progress_unless_json, show
+from tofuse.engine.errors import InputError
+
+# Colour and exit status of the decisions of a plan, the best first.
+_DECISIONS = {"enough": ("green", 0), "undecided": ("yellow", 4), "not enough": ("red", 3)}
 
 
 def demo(arguments: cli.Demo) -> int:
@@ -49,6 +55,7 @@ def simulate(arguments: cli.Simulate) -> int:
             first=arguments.first or 0,
             texture=not arguments.uniform,
             passing=passing,
+            mirror=_size(arguments.mirror),
             without=tuple(w for w in arguments.without.split(",") if w),
             correction=not arguments.no_correction,
             imu=arguments.imu,
@@ -57,6 +64,71 @@ def simulate(arguments: cli.Simulate) -> int:
         )
     print(f"{frames} frames in {arguments.out}")
     return 0
+
+
+def plan(arguments: cli.Plan) -> int:
+    """``tofuse plan``."""
+    from rich.table import Table
+
+    from tofuse.apps.results import load_result, run_json
+    from tofuse.engine.compute import threads
+    from tofuse.formats.poses import read_poses
+    from tofuse.lab import planning
+
+    poses = times = None
+    scan = load_result(arguments.result)
+    if arguments.path is not None:
+        read = read_poses(arguments.path)
+        poses, times = read.poses, read.timestamps
+    with progress_unless_json(arguments) as progress, threads(arguments.threads):
+        expected = planning.expect(
+            scan,
+            arguments.camera or (),
+            poses=poses,
+            times=times,
+            tolerance_m=arguments.tolerance,
+            threads=arguments.threads,
+            seed=arguments.seed or 0,
+            progress=progress,
+        )
+    table = Table.grid(padding=(0, 2))
+    table.add_row("camera", "bound, mm", "coverage", "frames posed", "")
+    for each in expected:
+        bound = f"{1e3 * each.bound_m:.1f}" if each.bound_m < inf else "none"
+        color, _ = _DECISIONS[each.decision]
+        table.add_row(
+            each.camera,
+            bound,
+            f"{each.coverage:.0%}",
+            f"{each.posed:.0%}",
+            f"[{color}]{each.decision}[/]",
+        )
+    return show(
+        arguments,
+        run_json.plain({"tolerance_m": arguments.tolerance, "cameras": [*map(vars, expected)]}),
+        table,
+        status=next(
+            status
+            for decision, (_, status) in _DECISIONS.items()
+            if any(each.decision == decision for each in expected)
+        ),
+    )
+
+
+def _size(text: str | None) -> tuple[float, float] | None:
+    """Return width and height of a mirror, m."""
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    try:
+        width, height = (float(part) for part in parts)
+    except ValueError:
+        width = height = 0.0
+    if not (0.05 <= width <= 10 and 0.05 <= height <= 10):
+        raise InputError(
+            f"is {text!r}", where="--mirror", remedy="give width x height in m, such as 0.8x1.2"
+        )
+    return width, height
 
 
 def experiments(arguments: cli.Experiments) -> int:

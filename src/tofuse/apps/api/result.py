@@ -1,4 +1,4 @@
-"""`tofuse.reconstruct`, `tofuse.merge` and `tofuse.load`, and the result that they return."""
+"""`tofuse.reconstruct`, `merge`, `load` and `Mapper`, and the result that they return."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ from tofuse.engine.frames import Frame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import Config, adaptation, changed, from_method, reconstructing
+from tofuse.engine.mapping import Mapper as OnlineMapper
 from tofuse.engine.parts import name_of
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction, accuracy_card
@@ -123,7 +124,7 @@ class Result(Reconstruction):
             )
             write_report_files(self.source, config, result, folder)
             return
-        title = Path(str(result.recording["path"])).name
+        title = Path(str(result.recording["path"] or result.recording["format"])).name
         write_report(result, folder / "report.html", ReportExtras(title))
 
     def evaluate(
@@ -232,6 +233,42 @@ class Result(Reconstruction):
             source = thumbnails.data_uri(scene.render(drawn, _THUMBNAIL))
             picture = f'<img src="{source}" alt="The model" style="border-radius:8px"><br>'
         return f"<div>{picture}<b>{verdict}</b>: {accuracy}</div>"
+
+
+class Mapper(OnlineMapper):
+    """Turns frames into a trajectory and a model, online.
+
+    >>> mapper = Mapper("default")
+    >>> for frame in frames:
+    ...     T_world_camera = mapper.push(frame)   # None where lost
+    ...     mapper.last.status, mapper.last.covariance
+    >>> mapper.finish().save("result")
+
+    Parameters
+    ----------
+    config
+        A configuration, or the name of one.
+    seed
+        The result is reproducible for each seed.
+    threads
+        Number of threads; None: all cores. The result does not depend on it.
+    loops
+        Given loops, in frame indices.
+    progress
+        Receives frames and stages.
+    tracker
+        Replaces that of the configuration's odometry.
+    """
+
+    def finish(self) -> Result:
+        """Join components, close loops, optimise, refine, fuse and judge.
+
+        Raises
+        ------
+        InputError
+            If no frame has a pose.
+        """
+        return Result.of(super().finish())
 
 
 def reconstruct(

@@ -10,7 +10,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.apps.cli import options
-    from tofuse.apps.cli.commands import print_result
+    from tofuse.apps.cli.commands import print_result, progress_unless_json, show
     from tofuse.apps.cli.program import console
     from tofuse.apps.cli.progress import TerminalProgress, progress_for
 

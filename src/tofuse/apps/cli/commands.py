@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
     from tofuse.apps.jobs import Options
-    from tofuse.apps.viewer import ReportServer
+    from tofuse.apps.viewer import LiveMap, ReportServer
     from tofuse.engine.graph import Optimisation, PoseGraph, certificate
 
 _Options = TypeVar("_Options", bound="DataclassInstance")
@@ -42,7 +42,7 @@ _NAME_WIDTH = 14  # width of the column of names
 _STATUS_COLORS = {True: "green", False: "red", None: "yellow"}
 _NOT_WITH_RIG = (
     *("view", "loops", "guess", "object"),
-    *("average_still", "camera", "topic", "no_report", "profile"),
+    *("average_still", "camera", "topic", "no_report", "profile", "mirrors"),
 )
 VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
 
@@ -322,7 +322,7 @@ def locate(arguments: cli.Locate) -> int:
 
 
 def check_overwrite(
-    arguments: cli.Register | cli.Judge | cli.Locate | cli.Compare | cli.Repeat,
+    arguments: cli.Register | cli.Judge | cli.Locate | cli.Compare | cli.Repeat | cli.Card,
 ) -> None:
     """Refuse --overwrite without --out, where that is optional."""
 
@@ -452,6 +452,7 @@ def record(arguments: cli.Record) -> int:
         device_named(arguments.device, options).open() as stream,
         _stop_on_signal() as stopped,
         progress_for(as_json=False) as progress,
+        _live_map(arguments) as live_map,
     ):
         progress.stage("recording (Ctrl-C stops)", arguments.frames)
         recorded = record_stream(
@@ -461,6 +462,7 @@ def record(arguments: cli.Record) -> int:
             frames=arguments.frames,
             stopped=stopped.is_set,
             progress=lambda _: progress.advance(),
+            seen=None if live_map is None else live_map.offer,
         )
     warnings = [f"{recorded.dropped} frames dropped: the disk was too slow"]
     _print_lines(
@@ -469,6 +471,23 @@ def record(arguments: cli.Record) -> int:
         *warning_lines([recorded.ended_by] if recorded.ended_by != "asked" else []),
     )
     return 0
+
+
+@contextmanager
+def _live_map(arguments: cli.Record) -> Iterator[LiveMap | None]:
+    """Yield a map that is shown in the browser, if that is asked for."""
+    from tofuse.apps.viewer import LiveMap, LiveView, address, serve, stop
+
+    if not arguments.view:
+        yield None
+        return
+    server = serve(arguments.port)
+    try:
+        _show(address(server), arguments)
+        with LiveMap(LiveView(server)) as live_map:
+            yield live_map
+    finally:
+        stop(server)
 
 
 @contextmanager
@@ -617,6 +636,7 @@ def export(arguments: cli.Export) -> int:
         faces=arguments.faces,
         every=arguments.every,
         pinhole=arguments.pinhole,
+        voxel_m=arguments.voxel,
         overwrite=arguments.overwrite,
     ):
         print(path)

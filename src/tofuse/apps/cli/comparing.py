@@ -1,4 +1,4 @@
-"""``tofuse compare`` and ``tofuse repeat``."""
+"""``tofuse compare``, ``tofuse repeat`` and ``tofuse card``."""
 
 from __future__ import annotations
 
@@ -89,4 +89,26 @@ def repeat(arguments: cli.Repeat) -> int:
         *map(escaped, bounds),
         *warning_lines(found.warnings),
         *([] if options.out is None else [escaped(f"see {options.out}")]),
+    )
+
+
+def card(arguments: cli.Card) -> int:
+    """``tofuse card``."""
+    from tofuse.apps.card import CardOptions, card_files
+
+    check_overwrite(arguments)
+    options = from_arguments(CardOptions, arguments)
+    found = card_files(arguments.results, options)
+    table = Table("quantity", "mean", "scatter", "over the time", "p", "", box=None)
+    for row in found.rows:
+        table.add_row(*row)
+    return show(
+        arguments,
+        {**found.to_dict(), "out": out_json(options.out)},
+        escaped(f"{len(found.sessions)} results of {found.camera}"),
+        escaped(found.sentence),
+        table,
+        *warning_lines(found.warnings),
+        *([] if options.out is None else [escaped(f"see {options.out / 'card.html'}")]),
+        status=3 if found.changed else 0,
     )

@@ -165,6 +165,8 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
         don't draw report.html, which takes up to half of a short run
     share
         write share.html and share.usdz as well: the model alone, to send and to show in a room
+    mirrors
+        find mirrors and glass, and cut the rooms behind mirrors out of the model
     texture
         texture the surface in mesh.glb and in the report, of colour images or else of amplitudes
         (default: if there are enough colour images)
@@ -227,6 +229,7 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     overwrite: bool = False
     no_report: bool = False
     share: bool = False
+    mirrors: bool = False
     texture: bool | None = None
     faces: Count | None = None
     voxel: Length | None = None
@@ -521,6 +524,32 @@ class Repeat(Json, Threads, Edited):
     overwrite: bool = False
 
 
+class Card(Json, Edited):
+    """Collect what results of one camera say about it, and whether it drifts.
+
+    Attributes
+    ----------
+    results : RESULT
+        results of one camera; their recordings must still be at their paths
+    out : DIR
+        folder for card.html and card.json (none)
+    overwrite
+        replace an existing card in --out
+
+    Exit status
+    -----------
+    0  no quantity changes with time by more than its uncertainty
+    2  nothing was written: one line on stderr states the reason
+    3  a quantity changes with time
+    """
+
+    home = "tofuse.apps.cli.comparing"
+
+    results: list[Path]
+    out: Path | None = None
+    overwrite: bool = False
+
+
 class RigOptions(Json, Threads):
     """Options of the commands of rigs.
 
@@ -656,6 +685,8 @@ class Simulate(Seed, Threads):
         a person walks through the view, covering this fraction of it, 0 to 1
     with_box : RATIO
         a box slides through the view, covering this fraction of it, 0 to 1
+    mirror : WxH
+        a mirror of this size in m hangs on a wall in view, e.g. 0.8x1.2
     without : EFFECTS
         sensor errors to disable, separated by commas, or `all`
     no_correction
@@ -678,10 +709,45 @@ class Simulate(Seed, Threads):
     uniform: bool = False
     with_person: Ratio | None = None
     with_box: Ratio | None = None
+    mirror: str | None = None
     without: str = ""
     no_correction: bool = False
     imu: bool = False
     sigma: Metres | None = None
+
+
+class Plan(Json, Seed, Threads, Edited):
+    """Say what cameras would achieve in a place, from a coarse scan of it.
+
+    Each camera is simulated along the path in the scan's model, and what it records is
+    reconstructed.
+
+    Attributes
+    ----------
+    result : RESULT
+        a result of the scan
+    camera : NAME
+        simulated camera; may be repeated (default: all)
+    path : FILE
+        trajectory in the world of the scan (default: its own)
+    tolerance : LENGTH
+        required 95 % bound on the positions of the camera (5mm)
+
+    Exit status
+    -----------
+    0  some camera would do
+    3  none would
+    4  undecided: too close to the tolerance
+    2  nothing was simulated: one line on stderr states the reason
+    """
+
+    home = _LAB
+    reconstructs = True
+
+    result: Path
+    camera: list[str] | None = None
+    path: Path | None = None
+    tolerance: Length = 0.005
 
 
 class Inspect(Json, Source):
@@ -720,7 +786,7 @@ class Convert(Selection):
     to: Literal["native", "tum", "open3d"] = "native"
 
 
-class Record(Command):
+class Record(Page):
     """Record from a connected camera.
 
     Attributes
@@ -735,6 +801,8 @@ class Record(Command):
         stop after this many frames
     set : NAME=VALUE
         camera option, e.g. serial=1234; may be repeated
+    view
+        map the frames meanwhile, and show the map and where to look next
     """
 
     device: str | None
@@ -742,6 +810,7 @@ class Record(Command):
     seconds: Seconds | None = None
     frames: Count | None = None
     set: list[str] | None = None
+    view: bool = False
 
 
 class Calibrate(Json, Seed, Selection):
@@ -878,15 +947,18 @@ class Export(Edited):
     result : DIR
         a result: the --out of `tofuse run`
     formats : FORMAT
-        pcd, las, laz, e57, glb, gltf, obj, usdz, stl, kitti, log, nerfstudio, colmap
+        pcd, las, laz, e57, glb, gltf, obj, usdz, stl, kitti, log, nerfstudio, colmap, rerun,
+        mcap, occupancy, esdf, octomap
     out : DIR
         folder for the files (default: that of the result)
     faces : N
         maximum number of triangles (60000; STL: all)
     every : N
-        every N-th image (nerfstudio, colmap)
+        every N-th frame (nerfstudio, colmap, rerun, mcap, occupancy, esdf, octomap)
     pinhole
         images without distortion (nerfstudio, colmap)
+    voxel : LENGTH
+        voxel size (occupancy, esdf, octomap; default: a 400th of the model's diagonal)
     overwrite
         replace existing files
     """
@@ -897,6 +969,7 @@ class Export(Edited):
     faces: Count | None = None
     every: Count = 1
     pinhole: bool = False
+    voxel: Length | None = None
     overwrite: bool = False
 
 
@@ -936,6 +1009,6 @@ class View(Page, Edited):
 
 
 COMMANDS: tuple[type[Command], ...] = (
-    *(Run, Batch, Register, Judge, Merge, Locate, Compare, Repeat, Rig, Demo, Simulate, Inspect),
-    *(Convert, Record, Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
+    *(Run, Batch, Register, Judge, Merge, Locate, Compare, Repeat, Card, Rig, Demo, Simulate, Plan),
+    *(Inspect, Convert, Record, Calibrate, Noise, Evaluate, Optimize, Export, Experiments, View),
 )

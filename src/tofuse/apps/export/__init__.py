@@ -1,7 +1,8 @@
 """A result in the formats of other programs: `tofuse export`.
 
 Clouds, surfaces and trajectories are converted from the files of the result; data sets of
-nerfstudio and COLMAP also need the images of its recording.
+nerfstudio and COLMAP, recordings of Rerun and Foxglove, and grids for planners also need the frames
+of its recording.
 """
 
 from typing import TYPE_CHECKING

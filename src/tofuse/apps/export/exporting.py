@@ -9,7 +9,11 @@ from functools import cached_property
 from pathlib import Path
 
 from tofuse.apps.export.colmap import write_colmap
+from tofuse.apps.export.grids import Grid
+from tofuse.apps.export.mcap_file import write_mcap
 from tofuse.apps.export.nerfstudio import write_nerfstudio
+from tofuse.apps.export.rerun_file import write_rerun
+from tofuse.apps.export.scene import Scene
 from tofuse.apps.results import folders, read_cloud, read_mesh, run_json, textured_record
 from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.errors import InputError, OutputError
@@ -38,6 +42,17 @@ class _Result:
     faces: int | None
     every: int
     pinhole: bool
+    voxel_m: float | None
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Poses and model, and on demand images."""
+        return Scene.read(self.folder, self.every)
+
+    @cached_property
+    def grid(self) -> Grid:
+        """Free and occupied space."""
+        return Grid(self.scene, self.voxel_m)
 
     @cached_property
     def cloud(self) -> GeometryRecord:
@@ -156,6 +171,11 @@ FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
     "log": ("trajectory.log", _log),
     "nerfstudio": ("nerfstudio", _images),
     "colmap": ("colmap", _images),
+    "rerun": ("result.rrd", lambda result, path: write_rerun(result.scene, path)),
+    "mcap": ("result.mcap", lambda result, path: write_mcap(result.scene, path)),
+    "occupancy": ("occupancy.npz", lambda result, path: result.grid.write_occupancy(path)),
+    "esdf": ("esdf.npz", lambda result, path: result.grid.write_esdf(path)),
+    "octomap": ("octomap.bt", lambda result, path: result.grid.write_octomap(path)),
 }
 
 
@@ -167,6 +187,7 @@ def export(
     faces: int | None = None,
     every: int = 1,
     pinhole: bool = False,
+    voxel_m: float | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
     """Write a result in other formats, and return the paths of the files.
@@ -187,6 +208,8 @@ def export(
         Every n-th of the images with a pose.
     pinhole
         Whether to rectify images, for programs without distortion models.
+    voxel_m
+        Voxel size of grids and octrees, m; by default see `occupancy_grid`.
     overwrite
         Whether existing files may be replaced.
 
@@ -215,7 +238,7 @@ def export(
                 raise OutputError(
                     "already exists", where=path, remedy="pass --overwrite to replace it"
                 )
-        result = _Result(folder, faces, every, pinhole)
+        result = _Result(folder, faces, every, pinhole, voxel_m)
         # Images first: only they can be missing after a complete run.
         for name in sorted(files, key=lambda name: FORMATS[name][1] is not _images):
             FORMATS[name][1](result, files[name])

@@ -85,6 +85,7 @@ class Options(OpeningOptions, ModelOptions):
     overwrite: bool = False
     no_report: bool = False
     share: bool = False
+    mirrors: bool = False
 
 
 def resolve(options: Options, kind: ViewKind = "range") -> Config:

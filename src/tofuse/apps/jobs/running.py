@@ -19,7 +19,7 @@ from tofuse.apps.jobs.report_files import write_report_files
 from tofuse.apps.jobs.run_options import Options, check_guess, check_unwrap, resolve, seed_of
 from tofuse.apps.jobs.tracked_file import TrackedFile
 from tofuse.apps.results import folders, run_json, write_result
-from tofuse.engine.compute import trim_memory
+from tofuse.engine.compute import threads, trim_memory
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.engine.fusion import texture
@@ -79,6 +79,8 @@ def run(
                 progress=progress,
                 tracked_frames=tracked_file,
             )
+            if options.mirrors:
+                result = _without_mirrors(job, result, options, progress)
             texture = _texture(job, result, options, progress)
             result = with_findings(result, job.findings, turning=options.object)
             opening = job.opening.to_dict()
@@ -144,6 +146,21 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
     for warning in (*recording.warnings, *(str(f) for f in findings)):
         progress.note(warning)
     return _Job(opening, recording, config, seed, loops, findings)
+
+
+@timing("mirrors")
+def _without_mirrors(
+    job: _Job, result: Reconstruction, options: Options, progress: Progress
+) -> Reconstruction:
+    """Find the mirrors of the main model; with a note on each."""
+    from tofuse.apps.mirrors import find_mirrors, sentences
+
+    progress.stage("looking for mirrors")
+    with threads(options.threads), threadpool_limits(1):
+        result = find_mirrors(job.recording, result, job.seed)
+    for sentence in sentences(result):
+        progress.note(sentence)
+    return result
 
 
 @timing("texture")

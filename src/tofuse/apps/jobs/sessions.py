@@ -13,7 +13,7 @@ from tofuse.apps.results import folders, reopening, run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
-from tofuse.engine.mapping import Config, adaptation, changed, from_method, kind_of
+from tofuse.engine.mapping import Config, adaptation, kind_of
 from tofuse.engine.progress import Progress
 from tofuse.engine.tracking import Keyframes, Status, given
 from tofuse.formats.files import reading
@@ -144,7 +144,8 @@ def _session(
             where=folder,
             remedy="pass their clouds together to one `tofuse run`",
         )
-    config = _config(part.config, recording, folder, threads, progress)
+    config = with_given_poses(reopening.stored_config(part, folder))
+    config = adaptation.adapted(config, recording, threads, progress)
     opening = reopening.locate_recording(part.opening, folder)
     return Session(part.name, folder, opening, recording, config, stated)
 
@@ -178,19 +179,6 @@ def _stated(folder: Path, run: dict[str, Any], components: int) -> dict[int, giv
 def _poses(folder: Path, run: dict[str, Any]) -> dict[int, Float64]:
     """Return (4, 4) T_world_camera by index, of the frames in a folder's main model."""
     return dict(zip(*run_json.main_poses(folder, run), strict=True))
-
-
-def _config(
-    stored: Mapping[str, Any],
-    recording: Recording,
-    folder: Path,
-    threads: int | None,
-    progress: Progress,
-) -> Config:
-    """Return the stored configuration of a result, with `GivenPoses` as odometry."""
-    where = f"{folder / 'run.json'}: config"
-    config = changed(from_method("default"), stored, where=where)
-    return adaptation.adapted(with_given_poses(config), recording, threads, progress)
 
 
 def with_given_poses(config: Config) -> Config:

@@ -52,6 +52,7 @@ def record(
     frames: int | None = None,
     stopped: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] | None = None,
+    seen: Callable[[RangeFrame], None] | None = None,
 ) -> Recorded:
     """Write the frames of a camera as a native recording.
 
@@ -70,6 +71,8 @@ def record(
         Called after each frame; recording ends if it returns true.
     progress
         Called with the number of frames written so far.
+    seen
+        Called with each frame.
 
     Raises
     ------
@@ -92,6 +95,8 @@ def record(
             writer.add(frame)
             if progress is not None:
                 progress(len(writer))
+            if seen is not None:
+                seen(frame)
             if len(writer) == frames or stopped():
                 break
             frame = reader.next()

@@ -17,6 +17,7 @@ from tofuse.engine.geometry import se3
 NO_MEASUREMENT = (128, 128, 132)
 REMOVED = (225, 40, 135)  # removed by the filter shown; not in the colour map
 BACKGROUND = (22, 25, 30)  # of the 3D view
+_SPLATS = 60_000  # points of a cloud that are drawn, at least
 _MIN_DEPTH = 0.02  # of the eye's distance; nearer points are not drawn
 
 
@@ -248,11 +249,10 @@ def cloud_image(
 
     `view` is the `framing`; None: its own.
     """
-    points = frame.points.astype(float)
+    points = frame.points[:: max(1, len(frame) // _SPLATS)].astype(float)
     is_range = isinstance(frame, RangeFrame)
     depth = points[:, 2] if is_range else np.linalg.norm(points - frame.origin, axis=1)
     low, high = limits
     T, scale = view or framing(points, size)
-    radius = 1 if len(points) > 60_000 else 2
     colors = viridis((depth - low) / (high - low))
-    return splat(points, colors, T, size, scale=scale, radius=radius)
+    return splat(points, colors, T, size, scale=scale, radius=2)

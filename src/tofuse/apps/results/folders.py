@@ -21,8 +21,9 @@ RECORDING = "recording"  # written by `tofuse demo` next to its result, and kept
 
 # Files of a result, by `tofuse run` and `tofuse export`; all of them are removed with it.
 _FILE = (
-    r"trajectory\.(txt|kitti\.txt|log)|rig_trajectory\.txt|pose_graph\.g2o|changes\.ply|"
+    r"trajectory\.(txt|kitti\.txt|log)|rig_trajectory\.txt|pose_graph\.g2o|changes\.ply|mirrors\.ply|"
     r"cloud\.(ply|pcd|las|laz|e57)|mesh\.(ply|glb|gltf|obj|mtl|png|jpg|stl|usdz)|"
+    r"result\.(rrd|mcap)|(occupancy|esdf)\.npz|octomap\.bt|"
     r"report\.html|share\.(html|usdz)|(run|judge)\.json|"
     # Of version 0.2 only.
     r"view\.npz|tiles/(tileset\.json|\d{1,4}(-\d{1,9}){3}\.glb)"

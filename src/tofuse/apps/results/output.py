@@ -111,6 +111,11 @@ def _write_model(result: Reconstruction, folder: Path) -> None:
         write_ply(folder / "mesh.ply", _without_black(result.mesh.record()))
     if result.changes:
         _write_changes(result, folder / "changes.ply")
+    if result.mirrors:
+        points = [m.points for m in result.mirrors]
+        number = np.repeat(np.arange(len(points), dtype=np.int32), [len(p) for p in points])
+        record = GeometryRecord(np.concatenate(points), scalars={"mirror": number})
+        write_ply(folder / "mirrors.ply", record.shifted(result.shift))
 
 
 def _without_black(record: GeometryRecord) -> GeometryRecord:

@@ -12,6 +12,7 @@ import numpy as np
 from tofuse.apps.results.folders import RECORDING
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, Recording, Source
+from tofuse.engine.mapping import Config, changed, from_method
 from tofuse.formats.recordings import Opening
 
 # Frames whose times differ by more are not of the same recording, s.
@@ -77,7 +78,7 @@ def stored_recordings(folder: Path, run: Mapping[str, Any]) -> Iterator[StoredRe
     sessions = run.get("sessions") or []
     single = {
         "name": folder.resolve().name,
-        "opening": run["input"]["opening"] or _opening_of_path(run["input"]),
+        "opening": run["input"]["opening"] or _opening_of_path(run["input"], folder),
         "config": run["config"],
         "first": 0,
         "count": max(times) + 1,
@@ -96,8 +97,11 @@ def stored_recordings(folder: Path, run: Mapping[str, Any]) -> Iterator[StoredRe
         )
 
 
-def _opening_of_path(recording: Mapping[str, Any]) -> dict[str, Any]:
+def _opening_of_path(recording: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return how to open the recording of a result written from Python: only its path is stored."""
+    if recording["path"] is None:
+        problem = "has no recording: its frames were pushed one by one"
+        raise InputError(problem, where=folder, remedy="record them, and run `tofuse run`")
     return Opening((Path(recording["path"]),)).to_dict()
 
 
@@ -145,6 +149,17 @@ def reopen(part: StoredRecording, folder: Path) -> Recording:
     if not matches:
         raise _changed(folder, recording.path)
     return recording
+
+
+def stored_config(part: StoredRecording, folder: Path) -> Config:
+    """Return the configuration of a recording of a result, not yet adapted to it.
+
+    Raises
+    ------
+    InputError
+        If `run.json` is damaged.
+    """
+    return changed(from_method("default"), part.config, where=f"{folder / 'run.json'}: config")
 
 
 def _changed(folder: Path, what: str) -> InputError:

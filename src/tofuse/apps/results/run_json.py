@@ -18,7 +18,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import Refinement, calibration_check
-from tofuse.engine.results import FrameRecord, Reason, Reconstruction, SelfCalibration
+from tofuse.engine.results import FrameRecord, Mirror, Reason, Reconstruction, SelfCalibration
 from tofuse.formats.files import reading
 from tofuse.formats.poses import read_tum
 
@@ -104,6 +104,7 @@ def _content(result: Reconstruction) -> dict[str, Any]:
             }
             for c in result.changes
         ],
+        **({"mirrors": [_mirror(m) for m in result.mirrors]} if result.mirrors else {}),
         "loops": [vars(loop) for loop in d.loops],
         "optimiser": [
             _fields(p, "first", "vertices", "edges", "before", "after", "improved", "converged")
@@ -119,6 +120,11 @@ def _content(result: Reconstruction) -> dict[str, Any]:
 def _fields(record: Any, *names: str) -> dict[str, Any]:
     """Some fields of a record, in this order."""
     return {name: getattr(record, name) for name in names}
+
+
+def _mirror(m: Mirror) -> dict[str, Any]:
+    names = ("kind", "normal", "offset_m", "corners", "area_m2", "agreement", "log_ratio")
+    return {**_fields(m, *names), "points": len(m.points)}
 
 
 def _frame(f: FrameRecord, result: Reconstruction) -> dict[str, Any]:
@@ -185,6 +191,7 @@ def _suspicion(check: calibration_check.CalibrationCheck | None) -> dict[str, An
         "camera": check.errors,
         "sigma": check.sigmas,
         "focal_sigma": check.focal_sigma,
+        "estimates": check.estimates,
         "focal_motion_m": 0.01 * check.motion["focal"][0] if check.motion else None,
         "support": check.support,
         "loop": gap,

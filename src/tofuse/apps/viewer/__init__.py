@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
+    from tofuse.apps.viewer.live_map import LiveMap
     from tofuse.apps.viewer.live_view import LiveView
     from tofuse.apps.viewer.report_server import FrameImages, ReportServer, report_pages
     from tofuse.apps.viewer.server import address, serve, stop

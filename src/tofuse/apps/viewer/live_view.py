@@ -1,35 +1,41 @@
-"""A run in the browser while it works: the growing model and the current frame."""
+"""A run in the browser while it works: the growing model, the current frame, and advice."""
 
 from __future__ import annotations
 
 import re
 import threading
+from collections.abc import Callable
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tofuse.apps.coach import advise_on
 from tofuse.apps.report import scene, thumbnails
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.progress import OnlineMap, Progress
 from tofuse.engine.results import FrameRecord
 
 if TYPE_CHECKING:
     from viser import ViserServer
 
 
-_PATH, _CURRENT = (90, 176, 245), (255, 225, 90)
+_PATH, _CURRENT, _ADVISED = (90, 176, 245), (255, 225, 90), (120, 230, 140)
 _FOV = 2 * float(np.arctan(0.5))  # of the camera's pyramid as drawn
 _POINTS = 4000  # of each view shown
 _CLOUDS = 120  # views shown; beyond, every second one is removed
 _MIN_DISTANCE, _MIN_ANGLE = 0.15, np.radians(8.0)  # m and rad between views that are shown
 _UPDATE_PERIOD = 0.3  # s between updates of the current frame
 _IMAGE_WIDTH = 240  # px
+# Time between questions to the coach: in s, and as a multiple of what the last one took.
+_ADVICE_PERIOD, _ADVICE_SHARE = 1.0, 20.0
+_ARROW_M = 0.5  # length of an arrow for a turn
 
 
-class LiveView:
-    """A `Progress` that shows the views at their current poses.
+class LiveView(Progress):
+    """A `Progress` that shows the views at their current poses, and where to look next.
 
     It copies a small part of each view, so that the job is hardly slowed down and not influenced.
     It is called from one thread at a time, and raises no error because of a browser.
@@ -41,20 +47,29 @@ class LiveView:
         self._path: list[Float64] = []
         self._lock = threading.Lock()
         self._stage, self._done, self._total = "opening", 0, 0
-        self._last_update = -1.0
+        self._last_update = self._next_advice = -1.0
+        self._so_far: Callable[[], OnlineMap] | None = None
+        self._advised: list[Any] = []  # what is drawn of the advice
         self._spacing = (_MIN_DISTANCE, _MIN_ANGLE)
         server.gui.main_panel.dock_right()
         server.scene.set_up_direction("-y")
         server.initial_camera.position = (0.6, -1.2, -2.2)
         server.initial_camera.look_at = (0.0, 0.0, 1.5)
         self._status = server.gui.add_markdown("Opening the recording.")
+        self._advice = server.gui.add_markdown("")
         self._image = server.gui.add_html("")
 
     def stage(self, name: str, total: int | None = None) -> None:
         """See `Progress`."""
         with self._lock:
             self._stage, self._done, self._total = name, 0, total or 0
+            self._so_far = None  # it would keep all views in memory
+            self._show_advice("", None)
             self._show_status()
+
+    def began(self, so_far: Callable[[], OnlineMap]) -> None:
+        """See `Progress`."""
+        self._so_far = so_far
 
     def advance(self, record: FrameRecord | None = None) -> None:
         """See `Progress`."""
@@ -79,6 +94,10 @@ class LiveView:
                 self._last_update = now
                 self._show_current(frame, T)
                 self._show_status()
+            if self._so_far is not None and now >= self._next_advice:
+                self._advise(self._so_far(), T)
+                seconds = _ADVICE_SHARE * (perf_counter() - now)
+                self._next_advice = now + max(_ADVICE_PERIOD, seconds)
 
     def finish(self, address: str) -> None:
         """Link to the report of the result, which is served at an address."""
@@ -90,6 +109,49 @@ class LiveView:
         if self._total:
             words += f" {self._done} of {self._total}"
         self._status.content = f"{words}\n\n{_escaped(detail)}" if detail else words
+
+    def _advise(self, so_far: OnlineMap, T: Float64) -> None:
+        advice = advise_on(so_far)
+        if advice is None:
+            return
+        target = advice.T_world_camera
+        if target is not None:  # loops have moved the latest pose in one of the two worlds
+            target = T @ se3.inverse(so_far.graph.poses[-1]) @ target
+        self._show_advice(f"**Next:** {_escaped(advice.words)}", target, T)
+
+    def _show_advice(self, words: str, target: Float64 | None, T: Float64 | None = None) -> None:
+        """Show words, and an arrow from the camera's pose T to a target."""
+        self._advice.content = words
+        for handle in self._advised:
+            handle.remove()
+        self._advised = []
+        if target is None or T is None:
+            return
+        start, step = T[:3, 3], target[:3, 3] - T[:3, 3]
+        end = start + (step if np.linalg.norm(step) > _MIN_DISTANCE else _ARROW_M * target[:3, 2])
+        draw = self._server.scene
+        arrow = np.stack([start, end])[None].astype(np.float32)
+        self._advised = [
+            draw.add_arrows(
+                "/live_advice",
+                arrow,
+                _ADVISED,
+                shaft_radius=0.025,
+                head_radius=0.08,
+                head_length=0.2,
+            ),
+            draw.add_camera_frustum(
+                "/live_target",
+                _FOV,
+                1.25,
+                scale=0.15,
+                thickness=2.5,
+                thickness_units="screen",
+                color=_ADVISED,
+                wxyz=np.roll(quaternion.from_matrix(target[:3, :3]), 1),
+                position=target[:3, 3],
+            ),
+        ]
 
     def _is_new_view(self, T: Float64) -> bool:
         if not self._shown:

@@ -26,7 +26,7 @@ from tofuse.engine.quality import (
 from tofuse.engine.refinement import Refinement, calibration_check
 from tofuse.engine.results import Component, FrameRecord, Reason, Verdict, checks, verdicts
 from tofuse.engine.sensor import CameraErrors
-from tofuse.engine.tracking import FrameTime, given
+from tofuse.engine.tracking import FrameTime, given, moving_objects
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +101,11 @@ class Assessment:
         moving = tuple(
             (e.record.index, e.moving_fraction) for e in self.tracked.posed if e.moving_fraction > 0
         )
-        rivals = tuple(
-            (e.record.index, e.step.rival)
-            for e in self.tracked.posed
-            if e.step is not None and e.step.rival > 0
+        posed_steps = [(e.record.index, e.step) for e in self.tracked.posed if e.step is not None]
+        moved = tuple(
+            k for k, step in posed_steps if step.moved > moving_objects.MIN_MOVING_FRACTION
         )
+        rivals = tuple((k, step.rival) for k, step in posed_steps if step.rival > 0)
         ambiguous = self._ambiguous(graph)
         indices = [e.record.index for e in self.log.entries]
         repeated = frame_ranges.runs_of(indices, self.log.repeated)
@@ -142,6 +142,7 @@ class Assessment:
             priors=closed.sensors.records,
             components=components,
             moving=moving,
+            moved=moved,
             rivals=rivals,
             doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
             single_link_frames=single_link_frames(self.tracked, loops),

@@ -1,8 +1,8 @@
-"""Prepared views without a model: of a recording with known poses, and of a clip as tracked."""
+"""Frames and views without a model: of a recording with known poses, and of a clip as tracked."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from tofuse.engine.arrays import Float64
@@ -42,20 +42,31 @@ def map_views(
     for index, T in sorted(poses.items()):
         selected.push(_Unread(index, depth), T)
     return [
-        PosedView(view, poses[view.index])
-        for unread in selected.views
-        if (view := _read(recording, config, unread.index)) is not None
+        PosedView(prepared_view(frame, config, past), poses[frame.index])
+        for frame, past in _read(recording, config, [unread.index for unread in selected.views])
+        if isinstance(frame, RangeFrame)
     ]
 
 
-def _read(recording: Recording, config: Config, index: int) -> PreparedView | None:
-    try:
-        frame = recording.source.read(index)
-    except UnreadableFrameError:
-        return None
-    if not isinstance(frame, RangeFrame):
-        return None
-    return prepared_view(frame, config, past_frames(recording, index, config.window - 1))
+def filtered_frames(
+    recording: Recording, config: Config, indices: Iterable[int]
+) -> Iterator[Frame]:
+    """Yield the readable frames among these, corrected, and filtered as for the model."""
+    preparation = Preparation(config)
+    for frame, past in _read(recording, config, indices):
+        yield preparation.process(frame, None, past, None).for_model
+
+
+def _read(
+    recording: Recording, config: Config, indices: Iterable[int]
+) -> Iterator[tuple[Frame, list[Frame]]]:
+    """Yield the readable frames, and those before that filters need."""
+    for index in indices:
+        try:
+            frame = recording.source.read(index)
+        except UnreadableFrameError:
+            continue
+        yield frame, past_frames(recording, index, config.window - 1)
 
 
 def prepared_view(frame: RangeFrame, config: Config, past: Sequence[Frame] = ()) -> PreparedView:

@@ -65,9 +65,11 @@ class FrameSequence:
         if not isinstance(frame, RangeFrame):
             return False
         previous, self._previous = self._previous, frame
-        if previous is None:
+        if previous is None or previous.depth.shape != frame.depth.shape:
             return False
-        return np.array_equal(previous.depth, frame.depth) and len(frame) > 0
+        # Images that differ nearly always do in some rows, too.
+        parts = ((image[:: len(image) // 8 + 1], image) for image in (previous.depth, frame.depth))
+        return all(np.array_equal(a, b) for a, b in zip(*parts, strict=True)) and len(frame) > 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from tofuse.engine.alignment import Link
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import job_pool
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Optimiser
+from tofuse.engine.graph import Optimiser, PoseGraph, graph_covariances
 from tofuse.engine.loops import ClosedLoop, Loops
 from tofuse.engine.mapping.frame_log import FrameLog, poses_in_world
 from tofuse.engine.mapping.tracked_graph import TrackedGraph
@@ -84,9 +84,13 @@ class LivePoses:
         # current one by loops.
         self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
         self._T_closed_tracked = np.eye(4)
+        # Of the frames of the first component, by index; None where a direction is not measured.
+        self._covariances: dict[int, Float64 | None] = {}
 
     def update(self, step: Step, log: FrameLog) -> None:
         """Add the next frame; correct this and the following poses if loops have closed."""
+        if step.T_component_camera is not None and step.component == 0:
+            self._covariances[log.entries[-1].record.index] = self._propagated(step)
         loops = self.due_loops(step, log)
         if not loops:
             return
@@ -110,8 +114,20 @@ class LivePoses:
         if not self._pending or self._n_new < _MIN_NEW_FRACTION * self._n_frames:
             return []
         self._pending, self._n_new = False, 0
-        component_frames = {e.record.index for e in log.of_component(step.component).posed}
-        return [c for c in self._loops.closed if {c.record.i, c.record.j} <= component_frames]
+        return self._closed_among(log.of_component(step.component))
+
+    def _closed_among(self, log: FrameLog) -> list[ClosedLoop]:
+        frames = {e.record.index for e in log.posed}
+        return [c for c in self._loops.closed if {c.record.i, c.record.j} <= frames]
+
+    def graph(self, component: int, log: FrameLog) -> PoseGraph:
+        """Return the graph of a component, given its log, optimised if loops have closed."""
+        loops = self._closed_among(log)
+        poses = poses_in_world(log, {component: np.eye(4)})
+        graph = TrackedGraph(log.posed, poses, ()).build(loops)
+        if not loops:
+            return graph
+        return graph_covariances.accepted_only(self._optimiser.optimise(graph)).graph
 
     def pose(self, step: Step) -> Float64 | None:
         """Return T_world_camera (4, 4); None if lost, or not connected to the first component."""
@@ -120,6 +136,22 @@ class LivePoses:
             return None
         T = T_world_component @ self._T_closed_tracked @ step.T_component_camera
         return np.asarray(T, np.float64)
+
+    def covariance(self, index: int) -> Float64 | None:
+        """Return the (6, 6) covariance of a frame's pose as tracked; None if it is not known."""
+        return self._covariances.get(index)
+
+    def _propagated(self, step: Step) -> Float64 | None:
+        """The covariance of a pose from that of its reference and the registration."""
+        r = step.registration
+        if r is None or step.reference is None:
+            return np.zeros((6, 6))
+        C_reference = self._covariances.get(step.reference)
+        if C_reference is None or len(r.unobservable):
+            return None
+        r = r.between(np.eye(4), np.eye(4))  # about the frame's own origin
+        A = se3.adjoint(se3.inverse(r.T_target_source))
+        return np.asarray(A @ C_reference @ A.T + np.linalg.inv(r.information), np.float64)
 
     def _connect(self, link: Link, log: FrameLog) -> None:
         a, b = log.step_of(link.i), log.step_of(link.j)

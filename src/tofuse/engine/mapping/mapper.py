@@ -24,7 +24,7 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.preparation import FilteredFrame, Preparation, Prepared
 from tofuse.engine.parts import check_number
-from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.progress import OnlineMap, Progress, Silent
 from tofuse.engine.results import FrameRecord, Reconstruction
 from tofuse.engine.stopwatch import current, timing
 from tofuse.engine.stored_views import PosedView
@@ -80,6 +80,7 @@ class Mapper:
         self._shift: Float64 = np.zeros(3)
         self._given_tracker = tracker
         self._start_method()
+        self._progress.began(self.so_far)
 
     def _start_method(self) -> None:
         self._preparation = Preparation(self.config)
@@ -119,7 +120,7 @@ class Mapper:
         -------
         Current estimate of T_world_camera (4, 4); None if the frame is lost, or in a component that
         is not yet connected to the first one. Loops take effect some frames later; `finish` joins
-        components and optimises all poses again.
+        components and optimises all poses again. Status and covariance are in `last`.
 
         Raises
         ------
@@ -223,6 +224,19 @@ class Mapper:
             self._tracker = config.odometry.start(self.seed, config.search)
 
     @property
+    def last(self) -> FrameRecord | None:
+        """The record of the latest frame: status, reason, residuals, covariance of the pose.
+
+        The covariance is that of tracking alone: it knows neither loops nor systematic errors,
+        which `finish` takes into account. None where a direction is not measured, and for
+        components that began after a gap.
+        """
+        if not self._log.entries:
+            return None
+        record = self._log.entries[-1].record
+        return replace(record, covariance=self._live_poses.covariance(record.index))
+
+    @property
     def log(self) -> FrameLog:
         """The log of all frames so far."""
         return self._log
@@ -231,6 +245,14 @@ class Mapper:
     def views(self) -> Sequence[PosedView[PreparedView]]:
         """Prepared views of frames with a pose, spaced by motion, in the order of their frames."""
         return self._observations.views.views
+
+    def so_far(self) -> OnlineMap:
+        """Return what is known of the component of the latest frame."""
+        log = self._log.of_component(self._component)
+        graph = self._live_poses.graph(self._component, log)
+        times = {e.record.index: e.record.timestamp for e in log.entries}
+        views = [v for v in self.views if v.component == self._component]
+        return OnlineMap(graph, np.array([times[i] for i in graph.ids.tolist()]), views)
 
     def finish(self) -> Reconstruction:
         """Join components, close loops, optimise, refine, fuse and judge.

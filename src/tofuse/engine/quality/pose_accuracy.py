@@ -413,6 +413,12 @@ def accuracy_of(
     )
 
 
+def bound_by_covariance(C: Float64) -> float:
+    """95 % bound on the rms error of positions with covariance (3m, 3m), which is all evidence."""
+    square, degrees = _of_chosen(C, np.ones(len(C) // 3, np.bool_))
+    return float(_bounds(np.array(square), np.array(degrees), np.array(_MODEL_DOF)))
+
+
 def covariances_of(
     covariances: graph_covariances.GraphCovariances, observed: ObservedErrors
 ) -> Float64:

@@ -101,6 +101,9 @@ class CalibrationCheck:
     focal_sigma
         Standard deviation of the focal length estimated from the views, as a fraction; None if
         there are too few views.
+    estimates
+        First estimate of each error alone, by one Newton step, and its standard deviation from the
+        spread between views, significant or not.
     motion
         Rms motion (m, rad) of the poses, after alignment, that a unit of each error causes.
     moved
@@ -122,6 +125,7 @@ class CalibrationCheck:
     gap: Gap | None = None
     best: str = ""
     focal_sigma: float | None = None
+    estimates: dict[str, tuple[float, float]] = field(default_factory=dict)
     motion: dict[str, tuple[float, float]] = field(default_factory=dict)
     moved: tuple[float, float] = (0.0, 0.0)
     changed: tuple[float, float] = (0.0, 0.0)
@@ -188,6 +192,7 @@ def check_calibration(
     significance = significance_of(len(views))
     without_error = CalibrationCheck(
         focal_sigma=first.sigmas["focal"],
+        estimates={name: (first.errors[name], first.sigmas[name]) for name in _INDEX},
         motion=first.motion,
         moved=first.largest_motion,
         significance=significance,

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         Component,
         Diagnostics,
         FrameRecord,
+        Mirror,
         Reason,
         Reconstruction,
         SelfCalibration,

@@ -104,7 +104,10 @@ class Evidence:
     components
         As in `Reconstruction`; empty if all frames are in one.
     moving
-        (frame index, fraction of the image) of frames with moving objects.
+        (frame index, fraction of the image) of frames with moving objects, or with depth that
+        varies as if there were.
+    moved
+        Indices of the frames in which something certainly moved.
     rivals
         (frame index, share of the view) of frames of which a share follows a rival motion.
     doubtful
@@ -135,6 +138,7 @@ class Evidence:
     priors: tuple[external_sensors.SensorRecord, ...] = ()
     components: tuple[Component, ...] = ()
     moving: tuple[tuple[int, float], ...] = ()
+    moved: tuple[int, ...] = ()
     rivals: tuple[tuple[int, float], ...] = ()
     doubtful: tuple[int, ...] = ()
     single_link_frames: tuple[int, ...] = ()
@@ -407,15 +411,25 @@ def _external_sensors(e: Evidence) -> Iterator[Reason]:
 
 
 def _scene(e: Evidence) -> Iterator[Reason]:
-    """Moving objects, and views with a bad fit."""
-    moving = {frame: fraction for frame, fraction in e.moving if fraction > 0}
-    where = e.runs_of(moving)
-    if where:
-        text = (
-            f"Moving objects cover up to {_percent(max(moving.values()))} of the image in "
-            f"{frame_ranges.in_words(where)}; they are excluded from tracking and from the model."
-        )
-        yield Reason("moving_objects", where, text)
+    """Moving objects, unstable depth, and views with a bad fit."""
+    fractions = {frame: fraction for frame, fraction in e.moving if fraction > 0}
+    runs = e.runs_of(fractions)
+    moving = tuple((a, b) for a, b in runs if any(a <= frame <= b for frame in e.moved))
+    for code, where, words in (
+        ("moving_objects", moving, "Moving objects cover up to {} of the image in {}; they are"),
+        (
+            "unstable_depth",
+            tuple(run for run in runs if run not in moving),
+            "The depth of up to {} of the image varies from view to view in {}, without a sign of "
+            "anything moving; it is",
+        ),
+    ):
+        if where:
+            largest = max(
+                x for frame, x in fractions.items() if any(a <= frame <= b for a, b in where)
+            )
+            text = words.format(_percent(largest), frame_ranges.in_words(where))
+            yield Reason(code, where, f"{text} excluded from tracking and from the model.")
     parts = [*e.moving, *e.rivals]
     if where := e.runs_of(open_motion(parts)):
         text = (

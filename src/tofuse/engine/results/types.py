@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.frames import frame_ranges
 from tofuse.engine.fusion import Cloud, Mesh, T_up_world
 from tofuse.engine.graph import GraphPart, LoopRecord, PoseGraph, certificate, external_sensors
@@ -292,6 +292,41 @@ class SessionChange:
     change: Change
 
 
+@dataclass(frozen=True, eq=False)
+class Mirror:
+    """A mirror or a pane of glass in the model.
+
+    Attributes
+    ----------
+    kind
+        "mirror", whose reflection was cut out of the model; "glass", through which some views
+        measure what is behind it and others the glass; "glass or mirror" where the surfaces that
+        it would reflect were not seen.
+    normal, offset_m
+        Its plane ``normal . p = offset_m``, in the world frame; the (3,) unit normal points to the
+        cameras.
+    corners
+        (K, 3) of its convex outline, m.
+    area_m2
+        Of the outline.
+    agreement
+        Share of the ranges measured in it that agree with the reflection of the model.
+    log_ratio
+        Logarithm of the likelihood ratio of a mirror to chance.
+    points
+        (N, 3) of the model that are seen through it: cut out, or behind glass.
+    """
+
+    kind: Literal["mirror", "glass", "glass or mirror"]
+    normal: Float64
+    offset_m: float
+    corners: Float64
+    area_m2: float
+    agreement: float
+    log_ratio: float
+    points: Float32
+
+
 def in_main_model(record: FrameRecord, components: Sequence[Component]) -> bool:
     """Whether a frame has a pose in the main model, not only in that of another component.
 
@@ -337,6 +372,8 @@ class Reconstruction:
         a run.
     changes
         Surfaces of the main model that changed between two sessions, in its world frame.
+    mirrors
+        Mirrors and panes of glass in the main model, if they were looked for.
     up
         (3,) unit vector against gravity in the world frame, measured by an accelerometer; None
         without one.
@@ -359,6 +396,7 @@ class Reconstruction:
     sessions: tuple[SessionRecord, ...] = ()
     session_pairs: tuple[SessionPair, ...] = ()
     changes: tuple[SessionChange, ...] = ()
+    mirrors: tuple[Mirror, ...] = ()
     up: Float64 | None = None
     shift: Float64 = field(default_factory=lambda: np.zeros(3))
 

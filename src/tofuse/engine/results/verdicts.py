@@ -49,6 +49,7 @@ REASONS: dict[str, tuple[str, str]] = {
         "The scene repeats itself: other steps between frames fit as well.",
     ),
     "moving_objects": ("note", "Objects move in front of the camera; they are excluded."),
+    "unstable_depth": ("note", "Depth varies from view to view; it is excluded there."),
     "not_improved": ("note", "The optimiser did not improve on the initial poses."),
     "not_refined": ("note", "Global refinement did not improve consistency and was discarded."),
     "sensor_differs": ("note", "An external sensor is inconsistent with the tracked motion."),

@@ -48,6 +48,9 @@ class Step:
         Factor by which the standard deviations of the registration were enlarged for that reason.
     moving
         (H, W) mask of the frame's pixels on moving objects; None without any.
+    moved
+        Fraction of the image on objects that certainly moved, see `outlines`; the rest of `moving`
+        may be due to errors of the depth.
     rival
         Share of the last views that follows a rival of the tracked motion, see `RivalMotions`.
     """
@@ -63,6 +66,7 @@ class Step:
     doubtful: bool = False
     inflation: float = 1.0
     moving: Bool | None = None
+    moved: float = 0.0
     rival: float = 0.0
 
 

@@ -19,6 +19,7 @@ from tofuse.engine.search import SearchOptions
 from tofuse.engine.tracking.base import Odometry, Status, Step, Tracker
 from tofuse.engine.tracking.keyframe_map import Keyframe, KeyframeMap
 from tofuse.engine.tracking.moving_objects import MIN_MOVING_FRACTION, MovingObjects, at_size
+from tofuse.engine.tracking.outlines import moved_fraction
 from tofuse.engine.views import PreparedView, prepare_view
 
 
@@ -85,17 +86,20 @@ class _GivenTracker(Tracker):
         keyframe = self._keyframes.overlapping(T)
         moving = self._objects.compare(view, T, keyframe.view, keyframe.T_component_camera)
         self._objects.update(moving)
-        mask = None
+        mask, moved = None, 0.0
         target = keyframe.target
         if moving.fraction > MIN_MOVING_FRACTION:
             mask = at_size(moving.view, frame)
+            T_keyframe_camera = se3.inverse(keyframe.T_component_camera) @ T
+            moved = moved_fraction(moving.view, view, keyframe.view, T_keyframe_camera)
             view = moving.applied(view)
             reference = moving.applied_to_reference(keyframe.view)
             target = projective.Target(reference, se3.inverse(keyframe.T_component_camera))
         registration = self._registration(view, keyframe, target, T)
         if self._keyframes.is_far(T, self._keyframes.newest):
             self._keyframes.add(Keyframe(view, T, 0))
-        return Step("tracked", "", T, keyframe.view.index, registration, view, moving=mask)
+        index = keyframe.view.index
+        return Step("tracked", "", T, index, registration, view, moving=mask, moved=moved)
 
     def _registration(
         self, view: PreparedView, keyframe: Keyframe, target: projective.Target, T: Float64

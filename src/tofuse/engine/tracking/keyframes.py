@@ -16,6 +16,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.engine.search import SearchOptions, verification
 from tofuse.engine.tracking.base import Guess, Odometry, Status, Step, Tracker
@@ -23,6 +24,7 @@ from tofuse.engine.tracking.hypotheses import Hypotheses, Hypothesis, TrackerSta
 from tofuse.engine.tracking.keyframe_map import Keyframe, KeyframeMap, Relocalizer
 from tofuse.engine.tracking.motion import FrameTime
 from tofuse.engine.tracking.moving_objects import MIN_MOVING_FRACTION, at_size
+from tofuse.engine.tracking.outlines import moved_fraction
 from tofuse.engine.tracking.selection import Selection
 from tofuse.engine.views import PreparedView, prepare_view
 
@@ -180,9 +182,13 @@ class KeyframeTracker(Tracker):
         self._state.fit_statistics.learn(accepted.aligned, view.depth)
         links = self._insert_keyframe(view, accepted)
         status, reason = _status_of(accepted, frame)
-        mask = None
+        mask, moved = None, 0.0
         if moving is not None and moving.fraction > MIN_MOVING_FRACTION:
             mask = at_size(moving.view, frame)
+            T_keyframe_camera = se3.inverse(accepted.keyframe.T_component_camera) @ (
+                accepted.T_component_camera
+            )
+            moved = moved_fraction(moving.view, view, accepted.keyframe.view, T_keyframe_camera)
             view = moving.applied(view)
         return Step(
             status,
@@ -196,6 +202,7 @@ class KeyframeTracker(Tracker):
             doubtful=not accepted.fit.is_usual,
             inflation=_inflation(accepted),
             moving=mask,
+            moved=moved,
             rival=rival,
         )
 

@@ -55,7 +55,7 @@ class CameraFile:
         Metres per count.
     depth_kind
         "z" or "range".
-    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind, sigma_unit_m, sensor
+    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind, sigma_unit_m, sensor, serial
         See the native format in docs/formats.md; None where not given.
     color_registered
         Whether colour without its own camera is registered to depth.
@@ -75,6 +75,7 @@ class CameraFile:
     amplitude_kind: AmplitudeKind | None = None
     sigma_unit_m: float | None = None
     sensor: str | None = None
+    serial: str | None = None
     color_registered: bool = True
     color: ColorCamera | None = None
     unknown: tuple[str, ...] = ()
@@ -82,7 +83,7 @@ class CameraFile:
     @property
     def metadata(self) -> dict[str, Any]:
         """Metadata of a recording's depth and sensor."""
-        return {"depth_kind": self.depth_kind, **self.stated("sensor")}
+        return {"depth_kind": self.depth_kind, **self.stated("sensor", "serial")}
 
     def stated(self, *names: str) -> dict[str, Any]:
         """Return those of the named attributes that are given."""
@@ -134,6 +135,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
         get.choice("amplitude_kind", AMPLITUDE_KINDS),  # type: ignore[arg-type]
         get.positive("sigma_unit_m"),
         get.text("sensor"),
+        get.text("serial"),
         get.flag("color_registered", default=True),
         color,
         tuple(key for key in data if key not in {"schema", *_LENS, *_KEYS}),

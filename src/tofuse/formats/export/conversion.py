@@ -129,7 +129,7 @@ def _writer(
     metadata = recording.metadata
     first = sample[0]
     properties: dict[str, Any] = {
-        name: metadata.get(name) for name in ("frame_rate_hz", "confidence_max", "sensor")
+        name: metadata.get(name) for name in ("frame_rate_hz", "confidence_max", "sensor", "serial")
     }
     if isinstance(first, CloudFrame):
         return RecordingWriter(folder, None, **properties)

@@ -230,8 +230,8 @@ def name_order(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(p), p) if p[:1].isdecimal() else (1, 0, p) for p in parts]
 
 
-def list_folder(path: str | Path) -> list[Path]:
-    """Return the visible entries of a folder in name order, see `name_order`.
+def list_folder(path: str | Path, matches: Callable[[Path], object] | None = None) -> list[Path]:
+    """Return the visible entries of a folder (that match) in name order, see `name_order`.
 
     Raises
     ------
@@ -239,9 +239,8 @@ def list_folder(path: str | Path) -> list[Path]:
         If it can't be listed.
     """
     with readable(path):
-        return sorted(
-            (p for p in Path(path).iterdir() if not p.name.startswith(".")), key=name_order
-        )
+        visible = (p for p in Path(path).iterdir() if not p.name.startswith("."))
+        return sorted(filter(matches, visible), key=name_order)
 
 
 def files_with(path: str | Path, *suffixes: str) -> list[Path]:
@@ -250,7 +249,7 @@ def files_with(path: str | Path, *suffixes: str) -> list[Path]:
     Including non-files and dangling links: each stands for an unreadable frame, without which all
     later ones would be assigned wrong times.
     """
-    return [p for p in list_folder(path) if p.suffix.lower() in suffixes]
+    return list_folder(path, lambda p: p.suffix.lower() in suffixes)
 
 
 def files_named(path: Path, matches: Callable[[str], object]) -> list[Path]:
@@ -258,7 +257,7 @@ def files_named(path: Path, matches: Callable[[str], object]) -> list[Path]:
     if not is_folder(path):
         return []
     try:
-        return [p for p in list_folder(path) if matches(p.name) and is_file(p)]
+        return list_folder(path, lambda p: matches(p.name) and is_file(p))
     except InputError:
         return []
 

@@ -260,7 +260,12 @@ class NativeSource(FileSource):
                 f"{', '.join(description.unknown)}"
             )
         self.metadata |= description.stated(
-            "sensor", "frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"
+            "sensor",
+            "serial",
+            "frame_rate_hz",
+            "ambiguity_m",
+            "confidence_max",
+            "amplitude_kind",
         )
         if self.camera is not None:
             self.metadata["depth_unit_m"] = description.depth_unit_m

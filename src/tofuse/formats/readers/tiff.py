@@ -76,7 +76,7 @@ class TiffSource(FileSource):
             self.amplitude = []
         self.read_sidecars(folder)
         self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
-        self.metadata |= description.stated("sensor", "frame_rate_hz", "ambiguity_m")
+        self.metadata |= description.stated("sensor", "serial", "frame_rate_hz", "ambiguity_m")
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""

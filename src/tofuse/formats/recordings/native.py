@@ -80,6 +80,7 @@ class RecordingWriter:
         confidence_max: float | None = None,
         amplitude_kind: str | None = None,
         sensor: str | None = None,
+        serial: str | None = None,
         sigma_unit_m: float | None = None,
         color_registered: bool = True,
         camera_per_frame: bool = False,
@@ -104,6 +105,7 @@ class RecordingWriter:
             "confidence_max": confidence_max,
             "amplitude_kind": amplitude_kind,
             "sensor": sensor,
+            "serial": serial,
             "sigma_unit_m": sigma_unit_m,
             "color_registered": None if color_registered else False,
         }

@@ -8,9 +8,9 @@ scaled to that stated by their makers.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from scipy.constants import speed_of_light
@@ -107,6 +107,30 @@ class CameraModel:
     compression: float = 0.1
     drift_m: float = 0.012
     drift_time_s: float = 240.0
+
+    def binned(self, columns: int) -> Self:
+        """Return the camera with squares of pixels summed, so that it has at most `columns`."""
+        n = -(-self.camera.width // columns)
+        lens = self.camera
+        camera = replace(
+            lens,
+            width=lens.width // n,
+            height=lens.height // n,
+            fx=lens.fx / n,
+            fy=lens.fy / n,
+            cx=(lens.cx + 0.5) / n - 0.5,
+            cy=(lens.cy + 0.5) / n - 0.5,
+        )
+        return replace(
+            self,
+            camera=camera,
+            signal_electrons=n**2 * self.signal_electrons,
+            ambient_electrons=n**2 * self.ambient_electrons,
+            full_well_electrons=n**2 * self.full_well_electrons,
+            read_noise_electrons=n * self.read_noise_electrons,
+            counts_per_electron=self.counts_per_electron / n**2,
+            blur_px=self.blur_px / n,
+        )
 
     @property
     def period_m(self) -> float:

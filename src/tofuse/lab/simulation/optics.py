@@ -177,6 +177,14 @@ def trace(
     return Returns(strength, path, diffuse, distance, points, normals, hits.surface)
 
 
+def travelled(returns: Returns) -> Float64:
+    """Half of the path of the light (N,), m: to the surface hit, or on from a perfect mirror."""
+    if returns.path.shape[1] == 1:
+        return returns.distance
+    from_mirror = (returns.diffuse == 0) & (returns.path[:, 1] > 0)
+    return np.where(from_mirror, returns.path[:, 1] / 2, returns.distance)
+
+
 def _mirrored(gloss: Float64, cosine: Float64) -> Float64:
     """Specular reflectance (Schlick 1994): gloss^2 at normal incidence, rising to grazing.
 

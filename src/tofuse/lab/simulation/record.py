@@ -22,6 +22,7 @@ from tofuse.formats.recordings import RecordingWriter
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.accelerometer import accelerations
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.mirrors import hang_mirror
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.passing import Passing, add_distractor
 from tofuse.lab.simulation.peaks import peaks_cameras, peaks_points, peaks_views
@@ -80,6 +81,18 @@ class RecordingPlan:
             if progress is not None:
                 progress(k + 1, len(self.raw))
 
+    def recording(self, *, correction: bool = True, progress: Progress | None = None) -> Recording:
+        """Render it in memory, with the true poses as its reference; see `simulate`."""
+        factory_correction = self.correction if correction else None
+        images = [
+            rendered.frame
+            if factory_correction is None
+            else _corrected(factory_correction, rendered.frame)
+            for rendered in self.frames(progress)
+        ]
+        source = ArraySource(images, self.poses, metadata=_metadata(self, correction))
+        return Recording.of(source, f"simulated {self.scene.name}", "simulated")
+
 
 def plan(
     scene: str,
@@ -93,6 +106,7 @@ def plan(
     texture: bool = True,
     axis_offset_m: float = 0.0,
     passing: Passing | None = None,
+    mirror: tuple[float, float] | None = None,
 ) -> RecordingPlan:
     """Plan a recording; see `simulate` for the parameters.
 
@@ -113,6 +127,9 @@ def plan(
             f"is {first}", where="first", remedy=f"use one from 0 to {sequence.frames - 1}"
         )
     raw = np.arange(first, sequence.frames, stride)[:frames]
+    if mirror is not None:
+        times = raw / sequence.frame_rate_hz
+        built, _ = hang_mirror(built, sequence, model, mirror, times=times, seed=seed)
     if passing is not None:
         times = raw[[0, -1]] / sequence.frame_rate_hz
         built, sequence = add_distractor(
@@ -135,6 +152,7 @@ def simulate_recording(
     texture: bool = True,
     axis_offset_m: float = 0.0,
     passing: Passing | None = None,
+    mirror: tuple[float, float] | None = None,
     sigma_m: float = 0.05,
     progress: Progress | None = None,
 ) -> Recording:
@@ -158,16 +176,9 @@ def simulate_recording(
         texture=texture,
         axis_offset_m=axis_offset_m,
         passing=passing,
+        mirror=mirror,
     )
-    factory_correction = planned.correction if correction else None
-    images = [
-        rendered.frame
-        if factory_correction is None
-        else _corrected(factory_correction, rendered.frame)
-        for rendered in planned.frames(progress)
-    ]
-    source = ArraySource(images, planned.poses, metadata=_metadata(planned, correction))
-    return Recording.of(source, f"simulated {scene}", "simulated")
+    return planned.recording(correction=correction, progress=progress)
 
 
 def simulate(
@@ -184,6 +195,7 @@ def simulate(
     texture: bool = True,
     axis_offset_m: float = 0.0,
     passing: Passing | None = None,
+    mirror: tuple[float, float] | None = None,
     imu: bool = False,
     sigma_m: float = 0.05,
     progress: Progress | None = None,
@@ -217,6 +229,8 @@ def simulate(
     passing
         A distractor that passes through the view; its pixels are flagged in truth/flags. It is not
         part of the surface in truth/.
+    mirror
+        Width and height in m of a mirror on a wall that the camera sees; its pixels are flagged.
     imu
         Whether an accelerometer on the camera is recorded as well.
     sigma_m
@@ -248,6 +262,7 @@ def simulate(
         texture=texture,
         axis_offset_m=axis_offset_m,
         passing=passing,
+        mirror=mirror,
     )
     return write(planned, out, correction=correction, imu=imu, progress=progress)
 

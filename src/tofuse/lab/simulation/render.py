@@ -111,8 +111,9 @@ def render(
     expected = sensor.expose(model, effects, exposure, None)
     ranges = _add_offsets(model, effects, measured.range_m, time_s)
     if not effects.wrap:
+        travelled = optics.travelled(centre_returns).reshape(shape[:2])[centre_grid.centre]
         periods = np.round(
-            (np.where(np.isfinite(distance), distance, ranges) - ranges) / model.period_m
+            (np.where(np.isfinite(travelled), travelled, ranges) - ranges) / model.period_m
         )
         ranges = np.maximum(ranges + periods * model.period_m, 0)
 

@@ -145,6 +145,15 @@ class Scene:
         scene._rows = texture.parameter_rows(scene.materials, self._seed)
         return scene
 
+    def with_surface(self, material: Material, mesh: Mesh) -> Self:
+        """Return the scene with one more surface in its room, a mirror for example."""
+        scene = copy.copy(self)
+        room = self._room.mesh
+        scene._room = Body(meshes.joined([room, mesh.of_surface(len(self.materials))]))
+        scene.materials = (*self.materials, material)
+        scene._rows = texture.parameter_rows(scene.materials, self._seed)
+        return scene
+
     @property
     def _moving(self) -> tuple[Body, ...]:
         """All moving bodies, the object first."""

@@ -1,0 +1,185 @@
+"""Mirrors and glass of a finished reconstruction, and the model without what is behind mirrors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from tofuse.apps.mirrors.openings import Opening, find_openings, find_planes
+from tofuse.apps.mirrors.reflection import MIN_PATCHES, Evidence, weigh
+from tofuse.apps.mirrors.views import Noise, View, read_views
+from tofuse.engine.arrays import Bool, Float32, Float64
+from tofuse.engine.frames import Recording, evenly_spaced
+from tofuse.engine.fusion import Cloud
+from tofuse.engine.results import Mirror, Reconstruction
+
+# A mirror is this much likelier than chance (logarithm), and agrees in this share of its pixels.
+_MIN_LOG_RATIO, _MIN_SHARE = 7.0, 0.55
+# Points that predict, views of a first look, and the smallest share there for a second one.
+_POINTS, _FIRST_LOOK, _PROMISING = 30_000, 10, 0.4
+# Glass: most of its cells are measured by some views and passed by others.
+_GLASS, _MIN_GLASS_M2 = 0.5, 0.1
+_ORIGINS = 300  # cameras from which points behind a mirror may be seen
+_MAX_GROWTH = 1.25  # of the area, by joining parts of one mirror
+
+
+def find_mirrors(recording: Recording, result: Reconstruction, seed: int = 0) -> Reconstruction:
+    """Return the result with its mirrors, and without the points and faces behind them.
+
+    Parameters
+    ----------
+    recording
+        The recording that it was made of; some frames are read again.
+    result
+        A reconstruction of range images; others have no mirrors.
+    seed
+        Of the sampling.
+    """
+    views = read_views(recording, result) if result.has_pose.any() else []
+    cloud = result.cloud
+    if not views or cloud.normals is None or not len(cloud):
+        return result
+    points, normals = cloud.points.astype(np.float64), cloud.normals.astype(np.float64)
+    noise = Noise.of(views, points)
+    rng = np.random.default_rng([seed, 17])
+    planes = find_planes(points, normals, noise.tolerance_m, rng)
+    chosen = rng.permutation(len(points))[:_POINTS]
+    points, normals = points[chosen], normals[chosen]
+    found = []
+    for plane in planes:
+        weighed = [
+            (opening, _weighed(opening, views, points, normals, noise))
+            for opening in find_openings(plane, views, noise)
+        ]
+        found += _mirrors_in(weighed) + _glass_in(weighed)
+    found.sort(key=lambda item: -item[1].log_ratio)
+    return _applied(result, views, noise, found)
+
+
+_Found = tuple[Opening, Evidence, Literal["mirror", "glass", "glass or mirror"]]
+
+
+def _weighed(
+    opening: Opening, views: Sequence[View], points: Float64, normals: Float64, noise: Noise
+) -> Evidence:
+    step = max(1, len(views) // _FIRST_LOOK)
+    first = weigh(opening, views[::step], points, normals, noise, compare=False)
+    if not opening.whole or (step > 1 and first.patches and first.share < _PROMISING):
+        return first
+    return weigh(opening, views, points, normals, noise)
+
+
+def _mirrors_in(weighed: Sequence[tuple[Opening, Evidence]]) -> list[_Found]:
+    """Select the mirrors in a plane; their parts that reflect too little to tell join them."""
+    accepted: list[_Found] = []
+    for opening, evidence in sorted(weighed, key=lambda item: -item[1].log_ratio):
+        if evidence.share < _MIN_SHARE:
+            continue
+        for k, (other, known, kind) in enumerate(accepted):
+            joined = other.joined(opening)
+            if joined.area_m2 < _MAX_GROWTH * (other.area_m2 + opening.area_m2):
+                accepted[k] = joined, known, kind
+                break
+        else:
+            if opening.whole and evidence.log_ratio > _MIN_LOG_RATIO:
+                accepted.append((opening, evidence, "mirror"))
+    return accepted
+
+
+def _glass_in(weighed: Sequence[tuple[Opening, Evidence]]) -> list[_Found]:
+    """Select openings whose plane other views measured."""
+    return [
+        (o, e, "glass" if e.patches >= MIN_PATCHES else "glass or mirror")
+        for o, e in weighed
+        if o.whole and o.mixed > _GLASS and o.area_m2 > _MIN_GLASS_M2
+        if e.log_ratio < _MIN_LOG_RATIO
+    ]
+
+
+def _applied(
+    result: Reconstruction, views: Sequence[View], noise: Noise, found: Sequence[_Found]
+) -> Reconstruction:
+    """Add mirrors to a result, the likeliest first, and remove what is behind them."""
+    posed = evenly_spaced(np.flatnonzero(result.has_pose), _ORIGINS)
+    origins = result.trajectory[posed, :3, 3]
+    cloud, mesh = result.cloud, result.mesh
+    mirrors: list[Mirror] = []
+    margin = 2 * noise.tolerance_m
+    taken: list[Opening] = []
+    for opening, evidence, kind in found:
+        centre = opening.corners.mean(0)[None]
+        if any(_same_place(other, centre, origins, margin) for other in taken):
+            continue
+        taken.append(opening)
+        behind = _behind(opening, cloud.points, views, origins, margin)
+        seen = cloud.points[behind]
+        if kind == "mirror":
+            cloud = _kept(cloud, ~behind)
+            if mesh is not None:
+                inside = ~_behind(opening, mesh.vertices, views, origins, margin)
+                mesh = mesh.rows(np.asarray(inside[mesh.faces].all(1), np.bool_))
+        mirrors.append(
+            Mirror(
+                kind,
+                opening.plane.normal,
+                opening.plane.offset,
+                opening.corners,
+                opening.area_m2,
+                evidence.share,
+                evidence.log_ratio,
+                seen,
+            )
+        )
+    return replace(result, cloud=cloud, mesh=mesh, mirrors=tuple(mirrors))
+
+
+def _same_place(known: Opening, centre: Float64, origins: Float64, margin: float) -> bool:
+    """Whether an opening's centre (1, 3) is in a known one, or in the room behind it."""
+    height = known.plane.height(centre)
+    in_it = abs(height) < margin and known.contains(centre - height[:, None] * known.plane.normal)
+    return bool(in_it or known.behind(centre, origins)[0])
+
+
+def _behind(
+    opening: Opening,
+    points: Float32,
+    views: Sequence[View],
+    origins: Float64,
+    margin: float,
+) -> Bool:
+    """Which points (N, 3) are seen through an opening only: not from behind its plane as well."""
+    world = points.astype(np.float64)
+    rows = np.flatnonzero(opening.plane.height(world) < -margin)
+    out = np.zeros(len(points), bool)
+    out[rows] = opening.grown(margin).behind(world[rows], origins)
+    for view in views:
+        if opening.plane.height(view.origin) > -margin or not out.any():
+            continue
+        rows = np.flatnonzero(out)
+        in_camera, pixels, inside = view.project(world[rows])
+        distance = np.linalg.norm(in_camera, axis=1)
+        out[rows] = ~(inside & (np.abs(view.at(view.ranges, pixels) - distance) < margin))
+    return out
+
+
+def _kept(cloud: Cloud, rows: Bool) -> Cloud:
+    def of(column: np.ndarray | None) -> np.ndarray | None:
+        return None if column is None else column[rows]
+
+    return Cloud(
+        cloud.points[rows], of(cloud.normals), of(cloud.color), cloud.views[rows], of(cloud.sigma)
+    )
+
+
+def sentences(result: Reconstruction) -> list[str]:
+    """Return a sentence for each mirror and pane of glass."""
+    done = {"mirror": "were cut out of the model", "glass": "are behind the glass"}
+    return [
+        f"{m.kind.capitalize()} of {m.area_m2:.2f} m² at "
+        f"({', '.join(f'{x:.2f}' for x in m.corners.mean(0))}) m: "
+        f"{len(m.points):,} points {done.get(m.kind, 'are behind or in it')}."
+        for m in result.mirrors
+    ]

@@ -1,0 +1,111 @@
+"""Plans: the scene of a scan, binned cameras, and decisions."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.apps.cli.program import main
+from tofuse.engine.errors import InputError
+from tofuse.engine.fusion import Mesh
+from tofuse.engine.geometry import se3
+from tofuse.lab import planning
+from tofuse.lab.simulation import CAMERAS, camera_model
+from tofuse.lab.simulation.models import noise_of
+
+
+def sheet() -> Mesh:
+    """A square of 2 m at z = 2 m, facing the camera, one half four times as bright as the other."""
+    x, y = (g.ravel() for g in np.meshgrid(*[np.linspace(-1, 1, 21)] * 2))
+    vertices = np.stack([x, y, np.full(len(x), 2.0)], 1).astype(np.float32)
+    k = np.arange(len(x)).reshape(21, 21)
+    a, b, c, d = (each.ravel() for each in (k[:-1, :-1], k[:-1, 1:], k[1:, 1:], k[1:, :-1]))
+    faces = np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)]).astype(np.int32)
+    color = np.repeat(np.where(x > 0, 200, 50)[:, None], 3, 1).astype(np.uint8)
+    zeros = np.zeros(len(x), np.float32)
+    normals = np.tile(np.float32([0, 0, -1]), (len(x), 1))
+    return Mesh(vertices, faces, normals, color, zeros, zeros.astype(np.int32))
+
+
+def test_scene_has_the_surface_and_the_brightness_of_the_scan() -> None:
+    scene = planning.scene_of(sheet())
+    rays = np.array([[-0.3, 0.1, 1.0], [0.3, 0.1, 1.0], [0.0, 0.9, 1.0]])
+    hits = scene.cast(np.zeros(3), rays / np.linalg.norm(rays, axis=1)[:, None])
+    np.testing.assert_allclose(hits.distance[:2], 2 * np.linalg.norm(rays[:2], axis=1), rtol=1e-5)
+    assert np.isinf(hits.distance[2])
+    assert hits.albedo[1] == pytest.approx(4 * hits.albedo[0], rel=0.05)
+    assert 0.1 < hits.albedo[0] < hits.albedo[1] < 0.9
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_binned_camera_sees_the_same_with_less_noise(name: str) -> None:
+    model = camera_model(name)
+    binned = model.binned(100)
+    n = -(-model.camera.width // 100)
+    assert binned.camera.width == model.camera.width // n <= 100
+    # The ray of a binned pixel is the mean of those that it sums.
+    full, rays = model.camera.rays().astype(float), binned.camera.rays()
+    row, column = binned.camera.height // 2, binned.camera.width // 2
+    block = full[n * row : n * row + n, n * column : n * column + n]
+    np.testing.assert_allclose(rays[row, column], block.mean((0, 1)), atol=1e-4)
+    # Sums of n^2 pixels in the same counts, with 1 / n of the noise.
+    law, single = noise_of(binned).range, noise_of(model).range
+    np.testing.assert_allclose(
+        np.array([*vars(law).values()]) * n, [*vars(single).values()], rtol=1e-6
+    )
+    wall = [m.signal_electrons * m.counts_per_electron for m in (model, binned)]
+    assert wall[0] == pytest.approx(wall[1])
+
+
+def test_planned_frames_are_as_dense_as_the_motion_needs() -> None:
+    steps = np.concatenate([np.full(20, 0.05), np.zeros(30)])  # 1 m, then a rest
+    poses = np.tile(np.eye(4), (51, 1, 1))
+    poses[1:, 0, 3] = np.cumsum(steps)
+    times = np.arange(51) / 10
+    plan = planning._planned(
+        planning.scene_of(sheet()), camera_model("sr4000"), poses, times, depth_m=2.0
+    )
+    moved = np.linalg.norm(np.diff(plan.poses[:, :3, 3], axis=0), axis=1)
+    np.testing.assert_allclose(moved, 1 / 17, rtol=0.01)
+    # The camera moves as fast as on the path while a frame is exposed.
+    t = 8 / plan.sequence.frame_rate_hz
+    before, after = (plan.sequence.T_room_camera(t + dt) for dt in (-0.01, 0.01))
+    assert np.linalg.norm((se3.inverse(before) @ after)[:3, 3]) == pytest.approx(
+        0.02 * 0.5, rel=0.05
+    )
+
+
+def test_decisions() -> None:
+    assert planning._decision(0.0031, 0.005) == "enough"
+    assert planning._decision(0.0045, 0.005) == "undecided"
+    assert planning._decision(0.0075, 0.005) == "undecided"
+    assert planning._decision(0.0085, 0.005) == "not enough"
+    assert planning._decision(np.inf, 0.005) == "not enough"
+
+
+def test_bad_input_is_named(room_result) -> None:
+    result = tofuse.load(room_result)
+    with pytest.raises(InputError, match="no camera called 'sr5000'"):
+        planning.expect(result, ["sr5000"])
+    with pytest.raises(InputError, match="the path: has fewer than two poses"):
+        planning.expect(result, ["sr4000"], poses=np.eye(4)[None])
+    with pytest.raises(InputError, match="has no surface"):
+        planning.expect(replace(result, mesh=None))
+
+
+@pytest.mark.nightly
+def test_plan_of_the_room(room_result, capsys) -> None:
+    status = main(
+        ["plan", str(room_result), "--camera", "ifm-o3r", "--tolerance", "50mm", "--json"]
+    )
+    said = json.loads(capsys.readouterr().out)
+    (camera,) = said["cameras"]
+    assert said["tolerance_m"] == 0.05
+    assert camera["camera"] == "ifm-o3r"
+    assert camera["posed"] == 1
+    assert camera["coverage"] > 0.6
+    assert status == {"enough": 0, "not enough": 3, "undecided": 4}[camera["decision"]]
