@@ -26,8 +26,6 @@ _PLANAR_POINTS, _FULL_POINTS = 200, 150
 # Sigma of the albedo's low-pass filter for the coarse grid, in the plane z = 1, and difference in
 # log albedo at which a point counts neither for nor against a pose.
 _ALBEDO_BLUR, _ALBEDO_TOLERANCE = 0.04, 0.12
-# Minimum fraction of known albedo under the filter.
-_MIN_DENSITY = 0.1
 _NO_BORDER = cv2.BORDER_CONSTANT
 # Nodes of the lookup grid of an image, along its wider side.
 _GRID_NODES = 128
@@ -122,13 +120,13 @@ def resampled(view: PreparedView) -> ResampledView:
 
 
 def _low_pass(albedo: Float64, sigma: float) -> Float32:
-    """Low-pass filter an image (H, W), to match the step of the coarse grid; fills small holes."""
+    """Low-pass filter an image (H, W), ignoring NaN, to match the step of the coarse grid."""
     valid = np.isfinite(albedo)
     size = (0, 0)
     total = cv2.GaussianBlur(np.where(valid, albedo, 0), size, sigma, borderType=_NO_BORDER)
     density = cv2.GaussianBlur(valid.astype(float), size, sigma, borderType=_NO_BORDER)
     mean = total / np.maximum(density, 1e-9)
-    return np.where(density > _MIN_DENSITY, mean, np.nan).astype(np.float32)
+    return np.where(valid, mean, np.nan).astype(np.float32)
 
 
 def planar_poses(

@@ -38,8 +38,9 @@ _COARSE_START = replace(_FEW_ITERATIONS, levels=COARSE)
 _SEARCH_ERROR = 0.03
 # Maximum inconsistency of forward and backward alignment: relative to the depth, and rad.
 _MAX_INCONSISTENCY = 0.03
-# Loss of score by noise when a pose is aligned, and lead that is not significant.
-_MAX_SCORE_LOSS, _TIE = 0.05, 0.025
+# Loss of score by noise when a pose is aligned, relative to the score, and lead that is not
+# significant.
+_MAX_SCORE_LOSS, _TIE = 0.1, 0.025
 # Minimum distance of rival poses relative to the depth (less than the error of a right pose), and
 # depth in m below which tolerances are reduced in proportion.
 _DISTINCT, _NEAR_M = 0.04, 1.0
@@ -284,7 +285,7 @@ class _Pair:
         views = self._compensated(match.agreement.falloff)
         aligned = self._aligned(views, match.T_target_source, options)
         pose_agreement = search.comparison.at(aligned.T_world_source)
-        if pose_agreement.score >= match.score - _MAX_SCORE_LOSS:
+        if pose_agreement.score >= (1 - _MAX_SCORE_LOSS) * match.score:
             return _Pose(views, aligned.T_world_source, aligned, options, pose_agreement)
         return _Pose(views, match.T_target_source, aligned, options, match.agreement)
 
