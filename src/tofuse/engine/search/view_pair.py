@@ -44,9 +44,6 @@ _MAX_SCORE_LOSS, _TIE = 0.1, 0.025
 # Minimum distance of rival poses relative to the depth (less than the error of a right pose), and
 # depth in m below which tolerances are reduced in proportion.
 _DISTINCT, _NEAR_M = 0.04, 1.0
-# Weight of a point in free space. Surfaces support many poses, as a wall does all along it; hardly
-# any point of a right pose is in free space.
-_VIOLATION_WEIGHT = 4.0
 # Exponent of the natural vignetting of a lens.
 _VIGNETTING = 4.0
 
@@ -209,7 +206,6 @@ class _Pair:
         agreement_options = replace(
             agreement_options,
             floor_m=agreement_options.floor_m * min(1.0, depth / _NEAR_M),
-            violation_weight=_VIOLATION_WEIGHT,
             extrapolated=True,
         )
         distinct_m = min(rival_m, _DISTINCT * depth)
