@@ -28,7 +28,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -124,6 +124,12 @@ def _sim(name: str, title: str, scene: str, every: int, frames: int, **options: 
     return Scene(name, title, opened, every, gaps, family)
 
 
+def _walk(name: str, title: str, camera: str, seed: int) -> Scene:
+    """A walk of 1140 frames: pairs of views 10 to 40 frames apart."""
+    scene = _sim(name, title, "flat", 10, 114, camera=camera, seed=seed)
+    return replace(scene, gaps=(1, 2, 3, 4))
+
+
 SCENES = {
     scene.name: scene
     for scene in (
@@ -132,6 +138,8 @@ SCENES = {
         _sim("plain-room", "Empty room, uniform albedo", "empty-room", 8, 24, texture=False),
         _sim("flat", "Flat of four rooms, SR4000", "flat", 12, 48),
         _sim("flat-alike", "Flat with similar rooms, SR4000", "flat-alike", 12, 48, seed=2),
+        _walk("flat-flexx", "Walk through a flat, pico flexx", "pico-flexx", 11),
+        _walk("flat-o3r", "Walk through a flat, ifm O3R", "ifm-o3r", 12),
         _sim("rail", "Rail, pico flexx", "rail", 40, 7, camera="pico-flexx"),
         _sim("hall", "Hall, ifm O3R", "hall", 12, 12, camera="ifm-o3r"),
         Scene("kitchen", "7-Scenes kitchen, Kinect v1", _kitchen, 2, (10, 30, 60), "kitchen"),

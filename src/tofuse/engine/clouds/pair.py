@@ -137,7 +137,12 @@ def _registered_as_images(
         return None  # registration as clouds may detect a wrong unit
     if search:
         registration = register_pair(
-            data, model, start, proposals=proposals, uncertainty=_RECORDED_VIEWS
+            data,
+            model,
+            start,
+            proposals=proposals,
+            uncertainty=_RECORDED_VIEWS,
+            informed=guess is not None,
         )
     else:
         registration = follow(data, model, start, uncertainty=_RECORDED_VIEWS)
