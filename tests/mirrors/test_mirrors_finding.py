@@ -52,7 +52,7 @@ def test_mirror_is_found(
     mirrored: tuple[Reconstruction, Reconstruction, Mirror, np.ndarray],
 ) -> None:
     _, found, mirror, T = mirrored
-    (best, *others) = [m for m in found.mirrors if m.kind == "mirror"]
+    best, *others = found.mirrors
     assert not others
     assert best.area_m2 == pytest.approx(mirror.area, rel=0.15)
     assert best.normal @ T[:3, :3] @ mirror.normal > 0.999
@@ -61,7 +61,6 @@ def test_mirror_is_found(
     assert np.linalg.norm(best.corners.mean(0) - centre) < 0.15
     assert any("cut out of the model" in sentence for sentence in sentences(found))
     (written, *_) = run_json._content(found)["mirrors"]
-    assert written["kind"] == "mirror"
     assert written["points"] == len(best.points)
 
 
@@ -91,7 +90,7 @@ def test_doorway_is_no_mirror() -> None:
     recording, _, _ = _recording("flat", 50, 10.0, lambda t: walk(20.0 + t), None)
     result = reconstructing.reconstruct(recording)
     found = find_mirrors(recording, result)
-    assert not [m for m in found.mirrors if m.kind == "mirror"]
+    assert not found.mirrors
     assert len(found.cloud) == len(result.cloud)
 
 

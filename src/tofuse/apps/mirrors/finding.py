@@ -1,15 +1,14 @@
-"""Mirrors and glass of a finished reconstruction, and the model without what is behind mirrors."""
+"""Mirrors of a finished reconstruction, and the model without what is behind mirrors."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
 from tofuse.apps.mirrors.openings import Opening, find_openings, find_planes
-from tofuse.apps.mirrors.reflection import MIN_PATCHES, Evidence, weigh
+from tofuse.apps.mirrors.reflection import Evidence, weigh
 from tofuse.apps.mirrors.views import Noise, View, read_views
 from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.frames import Recording, evenly_spaced
@@ -20,8 +19,6 @@ from tofuse.engine.results import Mirror, Reconstruction
 _MIN_LOG_RATIO, _MIN_SHARE = 7.0, 0.55
 # Points that predict, views of a first look, and the smallest share there for a second one.
 _POINTS, _FIRST_LOOK, _PROMISING = 30_000, 10, 0.4
-# Glass: most of its cells are measured by some views and passed by others.
-_GLASS, _MIN_GLASS_M2 = 0.5, 0.1
 _ORIGINS = 300  # cameras from which points behind a mirror may be seen
 _MAX_GROWTH = 1.25  # of the area, by joining parts of one mirror
 
@@ -54,12 +51,12 @@ def find_mirrors(recording: Recording, result: Reconstruction, seed: int = 0) ->
             (opening, _weighed(opening, views, points, normals, noise))
             for opening in find_openings(plane, views, noise)
         ]
-        found += _mirrors_in(weighed) + _glass_in(weighed)
+        found += _mirrors_in(weighed)
     found.sort(key=lambda item: -item[1].log_ratio)
     return _applied(result, views, noise, found)
 
 
-_Found = tuple[Opening, Evidence, Literal["mirror", "glass", "glass or mirror"]]
+_Found = tuple[Opening, Evidence]
 
 
 def _weighed(
@@ -78,25 +75,15 @@ def _mirrors_in(weighed: Sequence[tuple[Opening, Evidence]]) -> list[_Found]:
     for opening, evidence in sorted(weighed, key=lambda item: -item[1].log_ratio):
         if evidence.share < _MIN_SHARE:
             continue
-        for k, (other, known, kind) in enumerate(accepted):
+        for k, (other, known) in enumerate(accepted):
             joined = other.joined(opening)
             if joined.area_m2 < _MAX_GROWTH * (other.area_m2 + opening.area_m2):
-                accepted[k] = joined, known, kind
+                accepted[k] = joined, known
                 break
         else:
             if opening.whole and evidence.log_ratio > _MIN_LOG_RATIO:
-                accepted.append((opening, evidence, "mirror"))
+                accepted.append((opening, evidence))
     return accepted
-
-
-def _glass_in(weighed: Sequence[tuple[Opening, Evidence]]) -> list[_Found]:
-    """Select openings whose plane other views measured."""
-    return [
-        (o, e, "glass" if e.patches >= MIN_PATCHES else "glass or mirror")
-        for o, e in weighed
-        if o.whole and o.mixed > _GLASS and o.area_m2 > _MIN_GLASS_M2
-        if e.log_ratio < _MIN_LOG_RATIO
-    ]
 
 
 def _applied(
@@ -109,21 +96,19 @@ def _applied(
     mirrors: list[Mirror] = []
     margin = 2 * noise.tolerance_m
     taken: list[Opening] = []
-    for opening, evidence, kind in found:
+    for opening, evidence in found:
         centre = opening.corners.mean(0)[None]
         if any(_same_place(other, centre, origins, margin) for other in taken):
             continue
         taken.append(opening)
         behind = _behind(opening, cloud.points, views, origins, margin)
         seen = cloud.points[behind]
-        if kind == "mirror":
-            cloud = _kept(cloud, ~behind)
-            if mesh is not None:
-                inside = ~_behind(opening, mesh.vertices, views, origins, margin)
-                mesh = mesh.rows(np.asarray(inside[mesh.faces].all(1), np.bool_))
+        cloud = _kept(cloud, ~behind)
+        if mesh is not None:
+            inside = ~_behind(opening, mesh.vertices, views, origins, margin)
+            mesh = mesh.rows(np.asarray(inside[mesh.faces].all(1), np.bool_))
         mirrors.append(
             Mirror(
-                kind,
                 opening.plane.normal,
                 opening.plane.offset,
                 opening.corners,
@@ -175,11 +160,10 @@ def _kept(cloud: Cloud, rows: Bool) -> Cloud:
 
 
 def sentences(result: Reconstruction) -> list[str]:
-    """Return a sentence for each mirror and pane of glass."""
-    done = {"mirror": "were cut out of the model", "glass": "are behind the glass"}
+    """Return a sentence for each mirror."""
     return [
-        f"{m.kind.capitalize()} of {m.area_m2:.2f} m² at "
+        f"Mirror of {m.area_m2:.2f} m² at "
         f"({', '.join(f'{x:.2f}' for x in m.corners.mean(0))}) m: "
-        f"{len(m.points):,} points {done.get(m.kind, 'are behind or in it')}."
+        f"{len(m.points):,} points seen in it were cut out of the model."
         for m in result.mirrors
     ]

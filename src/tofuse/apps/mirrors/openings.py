@@ -86,15 +86,12 @@ class Opening:
     ----------
     outline
         (K, 2) corners in the axes of the plane, m.
-    mixed
-        Share of it where some rays end in the plane: of glass, which other views measure.
     whole
         Whether it is convex and surrounded by surface; else it may be a part of an opening.
     """
 
     plane: Plane
     outline: Float64
-    mixed: float
     whole: bool
 
     @property
@@ -216,6 +213,5 @@ def _regions(
         if convexity < _MIN_CONVEXITY or framed < _MIN_FRAME:
             continue
         whole = convexity > _WHOLE_CONVEXITY and framed > _WHOLE_FRAME
-        mixed = float((passing < (1 - _ENDING) * rays)[region > 0].mean())
-        openings.append(Opening(plane, low + cell * hull, mixed, whole))
+        openings.append(Opening(plane, low + cell * hull, whole))
     return openings

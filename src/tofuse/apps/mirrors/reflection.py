@@ -25,7 +25,7 @@ _SHIFTS_M, _TILT_RAD = (-0.4, -0.2, 0.2, 0.4), 0.2
 # Edge of a patch of the room, whose points are one piece of evidence, and how many it has.
 _PATCH_M, _MIN_IN_PATCH = 0.2, 5
 # Fewest patches that can decide, and smallest share of agreeing pixels worth a comparison.
-MIN_PATCHES, _MIN_SHARE = 15, 0.5
+_MIN_PATCHES, _MIN_SHARE = 15, 0.5
 # A mirror explains one of these shares of the pixels that chance does not: weak pixels, which are
 # unwrapped wrongly, are not explained. Chance before any comparison.
 _EXPLAINED, _CHANCE = np.linspace(0.05, 0.95, 10), 0.3
@@ -194,7 +194,7 @@ def weigh(
     agrees = seen.coincides(opening.plane, noise)
     found = patches(seen)
     share = float(agrees.mean()) if len(seen) else 0.0
-    if not compare or found < MIN_PATCHES or share < _MIN_SHARE:
+    if not compare or found < _MIN_PATCHES or share < _MIN_SHARE:
         return Evidence(share, 0.0, found)
     by_chance, compared = np.full(len(seen), _CHANCE), np.ones(len(seen))
     for plane in wrong_planes(opening):

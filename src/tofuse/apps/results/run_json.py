@@ -123,7 +123,7 @@ def _fields(record: Any, *names: str) -> dict[str, Any]:
 
 
 def _mirror(m: Mirror) -> dict[str, Any]:
-    names = ("kind", "normal", "offset_m", "corners", "area_m2", "agreement", "log_ratio")
+    names = ("normal", "offset_m", "corners", "area_m2", "agreement", "log_ratio")
     return {**_fields(m, *names), "points": len(m.points)}
 
 

@@ -294,14 +294,10 @@ class SessionChange:
 
 @dataclass(frozen=True, eq=False)
 class Mirror:
-    """A mirror or a pane of glass in the model.
+    """A mirror that was found, and what is seen in it cut out of the model.
 
     Attributes
     ----------
-    kind
-        "mirror", whose reflection was cut out of the model; "glass", through which some views
-        measure what is behind it and others the glass; "glass or mirror" where the surfaces that
-        it would reflect were not seen.
     normal, offset_m
         Its plane ``normal . p = offset_m``, in the world frame; the (3,) unit normal points to the
         cameras.
@@ -314,10 +310,9 @@ class Mirror:
     log_ratio
         Logarithm of the likelihood ratio of a mirror to chance.
     points
-        (N, 3) of the model that are seen through it: cut out, or behind glass.
+        (N, 3) of the model that were seen in it.
     """
 
-    kind: Literal["mirror", "glass", "glass or mirror"]
     normal: Float64
     offset_m: float
     corners: Float64
@@ -373,7 +368,7 @@ class Reconstruction:
     changes
         Surfaces of the main model that changed between two sessions, in its world frame.
     mirrors
-        Mirrors and panes of glass in the main model, if they were looked for.
+        Mirrors in the main model, if they were looked for.
     up
         (3,) unit vector against gravity in the world frame, measured by an accelerometer; None
         without one.
