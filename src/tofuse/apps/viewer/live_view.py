@@ -111,7 +111,10 @@ class LiveView(Progress):
         self._status.content = f"{words}\n\n{_escaped(detail)}" if detail else words
 
     def _advise(self, so_far: OnlineMap, T: Float64) -> None:
-        advice = advise_on(so_far)
+        try:
+            advice = advise_on(so_far)
+        except np.linalg.LinAlgError:  # of poses that are hardly measured yet; the job goes on
+            return
         if advice is None:
             return
         target = advice.T_world_camera
