@@ -1,10 +1,9 @@
 """``tofuse plan``: what a camera would achieve in a place that a coarse scan knows.
 
 The scan's mesh, with its brightness as albedo, is the scene of a simulation. Each camera is carried
-along the path of the scan or another one, with all its errors, and what it records is
-reconstructed: the bound on its poses and the part of the surface that it covers are expected of a
-real recording. Large images are binned, and frames are as dense as views are stored, so that this
-takes a minute.
+along the path of the scan or another one, and what it records is reconstructed: the bound on its
+poses and the part of the surface that it covers are expected of a real recording. Large images are
+binned, and frames are as dense as views are stored, so that this takes a minute.
 """
 
 from __future__ import annotations
@@ -37,7 +36,8 @@ _COVERAGE_POINTS, _COVERED = 5000, 0.005
 # Predicted and achieved bounds differ by less than this factor, see benchmarks/plan.py.
 UNCERTAINTY = 1.6
 
-_DEFAULT = Effects()
+# In the holes and rough spots of a coarse surface, multipath and smear are not those of the place.
+_DEFAULT = Effects().without("multipath", "smear")
 
 Decision = Literal["enough", "not enough", "undecided"]
 
