@@ -166,7 +166,7 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     share
         write share.html and share.usdz as well: the model alone, to send and to show in a room
     mirrors
-        find mirrors, and cut the rooms behind mirrors out of the model
+        find mirrors, and cut the rooms behind them out of the model (experimental)
     texture
         texture the surface in mesh.glb and in the report, of colour images or else of amplitudes
         (default: if there are enough colour images)
