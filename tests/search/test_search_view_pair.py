@@ -14,7 +14,7 @@ from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, agreement
+from tofuse.engine.search.pair_agreement import Agreement, agreement
 from tofuse.engine.search.pose_probability import ACCEPTED, PoseEvidence
 from tofuse.engine.search.verification import FitStatistics
 from tofuse.engine.search.view_pair import follow, register_pair
@@ -286,29 +286,3 @@ def test_consistent_search_and_alignment_stand_alone(pair):
     ):
         made = replace(near, believed=False, confirmed=confirmed, probability=probability)
         assert made.is_decisive == alone
-
-
-def test_unknown_albedo_is_no_evidence(pair):
-    """A wrong pose scores as if all albedo were known, not as if what is unknown agreed."""
-    target = surface(pair[1])
-    known = (np.arange(CAMERA.height)[:, None, None] // 8 % 2) == 0
-    for wrong in (5, 6, 7):
-        source = surface(seen(B, 1, scene=wrong))
-        partly = replace(source, albedo=np.where(known, source.albedo, np.float32(np.nan)))
-        extrapolated = AgreementOptions(extrapolated=True)
-        expected = agreement(source, target, TRUE, extrapolated).score
-        found = agreement(partly, target, TRUE, extrapolated).score
-        optimistic = agreement(partly, target, TRUE).score
-        assert abs(found - expected) < 0.5 * (optimistic - expected)
-
-
-def test_start_is_kept_along_wall_only_if_it_is_a_guess():
-    views = []
-    for k, x in enumerate((0.0, 0.5)):
-        frame = seen(at(x, 1.0, 0.0, pitch=0.0), k, boxes=(), spots=0)
-        views.append(surface(replace(frame, amplitude_image=None)))
-    guess = se3.exp([-0.2, 0, 0, 0, 0, 0])
-    kept = register_pair(views[1], views[0], guess)
-    assert abs(kept.T_target_source[0, 3] + 0.2) < 0.05
-    free = register_pair(views[1], views[0], guess, informed=False)
-    assert free.margin > -0.025  # no more than noise

@@ -137,12 +137,7 @@ def _registered_as_images(
         return None  # registration as clouds may detect a wrong unit
     if search:
         registration = register_pair(
-            data,
-            model,
-            start,
-            proposals=proposals,
-            uncertainty=_RECORDED_VIEWS,
-            informed=guess is not None,
+            data, model, start, proposals=proposals, uncertainty=_RECORDED_VIEWS
         )
     else:
         registration = follow(data, model, start, uncertainty=_RECORDED_VIEWS)

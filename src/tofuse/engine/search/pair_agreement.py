@@ -48,9 +48,6 @@ class AgreementOptions:
     violation_weight, clash_weight
         Weight of a point in free space, and maximum weight of one on a surface of another albedo,
         relative to a supporting point.
-    extrapolated
-        Whether points of unknown albedo on the surface count as the others do on average, instead
-        of as if their albedo agreed. Otherwise poses at which few points can be compared lead.
     """
 
     points: int = 2500
@@ -61,7 +58,6 @@ class AgreementOptions:
     albedo: float = 0.1
     violation_weight: float = 2.0
     clash_weight: float = 1.0
-    extrapolated: bool = False
 
 
 @dataclass(frozen=True)
@@ -183,8 +179,9 @@ class Comparison:
                 options.albedo
             )
             clash = int(np.count_nonzero(ratio > _CLASH_RATIO))
-            penalty = float(np.minimum(ratio**2, 1 + options.clash_weight).sum(dtype=np.float64))
-            consistent -= penalty * (consistent / len(ratio) if options.extrapolated else 1.0)
+            consistent -= float(
+                np.minimum(ratio**2, 1 + options.clash_weight).sum(dtype=np.float64)
+            )
         per_point = 1 / max(count, 1)
         return Agreement(
             overlap=float(total[kernels.COMPARED] * per_point),

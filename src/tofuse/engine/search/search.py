@@ -42,7 +42,7 @@ _PHOTOMETRIC = projective.ProjectiveOptions(
     common_slope=0.0,
 )
 # Pixels of each image that refine a candidate by ICP.
-_ICP_POINTS = 250
+_ICP_POINTS = 700
 # Number of best candidates that are refined again down to the noise, and of the pixels used.
 _MAX_REFINED, _REFINEMENT_POINTS = 10, 2500
 # Maximum score that a candidate may lose in photometric alignment.
@@ -84,7 +84,7 @@ class SearchOptions(Bounded):
     roll: Annotated[float, Bounds(0, 3.1416)] = 0.5
     reach: Annotated[float, Bounds(0, 10)] = 0.6
     planar_candidates: Annotated[int, Bounds(1, 1_000_000)] = 20
-    full_candidates: Annotated[int, Bounds(1, 1_000_000)] = 180
+    full_candidates: Annotated[int, Bounds(1, 1_000_000)] = 60
     photometric_candidates: Annotated[int, Bounds(1, 1_000_000)] = 30
 
 

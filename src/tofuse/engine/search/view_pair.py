@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -38,9 +37,8 @@ _COARSE_START = replace(_FEW_ITERATIONS, levels=COARSE)
 _SEARCH_ERROR = 0.03
 # Maximum inconsistency of forward and backward alignment: relative to the depth, and rad.
 _MAX_INCONSISTENCY = 0.03
-# Loss of score by noise when a pose is aligned, relative to the score, and lead that is not
-# significant.
-_MAX_SCORE_LOSS, _TIE = 0.1, 0.025
+# Loss of score by noise when a pose is aligned, and lead that is not significant.
+_MAX_SCORE_LOSS, _TIE = 0.05, 0.025
 # Minimum distance of rival poses relative to the depth (less than the error of a right pose), and
 # depth in m below which tolerances are reduced in proportion.
 _DISTINCT, _NEAR_M = 0.04, 1.0
@@ -89,7 +87,6 @@ def register_pair(
     proposals: Callable[[], Float64] | None = None,
     uncertainty: UncertaintyOptions | None = None,
     rival_m: float = math.inf,
-    informed: bool = True,
 ) -> Registration | None:
     """Register two prepared views.
 
@@ -112,8 +109,6 @@ def register_pair(
         Constants of the covariance; those of views without multipath unless given.
     rival_m
         Poses further apart than this, or 4 % of the depth if that is less, are rivals.
-    informed
-        Whether the guess is more than a start: it is kept along degenerate directions.
 
     Returns
     -------
@@ -136,11 +131,12 @@ def register_pair(
     match = None if search is None else search.exhaustive()
     if search is None or match is None:
         return None
-    select = partial(pair.selected, local, search, guess is not None, informed)
-    registration = select(match)
+    registration = pair.selected(local, match, search, guess is not None)
     if registration.believed or proposals is None:
         return registration
-    return select(search.with_proposals(proposals(), match))
+    return pair.selected(
+        local, search.with_proposals(proposals(), match), search, guess is not None
+    )
 
 
 def follow(
@@ -204,9 +200,7 @@ class _Pair:
         depth = 0.5 * (source.depth + target.depth)
         agreement_options = usual_tolerances(fit_statistics)
         agreement_options = replace(
-            agreement_options,
-            floor_m=agreement_options.floor_m * min(1.0, depth / _NEAR_M),
-            extrapolated=True,
+            agreement_options, floor_m=agreement_options.floor_m * min(1.0, depth / _NEAR_M)
         )
         distinct_m = min(rival_m, _DISTINCT * depth)
         return cls(source, target, fit_statistics, agreement_options, distinct_m, uncertainty)
@@ -259,7 +253,7 @@ class _Pair:
         )
 
     def selected(
-        self, local: _Pose | None, search: Search, has_guess: bool, informed: bool, match: Match
+        self, local: _Pose | None, match: Match, search: Search, has_guess: bool
     ) -> Registration:
         """Select between the poses of a search and the pose aligned from the start.
 
@@ -268,7 +262,7 @@ class _Pair:
         best = self.refined(match, search)
         confirmed = local is not None and not local.degenerate and self.are_same(local, best)
         if has_guess and local is not None:
-            best = self.preferred(local, best, search, informed)
+            best = self.preferred(local, best, search)
         rival = self.rival(best, match)
         lead = best.agreement.score - (max(rival.score, 0.0) if rival else 0.0)
         evidence = PoseEvidence.of(best.agreement, lead, best.degenerate)
@@ -281,16 +275,15 @@ class _Pair:
         views = self._compensated(match.agreement.falloff)
         aligned = self._aligned(views, match.T_target_source, options)
         pose_agreement = search.comparison.at(aligned.T_world_source)
-        if pose_agreement.score >= (1 - _MAX_SCORE_LOSS) * match.score:
+        if pose_agreement.score >= match.score - _MAX_SCORE_LOSS:
             return _Pose(views, aligned.T_world_source, aligned, options, pose_agreement)
         return _Pose(views, match.T_target_source, aligned, options, match.agreement)
 
-    def preferred(self, local: _Pose, best: _Pose, search: Search, informed: bool) -> _Pose:
+    def preferred(self, local: _Pose, best: _Pose, search: Search) -> _Pose:
         """Select between the pose aligned from the guess and the best one.
 
         An insignificant lead does not outweigh the guess, and neither does one along directions
-        that are degenerate for both, if the guess is informed: there the pose with the largest
-        overlap leads.
+        that are degenerate for both: there the pose with the largest overlap leads.
         """
         pose_agreement = search.comparison.at(local.T_target_source)
         local = replace(local, agreement=pose_agreement)
@@ -302,7 +295,7 @@ class _Pair:
         weak = local.aligned.unobservable
         across = se3.exp((difference - weak.T @ (weak @ difference)) * projective.UNITS)
         is_same = not are_distinct_poses(np.eye(4), across, self.distinct_m)
-        return local if informed and local.degenerate and best.degenerate and is_same else best
+        return local if local.degenerate and best.degenerate and is_same else best
 
     def are_same(self, a: _Pose, b: _Pose) -> bool:
         """Whether two poses are the same hypothesis."""
