@@ -29,12 +29,9 @@ from tofuse.formats.files import atomic, npz
 
 # Tracking that took less, in s, is repeated.
 _MIN_TRACKING_S = 10.0
-# Attributes of steps that are stored, and those of registrations that are arrays.
-_STORED = (
-    *("status", "reason", "T_component_camera", "registration", "links", "reference"),
-    *("component", "doubtful", "inflation", "rival"),
-)
-_ARRAYS = ("T_target_source", "information", "unobservable", "runner_up")
+# Images of steps, which are made again, and the arrays of registrations.
+_IMAGES = ("surface", "moving")
+_ARRAYS = ("T_target_source", "information", "unobservable", "runner_up", "reference_point")
 _MOVING = "moving-"  # prefix of the masks, by frame index
 _NOT_TRACKED = Step("lost", "not tracked before", None)
 
@@ -260,7 +257,7 @@ def _packed(log: FrameLog, tracker: LoggingTracker) -> npz.Arrays:
 def _plain(value: Any) -> Any:
     """Return what JSON can't represent as plain data: steps, arrays, NumPy's numbers."""
     if isinstance(value, Step):
-        return {name: getattr(value, name) for name in _STORED}
+        return {name: x for name, x in vars(value).items() if name not in _IMAGES}
     if isinstance(value, Registration | Link):
         return {name: x for name, x in vars(value).items() if name != "errors"}
     return value.tolist()
