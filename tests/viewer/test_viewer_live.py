@@ -111,8 +111,8 @@ def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, br
         watched_run = run(
             [room_recording], Options(out=tmp_path / "a", **quick), CombinedProgress(recorder, live)
         )
-        # The first frame is shown before any stage begins, and then each one with its pose.
-        assert recorder.frames[0][0::2] == (0, 0)
+        # The first frame is shown while the recording is opened, and then each one with its pose.
+        assert recorder.frames[0][0::2] == (0, 1)
         assert [k for k, *_ in recorder.frames[1:]] == [0, 1, 2, 3]
         np.testing.assert_allclose(recorder.frames[-1][1], watched_run.trajectory[3], atol=0.05)
         place = address(server)
