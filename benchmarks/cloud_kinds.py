@@ -176,18 +176,22 @@ def scans(name: str, *, moved: bool = False, points: int = 200_000, seed: int = 
     return make
 
 
-def scanned(name: str, max_scans: int, points: int, seed: int) -> Iterator[tuple[Float64, Float32]]:
-    """Poses (4, 4) in the room and points of a scanner with a grid of equal angles, z up."""
-    built, sequence = scenes.build(name, seed=seed)
-    rng = np.random.default_rng([seed, 5])
-    rows = int(np.sqrt(points / 2))
+def scanner_rays(count: int) -> Float64:
+    """About `count` unit rays (n, 3) of a scanner, z up, at equal angles."""
+    rows = int(np.sqrt(count / 2))
     up = np.linspace(-0.39 * np.pi, 0.5 * np.pi, rows)
     around = np.linspace(-np.pi, np.pi, 2 * rows, endpoint=False)
     elevation, azimuth = np.meshgrid(up, around, indexing="ij")
     level = np.cos(elevation)
-    rays = np.stack(
-        [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1
-    ).reshape(-1, 3)
+    rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1)
+    return np.asarray(rays.reshape(-1, 3), np.float64)
+
+
+def scanned(name: str, max_scans: int, points: int, seed: int) -> Iterator[tuple[Float64, Float32]]:
+    """Poses (4, 4) in the room and points of a scanner with a grid of equal angles, z up."""
+    built, sequence = scenes.build(name, seed=seed)
+    rng = np.random.default_rng([seed, 5])
+    rays = scanner_rays(points)
     last, count = np.full(3, np.inf), 0
     for frame in range(0, 1140, 3):
         at = sequence.T_room_camera(frame / sequence.frame_rate_hz)[:3, 3]

@@ -38,7 +38,7 @@ from tofuse.engine.arrays import Float32, Float64
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import tofuse
-from cloud_kinds import Pair, any_motion
+from cloud_kinds import Pair, any_motion, scanner_rays
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
@@ -147,14 +147,7 @@ def _of_scans(seed: int) -> Iterator[Case]:
             if T and np.linalg.norm(at - T[0][:3, 3]) < way:
                 continue
             points = int(np.exp(rng.uniform(np.log(20_000), np.log(100_000))))
-            rows = int(np.sqrt(points / 2))
-            up = np.linspace(-0.39 * np.pi, 0.5 * np.pi, rows)
-            around = np.linspace(-np.pi, np.pi, 2 * rows, endpoint=False)
-            elevation, azimuth = np.meshgrid(up, around, indexing="ij")
-            level = np.cos(elevation)
-            rays = np.stack(
-                [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1
-            ).reshape(-1, 3)
+            rays = scanner_rays(points)
             pose = np.asarray(se3.exp(np.array([0, 0, 0, 0, 0, rng.uniform(-np.pi, np.pi)])))
             pose[:3, 3] = at
             distance = built.cast(at, rays @ pose[:3, :3].T).distance.astype(float)

@@ -31,7 +31,8 @@ def with_box(shift=0, box_m=BOX_M):
 
 
 def moved(mask, first, second, T=None):
-    return moved_fraction(mask, view(first, 1), view(second, 2), np.eye(4) if T is None else T)
+    T = np.eye(4) if T is None else T
+    return moved_fraction(mask, view(first, 1), T, view(second, 2), np.eye(4))
 
 
 @pytest.mark.parametrize(

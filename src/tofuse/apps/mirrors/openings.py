@@ -21,8 +21,6 @@ _RAYS, _MIN_INCIDENCE = 6000, 0.08
 # fills, and share of its border where the plane is a surface; the last two also for a whole one.
 _MIN_CELLS, _MIN_RAYS, _MIN_CONVEXITY, _MIN_FRAME = 12, 3, 0.7, 0.3
 _WHOLE_CONVEXITY, _WHOLE_FRAME = 0.88, 0.8
-# Glass: smallest share of a cell's rays that end in it.
-_ENDING = 0.2
 
 
 @dataclass(frozen=True, eq=False)

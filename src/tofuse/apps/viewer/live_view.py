@@ -132,10 +132,9 @@ class LiveView(Progress):
             return
         start, step = T[:3, 3], target[:3, 3] - T[:3, 3]
         end = start + (step if np.linalg.norm(step) > _MIN_DISTANCE else _ARROW_M * target[:3, 2])
-        draw = self._server.scene
         arrow = np.stack([start, end])[None].astype(np.float32)
         self._advised = [
-            draw.add_arrows(
+            self._server.scene.add_arrows(
                 "/live_advice",
                 arrow,
                 _ADVISED,
@@ -143,18 +142,24 @@ class LiveView(Progress):
                 head_radius=0.08,
                 head_length=0.2,
             ),
-            draw.add_camera_frustum(
-                "/live_target",
-                _FOV,
-                1.25,
-                scale=0.15,
-                thickness=2.5,
-                thickness_units="screen",
-                color=_ADVISED,
-                wxyz=np.roll(quaternion.from_matrix(target[:3, :3]), 1),
-                position=target[:3, 3],
-            ),
+            self._draw_camera("/live_target", target, 1.25, _ADVISED),
         ]
+
+    def _draw_camera(
+        self, name: str, T: Float64, aspect: float, color: tuple[int, int, int]
+    ) -> Any:
+        """Draw the pyramid of a camera at pose T (4, 4)."""
+        return self._server.scene.add_camera_frustum(
+            name,
+            _FOV,
+            aspect,
+            scale=0.15,
+            thickness=2.5,
+            thickness_units="screen",
+            color=color,
+            wxyz=np.roll(quaternion.from_matrix(T[:3, :3]), 1),
+            position=T[:3, 3],
+        )
 
     def _is_new_view(self, T: Float64) -> bool:
         if not self._shown:
@@ -201,17 +206,8 @@ class LiveView(Progress):
             self._image.content = (
                 f'<img alt="The frame" src="{source}" style="width:100%;padding:0 0.6em">'
             )
-        self._server.scene.add_camera_frustum(
-            "/live_camera",
-            _FOV,
-            1.25 if image is None else image.shape[1] / image.shape[0],
-            scale=0.15,
-            thickness=2.5,
-            thickness_units="screen",
-            color=_CURRENT,
-            wxyz=np.roll(quaternion.from_matrix(T[:3, :3]), 1),
-            position=T[:3, 3],
-        )
+        aspect = 1.25 if image is None else image.shape[1] / image.shape[0]
+        self._draw_camera("/live_camera", T, aspect, _CURRENT)
         path = np.stack(self._path[:: -(-len(self._path) // 2000)])
         if len(path) > 1:
             ends = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)

@@ -84,13 +84,11 @@ class LivePoses:
         # current one by loops.
         self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
         self._T_closed_tracked = np.eye(4)
-        # Of the frames of the first component, by index; None where a direction is not measured.
+        # Of frames that were asked for, by index; None where a direction is not measured.
         self._covariances: dict[int, Float64 | None] = {}
 
     def update(self, step: Step, log: FrameLog) -> None:
         """Add the next frame; correct this and the following poses if loops have closed."""
-        if step.T_component_camera is not None and step.component == 0:
-            self._covariances[log.entries[-1].record.index] = self._propagated(step)
         loops = self.due_loops(step, log)
         if not loops:
             return
@@ -137,16 +135,26 @@ class LivePoses:
         T = T_world_component @ self._T_closed_tracked @ step.T_component_camera
         return np.asarray(T, np.float64)
 
-    def covariance(self, index: int) -> Float64 | None:
-        """Return the (6, 6) covariance of a frame's pose as tracked; None if it is not known."""
-        return self._covariances.get(index)
+    def covariance(self, index: int, log: FrameLog) -> Float64 | None:
+        """Return the (6, 6) covariance of the pose of a frame of the first component as tracked.
+
+        None if a direction is not measured. Those of its references are computed first.
+        """
+        chain: list[int] = []
+        reference: int | None = index
+        while reference is not None and reference not in self._covariances:
+            chain.append(reference)
+            reference = log.step_of(reference).reference
+        for k in reversed(chain):
+            self._covariances[k] = self._propagated(log.step_of(k))
+        return self._covariances[index]
 
     def _propagated(self, step: Step) -> Float64 | None:
         """The covariance of a pose from that of its reference and the registration."""
         r = step.registration
         if r is None or step.reference is None:
             return np.zeros((6, 6))
-        C_reference = self._covariances.get(step.reference)
+        C_reference = self._covariances[step.reference]
         if C_reference is None or len(r.unobservable):
             return None
         r = r.between(np.eye(4), np.eye(4))  # about the frame's own origin

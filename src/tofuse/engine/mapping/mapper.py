@@ -233,8 +233,11 @@ class Mapper:
         """
         if not self._log.entries:
             return None
-        record = self._log.entries[-1].record
-        return replace(record, covariance=self._live_poses.covariance(record.index))
+        entry = self._log.entries[-1]
+        if entry.step is None or entry.step.T_component_camera is None or entry.step.component:
+            return entry.record
+        covariance = self._live_poses.covariance(entry.record.index, self._log)
+        return replace(entry.record, covariance=covariance)
 
     @property
     def log(self) -> FrameLog:

@@ -90,8 +90,7 @@ class _GivenTracker(Tracker):
         target = keyframe.target
         if moving.fraction > MIN_MOVING_FRACTION:
             mask = at_size(moving.view, frame)
-            T_keyframe_camera = se3.inverse(keyframe.T_component_camera) @ T
-            moved = moved_fraction(moving.view, view, keyframe.view, T_keyframe_camera)
+            moved = moved_fraction(moving.view, view, T, keyframe.view, keyframe.T_component_camera)
             view = moving.applied(view)
             reference = moving.applied_to_reference(keyframe.view)
             target = projective.Target(reference, se3.inverse(keyframe.T_component_camera))

@@ -16,7 +16,6 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, RangeFrame
-from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.engine.search import SearchOptions, verification
 from tofuse.engine.tracking.base import Guess, Odometry, Status, Step, Tracker
@@ -185,10 +184,8 @@ class KeyframeTracker(Tracker):
         mask, moved = None, 0.0
         if moving is not None and moving.fraction > MIN_MOVING_FRACTION:
             mask = at_size(moving.view, frame)
-            T_keyframe_camera = se3.inverse(accepted.keyframe.T_component_camera) @ (
-                accepted.T_component_camera
-            )
-            moved = moved_fraction(moving.view, view, accepted.keyframe.view, T_keyframe_camera)
+            T, keyframe = accepted.T_component_camera, accepted.keyframe
+            moved = moved_fraction(moving.view, view, T, keyframe.view, keyframe.T_component_camera)
             view = moving.applied(view)
         return Step(
             status,

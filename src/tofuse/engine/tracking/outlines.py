@@ -29,7 +29,11 @@ _SQUARE = [np.ones((2 * radius + 1, 2 * radius + 1), np.uint8) for radius in ran
 
 
 def moved_fraction(
-    moving: Bool, view: PreparedView, other: PreparedView, T_other_view: Float64
+    moving: Bool,
+    view: PreparedView,
+    T_world_camera: Float64,
+    other: PreparedView,
+    T_world_other: Float64,
 ) -> float:
     """Return the fraction of a view's image on segments that moved, whatever the camera's errors.
 
@@ -37,16 +41,16 @@ def moved_fraction(
     ----------
     moving
         (H, W) pixels of the view that disagree with the other one.
-    view, other
-        The views, both with all their pixels.
-    T_other_view
-        (4, 4).
+    view, T_world_camera
+        The view, with all its pixels, and its (4, 4) pose.
+    other, T_world_other
+        The other one and its (4, 4) pose.
     """
     stride = stride_of(view)
     moving = moving[::stride, ::stride]
     z, rays = view.z[::stride, ::stride], view.rays[::stride, ::stride]
     seen = _Surfaces(z, rays, view.planes[::stride, ::stride])
-    other_seen = _seen_at(other, T_other_view, z, rays)
+    other_seen = _seen_at(other, se3.inverse(T_world_other) @ T_world_camera, z, rays)
     beside = ~moving & (z > 0) & (other_seen.z > 0)
     outline = moving & (z > 0) & (other_seen.z > 0)
     outline &= cv2.dilate((~moving).view(np.uint8), _SQUARE[1]) > 0
