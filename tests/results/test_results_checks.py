@@ -207,6 +207,10 @@ CASES = {
         evidence(sigma=(0.0001, 0.0001)),
         accuracy=Accuracy(0.001, 0.001, 0.001, True, by_odometry=(4, 5)),
     ),
+    "bounded_by_motion": replace(
+        evidence(sigma=(0.0001, 0.0001)),
+        accuracy=Accuracy(0.001, 0.001, 0.001, True, by_motion=(4, 5)),
+    ),
     "repeated_images": evidence(repeated=(4, 5)),
     "implausible_depth": evidence(depths=(25.0,) * 9),
     "stood_still": evidence(steps=[(0.001 * (k % 2), 0, 0, 0, 0, 0) for k in range(9)]),

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.engine.tracking.motion_prediction import Prediction, degenerate_runs
+from tofuse.engine.tracking.motion_prediction import (
+    Prediction,
+    degenerate_runs,
+    steps_between_bounded,
+)
 
 NONE, SOME = np.zeros((0, 6)), np.eye(6)[:1]
 
@@ -86,3 +90,61 @@ def test_few_poses_give_default_growth(n) -> None:
     assert np.isfinite(found.sigma).all()
     assert min(found.sigma) > 0
     assert found.power == (2.0, 2.0)
+
+
+def along(speeds):
+    """Poses (N, 4, 4) of a camera that moves along x by `speeds` (N - 1,), in m per frame."""
+    return path(np.array(speeds)[:, None] * np.eye(6)[0])
+
+
+N = 30
+
+
+def between(blind, speeds, spans=None):
+    """Steps at `blind` frames from frame 15 on, and the others before them."""
+    bounded = np.ones(N, np.bool_)
+    bounded[15 : 15 + blind] = False
+    unobservable = [NONE if known else SOME for known in bounded]
+    spans = np.ones(N - 1) if spans is None else spans
+    return steps_between_bounded(along(speeds), unobservable, bounded, spans)
+
+
+@pytest.mark.parametrize("blind", [1, 2, 3, 8])
+def test_stop_on_the_way_is_within_two_sigma_of_even_motion(blind) -> None:
+    """The camera stops first and then hurries, or the other way round; the ends are known."""
+    speed = 0.02
+    steps = between(blind, [speed] * (N - 1))
+    assert [k for k, _ in steps] == list(range(15, 16 + blind))
+    variance = np.cumsum([sigma[0] ** 2 for _, sigma in steps])[:-1]
+    nearer = np.minimum(variance, variance[::-1])
+    stopped = speed * np.minimum(np.arange(1, blind + 1), np.arange(blind, 0, -1))
+    assert (stopped < 2 * np.sqrt(nearer)).all()
+    assert (2 * np.sqrt(nearer) < 2 * stopped + 0.02).all()
+
+
+def test_unobserved_motion_over_a_gap_is_less_certain() -> None:
+    speeds, spans = np.full(N - 1, 0.02), np.ones(N - 1)
+    (_, short), *_ = between(1, speeds)
+    speeds[14:16], spans[14:16] = 0.1, 5.0
+    (_, long), *_ = between(1, speeds, spans)
+    assert long[0] > 4 * short[0]
+
+
+def test_slide_of_a_registration_counts_as_error() -> None:
+    speeds = np.full(N - 1, 0.02)
+    (_, even), *_ = between(1, speeds)
+    speeds[14] += 0.1
+    speeds[15] -= 0.1
+    (_, slid), *_ = between(1, speeds)
+    assert slid[0] == pytest.approx(np.hypot(even[0], 0.1), rel=0.05)
+
+
+def test_unobserved_ends_and_cameras_of_unknown_speed_stay_unbounded() -> None:
+    poses, spans = along([0.02] * (N - 1)), np.ones(N - 1)
+    bounded = np.ones(N, np.bool_)
+    bounded[:3] = bounded[-4:] = False
+    unobservable = [NONE if known else SOME for known in bounded]
+    assert steps_between_bounded(poses, unobservable, bounded, spans) == []
+    bounded[3:25] = False
+    bounded[10] = True
+    assert steps_between_bounded(poses, unobservable, bounded, spans) == []

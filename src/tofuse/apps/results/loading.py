@@ -143,6 +143,7 @@ def _accuracy(data: dict[str, Any]) -> pose_accuracy.Accuracy:
         worst,
         tuple(data["unbounded"]),
         tuple(data["by_odometry"]),
+        tuple(data["by_motion"]),
         data.get("causes_m", {}),
     )
 

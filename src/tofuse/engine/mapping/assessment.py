@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.frames import RangeFrame, frame_ranges
 from tofuse.engine.fusion import Model, with_pose_errors
-from tofuse.engine.graph import LoopRecord, PoseGraph, external_sensors, graph_covariances
+from tofuse.engine.graph import LoopRecord, Measured, PoseGraph, external_sensors, graph_covariances
 from tofuse.engine.loops import PriorLoop, cut_edges
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
@@ -175,18 +175,12 @@ class Assessment:
                 closed.optimisation.graph
             ).of_poses
         refinement = refined.refinement
-        full = images_only = graph_covariances.GraphCovariances(
-            self._measured(refined.graph, refinement)
-        )
+        graph = refined.graph
         if closed.sensors:  # the accuracy uses the images alone where they suffice
-            without_sensors = closed.visual.optimisation.graph
+            graph = closed.visual.optimisation.graph
             if refinement.kept:
-                without_sensors = self.tracked.build(
-                    closed.loops, refinement, confirmed=closed.confirmed
-                )
-            images_only = graph_covariances.GraphCovariances(
-                self._measured(without_sensors, refinement)
-            )
+                graph = self.tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
+        covariances = graph_covariances.GraphCovariances(self._measured(graph, refinement))
         refinement_shift = 0.0, 0.0
         if self._is_tracked:  # the initial error of given poses is unrelated to the final one
             refinement_shift = trajectory_errors.displacement(
@@ -202,21 +196,33 @@ class Assessment:
             refinement.split_rad,
             corrected=bool(self._estimated_corrections),
         )
-        covariances = pose_accuracy.covariances_of(full, observed)
-        del full  # only one large factor is in memory
-        accuracy = pose_accuracy.accuracy_of(images_only, observed, model.cloud.diagonal_m)
-        if accuracy.unbounded and closed.sensors.verified:
+        accuracy = pose_accuracy.accuracy_of(covariances, observed, model.cloud.diagonal_m)
+        graph = covariances.graph
+
+        def bounded_by(steps: tuple[Measured, ...]) -> tuple[int, ...]:
+            """Add steps to the graph, and return the frames that they bound."""
+            nonlocal accuracy, covariances, graph
+            graph = external_sensors.with_sensors(graph, external_sensors.SensorPriors(steps))
+            covariances = graph_covariances.GraphCovariances(graph)
             unbounded = set(accuracy.unbounded)
-            bounded = external_sensors.with_sensors(
-                images_only.graph,
-                external_sensors.SensorPriors(self.tracked.steps_at_degenerate(closed.sensors)),
+            accuracy = pose_accuracy.accuracy_of(covariances, observed, model.cloud.diagonal_m)
+            return tuple(sorted(unbounded.difference(accuracy.unbounded)))
+
+        by_odometry: tuple[int, ...] = ()
+        by_motion: tuple[int, ...] = ()
+        if accuracy.unbounded and closed.sensors.verified:
+            by_odometry = bounded_by(self.tracked.steps_at_degenerate(closed.sensors))
+        between = self.tracked.steps_at_unbounded(graph, accuracy.unbounded)
+        if between:
+            by_motion = bounded_by(between)
+        accuracy = replace(accuracy, by_odometry=by_odometry, by_motion=by_motion)
+        if closed.sensors:
+            del covariances  # only one large factor is in memory
+            graph = external_sensors.with_sensors(
+                self._measured(refined.graph, refinement), external_sensors.SensorPriors(between)
             )
-            accuracy = pose_accuracy.accuracy_of(
-                graph_covariances.GraphCovariances(bounded), observed, model.cloud.diagonal_m
-            )
-            by_odometry = tuple(sorted(unbounded.difference(accuracy.unbounded)))
-            accuracy = replace(accuracy, by_odometry=by_odometry)
-        return accuracy, covariances
+            covariances = graph_covariances.GraphCovariances(graph)
+        return accuracy, pose_accuracy.covariances_of(covariances, observed)
 
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
         return self.tracked.measured(graph, self.observations.views, refinement.non_overlap_edges)

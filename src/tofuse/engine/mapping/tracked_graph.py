@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured, Optimisation, PoseGraph, build_graph, external_sensors
 from tofuse.engine.loops import ClosedLoop, Join
 from tofuse.engine.mapping.frame_log import Entry
@@ -150,6 +151,36 @@ class TrackedGraph:
         """Return the odometry steps from and to degenerate frames, and over gaps."""
         ends, gaps = self.unobservable.keys(), self.gaps
         return tuple(s for s in sensors.steps if s.i in ends or s.j in ends or (s.i, s.j) in gaps)
+
+    def steps_at_unbounded(
+        self, graph: PoseGraph, unbounded: Collection[int]
+    ) -> tuple[Measured, ...]:
+        """Return the steps to and from unbounded frames of a graph that lie between bounded ones.
+
+        They are known as far as cameras move evenly: see `steps_between_bounded`.
+        """
+        if not unbounded:
+            return ()
+        position = {int(index): k for k, index in enumerate(graph.ids)}
+        records = [e.record for e in self.posed if e.record.index in position]
+        poses = graph.poses[[position[r.index] for r in records]]
+        bounded = np.array([r.index not in unbounded for r in records], np.bool_)
+        times = np.diff([r.timestamp for r in records])
+        interval = float(np.median(times)) if len(times) else 0.0
+        if interval <= 0:
+            return ()
+        found = motion_prediction.steps_between_bounded(
+            poses,
+            [r.unobservable for r in records],
+            bounded,
+            np.maximum(times / interval, 1.0),
+        )
+        steps = []
+        for k, sigma in found:
+            T_i_j = se3.inverse(poses[k - 1]) @ poses[k]
+            information = np.diag(np.repeat(sigma, 3) ** -2.0)
+            steps.append(Measured(records[k - 1].index, records[k].index, T_i_j, information))
+        return tuple(s for s in steps if (s.i, s.j) not in self.gaps)
 
     @property
     def gaps(self) -> set[tuple[int, int]]:

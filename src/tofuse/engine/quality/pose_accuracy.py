@@ -87,6 +87,8 @@ class Accuracy:
         Indices of the frames whose pose is unbounded in some direction.
     by_odometry
         Indices of the frames whose pose would be unbounded without the recorded odometry.
+    by_motion
+        Those between bounded ones, whose pose would be unbounded if the speed were.
     causes_m
         Rms error of the positions by its cause, see `ObservedErrors.mean_squares`; empty if they
         are not bounded.
@@ -99,6 +101,7 @@ class Accuracy:
     worst: WorstFrame | None = None
     unbounded: tuple[int, ...] = ()
     by_odometry: tuple[int, ...] = ()
+    by_motion: tuple[int, ...] = ()
     causes_m: dict[str, float] = field(default_factory=dict)
 
     @property

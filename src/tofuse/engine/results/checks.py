@@ -498,6 +498,13 @@ def accuracy_reasons(
             "geometry): the recorded odometry bounds the error there."
         )
         yield Reason("bounded_by_odometry", by_odometry, text)
+    by_motion = frame_ranges.runs_of(frames, a.by_motion)
+    if by_motion:
+        text = (
+            f"{_poses_of(by_motion)} not constrained by the images in some direction (degenerate "
+            "geometry): the bound holds if the camera moved on there, at up to twice its speed."
+        )
+        yield Reason("bounded_by_motion", by_motion, text)
     if unbounded or not np.isfinite(a.position_m):
         return
     if a.position_m > tolerance_m or a.rotation_rad > TOLERANCE_RAD:

@@ -54,6 +54,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "not_refined": ("note", "Global refinement did not improve consistency and was discarded."),
     "sensor_differs": ("note", "An external sensor is inconsistent with the tracked motion."),
     "bounded_by_odometry": ("note", "Only the recorded odometry constrains the motion there."),
+    "bounded_by_motion": ("note", "Only the motion before and after constrains some poses."),
     "unreadable_frames": ("note", "Some frames could not be read and were skipped."),
     "single_frame": ("degraded", "Single view: nothing to register, accuracy not assessed."),
     "stood_still": (
@@ -93,6 +94,7 @@ ADVICE: dict[str, str] = {
     "unchecked_calibration": "Turn the camera more, and return to the start.",
     "self_calibrated": "Copy the corrected values into camera.json, and check a known distance.",
     "unobserved_motion": "Keep corners, furniture or texture in view there.",
+    "bounded_by_motion": "Keep corners, furniture or texture in view there.",
     "unchecked_drift": "Return to the start, so that a loop closure can correct the drift.",
     "loop_gap": "Distances across the loop may be distorted; check one that you know.",
     "optimiser_gave_up": "Allow the optimiser more iterations.",

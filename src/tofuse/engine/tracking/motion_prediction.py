@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -25,6 +26,9 @@ _AHEAD = 8
 _POWERS = np.linspace(0.0, 2.0, 41)
 # If it can't be estimated from the recording.
 _DEFAULT_POWER = 2.0
+# Sigma of the speed of an unobserved motion, as a fraction of the speed before it: 95 % are between
+# standing still and twice as fast.
+_SPEED_SIGMA = 0.5
 
 
 @dataclass(frozen=True)
@@ -131,6 +135,64 @@ def degenerate_runs(unobservable: Sequence[Float64]) -> Intp:
     count = np.cumsum(weak)
     last_constrained = np.maximum.accumulate(np.where(weak == 0, count, 0))
     return np.asarray(count - last_constrained, np.intp)
+
+
+def steps_between_bounded(
+    poses: Float64, unobservable: Sequence[Float64], bounded: Bool, spans: Float64
+) -> list[tuple[int, tuple[float, float]]]:
+    """Return how far cameras may be from poses that only those before and after them bound.
+
+    Both ends of such a run of frames are measured. In between the speed is unknown, but for its
+    scale: sigma is half of that at the ends, or of the typical one if that is higher. The errors of
+    consecutive steps are alike, so that they grow in proportion to the time from the nearer end.
+    Added are the error of the prediction, which grows at the maximum rate, and the step's
+    difference from an even motion, as a registration may have moved along a degenerate direction.
+
+    Parameters
+    ----------
+    poses
+        (N, 4, 4) T_world_camera of consecutive frames.
+    unobservable
+        (k, 6) degenerate directions of each frame, m and rad.
+    bounded
+        (N,) whether measurements bound the pose.
+    spans
+        (N - 1,) time from each frame to the next, in intervals of the recording.
+
+    Returns
+    -------
+    For each step of these runs: the frame k that it leads to, from frame k - 1, and sigma of its
+    motion, m and rad. Empty if too few steps are measured to know the speed of the camera.
+    """
+    measured = bounded[1:] & bounded[:-1]
+    if 6 * np.count_nonzero(measured) < _MIN_CONSTRAINED:
+        return []
+    prediction = Prediction.of(poses, unobservable).with_max_growth()
+    velocities = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / spans[:, None]
+    speeds = np.linalg.norm(velocities.reshape(-1, 2, 3), axis=2)
+    typical = np.sqrt((speeds[measured] ** 2).mean(0))
+    known = np.flatnonzero(measured)
+    steps = []
+    for before, after in itertools.pairwise(known):
+        k = np.arange(before + 1, after)  # steps of the run, from frame k to k + 1
+        if not len(k):
+            continue
+        ends = np.cumsum(np.append(0.0, spans[k]))
+        n = np.minimum(ends[1:], (ends[-1] - ends[:-1]))  # time from the nearer end
+        speed = np.maximum(typical, speeds[[before, after]].max(0))
+        growth = n**2 - np.maximum(n - spans[k], 0.0) ** 2
+        share = ((ends[1:] + ends[:-1]) / (2 * ends[-1]))[:, None]
+        even = (1 - share) * velocities[before] + share * velocities[after]
+        uneven = (velocities[k] - even).reshape(-1, 2, 3) * spans[k, None, None]
+        error = [
+            prediction.error(*np.ceil([a, b]).astype(int)) for a, b in zip(n, spans[k], strict=True)
+        ]
+        variance = (_SPEED_SIGMA * speed) ** 2 * growth[:, None] + np.square(error)
+        sigma = np.sqrt(variance + (uneven**2).sum(2))
+        steps += [
+            (int(row) + 1, (float(m), float(rad))) for row, (m, rad) in zip(k, sigma, strict=True)
+        ]
+    return steps
 
 
 def with_prediction(
