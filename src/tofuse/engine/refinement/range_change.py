@@ -170,6 +170,7 @@ def range_change(
         found = linearised.response_to_scales(profile)
         step, sigma = float(found.estimate()[-1]), float(found.sigma(pairs, len(views))[-1])
         scale += step
+        del scaled, aligned, linearised, found  # before the views are copied again
         if abs(step) < _CONVERGED * TOLERANCE:
             break
     return RangeChange(1 / (1 + scale) - 1, sigma, likely.frame, likely.limit)

@@ -136,6 +136,8 @@ class SampledView:
 
     def scaled(self, factor: float) -> SampledView:
         """Return the view with its depth scaled."""
+        if factor == 1:
+            return self
         points, target = _scaled(self.points, self.target, factor)
         coarse = self.coarse.scaled(factor)
         return replace(self, depth=self.depth * factor, points=points, target=target, coarse=coarse)
