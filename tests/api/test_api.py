@@ -239,6 +239,22 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
         ({"timestamps": list("abcdef")}, "timestamps"),
         ({"camera": [[70, 0.5, 40], [0, 70, 30], [0, 0, 1]]}, "skew"),
         ({"amplitude_kind": "x"}, "use one of raw, range_compensated, ir"),
+        (
+            {"camera": [[70, 0, 95], [0, 70, 30], [0, 0, 1]]},
+            "(95, 30) outside of images of 80 x 60",
+        ),
+        ({"depth": np.ones((60, 80, 24))}, "frames come first; pass numpy.moveaxis(depth, -1, 0)"),
+        ({"depth": np.ones((60, 80, 90))}, "images of 80 x 60 pixels: frames come first"),
+        (
+            {"depth": np.ones((60, 80, 6)), "camera": tofuse.Pinhole(80, 60, 70, 70, 39.5, 29.5)},
+            "frames come first",
+        ),
+        ({"timestamps": np.arange(6) * 33_333_333}, "camera in ns; divide them by 1e+09"),
+        ({"timestamps": 1.7e15 + np.arange(6) * 33_333}, "camera in us"),
+        (
+            {"timestamps": np.array([0, 33, 67, 100, 133, 167])},
+            "interval of 33, which is that of a camera in ms",
+        ),
     ],
 )
 def test_inconsistent_arrays_are_rejected(arrays, change, named):
@@ -246,6 +262,20 @@ def test_inconsistent_arrays_are_rejected(arrays, change, named):
     with pytest.raises(tofuse.InputError) as error:
         tofuse.from_arrays(given.pop("depth"), given.pop("camera"), **given)
     assert named in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        np.array([0.0, 20, 61, 70, 130, 145]),  # triggered manually
+        np.arange(6) * np.timedelta64(1, "h"),
+        np.arange(6) / 30,
+    ],
+)
+def test_slow_cameras_and_parts_of_images_are_accepted(arrays, times):
+    K = arrays[1] + [[0, 0, 30], [0, 0, 0], [0, 0, 0]]  # as of an image cut at its left
+    recording = tofuse.from_arrays(arrays[0], K, timestamps=times)
+    assert len(recording) == 6
 
 
 @pytest.mark.parametrize(

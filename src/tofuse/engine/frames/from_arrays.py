@@ -22,6 +22,14 @@ from tofuse.engine.parts import check_number
 _MILLIMETRES = 1e-3
 # A larger median of depth can't be in metres.
 _MAX_MEDIAN_M = 200.0
+# Images are stacked along the last axis if the principal point is farther from their centre than
+# this fraction of their size, and than this multiple of that fraction for the other order.
+_MIN_OFFSET, _MIN_OFFSET_RATIO = 0.1, 3.0
+# Longest median interval of frames, s; also for a camera that runs freely: most intervals, up to
+# these percentiles, differ by less than this factor. And units that are mistaken for seconds.
+_MAX_INTERVAL_S, _MAX_REGULAR_INTERVAL_S = 1000.0, 5.0
+_MOST, _REGULAR_RATIO, _MIN_INTERVALS = (12.5, 50.0, 87.5), 1.5, 4
+_UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9}
 
 
 def from_arrays(
@@ -56,7 +64,7 @@ def from_arrays(
     confidence
         (N, H, W) uint8, higher is better.
     timestamps
-        (N,) s, or datetime64; 30 images per second unless given.
+        (N,) s, or datetime64 or timedelta64; 30 images per second unless given.
     reference
         (N, 4, 4) T_world_camera, NaN where unknown; used only for comparison.
     odometry
@@ -77,7 +85,7 @@ def from_arrays(
     shape = images[0].shape
     if len(shape) != 2:
         raise InputError(f"has images of shape {shape}", where="depth", remedy="pass (N, H, W)")
-    checked_camera = _camera(camera, shape)
+    checked_camera = _camera(camera, shape, len(images))
     times = _times(timestamps, len(images))
     colors = _optional("color", color, images, np.uint8, 3)
     amplitudes = _optional("amplitude", amplitude, images, np.float32)
@@ -121,7 +129,9 @@ def _images(name: str, values: Any, shape: tuple[int, ...] | None) -> list[NDArr
     for k, image in enumerate(images):
         if image.dtype.kind not in "iufb" or image.shape != expected:
             raise InputError(
-                f"image {k} is {image.dtype} of shape {image.shape}, not {expected}", where=name
+                f"image {k} is {image.dtype} of shape {image.shape}, not {expected}",
+                where=name,
+                remedy=f"pass (N, {', '.join(map(str, expected))})",
             )
     return images
 
@@ -167,13 +177,22 @@ def _to_metres(
     return to_metres
 
 
-def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
+def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...], count: int) -> Camera:
     height, width = shape
+    stacked_last = InputError(
+        f"has shape {(count, height, width)}, and the camera is that of images of "
+        f"{height} x {count} pixels: frames come first",
+        where="depth",
+        remedy="pass numpy.moveaxis(depth, -1, 0)",
+    )
     if isinstance(camera, Pinhole | RayTable):
+        if (camera.height, camera.width) == (count, height) != shape:
+            raise stacked_last
         if (camera.height, camera.width) != (height, width):
             raise InputError(
                 f"has {camera.width} x {camera.height} pixels, and depth {width} x {height}",
                 where="camera",
+                remedy="pass the camera of these images, which are (N, height, width)",
             )
         return camera
     try:
@@ -182,13 +201,28 @@ def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
         raise InputError(
             "is neither a camera nor a matrix", where="camera", remedy="pass K (3, 3)"
         ) from error
-    return Pinhole(width, height, **pinhole_values(K, height, "camera"))
+    values = pinhole_values(K, height, "camera")
+    offset, offset_if_last = (
+        max(abs(values["cx"] / w - 0.5), abs(values["cy"] / h - 0.5))
+        for h, w in (shape, (count, height))
+    )
+    if offset > max(_MIN_OFFSET, _MIN_OFFSET_RATIO * offset_if_last):
+        raise stacked_last
+    if not (-0.5 <= values["cx"] <= width - 0.5 and -0.5 <= values["cy"] <= height - 0.5):
+        raise InputError(
+            f"has its centre ({values['cx']:.0f}, {values['cy']:.0f}) outside of images of "
+            f"{width} x {height} pixels",
+            where="camera",
+            remedy="pass the K of the depth images; for a part of an image, a tofuse.Pinhole",
+        )
+    return Pinhole(width, height, **values)
 
 
 def _times(timestamps: ArrayLike | None, count: int) -> Float64:
     if timestamps is None:
         return np.arange(count) / 30
     times = np.asarray(timestamps)
+    is_number = times.dtype.kind in "iuf"
     times = _seconds(times) if times.dtype.kind in "iufmM" else np.full(count, np.nan)
     if times.shape != (count,) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise InputError(
@@ -196,7 +230,22 @@ def _times(timestamps: ArrayLike | None, count: int) -> Float64:
             where="timestamps",
             remedy="use seconds",
         )
+    if is_number and count > 1:
+        _check_seconds(np.diff(times))
     return times
+
+
+def _check_seconds(steps: Float64) -> None:
+    """Raise InputError if intervals between frames are those of a camera in another unit."""
+    low, interval, high = np.percentile(steps, _MOST)
+    is_regular = len(steps) >= _MIN_INTERVALS and high < _REGULAR_RATIO * low
+    if interval > (_MAX_REGULAR_INTERVAL_S if is_regular else _MAX_INTERVAL_S):
+        unit = next((name for name, factor in _UNITS.items() if interval < factor), "ns")
+        raise InputError(
+            f"have a median interval of {interval:.4g}, which is that of a camera in {unit}",
+            where="timestamps",
+            remedy=f"divide them by {_UNITS[unit]:.0e}, or use timedelta64, which states its unit",
+        )
 
 
 def _seconds(times: NDArray[Any]) -> Float64:
