@@ -97,6 +97,45 @@ def test_zero_and_65535_are_invalid(tmp_path: Path) -> None:
     assert frame.depth[0, :4].tolist() == pytest.approx([0, 0, 65534 * 0.0005, 0.5])
 
 
+@pytest.mark.parametrize("dtype", ["uint16", "float32", ">f8"])
+def test_depth_saved_by_numpy(tmp_path: Path, dtype: str) -> None:
+    folder = write(tmp_path / "r", depth_unit_m=0.001)
+    as_png = [NativeSource(folder).read(k) for k in range(4)]
+    for k, frame in enumerate(as_png):
+        (folder / "depth" / f"{k:06d}.png").unlink()
+        counts = np.rint(frame.depth * 1000)
+        counts[5, 5] = 65535
+        values = counts if dtype == "uint16" else np.where(counts > 0, counts / 1000, np.nan)
+        values[5, 5] = 65535 if dtype == "uint16" else np.inf
+        np.save(folder / "depth" / f"{k:06d}.npy", values.astype(dtype))
+    for frame, truth in zip(map(NativeSource(folder).read, range(4)), as_png, strict=True):
+        assert frame.depth[5, 5] == 0
+        expected = np.where(frame.depth == 0, 0, truth.depth)
+        np.testing.assert_allclose(frame.depth, expected, rtol=1e-6)
+        assert frame.valid.sum() == truth.valid.sum() - 1
+        np.testing.assert_array_equal(frame.color_image, truth.color_image)
+
+
+@pytest.mark.parametrize(
+    ("saved", "words"),
+    [
+        (np.full((30, 40), 1500.0), "median of 1500, which can't be m; save metres"),
+        (np.ones((4, 30, 40)), r"of shape \(4, 30, 40\); save \(H, W\) floats"),
+        (np.array([[{}]]), "is not an array; write it by numpy.save"),
+        (np.ones((30, 40), complex), "is complex128"),
+    ],
+)
+def test_other_arrays_as_depth_are_refused(tmp_path: Path, saved: Any, words: str) -> None:
+    folder = write(tmp_path / "r", 1)
+    (folder / "depth" / "000000.png").unlink()
+    np.save(folder / "depth" / "000000.npy", saved)
+    with pytest.raises(UnreadableFrameError, match=words):
+        NativeSource(folder).read(0)
+    np.save(folder / "depth" / "000000.npy", np.ones((40, 30)))
+    with pytest.raises(InputError, match=r"000000.npy: is 30 x 40 pixels, camera.json states"):
+        NativeSource(folder)
+
+
 def test_depth_beyond_sixteen_bits_is_invalid_and_counted(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a", PINHOLE, depth_unit_m=0.0001)
     depth = np.full((30, 40), 2.0, np.float32)

@@ -1,4 +1,4 @@
-"""PNG, JPEG and raw images, checked before they are decoded.
+"""PNG, JPEG, NumPy and raw images, checked before they are decoded.
 
 OpenCV fills the missing part of a truncated file with zeros or grey, reports it at most on stderr,
 and allocates any size that a header declares. So the structure of a file is checked first.
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.errors import InputError
-from tofuse.formats.files import atomic, reading
+from tofuse.formats.files import atomic, npz, reading
 
 MAX_PIXELS = 1 << 26  # 8192 x 8192: far beyond any depth camera, and 400 MB of colour
 MAX_IMAGE_BYTES = 1 << 29
@@ -44,13 +44,16 @@ class ImageHeader:
 
 
 def read_header(path: str | Path) -> ImageHeader:
-    """Read size and type of a PNG or JPEG without decoding it.
+    """Read size and type of a PNG, JPEG or .npy without decoding it.
 
     Raises
     ------
     InputError
-        If it is neither, is cut off within its header, or declares an absurd size.
+        If it is none of these, is cut off within its header, or declares an absurd size.
     """
+    if Path(path).suffix.lower() == ".npy":
+        image = _npy_image(path, None)
+        return ImageHeader("npy", *image.shape[::-1], 1, 8 * image.itemsize)
     head = reading.read_head(path, 64)
     with reading.about(path, _COPY_AGAIN):
         return _header(
@@ -163,6 +166,8 @@ def read_image(
 ) -> NDArray[Any]:
     """Read a PNG or JPEG as it is stored: (H, W) grey, or (H, W, 3) RGB; uint8 or uint16.
 
+    Also the numbers (H, W) of an .npy file, which may have any type.
+
     Parameters
     ----------
     path
@@ -177,9 +182,22 @@ def read_image(
     InputError
         If it can't be read, is cut off or damaged, or isn't of that size and type.
     """
+    if Path(path).suffix.lower() == ".npy":
+        return _npy_image(path, size)
     return parse_image(
         reading.read_bytes(path, limit=MAX_IMAGE_BYTES), path, size=size, dtype=dtype
     )
+
+
+def _npy_image(path: str | Path, size: tuple[int, int] | None) -> NDArray[Any]:
+    image = npz.read_npy(path)
+    with reading.about(path, "save (H, W) floats in metres, or integers"):
+        if image.ndim != 2 or image.dtype.kind not in "uif":
+            raise InputError(f"is {image.dtype} of shape {image.shape}")
+        height, width = image.shape
+        check_pixels(width, height)
+        check_camera_size(width, height, size)
+    return image
 
 
 def parse_image(

@@ -1,4 +1,4 @@
-"""The native recording: a folder of PNG images (or PLY clouds), described by a camera.json."""
+"""The native recording: a folder of images (or PLY clouds), described by a camera.json."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float64
+from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
@@ -30,6 +30,7 @@ from tofuse.formats.sources import (
 )
 
 _IMAGES = (".png", ".jpg", ".jpeg")
+_MAX_MEDIAN_M = 200.0  # floats with a larger median are not in metres
 
 
 class NativeSource(FileSource):
@@ -64,6 +65,8 @@ class NativeSource(FileSource):
         name, suffixes = ("cloud", (".ply",)) if self.is_clouds else ("depth", (".png",))
         remedy = "check that the recording is complete"
         files = reading.files_with(folder / name, *suffixes)
+        if not (files or self.is_clouds):
+            files = reading.files_with(folder / name, ".npy")
         self.files = inputs.required(files, f"{suffixes[0]} files", folder / name, remedy)
         self.description, self.camera = self._read_camera(camera_path)
         self.unit, self.kind = self.description.depth_unit_m, self.description.depth_kind
@@ -99,8 +102,7 @@ class NativeSource(FileSource):
         if self.camera is None:
             return cloud_frames.ply_frame(self.files[index], index, timestamp)
         camera = self._camera_of(index, self.camera)
-        counts = self._read(self.files, index, "uint16")
-        depth = depth_counts.depth_from_counts(counts, self.unit)
+        depth = self._depth(index)
         if self.correction is not None:
             depth = corrected_depth(self.correction, camera, depth, self.kind)
         images: dict[str, Any] = {"camera": camera}
@@ -121,11 +123,31 @@ class NativeSource(FileSource):
             index, depth, color_registered=self.description.color_registered, **images
         )
 
+    def _depth(self, index: int) -> Float32:
+        """Depth (H, W), m."""
+        path = self.files[index]
+        if path.suffix.lower() != ".npy":
+            counts = self._read(self.files, index, "uint16")
+            return depth_counts.depth_from_counts(counts, self.unit)
+        numbers = read_image(path, size=self._size)
+        in_metres = numbers.dtype.kind == "f"
+        depth = depth_counts.depth_from_numbers(numbers, 1.0 if in_metres else self.unit)
+        if in_metres and (depth > _MAX_MEDIAN_M).sum() > (depth > 0).sum() / 2:
+            raise InputError(
+                f"has floats with a median of {np.median(depth[depth > 0]):.4g}, which can't be m",
+                where=path,
+                remedy="save metres, or integers in units of depth_unit_m",
+            )
+        return depth
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        assert self.camera is not None
+        return self.camera.width, self.camera.height
+
     def _read(self, files: list[Path], index: int, dtype: str) -> NDArray[Any]:
         """The counts (H, W) in a file of a channel."""
-        assert self.camera is not None
-        size = (self.camera.width, self.camera.height)
-        return read_image(files[index], size=size, dtype=dtype).astype(dtype, copy=False)
+        return read_image(files[index], size=self._size, dtype=dtype).astype(dtype, copy=False)
 
     def _camera_of(self, index: int, camera: Camera) -> Camera:
         """Return the camera of a frame: its own, if the recording has one per frame."""
@@ -241,7 +263,7 @@ class NativeSource(FileSource):
         """Compare the size in camera.json with the first readable header of each channel."""
         if self.camera is None:
             return
-        size, where = (self.camera.width, self.camera.height), "camera.json states"
+        size, where = self._size, "camera.json states"
         remedy = "use the camera.json of these images"
         for channel in (self.files, self.amplitude, self.confidence, self.sigma):
             check_first_size(channel, size, where, remedy)
@@ -279,7 +301,7 @@ class NativeSource(FileSource):
 
 @part("reader", "native", label="validated")
 class Native(Reader):
-    """Folders with a camera.json and depth/ (PNG) or cloud/ (PLY)."""
+    """Folders with a camera.json and depth/ (PNG, or .npy) or cloud/ (PLY)."""
 
     joinable = True
 
