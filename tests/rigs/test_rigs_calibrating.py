@@ -102,6 +102,8 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["rig", "check", str(out), *cameras, "--json"]) == 0
     checked = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert not any(c["moved"] for c in checked["cameras"])
+    # They agree with themselves, whatever happened to the cameras.
+    assert checked["images_of_calibration"] == ["cam0", "cam1"]
 
     assert main(["rig", "check", str(out), *cameras[:1]]) == 2
     assert "2 cameras" in capsys.readouterr().err

@@ -1,13 +1,17 @@
 """Detection of displaced cameras of a rig, without false alarms."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import tofuse
 from tofuse.apps.rigs.checking import compare, compare_in_scene
+from tofuse.apps.rigs.inputs import Camera
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.geometry import se3
-from tofuse.formats.rigs.rig_file import Rig, RigCamera
+from tofuse.formats.rigs.rig_file import Rig, RigCamera, read_rig, write_rig
 
 SIGMA = np.array([0.0006] * 3 + [np.radians(0.03)] * 3)
 
@@ -68,6 +72,28 @@ def test_systematic_errors_recur_in_same_scene() -> None:
     found = compare_in_scene(*rigs)
     assert [m.name for m in found if m.moved] == ["2"]
     assert found[2].chance < 0.01 < found[2].chance_elsewhere
+
+
+def test_images_of_the_calibration_are_recognised(tmp_path: Path) -> None:
+    cameras = [
+        Camera(
+            name, tofuse.from_arrays(np.full((2, 30, 40), depth), Pinhole(40, 30, 35, 35, 20, 15))
+        )
+        for name, depth in (("left", 1.0), ("right", 1.5), ("top", 2.0))
+    ]
+    rig = Rig(
+        tuple(
+            RigCamera(c.name, "", np.eye(4), np.eye(6), first_image=c.first_image) for c in cameras
+        )
+    )
+    write_rig(tmp_path / "rig.json", rig)
+    again = read_rig(tmp_path / "rig.json")
+    assert again.with_same_images(rig) == ("left", "right", "top")
+    images = ("", cameras[1].first_image, cameras[1].first_image)  # unknown, same, of another
+    other = tuple(replace(c, first_image=i) for c, i in zip(rig.cameras, images, strict=True))
+    assert again.with_same_images(Rig(other)) == ("right",)
+    unknown = replace(rig.cameras[0], first_image="")
+    assert Rig((unknown,)).with_same_images(Rig((unknown,))) == ()
 
 
 def test_camera_without_common_surface_is_not_compared() -> None:

@@ -64,11 +64,18 @@ def rig_check(arguments: RigCheck) -> int:
         for c in cameras
     ]
     width = max(len(camera.name) for camera in cameras)
+    same = rig.with_same_images(calibration.rig)
+    notes = list(calibration.notes)
+    if same:
+        notes.append(
+            f"{', '.join(same)}: {arguments.rig} was made from these images, which agree with it even "
+            "if the camera was moved since: record it again"
+        )
     return show(
         arguments,
-        run_json.plain({"cameras": rows}),
+        run_json.plain({"cameras": rows, "images_of_calibration": same}),
         *(escaped(f"{camera.name:<{width}}  {_outcome(camera)}") for camera in cameras),
-        *warning_lines(calibration.notes),
+        *warning_lines(notes),
         status=3 if any(camera.moved or camera.reason for camera in cameras) else 0,
     )
 

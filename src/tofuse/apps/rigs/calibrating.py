@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -59,7 +60,11 @@ def calibrate_cameras(
     """Calibrate opened cameras; see `calibrate`."""
     progress = progress or Silent()
     progress.stage("opening")
-    return (calibrate_moving if moves(cameras, motion) else calibrate_static)(cameras, progress)
+    method = calibrate_moving if moves(cameras, motion) else calibrate_static
+    calibration = method(cameras, progress)
+    images = {camera.name: camera.first_image for camera in cameras}
+    placed = tuple(replace(c, first_image=images[c.name]) for c in calibration.rig.cameras)
+    return replace(calibration, rig=replace(calibration.rig, cameras=placed))
 
 
 def moves(cameras: Sequence[Camera], motion: Motion) -> bool:

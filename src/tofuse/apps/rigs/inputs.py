@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -51,6 +52,12 @@ class Camera:
                 remedy="check the recording with `tofuse inspect`",
             )
         return frames
+
+    @cached_property
+    def first_image(self) -> str:
+        """Digest of the depth of its first image; empty if that can't be read."""
+        frame = self.image(0)
+        return "" if frame is None else hashlib.sha256(frame.depth.tobytes()).hexdigest()
 
     def image(self, k: int) -> RangeFrame | None:
         """Read image `k`; None if it can't be read, or is empty."""

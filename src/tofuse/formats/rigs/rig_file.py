@@ -40,6 +40,8 @@ class RigCamera:
     random_covariance
         (6, 6) the part of it due to errors that differ between two calibrations in the same scene,
         without systematic ones such as multipath; None if unknown.
+    first_image
+        Digest of the depth of the first image of `recording`; empty if unknown.
     time_offset_s
         The rig's time is the camera's timestamp plus this.
     depth_offset_m
@@ -53,6 +55,7 @@ class RigCamera:
     time_offset_s: float = 0.0
     depth_offset_m: float = 0.0
     random_covariance: Float64 | None = None
+    first_image: str = ""
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,11 @@ class Rig:
         """Return the camera called `name`; None if there is none."""
         return next((camera for camera in self.cameras if camera.name == name), None)
 
+    def with_same_images(self, other: Rig) -> tuple[str, ...]:
+        """Return the names of the cameras whose first image is that in another rig."""
+        images = {(c.name, c.first_image) for c in other.cameras if c.first_image}
+        return tuple(c.name for c in self.cameras if (c.name, c.first_image) in images)
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain data, as stored in rig.json."""
         data: dict[str, Any] = {
@@ -110,6 +118,8 @@ def _camera_data(camera: RigCamera) -> dict[str, Any]:
     }
     if camera.random_covariance is not None:
         data["random_covariance"] = camera.random_covariance.ravel().tolist()
+    if camera.first_image:
+        data["first_image"] = camera.first_image
     return data
 
 
@@ -194,6 +204,7 @@ def _camera(row: dict[str, Any], where: str) -> RigCamera:
         _number(row, "time_offset_s", _MAX_SECONDS, where, 0.0),
         _number(row, "depth_offset_m", _MAX_METRES, where, 0.0),
         random,
+        str(row.get("first_image", "")),
     )
 
 
