@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tofuse.apps.pairs.views import named_view
 from tofuse.engine.arrays import Float32, Intp
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Pinhole, Rational
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.formats.geometry.ply import write_ply
+from tofuse.formats.geometry.ply import read_ply, write_ply
 from tofuse.formats.recordings.open import open_recording
 from tofuse.formats.sources.organised import find_deprojection
 
@@ -84,10 +85,35 @@ def test_other_clouds_stay_clouds(change: str) -> None:
         "merged": np.concatenate([points, moved(points)]),
         "averaged": points + off,
         "scattered": scattered,
-        "behind": -points,
+        "behind": points * np.where(rng.random((len(points), 1)) < 0.5, -1, 1),
         "few": points[:300],
     }[change]
     assert find_deprojection([CloudFrame.of(other)]) is None
+
+
+def test_files_of_the_realsense_viewer_are_turned(tmp_path: Path) -> None:
+    frame, turn = seen(PINHOLE, 0), (1, -1, -1)
+    normals = np.tile(np.float32([0.6, 0, -0.8]), (len(frame), 1))
+    write_ply(tmp_path / "a.ply", GeometryRecord(frame.points * turn, normals=normals * turn))
+    recording = open_recording(tmp_path / "a.ply")
+    assert any("RealSense Viewer" in text for text in recording.warnings)
+    image = recording[0]
+    np.testing.assert_array_equal(image.depth, frame.depth)
+    np.testing.assert_allclose(image.camera.rays(), PINHOLE.rays(), atol=1e-5)
+    np.testing.assert_array_equal(image.normals, normals)
+    # A pair is registered in the coordinates of its files.
+    view = named_view(str(tmp_path / "a.ply")).frame
+    assert isinstance(view, CloudFrame)
+    np.testing.assert_allclose(view.points, frame.points * turn, atol=2e-5)
+    np.testing.assert_array_equal(view.normals, normals * turn)
+
+
+def test_real_file_of_the_realsense_viewer(shared_data: Path) -> None:
+    recording = open_recording(shared_data / "cases" / "realsense_viewer")
+    frame = recording[0]
+    assert (frame.camera.width, frame.camera.height, len(frame)) == (612, 465, 129601)
+    stored = read_ply(shared_data / "cases" / "realsense_viewer" / "45.ply").points
+    assert frame.z.max() == np.float32(-stored[:, 2].min())
 
 
 @pytest.mark.nightly

@@ -68,8 +68,8 @@ def rig_check(arguments: RigCheck) -> int:
     notes = list(calibration.notes)
     if same:
         notes.append(
-            f"{', '.join(same)}: {arguments.rig} was made from these images, which agree with it even "
-            "if the camera was moved since: record it again"
+            f"{', '.join(same)}: {arguments.rig} was made from these images, which agree with it "
+            "even if the camera was moved since: record it again"
         )
     return show(
         arguments,

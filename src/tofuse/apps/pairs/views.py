@@ -62,7 +62,7 @@ def named_view(
         cloud = read_cloud(folder)
         frame = CloudFrame.of(_checked(cloud.points, name))
         return SingleView(name, name, "result", 0, frame)
-    return open_view(name, format=format, camera=camera, topic=topic)
+    return open_view(name, format=format, camera=camera, topic=topic, file_axes=True)
 
 
 def _checked(points: ArrayLike, name: str) -> Float64:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames import NOISE_MODEL, CloudFrame, Frame, Recording, Source
+from tofuse.engine.frames import NOISE_MODEL, CloudFrame, Frame, RangeFrame, Recording, Source
 from tofuse.engine.parts import discover, name_of, registered
 from tofuse.formats.cameras import read_noise
 from tofuse.formats.files import reading
@@ -22,7 +22,7 @@ from tofuse.formats.recordings.archives import unzipped
 from tofuse.formats.recordings.joined import JoinedSource, LimitedSource
 from tofuse.formats.recordings.still import average_still
 from tofuse.formats.rigs import RigSource, read_rig, recordings_of, rig_file_in
-from tofuse.formats.sources import Reader, ReaderOptions, Sniff
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, organised
 
 # Proprietary recordings: problem and remedy by suffix.
 CLOSED = {
@@ -450,10 +450,12 @@ def open_view(
     format: str | None = None,  # noqa: A002
     camera: Path | None = None,
     topic: str | None = None,
+    file_axes: bool = False,
 ) -> SingleView:
     """Read the view called `name`; for the options see `open_recording`.
 
-    Of a mesh (.ply, .obj, .stl, .glb; m) it is points spread evenly over its area.
+    Of a mesh (.ply, .obj, .stl, .glb; m) it is points spread evenly over its area. With `file_axes`
+    clouds that the reader turned to the axes of a camera are clouds in those of their file.
 
     Raises
     ------
@@ -477,10 +479,10 @@ def open_view(
     if index >= count:
         available = "its only frame is 0" if count == 1 else f"its frames are 0 to {count - 1}"
         raise InputError(f"has no frame {index}", where=path, remedy=available)
-    view = SingleView(
-        name, path, recording.format, index, recording[index], tuple(recording.warnings)
-    )
-    return _checked(view)
+    frame, warnings = recording[index], tuple(recording.warnings)
+    if file_axes and "stored_axes" in recording.metadata and isinstance(frame, RangeFrame):
+        frame, warnings = organised.stored_cloud(frame), ()
+    return _checked(SingleView(name, path, recording.format, index, frame, warnings))
 
 
 def _checked(view: SingleView) -> SingleView:

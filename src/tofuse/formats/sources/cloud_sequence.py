@@ -58,6 +58,12 @@ class CloudFileSource(FileSource):
         self._deprojection = self._find_deprojection() if deproject else None
         if self._deprojection is not None:
             self.metadata["depth_kind"] = "z"
+            if self._deprojection.turned:
+                self.metadata["stored_axes"] = "x right, y up, z backwards"
+                self.warnings.append(
+                    f"{path}: y is up and z backwards, as in files of the RealSense Viewer: turned "
+                    "to the camera's axes, y down and z forward"
+                )
 
     def where(self, index: int) -> str:
         """See `FileSource.where`."""

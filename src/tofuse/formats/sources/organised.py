@@ -258,6 +258,8 @@ _DEGREES = ((8.0, 1), (16.0, 3), (48.0, 5), (np.inf, 7))
 _MAX_OFFSET_PX, _MIN_GROWING_FRACTION, _MIN_FRACTION = 0.25, 0.9, 0.99
 # Newton iterations from pixels to slopes.
 _NEWTON_ITERATIONS = 6
+# From x right, y up, z backwards to the axes of a camera, and back.
+_TURN = np.array([1, -1, -1], np.float32)
 # Slopes mapped at a time, for the CPU cache.
 _CHUNK = 8192
 
@@ -272,10 +274,13 @@ class Deprojection:
         Cropped to the columns and rows with measurements.
     lattice
         Maps slopes to its pixels.
+    turned
+        Whether the clouds have y up and z backwards, as those of the RealSense Viewer.
     """
 
     camera: Camera
     lattice: _Lattice
+    turned: bool = False
 
     def image(self, cloud: CloudFrame) -> RangeFrame:
         """Return the image that a cloud was deprojected from.
@@ -285,7 +290,9 @@ class Deprojection:
         InputError
             If its points are not on the rays of the pixels.
         """
-        points = cloud.points
+        points, normals = cloud.points, cloud.normals
+        if self.turned:
+            points, normals = points * _TURN, None if normals is None else normals * _TURN
         pixel, on_lattice = self.lattice.pixels(points)
         if len(points) and on_lattice.mean() < _MIN_FRACTION:
             raise InputError("has points off the rays of the previous clouds", remedy=_REMEDY)
@@ -299,7 +306,7 @@ class Deprojection:
             ("depth", points[:, 2], 0),
             ("amplitude_image", cloud.amplitude, 0),
             ("color_image", cloud.color, 0),
-            ("normal_image", cloud.normals, np.nan),
+            ("normal_image", normals, np.nan),
         ):
             if values is not None:
                 image = np.full((*shape, *values.shape[1:]), missing, values.dtype)
@@ -308,11 +315,23 @@ class Deprojection:
         return RangeFrame(cloud.index, cloud.timestamp, camera, **images)
 
 
+def stored_cloud(frame: RangeFrame) -> CloudFrame:
+    """Return the points of an image of a cloud that was turned, in the axes of its file."""
+    normals = None if frame.normals is None else frame.normals * _TURN
+    channels = {"normals": normals, "amplitude": frame.amplitude, "color": frame.color}
+    return CloudFrame.of(
+        frame.points * _TURN, index=frame.index, timestamp=frame.timestamp, **channels
+    )
+
+
 def find_deprojection(clouds: Sequence[CloudFrame]) -> Deprojection | None:
     """Return the camera from which all clouds were deprojected; None if there is none."""
     if any(np.any(cloud.origin) for cloud in clouds):
         return None
     points = [cloud.points for cloud in clouds if len(cloud)]
+    turned = bool(points) and bool((points[0][:, 2] < 0).all())
+    if turned:
+        points = [p * _TURN for p in points]
     if not points or not all(bool((p[:, 2] > 0).all()) for p in points):
         return None
     slopes = [p[:, :2].astype(np.float64) / p[:, 2:] for p in points]
@@ -333,7 +352,7 @@ def find_deprojection(clouds: Sequence[CloudFrame]) -> Deprojection | None:
         return None
     lattice = lattice.with_origin(low)
     camera = _camera(lattice, pixel - low, np.concatenate(slopes), width, height)
-    return None if camera is None else Deprojection(camera, lattice)
+    return None if camera is None else Deprojection(camera, lattice, turned)
 
 
 @dataclass(frozen=True, eq=False)
