@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,9 +49,11 @@ MISREAD = {
     "turned by 270 degrees": lambda T: turned(T, -3),
     "in mm": lambda T: scaled(T, 1000),
     "in cm": lambda T: scaled(T, 100),
+    "in feet": lambda T: scaled(T, 3.281),
     "2.5 times as far apart": lambda T: scaled(T, 2.5),
     "0.4 times as far apart": lambda T: scaled(T, 0.4),
 }
+SCALES = ("in feet", "2.5 times as far apart", "0.4 times as far apart")
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +89,24 @@ def test_convention_is_named(sample, recording, words):
     start = se3.exp(np.array([1.0, -2, 0.5, 0.4, 0.9, -0.3]))
     poses = start @ recording.reference
     (found,) = misread_poses(sample, MISREAD[words](poses))
-    assert found.code == "poses_misread"
+    assert found.code == ("depth_scale" if words in SCALES else "poses_misread")
     assert words in found.text
     assert all(np.isfinite(value) for value in found.evidence.values())
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [(4.0, "the depth is 4 times too large"), (0.2, "the depth is 5 times too small")],
+)
+def test_depth_of_another_scale_than_the_poses(recording, factor, words):
+    frames = [replace(f, depth=f.depth * np.float32(factor)) for f in recording]
+    source = ArraySource(frames, recording.reference, metadata={"depth_unit_m": 0.001})
+    scaled_recording = Recording.of(source, "somewhere", "frames")
+    (found,) = misread_poses(Sample.of(scaled_recording, 8), recording.reference)
+    assert found.code == "depth_scale"
+    assert words in found.text
+    assert found.evidence["factor"] == pytest.approx(1 / factor, rel=0.1)
+    assert found.evidence["sigma"] < 0.1 * found.evidence["factor"]
 
 
 def test_right_poses_are_not_reported(sample, recording):

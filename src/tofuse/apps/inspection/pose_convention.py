@@ -1,4 +1,4 @@
-"""Check of the poses of a recording: whether they are read in another convention than they have."""
+"""Check of the poses of a recording: their convention, and their scale relative to the depth."""
 
 from __future__ import annotations
 
@@ -22,6 +22,10 @@ _MIN_LEAD, _MIN_LEAD_SIGMAS, _MAX_REMAINING, _EQUAL = np.radians(1.5), 4.0, 0.35
 # that is not reported: devices err by less; and within which of a unit's that unit is named.
 _MIN_DISTANCE, _MAX_FACTOR, _MIN_FIT = 0.015, 1.3, 1.2
 _UNITS = {"mm": 1000.0, "cm": 100.0, "inches": 39.37, "feet": 3.281}
+_IMPLAUSIBLE_FOR_DEPTH = (
+    "mm",
+    "cm",
+)  # if depth were wrong by that factor, its median would show it
 _MIN_PAIRS, _VIEWS = 3, 8
 # Rotation between two views, rad, that shows the convention, and within which views overlap; and
 # the number of frames among which it is sought.
@@ -150,10 +154,20 @@ def misread_poses(sample: Sample, poses: Float64) -> Iterator[Finding]:
     if not is_significant(np.sign(np.log(factor)) * ratio, np.log(_MAX_FACTOR), _MIN_LEAD_SIGMAS):
         return
     unit = next((u for u, f in _UNITS.items() if 1 / _MIN_FIT < factor / f < _MIN_FIT), None)
+    apart = f"The poses are {factor:.2g} times as far apart as the images show"
+    if unit in _IMPLAUSIBLE_FOR_DEPTH:
+        remedy = "Write their positions in metres."
+        yield Finding("poses_misread", f"{apart}: they are in {unit}.", remedy, {"factor": factor})
+        return
+    sigma = factor * float(ratio.std(ddof=1) / np.sqrt(len(ratio)))
+    wrong = f"{1 / factor:.2g} times too large" if factor < 1 else f"{factor:.2g} times too small"
+    stated = sample.recording.metadata.get("depth_unit_m")
     yield Finding(
-        "poses_misread",
-        f"The poses are {factor:.2g} times as far apart as the images show"
-        + (f": they are in {unit}." if unit else "."),
-        "Write their positions in metres." if unit else "Scale their positions.",
-        {"factor": factor},
+        "depth_scale",
+        f"{apart}: either the depth is {wrong}, or "
+        + (f"they are in {unit}." if unit else "their positions are not in metres."),
+        f"If the poses are right, multiply the depth by {factor:.3g}"
+        + (f" (depth_unit_m: {stated * factor:.3g})" if isinstance(stated, float) else "")
+        + "; else scale their positions.",
+        {"factor": factor, "sigma": sigma},
     )
