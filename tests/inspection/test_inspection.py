@@ -14,9 +14,11 @@ import pytest
 
 import tofuse
 from tofuse.apps.cli.program import main
+from tofuse.apps.inspection.channels import check_mirrored
 from tofuse.apps.inspection.finding import CODES, Finding
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.apps.inspection.planar import Distortion
+from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.jobs.running import with_findings
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
@@ -282,6 +284,45 @@ def test_swapped_bytes_are_detected() -> None:
         replace(f, depth=n.astype(np.float32) / 1000) for f, n in zip(right, noisy, strict=True)
     ]
     assert "bytes" not in str(tofuse.inspect(of(unreadable)).findings)
+
+
+@pytest.mark.parametrize(
+    ("flip", "words"),
+    [
+        (np.s_[:, ::-1], "left to right"),
+        (np.s_[::-1], "upside down"),
+        (np.s_[::-1, ::-1], "rotated by 180"),
+        (np.s_[:], None),
+    ],
+)
+def test_mirrored_color_is_detected(turn, flip, words) -> None:
+    """Colour of another camera: black at pixels without depth, and edges a bit apart."""
+    rng = np.random.default_rng(3)
+    frames = []
+    for frame in colored(turn, 2):
+        seen = rng.random((72, 96)) < np.abs(np.linspace(-2, 2, 96)) + 0.3
+        color = np.where(seen[..., None], frame.color_image, 0)[flip]
+        kept = replace(frame.keep(seen), amplitude_image=None)
+        frames.append(replace(kept, color_image=np.ascontiguousarray(color)))
+    found = [f.text for f in check_mirrored(Sample.of(of(frames), 8))]
+    assert len(found) == (words is not None)
+    assert all(words in text for text in found)
+
+
+def test_colors_of_other_frames_are_not_mirrored(turn) -> None:
+    """Their edges are in the same parts of the images."""
+    images = [f.color_image for f in colored(turn, 0)]
+    for shift in (4, 7, 9):
+        for flip in (np.s_[:], np.s_[:, ::-1], np.s_[::-1]):
+            frames = [
+                replace(
+                    f,
+                    amplitude_image=None,
+                    color_image=np.ascontiguousarray(images[(k + shift) % len(images)][flip]),
+                )
+                for k, f in enumerate(turn)
+            ]
+            assert not list(check_mirrored(Sample.of(of(frames), 8)))
 
 
 @pytest.mark.nightly_part

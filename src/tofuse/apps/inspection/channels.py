@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.apps.inspection.finding import Finding, is_significant
 from tofuse.apps.inspection.sample import Sample
-from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.geometry import se3
 
@@ -24,7 +24,7 @@ _ORIENTATIONS: dict[str, Callable[[Float32], Float32]] = {
 }
 # Minimum correlation of the edges of two channels, and its lead over the identity, also in standard
 # errors.
-_MIN_CORRELATION, _MIN_LEAD, _MIN_LEAD_SIGMAS = 0.15, 0.06, 4.0
+_MIN_CORRELATION, _MIN_LEAD, _MIN_LEAD_SIGMAS = 0.1, 0.06, 4.0
 # Minimum relevant and maximum tested shift of colour, as fractions of the width.
 _MIN_SHIFT, _MAX_SHIFT = 0.02, 0.12
 _MIN_FRAMES = 3
@@ -45,24 +45,30 @@ _MIN_DELAY, _MAX_DELAY, _MIN_DELAYED, _MAX_UNEXPLAINED = 0.7, 8.5, 0.6, 0.5
 def check_mirrored(sample: Sample) -> Iterator[Finding]:
     """Check that edges of depth and amplitude (else colour) do not match better if mirrored."""
     for name, channel_of in (("amplitude", _amplitude), ("colour", _grey)):
-        edges = _edge_pairs(sample.images, channel_of)
-        if len(edges) < _MIN_FRAMES:
+        images = [
+            (_oriented_edges(_log_depth(f)), image)
+            for f in sample.images
+            if (image := channel_of(f)) is not None
+        ]
+        if len(images) < _MIN_FRAMES:
             continue
-        scores = {
-            label: _correlations([(d, transform(a)) for d, a in edges], 0)[:, 0, 0]
-            for label, transform in _ORIENTATIONS.items()
+        turned = {
+            label: [(depth, _oriented_edges(turn(image))) for depth, image in images]
+            for label, turn in _ORIENTATIONS.items()
         }
+        scores = {label: _correlations(edges, 0)[:, 0, 0] for label, edges in turned.items()}
         identity = scores.pop("as it is")
         orientation, best = max(scores.items(), key=lambda item: float(item[1].mean()))
         if best.mean() <= _MIN_CORRELATION or not is_significant(
             best - identity, _MIN_LEAD, _MIN_LEAD_SIGMAS
         ):
             continue
-        # Unrelated edges in the same part of the images correlate too, but then a shift fits too.
-        turned = [(d, _ORIENTATIONS[orientation](a)) for d, a in edges]
-        max_shift = round(_MAX_SHIFT * edges[0][0].shape[1])
-        from_peak = _from_peak(_correlations(turned, max_shift).mean(0))
-        if from_peak[max_shift, max_shift] > _PEAK_RADIUS_PX:
+        # Unrelated edges in the same part of the images correlate too, but then those of another
+        # frame or a shift fit as well.
+        max_shift = round(_MAX_SHIFT * images[0][0].shape[1])
+        from_peak = _from_peak(_correlations(turned[orientation], max_shift).mean(0))
+        is_unshifted = from_peak[max_shift, max_shift] <= _PEAK_RADIUS_PX
+        if not (is_unshifted or _match_own_frame(turned[orientation])):
             continue
         yield Finding(
             "mirrored",
@@ -73,6 +79,21 @@ def check_mirrored(sample: Sample) -> Iterator[Finding]:
             {"correlation": float(identity.mean()), "correlation_if_turned": float(best.mean())},
         )
         return
+
+
+def _match_own_frame(edges: Sequence[tuple[Float32, Float32]]) -> bool:
+    """Whether edges of depth match another channel of their frame better than that of others."""
+    edges = edges[::2]  # neighbours hardly differ
+    if len(edges) < _MIN_FRAMES:
+        return False
+    depth, other = (
+        np.stack([((e - e.mean((0, 1))) / max(e.std(), 1e-9)).ravel() for e in channel])
+        for channel in zip(*edges, strict=True)
+    )
+    scores = depth @ other.T
+    own = np.diag(scores)
+    of_others = (scores.sum(0) + scores.sum(1) - 2 * own) / (2 * (len(own) - 1))
+    return is_significant(own - of_others, 0.0, _MIN_LEAD_SIGMAS)
 
 
 def check_color(sample: Sample) -> Iterator[Finding]:
@@ -194,29 +215,53 @@ def _grey(frame: RangeFrame) -> Float32 | None:
     if frame.color_image is None:
         return None
     grey = cv2.cvtColor(np.ascontiguousarray(frame.color_image), cv2.COLOR_RGB2GRAY)
-    return np.log1p(grey.astype(np.float32))
+    # Black is what the colour camera doesn't see.
+    return _filled(np.log1p(grey.astype(np.float32)), grey > 0)
 
 
 def _log_depth(frame: RangeFrame) -> Float32:
-    """Logarithm of depth (H, W); holes are filled from their surroundings to avoid edges."""
-    z = np.where(frame.valid, frame.z, 0).astype(np.float32)
-    valid = (z > 0).astype(np.float32)
-    blurred = cv2.GaussianBlur(np.log(np.maximum(z, 1e-3)) * valid, (0, 0), 3)
-    weight = cv2.GaussianBlur(valid, (0, 0), 3)
-    filled = blurred / np.maximum(weight, 1e-6)
-    return np.where(valid > 0, np.log(np.maximum(z, 1e-3)), filled).astype(np.float32)
+    """Logarithm of depth (H, W), without edges at holes."""
+    return _filled(
+        np.log(np.maximum(frame.z, 1e-3)).astype(np.float32), frame.valid & (frame.z > 0)
+    )
+
+
+def _filled(values: Float32, known: Bool) -> Float32:
+    """Values (H, W) with unknown ones filled from their surroundings, to avoid edges."""
+    weight = known.astype(np.float32)
+    blurred = cv2.GaussianBlur(np.where(known, values, 0).astype(np.float32), (0, 0), 3)
+    filled = blurred / np.maximum(cv2.GaussianBlur(weight, (0, 0), 3), 1e-6)
+    return np.where(known, values, filled).astype(np.float32)
 
 
 def _edges(image: Float32) -> Float32:
     """Edge strength (h, w) of a downscaled image, 0 to 1."""
+    return np.asarray(np.hypot(*_gradient(image)), np.float32)
+
+
+def _oriented_edges(image: Float32) -> Float32:
+    """Edges (h, w, 3) of a downscaled image: their strength times x x, y y and x y of their normal.
+
+    Slightly blurred, as edges of two cameras don't coincide exactly.
+    """
+    x, y = _gradient(image)
+    strength = np.maximum(np.hypot(x, y), 1e-9)
+    return cv2.GaussianBlur(
+        np.stack([x * x, y * y, np.sqrt(2) * x * y], -1) / strength[..., None], (0, 0), 1.5
+    ).astype(np.float32)
+
+
+def _gradient(image: Float32) -> tuple[Float32, Float32]:
+    """Gradient (h, w) along x and y of a downscaled image; strong ones saturate at length 1."""
     columns = min(_COLUMNS, image.shape[1])
     rows = max(round(image.shape[0] * columns / image.shape[1]), 2)
     small = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), 1.0)
-    strength = np.hypot(cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1))
-    # Strong edges saturate.
-    saturation = float(np.percentile(strength, 95)) or 1.0
-    return np.minimum(strength / max(saturation, 1e-6), 1.0).astype(np.float32)
+    x, y = cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1)
+    strength = np.hypot(x, y)
+    saturation = max(float(np.percentile(strength, 95)) or 1.0, 1e-6)
+    scale = 1 / np.maximum(strength, saturation)
+    return x * scale, y * scale
 
 
 def _edge_pairs(

@@ -18,9 +18,10 @@ from tofuse.formats.poses import OPENGL
 # remaining one, as a fraction: with another wrong convention, some motions fit too. All within this
 # factor of the best one are named, as about one axis some are the same.
 _MIN_LEAD, _MIN_LEAD_SIGMAS, _MAX_REMAINING, _EQUAL = np.radians(1.5), 4.0, 0.35, 1.5
-# Shortest distance from which the scale is estimated, as a fraction of the depth; largest factor
-# that is not reported: devices err by less; and within which of a unit's that unit is named.
-_MIN_DISTANCE, _MAX_FACTOR, _MIN_FIT = 0.015, 1.3, 1.2
+# Shortest distance from which the scale is estimated, as a fraction of the depth, and cosine of its
+# directions; largest factor that is not reported: devices err by less; and within which of a unit's
+# that unit is named.
+_MIN_DISTANCE, _MIN_COSINE, _MAX_FACTOR, _MIN_FIT = 0.015, 0.9, 1.3, 1.2
 _UNITS = {"mm": 1000.0, "cm": 100.0, "inches": 39.37, "feet": 3.281}
 _IMPLAUSIBLE_FOR_DEPTH = (
     "mm",
@@ -144,9 +145,11 @@ def misread_poses(sample: Sample, poses: Float64) -> Iterator[Finding]:
             },
         )
         return
-    distances = np.linalg.norm(measured[:, :3, 3], axis=1)
-    given = np.linalg.norm(between(poses)[:, :3, 3], axis=1)
-    moves = (distances > _MIN_DISTANCE * depth) & (given > 0)
+    t_measured, t_given = measured[:, :3, 3], between(poses)[:, :3, 3]
+    distances, given = (np.linalg.norm(t, axis=1) for t in (t_measured, t_given))
+    # A scale does not change the direction.
+    agrees = (t_measured * t_given).sum(1) > _MIN_COSINE * distances * given
+    moves = (distances > _MIN_DISTANCE * depth) & agrees
     if moves.sum() < _MIN_PAIRS:
         return
     ratio = np.log(given[moves] / distances[moves])
