@@ -260,8 +260,8 @@ def _gradient(image: Float32) -> tuple[Float32, Float32]:
     x, y = cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1)
     strength = np.hypot(x, y)
     saturation = max(float(np.percentile(strength, 95)) or 1.0, 1e-6)
-    scale = 1 / np.maximum(strength, saturation)
-    return x * scale, y * scale
+    scale = (1 / np.maximum(strength, saturation)).astype(np.float32)
+    return np.asarray(x * scale, np.float32), np.asarray(y * scale, np.float32)
 
 
 def _edge_pairs(

@@ -53,7 +53,8 @@ def read_header(path: str | Path) -> ImageHeader:
     """
     if Path(path).suffix.lower() == ".npy":
         image = _npy_image(path, None)
-        return ImageHeader("npy", *image.shape[::-1], 1, 8 * image.itemsize)
+        height, width = image.shape
+        return ImageHeader("npy", width, height, 1, 8 * image.itemsize)
     head = reading.read_head(path, 64)
     with reading.about(path, _COPY_AGAIN):
         return _header(

@@ -317,10 +317,13 @@ class Deprojection:
 
 def stored_cloud(frame: RangeFrame) -> CloudFrame:
     """Return the points of an image of a cloud that was turned, in the axes of its file."""
-    normals = None if frame.normals is None else frame.normals * _TURN
-    channels = {"normals": normals, "amplitude": frame.amplitude, "color": frame.color}
     return CloudFrame.of(
-        frame.points * _TURN, index=frame.index, timestamp=frame.timestamp, **channels
+        frame.points * _TURN,
+        index=frame.index,
+        timestamp=frame.timestamp,
+        normals=None if frame.normals is None else frame.normals * _TURN,
+        amplitude=frame.amplitude,
+        color=frame.color,
     )
 
 
