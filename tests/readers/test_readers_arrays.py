@@ -60,6 +60,10 @@ def test_npz_with_metres_and_rays(tmp_path: Path) -> None:
         ({"K": None}, "K: is missing, and so is rays"),
         ({"K": np.eye(4)}, r"K: has shape \(4, 4\); save \(3, 3\)"),
         ({"K": np.array([[20, 1, 8], [0, 20, 6], [0, 0, 1.0]])}, "K: has a skew of 1 px"),
+        (
+            {"depth": np.moveaxis(made.COUNTS, 0, -1)},
+            r"K: is that of images of 16 x 12 pixels, and",
+        ),
         ({"depth": made.COUNTS[0, 0]}, r"depth: has shape \(16,\)"),
         ({"depth_kind": "radial"}, "depth_kind: is 'radial'; save one of z, range"),
         ({"timestamps": np.zeros(2)}, "timestamps: has 2 values; save 3"),

@@ -388,24 +388,28 @@ def _frozen(a: Float32) -> Float32:
 
 
 _MAX_SKEW_PX = 0.005  # a smaller displacement of pixels by skew is neglected
+# Images are stacked along the last axis if the principal point is farther from their centre than
+# this fraction of their size, and than this multiple of that fraction for the other order.
+_MIN_OFFSET, _MIN_OFFSET_RATIO = 0.1, 3.0
 
 
-def pinhole_values(K: Float64, height: int, where: str | Path) -> dict[str, float]:
+def pinhole_values(K: Float64, shape: tuple[int, ...], where: str | Path) -> dict[str, float]:
     """Return fx, fy, cx and cy of a matrix K (3, 3).
 
     Parameters
     ----------
     K
         The matrix.
-    height
-        Of the images, in pixels: it decides whether a skew is negligible.
+    shape
+        (N, H, W) of its images, or (H, W): H decides whether a skew is negligible.
     where
         The file or argument, for errors.
 
     Raises
     ------
     InputError
-        If it is not such a matrix, or has skew, which a pinhole camera has not.
+        If it is not such a matrix, or has skew, which a pinhole camera has not; if it shows that
+        the images are stacked along the last axis.
     """
     if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)) or K[1, 0] != 0:
         raise InputError(
@@ -413,11 +417,21 @@ def pinhole_values(K: Float64, height: int, where: str | Path) -> dict[str, floa
             where=where,
             remedy="use [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the depth images",
         )
-    if abs(K[0, 1]) * height > _MAX_SKEW_PX * abs(K[1, 1]):
+    if abs(K[0, 1]) * shape[-2] > _MAX_SKEW_PX * abs(K[1, 1]):
         raise InputError(
             f"has a skew of {K[0, 1]:.3g} px",
             where=where,
             remedy="use the rays of the pixels (rays, RayTable), or 0 if it is negligible",
+        )
+    offset, offset_if_last = (
+        np.abs(K[:2, 2] / (width, height) - 0.5).max() for height, width in (shape[-2:], shape[:2])
+    )
+    if len(shape) == 3 and offset > max(_MIN_OFFSET, _MIN_OFFSET_RATIO * offset_if_last):
+        raise InputError(
+            f"is that of images of {shape[1]} x {shape[0]} pixels, and depth has shape {shape}: "
+            "frames come first",
+            where=where,
+            remedy="pass numpy.moveaxis(depth, -1, 0)",
         )
     return lens_values(K)
 

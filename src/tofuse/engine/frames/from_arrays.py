@@ -22,9 +22,6 @@ from tofuse.engine.parts import check_number
 _MILLIMETRES = 1e-3
 # A larger median of depth can't be in metres.
 _MAX_MEDIAN_M = 200.0
-# Images are stacked along the last axis if the principal point is farther from their centre than
-# this fraction of their size, and than this multiple of that fraction for the other order.
-_MIN_OFFSET, _MIN_OFFSET_RATIO = 0.1, 3.0
 # Longest median interval of frames, s; also for a camera that runs freely: most intervals, up to
 # these percentiles, differ by less than this factor. And units that are mistaken for seconds.
 _MAX_INTERVAL_S, _MAX_REGULAR_INTERVAL_S = 1000.0, 5.0
@@ -179,20 +176,15 @@ def _to_metres(
 
 def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...], count: int) -> Camera:
     height, width = shape
-    stacked_last = InputError(
-        f"has shape {(count, height, width)}, and the camera is that of images of "
-        f"{height} x {count} pixels: frames come first",
-        where="depth",
-        remedy="pass numpy.moveaxis(depth, -1, 0)",
-    )
     if isinstance(camera, Pinhole | RayTable):
-        if (camera.height, camera.width) == (count, height) != shape:
-            raise stacked_last
         if (camera.height, camera.width) != (height, width):
+            is_last = (camera.height, camera.width) == (count, height)
             raise InputError(
                 f"has {camera.width} x {camera.height} pixels, and depth {width} x {height}",
                 where="camera",
-                remedy="pass the camera of these images, which are (N, height, width)",
+                remedy="frames come first: pass numpy.moveaxis(depth, -1, 0)"
+                if is_last
+                else "pass the camera of these images, which are (N, H, W)",
             )
         return camera
     try:
@@ -201,13 +193,7 @@ def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...], count: int) -> C
         raise InputError(
             "is neither a camera nor a matrix", where="camera", remedy="pass K (3, 3)"
         ) from error
-    values = pinhole_values(K, height, "camera")
-    offset, offset_if_last = (
-        max(abs(values["cx"] / w - 0.5), abs(values["cy"] / h - 0.5))
-        for h, w in (shape, (count, height))
-    )
-    if offset > max(_MIN_OFFSET, _MIN_OFFSET_RATIO * offset_if_last):
-        raise stacked_last
+    values = pinhole_values(K, (count, height, width), "camera")
     if not (-0.5 <= values["cx"] <= width - 0.5 and -0.5 <= values["cy"] <= height - 0.5):
         raise InputError(
             f"has its centre ({values['cx']:.0f}, {values['cy']:.0f}) outside of images of "

@@ -158,7 +158,7 @@ class NpzSource(FileSource):
         K = self._floats(arrays, "K")
         if K.shape != (3, 3):
             raise self._error("K", f"has shape {K.shape}", "save (3, 3)")
-        values: dict[str, Any] = {**pinhole_values(K, height, f"{self.path}: K")}
+        values: dict[str, Any] = {**pinhole_values(K, self.depth.shape, f"{self.path}: K")}
         distortion = np.zeros(0)
         if "distortion" in arrays:
             distortion = self._floats(arrays, "distortion").ravel()
