@@ -23,10 +23,8 @@ _MIN_LEAD, _MIN_LEAD_SIGMAS, _MAX_REMAINING, _EQUAL = np.radians(1.5), 4.0, 0.35
 # that unit is named.
 _MIN_DISTANCE, _MIN_COSINE, _MAX_FACTOR, _MIN_FIT = 0.015, 0.9, 1.3, 1.2
 _UNITS = {"mm": 1000.0, "cm": 100.0, "inches": 39.37, "feet": 3.281}
-_IMPLAUSIBLE_FOR_DEPTH = (
-    "mm",
-    "cm",
-)  # if depth were wrong by that factor, its median would show it
+# If depth were wrong by these factors, its median would show it.
+_IMPLAUSIBLE_FOR_DEPTH = ("mm", "cm")
 _MIN_PAIRS, _VIEWS = 3, 8
 # Rotation between two views, rad, that shows the convention, and within which views overlap; and
 # the number of frames among which it is sought.
