@@ -55,6 +55,7 @@ def test_words_become_options(words: str, changed: dict[str, Any]) -> None:
 
 def test_options_become_configuration(tmp_path: Path) -> None:
     assert config_of("--guess", "identity")["odometry"]["guess"] == "identity"
+    assert config_of("--moving", "ignore")["odometry"]["moving"] == "ignore"
     assert config_of("--tolerance", "5mm")["tolerance_m"] == 0.005
     fusion = config_of("--voxel", "10cm", "--faces", 5000)["fusion"]
     assert (fusion["voxel_m"], fusion["faces"]) == (0.1, 5000)

@@ -14,6 +14,7 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.geometry.rigid_motion_kernels import distance_and_angle
 from tofuse.engine.search.pair_agreement import agreement
+from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.tracking.moving_objects import (
     Moving,
     MovingObjects,
@@ -171,6 +172,22 @@ def test_entering_object_is_segmented_and_forgotten_after_leaving(room):
     assert np.count_nonzero(found[n - 1][2].view & mask) > 0.9 * mask.sum()
     assert seen[-1] < FRAMES - 1
     assert found[-1][2].fraction < 0.01
+
+
+@pytest.mark.parametrize("moving", ["exclude", "ignore"])
+def test_moving_objects_are_excluded_unless_ignored(room, moving):
+    frames, _, noise = room
+    centres, half = trajectory("sideways", 0.25, frames[0])
+    tracker = Keyframes(moving=moving).start(0)
+    steps = [
+        tracker.push(with_box(frame, centre, half, noise, n)[0])
+        for n, (frame, centre) in enumerate(zip(frames, centres, strict=True))
+    ]
+    masks = [step.moving for step in steps if step.moving is not None]
+    assert (len(masks) > FRAMES // 2) == (moving == "exclude")
+    if moving == "ignore":
+        assert not masks
+        assert not any(step.moved or step.rival for step in steps)
 
 
 def test_stopped_object_becomes_static(room):

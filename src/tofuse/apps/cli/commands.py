@@ -41,7 +41,7 @@ _SEVERITY_COLORS = {"severe": "red", "warning": "yellow", "note": "cyan"}
 _NAME_WIDTH = 14  # width of the column of names
 _STATUS_COLORS = {True: "green", False: "red", None: "yellow"}
 _NOT_WITH_RIG = (
-    *("view", "loops", "guess", "object"),
+    *("view", "loops", "guess", "moving", "object"),
     *("average_still", "camera", "topic", "no_report", "profile", "mirrors"),
 )
 VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}

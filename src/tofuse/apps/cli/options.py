@@ -189,6 +189,9 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
         options from a .toml file, or from the run.json of an earlier result
     guess
         initial guess of each registration
+    moving
+        exclude what moves from tracking and model (default), or ignore that anything may: for a
+        scene that is static for certain
     prior
         priors in addition to the images, as far as they agree: gravity and a phone's own poses
         (auto, the default), none, or odometry as well (device)
@@ -239,6 +242,7 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     method: str | None = None
     config: Path | None = None
     guess: Literal["identity", "previous", "odometry"] | None = None
+    moving: Literal["exclude", "ignore"] | None = None
     prior: Literal["auto", "none", "device"] = "auto"
     loops: Path | None = None
     object: bool = False

@@ -77,6 +77,7 @@ class Options(OpeningOptions, ModelOptions):
     min_depth: float | None = None
     max_depth: float | None = None
     guess: Literal["identity", "previous", "odometry"] | None = None
+    moving: Literal["exclude", "ignore"] | None = None
     prior: adaptation.Prior = "auto"
     loops: Path | None = None
     object: bool = False
@@ -98,6 +99,8 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
     config = changed(config, {**changes, "method": method}, where=str(options.config or "--config"))
     if options.guess:
         config = changed(config, {"odometry": {"guess": options.guess}}, where="--guess")
+    if options.moving:
+        config = changed(config, {"odometry": {"moving": options.moving}}, where="--moving")
     config = options.applied(config)
     if options.memory is not None:
         megabytes = options.memory // 1_000_000

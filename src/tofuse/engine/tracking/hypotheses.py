@@ -52,6 +52,8 @@ class TrackerState:
         Searches for poses, and their budget.
     fit_statistics
         Usual fit of views of this camera.
+    is_static
+        Whether nothing moves for certain.
     motion
         Velocity of the camera.
     objects
@@ -73,6 +75,7 @@ class TrackerState:
     keyframes: KeyframeMap
     relocalizer: Relocalizer
     fit_statistics: verification.FitStatistics
+    is_static: bool = False
     motion: MotionModel = field(default_factory=MotionModel)
     objects: MovingObjects = field(default_factory=MovingObjects)
     rivals: RivalMotions = field(default_factory=RivalMotions)
@@ -226,6 +229,8 @@ class Hypotheses:
         predicted pose is the better start. Where objects begin to move, the camera itself may have
         jumped instead; so a search must not confirm that.
         """
+        if self.state.is_static:
+            return ()
         if hypothesis not in self._static:
             poses = [hypothesis.T_component_camera]
             if hypothesis.predicted and self.T_predicted is not None:
@@ -240,6 +245,8 @@ class Hypotheses:
         -------
         The accepted hypothesis, realigned if enough moves; and the segmentation, if any.
         """
+        if self.state.is_static:
+            return hypothesis, None
         view, aligned, objects = self.view, hypothesis.aligned, self.state.objects
         suspected = hypothesis.view is not self.static_view
         is_due = (
@@ -274,6 +281,8 @@ class Hypotheses:
         The hypothesis and its segmentation, and the share of the view that follows a rival.
         """
         keyframe, state = accepted.keyframe, self.state
+        if state.is_static:
+            return accepted, moving, 0.0
         if state.last is not None:
             step = se3.inverse(state.last.T_component_camera) @ accepted.T_component_camera
             if float(se3.angle(step)) > _MAX_STEP_RAD:

@@ -7,7 +7,7 @@ component.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
@@ -49,6 +49,9 @@ class Keyframes(Bounded, Odometry):
     guess
         Where an alignment starts: "previous" (constant velocity), "identity" (the last pose),
         "odometry" (the motion between the poses of an odometry file).
+    moving
+        What moves relative to the rest of the view: "exclude" it from alignment and model, or
+        "ignore" that anything may, in a static scene.
     keyframe_angle, keyframe_distance
         Motion after which a frame becomes a keyframe: rad, and as a fraction of the median depth.
     minimum_points
@@ -58,6 +61,7 @@ class Keyframes(Bounded, Odometry):
     views: ViewOptions = ViewOptions()  # noqa: RUF009 - immutable
     searches: bool = True
     guess: Guess = "previous"
+    moving: Literal["exclude", "ignore"] = "exclude"
     keyframe_angle: Annotated[float, Bounds(0, exclusive=True)] = 0.2
     keyframe_distance: Annotated[float, Bounds(0, exclusive=True)] = 0.1
     minimum_points: Annotated[int, Bounds(1)] = 100
@@ -79,6 +83,7 @@ class KeyframeTracker(Tracker):
             KeyframeMap(options.keyframe_angle, options.keyframe_distance),
             Relocalizer(search if options.searches else None, fit_statistics),
             fit_statistics,
+            is_static=options.moving == "ignore",
         )
 
     def prepare(self, frame: Frame) -> PreparedView | None:
