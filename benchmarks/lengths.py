@@ -21,6 +21,8 @@ import numpy as np
 
 import phone
 import unusual
+from tofuse.apps.api.result import Result, reconstruct
+from tofuse.apps.coach import LengthErrors
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
@@ -37,9 +39,15 @@ CAMERAS = {
     "o3r": unusual.pinhole("ifm-o3r", 80, 60, 60),
     "azure": unusual.pinhole("azure-nfov", 96, 80, 75),
     "sr4000": unusual.pinhole("sr4000", 88, 72, 44),
-    "phone": unusual.pinhole("ifm-o3r", 96, 72, 62),
+    "phone": unusual.pinhole("sr4000", 96, 72, 62),
 }
-VERTICES, PAIRS = 400, 4000
+# Points of a model, and pairs of them of each kind, which are at least so far apart.
+VERTICES, PAIRS, MIN_LENGTH = 400, 400, 0.05
+# Points count that at least so many images saw, without a larger jump of the range, as a fraction of
+# it, within so many pixels: no one can tap on what is mixed with its background.
+VIEWS, JUMP, EDGE = 3, 0.15, 2
+# Pairs of points by the fraction of the images of one that saw the other as well, above the first.
+KINDS = {"the same views": 0.8, "some of them": 0.0, "no common view": -1.0}
 
 
 @dataclass(frozen=True)
@@ -51,25 +59,17 @@ class Case:
     rate_hz: float
 
 
-def _around_table(seed: int) -> paths.Path:
-    orbit = unusual.around(1.3, 0.9, (0.0, 0.0, 0.0), 20.0)
-    return unusual.fixed(orbit)(seed)
+def _unusual(name: str) -> unusual.Unusual:
+    return unusual.UNUSUAL[name]
 
 
-_room = unusual.UNUSUAL["80 x 60 pixels"]
-_flat = unusual.UNUSUAL["elsewhere in the flat"]
-_table = unusual.Unusual(unusual.built("table", unusual._table), _around_table, CAMERAS["o3r"])
-_bathroom = unusual.Unusual(
-    unusual.built("bathroom", unusual._bathroom),
-    unusual.fixed(unusual._in_the_bathroom),
-    CAMERAS["o3r"],
-)
+_room, _flat = _unusual("80 x 60 pixels"), _unusual("elsewhere in the flat")
 CASES = {
-    "room, turn": Case(_room, 60, 2.0),
-    "room, short": Case(_room, 16, 5.0),
-    "bathroom, turn": Case(_bathroom, 44, 4.2),
-    "table, orbit": Case(_table, 48, 2.4),
-    "flat, walk": Case(_flat, 36, 6.0),
+    "room, turn": Case(_room, 64, 2.1),
+    "room, short": Case(_room, 24, 6.0),
+    "attic, turn": Case(_unusual("attic"), 64, 6.2),
+    "flat, walk": Case(_flat, 48, 6.0),
+    "books, pan": Case(_unusual("bookshelf"), 40, 4.0),
 }
 
 
@@ -115,8 +115,9 @@ def simulated(case: Case, camera: str, seed: int, focal: float) -> Taken:
         else:
             depth = corrected_depth(factory, frame.camera, frame.depth, frame.depth_kind)
             frame = replace(frame, depth=depth)
-        exact = replace(rendered.frame, depth=rendered.depth)
-        points.append(se3.transform(T, exact.points).reshape(*exact.depth.shape, 3))
+        z = replace(rendered.frame, depth=rendered.depth).z.astype(float)[..., None]
+        exact = np.where(z > 0, np.concatenate([z * true.rays(), z], -1), np.nan)
+        points.append(exact @ T[:3, :3].T + T[:3, 3])
         frames.append(replace(frame, camera=stated))
     metadata = {"frame_rate_hz": case.rate_hz, "sensor": f"lengths {camera}"}
     poses = made.poses
@@ -127,6 +128,14 @@ def simulated(case: Case, camera: str, seed: int, focal: float) -> Taken:
         metadata |= {POSES_BY: "a simulated phone", "depth_kind": "z", "depth_unit_m": 0.001}
     source = ArraySource(frames, poses, metadata=metadata)
     return Taken(Recording.of(source, "simulated", "simulated"), stated, points, made.poses)
+
+
+def _spread(range_m: Float64) -> Float64:
+    """Difference of the largest and smallest range around each pixel; NaN at missing ones."""
+    size = 2 * EDGE + 1
+    padded = np.pad(range_m, EDGE, constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(padded, (size, size))
+    return np.ptp(around, axis=(2, 3))
 
 
 def true_places(taken: Taken, poses: Float64, vertices: Float64) -> tuple[Float64, Float64]:
@@ -146,17 +155,67 @@ def true_places(taken: Taken, poses: Float64, vertices: Float64) -> tuple[Float6
         place = se3.transform(se3.inverse(poses[k]), vertices)
         pixel = np.nan_to_num(camera.project(place), nan=-1)
         low = np.floor(pixel).astype(int)
-        inside = ((low >= 0) & (low < (camera.width - 1, camera.height - 1))).all(1)
+        edge = np.array([camera.width, camera.height]) - EDGE - 1
+        inside = ((low >= EDGE) & (low < edge)).all(1)
         u, v = np.where(inside[:, None], low, 0).T
         a, b = np.where(inside[:, None], pixel - low, 0).T[..., None]
         corners = [points[v, u], points[v, u + 1], points[v + 1, u], points[v + 1, u + 1]]
         q = (1 - b) * ((1 - a) * corners[0] + a * corners[1])
         q += b * ((1 - a) * corners[2] + a * corners[3])
-        centre = taken.poses[k, :3, 3]
-        ranges = np.linalg.norm(np.array(corners) - centre, axis=2)
+        range_m = np.linalg.norm(points - taken.poses[k, :3, 3], axis=2)
         depth = np.linalg.norm(place, axis=1)
-        near = np.abs(ranges.mean(0) - depth) < 0.05 + 0.05 * depth
-        ok = inside & near & (np.ptp(ranges, axis=0) < 0.1 * depth)
+        near = np.abs(range_m[v, u] - depth) < 0.05 + 0.05 * depth
+        ok = inside & near & (_spread(range_m)[v, u] < JUMP * depth)
         total[ok] += q[ok]
         seen[ok, k] = True
     return total / seen.sum(1)[:, None], seen
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Lengths of one kind: errors and half widths of their 95 % intervals, m; inf if unbounded."""
+
+    errors: Float64
+    bounds: Float64
+
+    def cells(self) -> str:
+        """Return the cells of a row of the table."""
+        bounded = np.isfinite(self.bounds)
+        if not bounded.any():
+            return f"{len(self.errors)} | 0 % | - | - | - | -"
+        error, bound = np.abs(self.errors[bounded]), self.bounds[bounded]
+        median = float(np.median(error))
+        return (
+            f"{len(self.errors)} | {bounded.mean():.0%} | {(error <= bound).mean():.0%} | "
+            f"{1e3 * median:.1f} | {1e3 * np.median(bound):.1f} | {np.median(bound) / median:.1f}"
+        )
+
+
+def measured(taken: Taken, result: Result, frame: RangeFrame) -> dict[str, Measured]:
+    """Measure random lengths in a model, by kind of pair."""
+    errors = LengthErrors.of(result, frame)
+    if errors is None or result.mesh is None:
+        return {}
+    rng = np.random.default_rng(0)
+    rows = rng.permutation(len(result.mesh.vertices))[:VERTICES]
+    vertices = result.mesh.vertices[rows].astype(float)
+    true, seen = true_places(taken, result.trajectory, vertices)
+    count = seen.sum(1)
+    known = count >= VIEWS
+    vertices, true, seen, count = vertices[known], true[known], seen[known], count[known]
+    i, j = np.triu_indices(len(vertices), 1)
+    length = np.linalg.norm(vertices[i] - vertices[j], axis=1)
+    i, j = i[length > MIN_LENGTH], j[length > MIN_LENGTH]
+    common = (seen[i] & seen[j]).sum(1) / np.minimum(count[i], count[j])
+    out, above = {}, np.inf
+    for kind, least in KINDS.items():
+        chosen = np.flatnonzero((common > least) & (common <= above))
+        above = least
+        chosen = rng.permutation(chosen)[:PAIRS]
+        lengths = [errors.between(vertices[i[k]], vertices[j[k]]) for k in chosen]
+        truth = np.linalg.norm(true[i[chosen]] - true[j[chosen]], axis=1)
+        out[kind] = Measured(
+            np.array([one.length_m for one in lengths]) - truth,
+            np.array([one.bound_m for one in lengths]),
+        )
+    return out

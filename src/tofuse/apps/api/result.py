@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from tofuse.apps.cli import TerminalProgress
+from tofuse.apps.coach import Length, LengthErrors
 from tofuse.apps.jobs import (
     Evaluation,
     evaluate,
@@ -27,7 +28,14 @@ from tofuse.apps.jobs import (
     with_findings,
     write_report_files,
 )
-from tofuse.apps.results import folders, integrity, load_result, write_result
+from tofuse.apps.results import (
+    folders,
+    integrity,
+    load_result,
+    reopening,
+    run_json,
+    write_result,
+)
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Foreground
 from tofuse.engine.frames import Frame, Recording
@@ -193,6 +201,41 @@ class Result(Reconstruction):
                 )
             return locating.ResultMap.read(self.folder, None, Silent())
         return locating.ResultMap.of_result(self.source, self.fitted, self)
+
+    def distance(self, point_a: ArrayLike, point_b: ArrayLike) -> Length:
+        """Return the distance of two points of the model, with its 95 % interval and causes.
+
+        As the report measures: points that the same views saw share the errors of their poses.
+
+        Parameters
+        ----------
+        point_a, point_b
+            (3,) each, in the world.
+
+        Raises
+        ------
+        InputError
+            If they are not two different points; or if the result has no surface of a single
+            camera, or no covariances of poses.
+        """
+        if self._length_errors is None:
+            raise InputError(
+                "states no errors of lengths",
+                where="the result",
+                remedy="use a result with a surface of a single camera, and covariances of poses",
+            )
+        return self._length_errors.between(point_a, point_b)
+
+    @cached_property
+    def _length_errors(self) -> LengthErrors | None:
+        frame = None
+        if self.source is not None:
+            frame = self.source.first_readable()
+        elif self.folder is not None:  # without its recording, the field of view is a usual one
+            with suppress(InputError), run_json.opened(self.folder) as run:
+                part = next(reopening.stored_recordings(self.folder, run))
+                frame = reopening.reopen(part, self.folder).first_readable()
+        return LengthErrors.of(self, frame)
 
     def view(self, *, port: int | None = None, open_browser: bool = True) -> ReportServer:
         """Show the report in the browser, as ``tofuse view`` does, and return the server.

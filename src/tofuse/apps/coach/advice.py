@@ -84,10 +84,7 @@ def advise(source: Mapper | Reconstruction) -> Advice | None:
     if isinstance(source, Mapper):
         return advise_on(source.so_far())
     recording = getattr(source, "source", None)
-    frame = None if recording is None else recording.first_readable()
-    rays = None if frame is None or frame.camera is None else frame.camera.rays()
-    field = None if rays is None else np.array([np.nanmin(rays, (0, 1)), np.nanmax(rays, (0, 1))])
-    known = Known.of_result(source, field)
+    known = Known.of_result(source, None if recording is None else recording.first_readable())
     return None if known is None else best(known)
 
 

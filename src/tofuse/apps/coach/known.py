@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.apps.coach.surfaces import Seen, Surfaces, pair_information, scales
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
-from tofuse.engine.frames import evenly_spaced
+from tofuse.engine.frames import Frame, evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import PoseGraph, graph_covariances
 from tofuse.engine.progress import OnlineMap
@@ -90,8 +90,12 @@ class Known:
         return None if found is None else found._with_pairs()
 
     @classmethod
-    def of_result(cls, result: Reconstruction, field: Float64 | None) -> Self | None:
-        """Return what a result knows, whose camera has a field of view, see `Surfaces`."""
+    def of_result(cls, result: Reconstruction, frame: Frame | None) -> Self | None:
+        """Return what a result knows, with the field of view of a frame, if there is one."""
+        rays = None if frame is None or frame.camera is None else frame.camera.rays()
+        field = (
+            None if rays is None else np.array([np.nanmin(rays, (0, 1)), np.nanmax(rays, (0, 1))])
+        )
         graph, mesh, cloud = result.graph, result.mesh, result.cloud
         points, normals = cloud.points, cloud.normals
         if mesh is not None and len(mesh.vertices):
@@ -199,6 +203,19 @@ class Known:
         blocks[np.arange(k), :, np.arange(k)] = J
         spread = blocks.reshape(3 * k, 6 * k)
         return spread - motion @ (np.linalg.pinv(motion, rcond=1e-9) @ spread)
+
+    @property
+    def mean_square(self) -> float:
+        """Mean square of the errors of position, by the covariance alone."""
+        P = self._to_positions
+        return float(((P @ self.covariance) * P).sum()) / len(self.poses)
+
+    @property
+    def position_variances(self) -> Float64:
+        """(K,) mean squares of the errors of each position, relative to the graph's first pose."""
+        k, J = len(self.poses), self._jacobians
+        C = self.covariance.reshape(k, 6, k, 6)[np.arange(k), :, np.arange(k), :]
+        return np.asarray(np.einsum("kij,kjl,kil->k", J, C, J), np.float64)
 
     @property
     def step_squares(self) -> Float64:

@@ -1,91 +1,193 @@
 """How well the distance of two points of a model is known.
 
-Errors of the poses move a point with the keyframes that saw it, so that two points in the same
-views share them: what counts is the joint covariance of the keyframes of both. Errors of the camera
-deform what each view sees, and that of the depth scale stretches everything. The noise of the
-surface is added at both ends.
+Errors of the poses move a point with the keyframes that saw it, and points that the same ones saw
+move together: only the joint covariance of the keyframes says how far apart two points are. Errors
+of the camera deform what each keyframe saw, that of the depth scale stretches everything, and views
+disagree about a surface by what their noise and multipath leave.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
 from tofuse.apps.coach.known import Known
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames import Frame
+from tofuse.engine.geometry import KdTree
+from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.results import Reconstruction
+
+# Standard deviation of the depth scale, which no view of the recording shows, and multipath changes
+# as well: data sheets of depth cameras state 1 %.
+_SCALE = 0.01
+# Small motions of a keyframe whose pose is not bounded: m, and rad.
+_UNBOUNDED = np.array([30.0] * 3 + [10.0] * 3)
+# Reasons for which the poses have no bound, although their covariance is small.
+_UNTRUSTED = {"open_motion", "ambiguous_steps", "range_changes", "repeated_images"}
+
+
+@dataclass(frozen=True)
+class Length:
+    """The distance of two points of a model.
+
+    Attributes
+    ----------
+    length_m
+        The distance.
+    bound_m
+        Half of its 95 % interval; inf if no measurement bounds it.
+    causes_m
+        The parts of `bound_m`, whose squares add up: errors of the `poses`, of the `focal` length,
+        of the range (`offset`), of the depth `scale`, and of the `surface`.
+    """
+
+    length_m: float
+    bound_m: float
+    causes_m: dict[str, float]
+
+    @property
+    def interval_m(self) -> tuple[float, float]:
+        """The 95 % interval."""
+        return max(self.length_m - self.bound_m, 0.0), self.length_m + self.bound_m
+
+    def __str__(self) -> str:
+        if not np.isfinite(self.bound_m):
+            return f"{1e3 * self.length_m:.1f} mm, not bounded"
+        return f"{1e3 * self.length_m:.1f} ± {1e3 * self.bound_m:.1f} mm (95 %)"
 
 
 @dataclass(frozen=True, eq=False)
 class LengthErrors:
-    """What the errors of lengths in a model follow from.
+    """What the errors of all lengths follow from.
 
     Attributes
     ----------
+    centre
+        (3,) mean of the keyframes' positions in the world, which the rest is relative to.
     points
-        (P, 3) of its surfaces, in the world.
+        (P, 3) of the surfaces.
     weights
-        (P, K) of the keyframes that saw each, up to a factor.
-    poses
-        (K, 4, 4).
+        (P, K) weights of the keyframes that saw each, up to a factor.
+    cameras
+        (K, 6) position and viewing direction of each keyframe.
     covariance
-        (6K, 6K) of small motions of the keyframes in the world, about `centre`.
+        (6K, 6K) of small motions of the keyframes: translation, and rotation about the centre.
+    sigmas
+        Standard deviations of the errors of the camera, and of the surface at both ends together.
+    quantile
+        Number of standard deviations of a 95 % interval.
     """
 
-    points: Float64
-    weights: Float64
-    poses: Float64
-    covariance: Float64
     centre: Float64
-    by_cov: float
+    points: Float32
+    weights: UInt8
+    cameras: Float32
+    covariance: Float32
+    sigmas: Mapping[str, float]
+    quantile: float
 
     @classmethod
-    def of(cls, result: Reconstruction, rays: Float64 | None = None) -> Self | None:
-        known = Known.of_result(result, rays)
+    def of(cls, result: Reconstruction, frame: Frame | None) -> Self | None:
+        """Return those of a result, with the field of view of one of its frames, if known.
+
+        None where it has no surface of a single camera, or its poses no covariance.
+        """
+        accuracy = result.diagnostics.accuracy
+        if result.mesh is None or result.recording.get("rig") or not accuracy.assessed:
+            return None
+        known = Known.of_result(result, frame)
         if known is None:
             return None
-        W = known.seen.pixels.T.astype(float)
-        seen = W.any(1)
-        C = known.covariance
-        P = known._to_positions
+        seen = known.seen.pixels.any(0)
+        weights = known.seen.pixels.T[seen]
+        if not len(weights):
+            return None
+        weights = np.ceil(254 * weights / weights.max(1, keepdims=True)).astype(np.uint8)
+        cameras = known.poses[:, :3, [3, 2]].swapaxes(1, 2).reshape(-1, 6)
+        surface = accuracy.surface_m or 0.0
         return cls(
-            known.surfaces.points[seen].astype(float),
-            W[seen] / W[seen].sum(1, keepdims=True),
-            known.poses,
-            C,
             known.centre,
-            float(np.trace(P @ C @ P.T)) / len(known.poses),
+            known.surfaces.points[seen],
+            weights,
+            cameras.astype(np.float32),
+            _covariance(known, result).astype(np.float32),
+            {**accuracy.camera_sigmas, "scale": _SCALE, "surface": surface},
+            float(stdtrit(accuracy.degrees, 0.975)),
         )
 
-    def parts(self, a: Float64, b: Float64):
-        a = a - self.centre
-        b = b - self.centre
-        L = np.linalg.norm(a - b, axis=1)
-        e = (a - b) / L[:, None]
-        tree = KdTree(self.points)
-        out = []
-        hs = []
-        foc = []
-        off = []
-        K = len(self.poses)
-        R = self.poses[:, :3, :3]
-        t = self.poses[:, :3, 3]
-        for p in (a, b):
-            k, _ = tree.nearest(p)
-            w = self.weights[k]
-            row = np.concatenate([e, np.cross(p, e)], 1)
-            hs.append(w[:, :, None] * row[:, None])
-            d = p[:, None] - t
-            z = np.einsum("nki,ki->nk", d, R[:, :, 2])
-            lat = d - z[..., None] * R[:, :, 2]
-            foc.append(np.einsum("nk,nki,ni->n", w, lat, e))
-            off.append(
-                np.einsum("nk,nki,ni->n", w, d / np.linalg.norm(d, axis=2, keepdims=True), e)
-            )
-        h = (hs[0] - hs[1]).reshape(len(a), -1)
-        pose = np.einsum("ni,ij,nj->n", h, self.covariance, h)
-        return L, pose, foc[0] - foc[1], off[0] - off[1]
+    @cached_property
+    def _tree(self) -> KdTree:
+        return KdTree(self.points.astype(np.float64))
+
+    def between(self, a: ArrayLike, b: ArrayLike) -> Length:
+        """Return the distance of two points (3,) of the model, in the world.
+
+        Raises
+        ------
+        InputError
+            If they are not two different points.
+        """
+        ends = np.array([a, b], float)
+        if ends.shape != (2, 3) or not np.isfinite(ends).all() or not np.ptp(ends, axis=0).any():
+            raise InputError("are not two different points (3,)", where="the ends of the length")
+        ends -= self.centre
+        length = float(np.linalg.norm(ends[0] - ends[1]))
+        e = (ends[0] - ends[1]) / length
+        nearest, _ = self._tree.nearest(ends)
+        by_motion, by_focal, by_offset = np.zeros((len(self.cameras), 6)), 0.0, 0.0
+        for p, row, sign in zip(ends, nearest, (1.0, -1.0), strict=True):
+            w = sign * self.weights[row] / self.weights[row].sum(dtype=float)
+            by_motion += np.outer(w, np.concatenate([e, np.cross(p, e)]))
+            arm, axis = p - self.cameras[:, :3], self.cameras[:, 3:]
+            across = arm - (arm * axis).sum(1, keepdims=True) * axis
+            by_focal += float(w @ across @ e)
+            by_offset += float(w @ (arm / np.linalg.norm(arm, axis=1, keepdims=True)) @ e)
+        h = by_motion.ravel()
+        variances = {"poses": max(float(h @ self.covariance @ h), 0.0)}
+        effects = {"focal": by_focal, "offset": by_offset, "scale": length, "surface": 1.0}
+        for name, effect in effects.items():
+            variances[name] = (self.sigmas.get(name, 0.0) * effect) ** 2
+        bound = self.quantile * float(np.sqrt(sum(variances.values())))
+        causes = {name: self.quantile * float(np.sqrt(v)) for name, v in variances.items()}
+        return Length(length, bound if bound < max(length, 1.0) else np.inf, causes)
+
+
+def _covariance(known: Known, result: Reconstruction) -> Float64:
+    """(6K, 6K) joint covariance of the keyframes, with all errors that the bound includes.
+
+    Its mean square is that of the causes of the result's bound. Motions of all keyframes together
+    change no length, and are removed.
+    """
+    accuracy, C = result.diagnostics.accuracy, known.covariance
+    k = len(known.poses)
+    records = {r.index: r.covariance for r in result.diagnostics.frames}
+    unbounded = np.isin(known.frames, accuracy.unbounded)
+    total = sum(cause**2 for cause in accuracy.causes_m.values())
+    codes = {reason.code for reason in result.diagnostics.reasons}
+    if total:
+        C = C * (total / known.mean_square)
+    elif unbounded.all() or not unbounded.any() or codes & _UNTRUSTED:
+        unbounded[:] = True
+    else:  # the covariances of the others include all errors
+        stated = [records.get(int(i)) for i in known.frames]
+        by_graph = known.position_variances
+        ratios = [
+            float(np.trace(S[:3, :3])) / v
+            for S, v, left_out in zip(stated, by_graph, unbounded, strict=True)
+            if S is not None and not left_out and v > 0
+        ]
+        C = C * (np.median(ratios) / pose_accuracy.factor_of(accuracy.degrees) if ratios else 1.0)
+    C = C + np.diag(np.repeat(unbounded, 6) * np.tile(_UNBOUNDED, k) ** 2)
+    # Less the mean motion, which is that of all.
+    blocks = C.reshape(k, 6, k, 6)
+    blocks = blocks - blocks.mean(0, keepdims=True)
+    blocks -= blocks.mean(2, keepdims=True)
+    return blocks.reshape(6 * k, 6 * k)

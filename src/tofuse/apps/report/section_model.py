@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.apps.coach import LengthErrors
 from tofuse.apps.report import plots, thumbnails, words
 from tofuse.apps.report.fields import accuracy, fields
 from tofuse.apps.report.packing import pack
@@ -50,6 +51,7 @@ def model(s: Subject) -> Values:
             },
             "lens": None if rig else _lens(s),
             "axes": s.R_display_world.tolist(),
+            "lengths": _packed_lengths(s),
         },
         "still": thumbnails.data_uri(render(displayed, yaw=opening_yaw(displayed))),
         "has": {
@@ -108,6 +110,23 @@ def _lens(s: Subject) -> dict[str, float] | None:
     camera = raw.camera.fit if isinstance(raw.camera, RayTable) else raw.camera
     assert isinstance(camera, Pinhole)
     return {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+
+
+def _packed_lengths(s: Subject) -> Values | None:
+    """What the errors of lengths follow from, for the viewer; None if that is unknown."""
+    frame = s.extras.filter_steps[0][1] if s.extras.filter_steps else None
+    errors = LengthErrors.of(s.result, frame if isinstance(frame, RangeFrame) else None)
+    if errors is None:
+        return None
+    return {
+        "centre": errors.centre.tolist(),
+        "points": pack(errors.points),
+        "weights": pack(errors.weights),
+        "cameras": pack(errors.cameras),
+        "covariance": pack(errors.covariance[np.tril_indices(len(errors.covariance))]),
+        "sigmas": dict(errors.sigmas),
+        "quantile": errors.quantile,
+    }
 
 
 def position_errors(s: Subject) -> Float64:

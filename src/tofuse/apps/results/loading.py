@@ -145,6 +145,7 @@ def _accuracy(data: dict[str, Any]) -> pose_accuracy.Accuracy:
         tuple(data["by_odometry"]),
         tuple(data["by_motion"]),
         data.get("causes_m", {}),
+        **{name: data[name] for name in ("degrees", "camera_sigmas", "surface_m") if name in data},
     )
 
 

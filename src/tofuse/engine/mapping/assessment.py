@@ -98,6 +98,12 @@ class Assessment:
         loops = tuple(c.record for c in closed.loops)
         cross_view = self._cross_view(graph)
         accuracy, covariances = self._accuracy(closed, refined, model, cross_view)
+        rms_m = np.nan if cross_view is None else cross_view.rms_m()
+        accuracy = replace(
+            accuracy,
+            camera_sigmas=self._camera_sigmas(refined.refinement.calibration_check),
+            surface_m=rms_m if np.isfinite(rms_m) else None,
+        )
         moving = tuple(
             (e.record.index, e.moving_fraction) for e in self.tracked.posed if e.moving_fraction > 0
         )
@@ -261,6 +267,30 @@ class Assessment:
                     errors.append(unknown * usual * np.array(motion))
         m, rad = np.linalg.norm(errors, axis=0).tolist()
         return m, rad
+
+    def _camera_sigmas(
+        self, check: calibration_check.CalibrationCheck | None
+    ) -> dict[str, float]:
+        """Return the standard deviations of the focal length and of the range offset.
+
+        They are those of usual cameras, as far as the views don't know better; an estimated error
+        that was not corrected counts as in the errors of the poses.
+        """
+        if check is None:
+            return {}
+        unknown = np.sqrt(pose_accuracy.UNKNOWN_FRACTION)
+        is_likely = check.unconfirmed or (check.improves and check.large)
+        sigmas = {}
+        for name in ("focal", "offset"):
+            tolerance = calibration_check.TOLERANCES[name]
+            error, sigma = check.estimates.get(name, (0.0, np.inf))
+            known = tolerance * sigma / np.hypot(tolerance, sigma) if sigma < np.inf else tolerance
+            corrections = [part.sigmas[name] for part in self._estimated_corrections]
+            shown = max(corrections, default=0.0)
+            if not corrections and check.determines(name):
+                shown = (1.0 if is_likely and name in check.errors else unknown) * abs(error)
+            sigmas[name] = float(np.hypot(shown, known))
+        return sigmas
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
         """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""

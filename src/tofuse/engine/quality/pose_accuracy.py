@@ -92,6 +92,13 @@ class Accuracy:
     causes_m
         Rms error of the positions by its cause, see `ObservedErrors.mean_squares`; empty if they
         are not bounded.
+    degrees
+        Degrees of freedom of the mean square of the positions as an estimate.
+    camera_sigmas
+        Standard deviations of errors of the camera, by their name; empty if its images were not
+        compared.
+    surface_m
+        Rms distance between the surfaces of overlapping views, m; None if there are none.
     """
 
     position_m: float = np.inf
@@ -103,6 +110,9 @@ class Accuracy:
     by_odometry: tuple[int, ...] = ()
     by_motion: tuple[int, ...] = ()
     causes_m: dict[str, float] = field(default_factory=dict)
+    degrees: float = _MODEL_DOF
+    camera_sigmas: dict[str, float] = field(default_factory=dict)
+    surface_m: float | None = None
 
     @property
     def limited_by(self) -> str:
@@ -413,6 +423,7 @@ def accuracy_of(
         ),
         unbounded_frames,
         causes_m=causes_m if np.isfinite(position) else {},
+        degrees=float(observed.scale_degrees[0]),
     )
 
 
@@ -439,10 +450,13 @@ def covariances_of(
     scale = np.repeat(np.sqrt(np.maximum(_ratio(noise, squares), 1.0)), 3)
     C = covariances.of_poses * np.outer(scale, scale)
     C[1:] += np.diag(np.repeat(more / 3, 3))
-    is_measured = observed.scale_degrees > _MODEL_DOF
-    factor = np.where(is_measured, COVARIANCE_FACTOR, _MODEL_FACTOR)
-    factor = np.repeat(np.sqrt(factor), 3)
+    factor = np.repeat(np.sqrt([factor_of(d) for d in observed.scale_degrees]), 3)
     return np.asarray(C * np.outer(factor, factor), np.float64)
+
+
+def factor_of(degrees: float) -> float:
+    """Factor by which covariances are larger, so that ellipsoids are as of normal errors."""
+    return COVARIANCE_FACTOR if degrees > _MODEL_DOF else _MODEL_FACTOR
 
 
 def _ratio(noise: Float64, by_covariance: Float64) -> Float64:

@@ -137,6 +137,10 @@ class CalibrationCheck:
         """Whether a wrong focal length would not show in this recording."""
         return self.focal_sigma is not None and not _determined("focal", self.focal_sigma)
 
+    def determines(self, name: str) -> bool:
+        """Whether the views determine an error of the camera."""
+        return name in self.estimates and _determined(name, self.estimates[name][1])
+
     @property
     def unconfirmed(self) -> dict[str, float]:
         """Significant errors without an alarm that may be true.

@@ -1,5 +1,5 @@
 // Taps points of the model: where one is, how far two are apart, and how well that is known.
-function makeMeasure(box, view, painter, { sigmaOf, axes, changed }) {
+function makeMeasure(box, view, painter, { sigmaOf, axes, lengths, changed }) {
   const button = box.querySelector("[data-tool=measure]"), label = box.querySelector(".measured"), pins = box.querySelectorAll(".pin");
   const line = { place: painter.buffer(new Float32Array(6)), color: [1, 0.88, 0.35], count: 0, over: 0.002 };
   const ends = [];
@@ -33,14 +33,15 @@ function makeMeasure(box, view, painter, { sigmaOf, axes, changed }) {
     place();
     changed();
   }
-  // Coordinates in the world of the trajectory and of the files; the model is shown in turned axes.
+  // In the world of the trajectory and of the files; the model is shown in turned axes.
+  const inWorld = (point) => (axes ? [0, 1, 2].map((k) => dot(axes.map((row) => row[k]), point)) : point);
   function position() {
     const [{ point, sigma }] = ends;
-    const world = axes ? [0, 1, 2].map((k) => dot(axes.map((row) => row[k]), point)) : point;
-    return bounded(`${world.map((value) => value.toFixed(3).replace("-", "−")).join(", ")} m`, sigma, 1);
+    return bounded(`${inWorld(point).map((value) => value.toFixed(3).replace("-", "−")).join(", ")} m`, sigma, 1);
   }
   function distance() {
     const [a, b] = ends, length = Math.hypot(...minus(a.point, b.point));
+    if (lengths && length) return bounded(metres(length), lengths(inWorld(a.point), inWorld(b.point)), Math.max(length, 1));
     const known = a.sigma !== null && b.sigma !== null;
     return bounded(metres(length), known ? Math.hypot(a.sigma, b.sigma) : null, Math.max(length, 1));
   }
@@ -63,6 +64,45 @@ function makeMeasure(box, view, painter, { sigmaOf, axes, changed }) {
   }
   button.addEventListener("click", () => toggle());
   return { toggle, add, miss: () => say("No surface there: tap the model"), place, line, get on() { return on; } };
+}
+
+// The 95 % bound of the distance of two points in the world: `LengthErrors.between` in Python.
+async function makeLengths({ centre, points, weights, cameras, covariance, sigmas, quantile }) {
+  const [P, camera, C] = await Promise.all([points, cameras, covariance].map((text, k) => unpack(text, Float32Array, [3, 6, 1][k])));
+  const K = camera.length / 6, seen = await unpack(weights, Uint8Array, K);
+  const nearest = (p) => {
+    let best = 0, least = Infinity;
+    for (let k = 0; k < P.length / 3; k++) {
+      const square = (P[3 * k] - p[0]) ** 2 + (P[3 * k + 1] - p[1]) ** 2 + (P[3 * k + 2] - p[2]) ** 2;
+      if (square < least) { least = square; best = k; }
+    }
+    return best;
+  };
+  return (a, b) => {
+    const d = minus(a, b), length = Math.hypot(...d), e = d.map((value) => value / length);
+    const h = new Float64Array(6 * K);
+    let focal = 0, offset = 0;
+    for (const [end, sign] of [[a, 1], [b, -1]]) {
+      const p = minus(end, centre), row = K * nearest(p), used = seen.subarray(row, row + K);
+      const total = used.reduce((sum, value) => sum + value, 0);
+      const motion = [...e, p[1] * e[2] - p[2] * e[1], p[2] * e[0] - p[0] * e[2], p[0] * e[1] - p[1] * e[0]];
+      used.forEach((value, k) => {
+        if (!value) return;
+        const w = sign * value / total, arm = minus(p, camera.subarray(6 * k, 6 * k + 3)), axis = camera.subarray(6 * k + 3, 6 * k + 6);
+        motion.forEach((m, i) => { h[6 * k + i] += w * m; });
+        focal += w * (dot(arm, e) - dot(arm, axis) * dot(axis, e));
+        offset += w * dot(arm, e) / Math.hypot(...arm);
+      });
+    }
+    // The lower triangle of the covariance, row by row.
+    let poses = 0;
+    for (let i = 0, at = 0; i < 6 * K; i++) {
+      for (let j = 0; j <= i; j++, at++) poses += (i === j ? 1 : 2) * h[i] * C[at] * h[j];
+    }
+    const effects = { focal, offset, scale: length, surface: 1 };
+    const others = Object.entries(effects).map(([name, effect]) => (sigmas[name] || 0) * effect);
+    return quantile * Math.hypot(Math.sqrt(Math.max(poses, 0)), ...others);
+  };
 }
 
 function metres(value) {

@@ -59,7 +59,8 @@ async function startViewer(box, scene, bus) {
     const field = fields.accuracy;
     return field ? field.span[0] * (field.span[1] / field.span[0]) ** (value / 255) : null;
   };
-  const measure = box.querySelector("[data-tool=measure]") ? makeMeasure(box, view, painter, { sigmaOf, axes: scene.axes, changed: draw }) : null;
+  const lengths = scene.lengths && (await makeLengths(scene.lengths));
+  const measure = box.querySelector("[data-tool=measure]") ? makeMeasure(box, view, painter, { sigmaOf, axes: scene.axes, lengths, changed: draw }) : null;
   const overlay = makeOverlay(box, view, draw);
   let marked = null;
 
