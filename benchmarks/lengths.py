@@ -1,22 +1,24 @@
 """Lengths between two points of a model: whether the stated intervals contain the true ones.
 
-`simulated`: points of the surface in simulated recordings with exact truth, of ToF cameras and of a
-phone with smooth depth, with the right focal length and with wrong ones. The true place of a point
-is the mean of what the images that measured it saw at its pixels.
+`simulated`: points of the surface in simulated recordings, by time-of-flight cameras with multipath
+and by a phone with smooth depth and poses that drift; with the right focal length, and with wrong
+ones. The true place of a point is the mean of what the images that measured it saw at its pixels.
 
-`recorded`: known lengths in real recordings.
+`recorded`: corners of tags on a table before an Azure Kinect, tapped in the depth images. Their
+true places are triangulated from the colour images at the poses of a bundle adjustment of the tags.
 
-    python benchmarks/lengths.py simulated [--names "room, turn"] [--focal 1 1.02] [--seeds 1]
+    python benchmarks/lengths.py simulated [--only 3]
     python benchmarks/lengths.py recorded [--data FOLDER]
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 import phone
@@ -29,10 +31,10 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.formats.cameras.calibration_files import corrected_depth
+from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import RecordingPlan
-from tofuse.lab.world import paths
 from tofuse.lab.world import scene as scenes
 
 CAMERAS = {
@@ -43,10 +45,33 @@ CAMERAS = {
 }
 # Points of a model, and pairs of them of each kind, which are at least so far apart.
 VERTICES, PAIRS, MIN_LENGTH = 400, 400, 0.05
-# Points count that at least so many images saw, without a larger jump of the range, as a fraction of
-# it, within so many pixels: no one can tap on what is mixed with its background.
+# Points count that at least so many images saw, without a larger jump of the range, as a fraction
+# of it, within so many pixels: no one can tap on what is mixed with its background.
 VIEWS, JUMP, EDGE = 3, 0.15, 2
 # Pairs of points by the fraction of the images of one that saw the other as well, above the first.
+# Recordings: case, camera, stated focal length relative to the true one, and seed.
+RUNS = (
+    ("room, short", "phone", 1.0, 0),
+    ("room, turn", "o3r", 1.0, 0),
+    ("attic, turn", "phone", 1.02, 0),
+    ("books, pan", "azure", 1.0, 0),
+    ("room, short", "sr4000", 1.02, 0),
+    ("room, short", "azure", 0.99, 1),
+    ("books, pan", "phone", 0.98, 1),
+    ("attic, turn", "o3r", 0.98, 1),
+    ("room, turn", "phone", 1.0, 0),
+    ("room, turn", "azure", 1.02, 1),
+    ("books, pan", "sr4000", 1.01, 1),
+    ("room, short", "o3r", 1.01, 2),
+    ("attic, turn", "azure", 1.0, 1),
+    ("room, short", "phone", 1.02, 2),
+    ("room, turn", "sr4000", 1.0, 2),
+    ("flat, walk", "phone", 1.0, 0),
+    ("flat, walk", "azure", 1.0, 0),
+    ("attic, turn", "sr4000", 1.01, 2),
+)
+TITLES = "pairs | bounded | inside | error, mm | interval, mm | interval / error"
+TAGS = cv2.aruco.DICT_6X6_50
 KINDS = {"the same views": 0.8, "some of them": 0.0, "no common view": -1.0}
 
 
@@ -219,3 +244,104 @@ def measured(taken: Taken, result: Result, frame: RangeFrame) -> dict[str, Measu
             np.array([one.bound_m for one in lengths]),
         )
     return out
+
+
+def table(results: Iterable[tuple[str, dict[str, Measured]]]) -> None:
+    """Print the table of simulated recordings."""
+    print(f"| recording | points in | {TITLES} |")
+    print("|---|---|---|---|---|---|---|---|")
+    every: dict[str, list[Measured]] = {}
+    for name, kinds in results:
+        for kind, found in kinds.items():
+            print(f"| {name} | {kind} | {found.cells()} |", flush=True)
+            every.setdefault(kind, []).append(found)
+    for kind, found in [*every.items(), ("", [m for of_kind in every.values() for m in of_kind])]:
+        errors, bounds = (
+            np.concatenate([getattr(m, n) for m in found]) for n in ("errors", "bounds")
+        )
+        print(f"| all | {kind} | {Measured(errors, bounds).cells()} |")
+
+
+def named(run: tuple[str, str, float, int]) -> str:
+    """Return the name of a run for the table."""
+    case, camera, focal, _ = run
+    wrong = "" if focal == 1 else f", focal length {focal - 1:+.0%}"
+    return f"{case}, {camera}{wrong}"
+
+
+def simulate(run: tuple[str, str, float, int]) -> tuple[str, dict[str, Measured]]:
+    """Simulate, reconstruct and measure."""
+    case, camera, focal, seed = run
+    taken = simulated(CASES[case], camera, seed, focal)
+    result = reconstruct(taken.recording)
+    frame = taken.recording.first_readable()
+    assert isinstance(frame, RangeFrame)
+    return named(run), measured(taken, result, frame)
+
+
+def recorded(folder: Path, every: int) -> None:
+    """Print the row of the tags, of all pairs of their corners."""
+    recording = open_recording(folder).select(every=every)
+    result = reconstruct(recording)
+    assert recording.reference is not None
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(TAGS))
+    rays: dict[tuple[int, int], list[tuple[Float64, Float64]]] = {}
+    tapped: dict[tuple[int, int], list[Float64]] = {}
+    poses = zip(recording, recording.reference, result.trajectory, strict=True)
+    for frame, T_true, T in poses:
+        assert isinstance(frame, RangeFrame)
+        assert frame.color_image is not None
+        found, ids, _ = detector.detectMarkers(frame.color_image)
+        for of_tag, tag in zip(found, [] if ids is None else ids.ravel().tolist(), strict=True):
+            for k, (x, y) in enumerate(of_tag[0].astype(float)):
+                u, v = round(x), round(y)
+                z = frame.z[v - 2 : v + 3, u - 2 : u + 3]
+                ray = cv2.remap(frame.camera.rays(), np.float32([[x]]), np.float32([[y]]), 1)[0, 0]
+                direction = T_true[:3, :3] @ np.append(ray.astype(float), 1.0)
+                rays.setdefault((tag, k), []).append((T_true[:3, 3], direction))
+                if z.size == 25 and (z > 0).all():
+                    place = np.append(ray.astype(float), 1.0) * np.median(z)
+                    tapped.setdefault((tag, k), []).append(se3.transform(T, place[None])[0])
+    corners = [key for key in rays if len(rays[key]) > len(recording) / 2 and key in tapped]
+    true = np.array([_nearest(rays[key]) for key in corners])
+    places = np.array([np.mean(tapped[key], axis=0) for key in corners])
+    errors = LengthErrors.of(result, recording.first_readable())
+    assert errors is not None
+    i, j = np.triu_indices(len(corners), 1)
+    lengths = [errors.between(places[a], places[b]) for a, b in zip(i, j, strict=True)]
+    truth = np.linalg.norm(true[i] - true[j], axis=1)
+    found_m = np.array([one.length_m for one in lengths])
+    print(f"corners: {len(corners)}, lengths: {truth.min():.3f} to {truth.max():.3f} m")
+    print(f"mean relative error: {np.mean(found_m / truth - 1):+.2%}")
+    print(f"| recording | {TITLES} |")
+    print("|---|---|---|---|---|---|---|")
+    bounds = np.array([one.bound_m for one in lengths])
+    print(f"| azure_kinect_tags | {Measured(found_m - truth, bounds).cells()} |")
+
+
+def _nearest(lines: Sequence[tuple[Float64, Float64]]) -> Float64:
+    """Return the point (3,) nearest to lines, each a point and a direction."""
+    A, y = np.zeros((3, 3)), np.zeros(3)
+    for start, direction in lines:
+        d = direction / np.linalg.norm(direction)
+        across = np.eye(3) - np.outer(d, d)
+        A, y = A + across, y + across @ start
+    return np.asarray(np.linalg.solve(A, y), np.float64)
+
+
+def main() -> None:
+    """Parse the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=("simulated", "recorded"))
+    parser.add_argument("--only", type=int, default=len(RUNS), help="number of recordings")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--every", type=int, default=4, help="use every N-th recorded frame")
+    options = parser.parse_args()
+    if options.what == "simulated":
+        table(map(simulate, RUNS[: options.only]))
+    else:
+        recorded(options.data / "azure_kinect_tags", options.every)
+
+
+if __name__ == "__main__":
+    main()

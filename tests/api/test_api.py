@@ -95,6 +95,12 @@ def test_saved_result_round_trips(result, tmp_path):
             theirs.reason,
         )
         np.testing.assert_allclose(mine.covariance, theirs.covariance)
+    # It measures the same, though with a usual field of view without its recording.
+    a, b = result.mesh.vertices[[0, -1]]
+    mine, theirs = again.distance(a, b), result.distance(a, b)
+    assert mine.length_m == theirs.length_m
+    assert mine.causes_m["scale"] == theirs.causes_m["scale"]
+    assert theirs.causes_m["surface"] > 0
     # A loaded result can be saved; run.json is the same except for the refinement.
     again.save(tmp_path / "copy")
     first, second = (

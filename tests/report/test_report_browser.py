@@ -11,6 +11,9 @@ import pytest
 
 from browser import changed, chromium, watched
 from report_results import make_room
+from tofuse.apps.coach import LengthErrors
+from tofuse.apps.report.html import asset
+from tofuse.apps.report.section_model import packed_lengths
 from tofuse.apps.report.sections import write_report
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.texture import baked
@@ -123,6 +126,33 @@ def test_two_taps_measure_distance_with_error(browser, report):
         page.keyboard.press("Escape")
         assert caption.is_hidden()
         seen.check()
+
+
+def test_page_bounds_lengths_as_python_does(browser):
+    rng = np.random.default_rng(4)
+    count, cameras = 50, 7
+    L = rng.normal(0, 0.003, (6 * cameras, 6 * cameras))
+    axes = rng.normal(size=(cameras, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    errors = LengthErrors(
+        rng.normal(size=3),
+        rng.normal(0, 3, (count, 3)).astype(np.float32),
+        rng.integers(0, 2, (count, cameras), np.uint8) * np.uint8(80) + np.uint8(1),
+        np.concatenate([rng.normal(size=(cameras, 3)), axes], 1).astype(np.float32),
+        (L @ L.T).astype(np.float32),
+        {"focal": 0.01, "offset": 0.004, "scale": 0.02, "surface": 0.003},
+    )
+    ends = rng.normal(0, 3, (20, 2, 3))
+    page = browser.new_page()
+    names = ("bytes", "eye", "measure")
+    scripts = "\n".join(asset(f"js/{name}.js") for name in names)
+    bounds = page.evaluate(
+        f"async ([packed, ends]) => {{ {scripts}\n"
+        "const bound = await makeLengths(packed); return ends.map(([a, b]) => bound(a, b)); }",
+        [packed_lengths(errors), ends.tolist()],
+    )
+    for (a, b), found in zip(ends, bounds, strict=True):
+        assert found == pytest.approx(errors.between(a, b).causes_m, rel=1e-5)
 
 
 def floor_below(cloud) -> Mesh:

@@ -28,6 +28,8 @@ from tofuse.engine.results import Reconstruction
 # Standard deviation of the depth scale, which no view of the recording shows, and multipath changes
 # as well: data sheets of depth cameras state 1 %.
 _SCALE = 0.01
+# Errors of the camera are known as well as covariances that nothing confirms.
+_MODEL_DOF = pose_accuracy.Accuracy.degrees
 # Small motions of a keyframe whose pose is not bounded: m, and rad.
 _UNBOUNDED = np.array([30.0] * 3 + [10.0] * 3)
 # Reasons for which the poses have no bound, although their covariance is small.
@@ -79,11 +81,10 @@ class LengthErrors:
     cameras
         (K, 6) position and viewing direction of each keyframe.
     covariance
-        (6K, 6K) of small motions of the keyframes: translation, and rotation about the centre.
-    sigmas
-        Standard deviations of the errors of the camera, and of the surface at both ends together.
-    quantile
-        Number of standard deviations of a 95 % interval.
+        (6K, 6K) of small motions of the keyframes, translation and rotation about the centre, times
+        the square of the quantile of a 95 % interval.
+    bounds
+        95 % bounds of the errors of the camera, and of the surface at both ends together.
     """
 
     centre: Float64
@@ -91,8 +92,7 @@ class LengthErrors:
     weights: UInt8
     cameras: Float32
     covariance: Float32
-    sigmas: Mapping[str, float]
-    quantile: float
+    bounds: Mapping[str, float]
 
     @classmethod
     def of(cls, result: Reconstruction, frame: Frame | None) -> Self | None:
@@ -112,15 +112,15 @@ class LengthErrors:
             return None
         weights = np.ceil(254 * weights / weights.max(1, keepdims=True)).astype(np.uint8)
         cameras = known.poses[:, :3, [3, 2]].swapaxes(1, 2).reshape(-1, 6)
-        surface = accuracy.surface_m or 0.0
+        sigmas = {**accuracy.camera_sigmas, "scale": _SCALE, "surface": accuracy.surface_m or 0.0}
+        quantile, of_model = stdtrit([accuracy.degrees, _MODEL_DOF], 0.975).tolist()
         return cls(
             known.centre,
             known.surfaces.points[seen],
             weights,
             cameras.astype(np.float32),
-            _covariance(known, result).astype(np.float32),
-            {**accuracy.camera_sigmas, "scale": _SCALE, "surface": surface},
-            float(stdtrit(accuracy.degrees, 0.975)),
+            (quantile**2 * _covariance(known, result)).astype(np.float32),
+            {name: of_model * sigma for name, sigma in sigmas.items()},
         )
 
     @cached_property
@@ -151,12 +151,11 @@ class LengthErrors:
             by_focal += float(w @ across @ e)
             by_offset += float(w @ (arm / np.linalg.norm(arm, axis=1, keepdims=True)) @ e)
         h = by_motion.ravel()
-        variances = {"poses": max(float(h @ self.covariance @ h), 0.0)}
+        causes = {"poses": float(np.sqrt(max(float(h @ self.covariance @ h), 0.0)))}
         effects = {"focal": by_focal, "offset": by_offset, "scale": length, "surface": 1.0}
         for name, effect in effects.items():
-            variances[name] = (self.sigmas.get(name, 0.0) * effect) ** 2
-        bound = self.quantile * float(np.sqrt(sum(variances.values())))
-        causes = {name: self.quantile * float(np.sqrt(v)) for name, v in variances.items()}
+            causes[name] = self.bounds.get(name, 0.0) * abs(effect)
+        bound = float(np.linalg.norm([*causes.values()]))
         return Length(length, bound if bound < max(length, 1.0) else np.inf, causes)
 
 

@@ -51,7 +51,7 @@ def model(s: Subject) -> Values:
             },
             "lens": None if rig else _lens(s),
             "axes": s.R_display_world.tolist(),
-            "lengths": _packed_lengths(s),
+            "lengths": _lengths(s),
         },
         "still": thumbnails.data_uri(render(displayed, yaw=opening_yaw(displayed))),
         "has": {
@@ -112,20 +112,21 @@ def _lens(s: Subject) -> dict[str, float] | None:
     return {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 
 
-def _packed_lengths(s: Subject) -> Values | None:
-    """What the errors of lengths follow from, for the viewer; None if that is unknown."""
+def _lengths(s: Subject) -> Values | None:
     frame = s.extras.filter_steps[0][1] if s.extras.filter_steps else None
     errors = LengthErrors.of(s.result, frame if isinstance(frame, RangeFrame) else None)
-    if errors is None:
-        return None
+    return None if errors is None else packed_lengths(errors)
+
+
+def packed_lengths(errors: LengthErrors) -> Values:
+    """Return what the errors of lengths follow from, for `makeLengths` of `measure.js`."""
     return {
         "centre": errors.centre.tolist(),
         "points": pack(errors.points),
         "weights": pack(errors.weights),
         "cameras": pack(errors.cameras),
         "covariance": pack(errors.covariance[np.tril_indices(len(errors.covariance))]),
-        "sigmas": dict(errors.sigmas),
-        "quantile": errors.quantile,
+        "bounds": dict(errors.bounds),
     }
 
 

@@ -268,9 +268,7 @@ class Assessment:
         m, rad = np.linalg.norm(errors, axis=0).tolist()
         return m, rad
 
-    def _camera_sigmas(
-        self, check: calibration_check.CalibrationCheck | None
-    ) -> dict[str, float]:
+    def _camera_sigmas(self, check: calibration_check.CalibrationCheck | None) -> dict[str, float]:
         """Return the standard deviations of the focal length and of the range offset.
 
         They are those of usual cameras, as far as the views don't know better; an estimated error
@@ -283,6 +281,8 @@ class Assessment:
         sigmas = {}
         for name in ("focal", "offset"):
             tolerance = calibration_check.TOLERANCES[name]
+            if name == "offset":  # at most a centimetre, say makers
+                tolerance *= unknown
             error, sigma = check.estimates.get(name, (0.0, np.inf))
             known = tolerance * sigma / np.hypot(tolerance, sigma) if sigma < np.inf else tolerance
             corrections = [part.sigmas[name] for part in self._estimated_corrections]

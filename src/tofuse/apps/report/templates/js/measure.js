@@ -41,7 +41,12 @@ function makeMeasure(box, view, painter, { sigmaOf, axes, lengths, changed }) {
   }
   function distance() {
     const [a, b] = ends, length = Math.hypot(...minus(a.point, b.point));
-    if (lengths && length) return bounded(metres(length), lengths(inWorld(a.point), inWorld(b.point)), Math.max(length, 1));
+    if (lengths && length) {
+      const causes = lengths(inWorld(a.point), inWorld(b.point)), names = Object.keys(causes);
+      const most = names.reduce((x, y) => (causes[y] > causes[x] ? y : x));
+      const words = bounded(metres(length), Math.hypot(...Object.values(causes)), Math.max(length, 1));
+      return words.includes("±") ? `${words}\nmostly ${CAUSES[most]}` : words;
+    }
     const known = a.sigma !== null && b.sigma !== null;
     return bounded(metres(length), known ? Math.hypot(a.sigma, b.sigma) : null, Math.max(length, 1));
   }
@@ -57,17 +62,23 @@ function makeMeasure(box, view, painter, { sigmaOf, axes, lengths, changed }) {
       if (there) pin.style.transform = `translate(${there[0]}px, ${there[1]}px)`;
     });
     const middle = ends.length && along(ends[0].point, minus(ends[ends.length - 1].point, ends[0].point), 0.5);
-    const shown = middle && view.onScreen(middle);
+    const shown = middle && view.onScreen(middle), places = ends.map((end) => view.onScreen(end.point));
     label.classList.toggle("placed", Boolean(shown));
     if (!shown) { label.style.transform = ""; return; }
-    label.style.transform = `translate(${Math.round(shown[0])}px, ${Math.round(shown[1])}px) translate(-50%, -150%)`;
+    const half = label.offsetWidth / 2 + 4, left = Math.max(half, Math.min(box.clientWidth - half, shown[0]));
+    // Above both ends, unless they are apart.
+    const covered = places.filter((there) => there && Math.abs(there[0] - left) < half + 8).map((there) => there[1]);
+    const top = Math.min(shown[1], ...covered);
+    label.style.transform = `translate(${Math.round(left)}px, ${Math.round(top)}px) translate(-50%, calc(-100% - 12px))`;
   }
   button.addEventListener("click", () => toggle());
   return { toggle, add, miss: () => say("No surface there: tap the model"), place, line, get on() { return on; } };
 }
 
-// The 95 % bound of the distance of two points in the world: `LengthErrors.between` in Python.
-async function makeLengths({ centre, points, weights, cameras, covariance, sigmas, quantile }) {
+const CAUSES = { poses: "poses", focal: "focal length", offset: "range offset", scale: "depth scale", surface: "the surfaces" };
+
+// The 95 % bounds of the distance of two points in the world by cause: `LengthErrors.between` in Python.
+async function makeLengths({ centre, points, weights, cameras, covariance, bounds }) {
   const [P, camera, C] = await Promise.all([points, cameras, covariance].map((text, k) => unpack(text, Float32Array, [3, 6, 1][k])));
   const K = camera.length / 6, seen = await unpack(weights, Uint8Array, K);
   const nearest = (p) => {
@@ -100,8 +111,8 @@ async function makeLengths({ centre, points, weights, cameras, covariance, sigma
       for (let j = 0; j <= i; j++, at++) poses += (i === j ? 1 : 2) * h[i] * C[at] * h[j];
     }
     const effects = { focal, offset, scale: length, surface: 1 };
-    const others = Object.entries(effects).map(([name, effect]) => (sigmas[name] || 0) * effect);
-    return quantile * Math.hypot(Math.sqrt(Math.max(poses, 0)), ...others);
+    const others = Object.entries(effects).map(([name, effect]) => [name, (bounds[name] || 0) * Math.abs(effect)]);
+    return { poses: Math.sqrt(Math.max(poses, 0)), ...Object.fromEntries(others) };
   };
 }
 

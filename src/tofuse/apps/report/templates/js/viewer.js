@@ -305,6 +305,6 @@ function captions(pen, box, canvas) {
     pen.fillStyle = "rgba(22, 25, 30, .85)";
     pen.fillRect(x - there.width / 2, y - there.height / 2, there.width, there.height);
     pen.fillStyle = "#ffe15a";
-    pen.fillText(label.textContent, x, y);
+    label.textContent.split("\n").forEach((line, k, lines) => pen.fillText(line, x, y + 18 * (k - (lines.length - 1) / 2)));
   }
 }
