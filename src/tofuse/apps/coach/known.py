@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.apps.coach.surfaces import Seen, Surfaces, pair_information, scales
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
-from tofuse.engine.frames import Frame, evenly_spaced
+from tofuse.engine.frames import Frame, RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import PoseGraph, graph_covariances
 from tofuse.engine.progress import OnlineMap
@@ -92,7 +92,7 @@ class Known:
     @classmethod
     def of_result(cls, result: Reconstruction, frame: Frame | None) -> Self | None:
         """Return what a result knows, with the field of view of a frame, if there is one."""
-        rays = None if frame is None or frame.camera is None else frame.camera.rays()
+        rays = frame.camera.rays() if isinstance(frame, RangeFrame) else None
         field = (
             None if rays is None else np.array([np.nanmin(rays, (0, 1)), np.nanmax(rays, (0, 1))])
         )

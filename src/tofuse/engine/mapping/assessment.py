@@ -271,8 +271,9 @@ class Assessment:
     def _camera_sigmas(self, check: calibration_check.CalibrationCheck | None) -> dict[str, float]:
         """Return the standard deviations of the focal length and of the range offset.
 
-        They are those of usual cameras, as far as the views don't know better; an estimated error
-        that was not corrected counts as in the errors of the poses.
+        That of the focal length is that of usual cameras, as far as the views don't know better; it
+        stands for an offset that they don't determine. An estimated error that was not corrected
+        counts as in the errors of the poses.
         """
         if check is None:
             return {}
@@ -281,15 +282,14 @@ class Assessment:
         sigmas = {}
         for name in ("focal", "offset"):
             tolerance = calibration_check.TOLERANCES[name]
-            if name == "offset":  # at most a centimetre, say makers
-                tolerance *= unknown
             error, sigma = check.estimates.get(name, (0.0, np.inf))
-            known = tolerance * sigma / np.hypot(tolerance, sigma) if sigma < np.inf else tolerance
             corrections = [part.sigmas[name] for part in self._estimated_corrections]
             shown = max(corrections, default=0.0)
             if not corrections and check.determines(name):
                 shown = (1.0 if is_likely and name in check.errors else unknown) * abs(error)
-            sigmas[name] = float(np.hypot(shown, known))
+            known = float(1 / np.hypot(1 / tolerance, 1 / sigma))
+            if name == "focal" or shown > 0:
+                sigmas[name] = float(np.hypot(shown, known))
         return sigmas
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
