@@ -170,11 +170,15 @@ def _covariance(known: Known, result: Reconstruction) -> Float64:
     records = {r.index: r.covariance for r in result.diagnostics.frames}
     unbounded = np.isin(known.frames, accuracy.unbounded)
     total = sum(cause**2 for cause in accuracy.causes_m.values())
+    # Unbounded keyframes share their error up to the next frame with a degenerate direction.
+    degenerate = [r.index for r in result.diagnostics.frames if len(r.unobservable)]
+    part = np.searchsorted(degenerate, known.frames, side="right")
+    lost = unbounded[:, None] & unbounded & (part[:, None] == part)
     codes = {reason.code for reason in result.diagnostics.reasons}
     if total:
         C = C * (total / known.mean_square)
     elif unbounded.all() or not unbounded.any() or codes & _UNTRUSTED:
-        unbounded[:] = True
+        lost = np.eye(k, dtype=np.bool_)
     else:  # the covariances of the others include all errors
         stated = [records.get(int(i)) for i in known.frames]
         by_graph = known.position_variances
@@ -184,7 +188,7 @@ def _covariance(known: Known, result: Reconstruction) -> Float64:
             if S is not None and not left_out and v > 0
         ]
         C = C * (np.median(ratios) / pose_accuracy.factor_of(accuracy.degrees) if ratios else 1.0)
-    C = C + np.diag(np.repeat(unbounded, 6) * np.tile(_UNBOUNDED, k) ** 2)
+    C = C + np.kron(lost, np.diag(_UNBOUNDED**2))
     # Less the mean motion, which is that of all.
     blocks = C.reshape(k, 6, k, 6)
     blocks = blocks - blocks.mean(0, keepdims=True)
