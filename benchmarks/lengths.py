@@ -193,7 +193,7 @@ def true_places(taken: Taken, poses: Float64, vertices: Float64) -> tuple[Float6
         ok = inside & near & (_spread(range_m)[v, u] < JUMP * depth)
         total[ok] += q[ok]
         seen[ok, k] = True
-    return total / seen.sum(1)[:, None], seen
+    return total / np.maximum(seen.sum(1), 1)[:, None], seen
 
 
 @dataclass(frozen=True, eq=False)
