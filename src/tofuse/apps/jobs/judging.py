@@ -1,22 +1,23 @@
 """Assessing poses from other sources: their consistency with the depth, and their accuracy.
 
-The poses replace tracking; otherwise it is a run: loops are closed, and all views are refined
-jointly. The error bound of the given poses is their distance from the refined ones plus the error
-bound of those. If images contradict even the refined poses, the recording is tracked again, and the
-trajectory with more support by the images counts.
+As many views decide as show the whole path: a sample, spaced by the motion of the camera and with
+the frames around jumps. Its poses replace tracking; loops are closed, and the views are refined
+jointly. If images contradict even the refined poses, the recording is tracked, and the trajectory
+with more support by the images counts.
 
 Refined poses have errors too, mostly in poorly observable directions, so a distance from them does
 not prove the given poses wrong. Pairs of views, registered around the refined poses, test that
-(`evaluation.deviation`).
+(`pose_deviation`). The error bound is the deviation that they prove, plus that of the remainder:
+the remaining distance from the refined poses and their own bound, which are independent.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
-from functools import cache
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,24 +27,33 @@ from threadpoolctl import threadpool_limits
 from tofuse.apps.inspection import convention_of
 from tofuse.apps.jobs import pose_scale
 from tofuse.apps.results import folders, run_json, write_result
-from tofuse.engine.arrays import Float64
+from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Recording, evenly_spaced, frame_ranges
+from tofuse.engine.frames import Frame, Recording, Source, evenly_spaced, frame_ranges
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping import Config, adaptation, check_views, from_method, reconstructing
+from tofuse.engine.mapping import (
+    Config,
+    adaptation,
+    check_views,
+    clips,
+    from_method,
+    reconstructing,
+)
 from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import (
     cross_view_agreement,
     map_agreement,
     pose_accuracy,
+    pose_causes,
     pose_deviation,
     trajectory_errors,
 )
+from tofuse.engine.refinement import propagate_poses
 from tofuse.engine.results import Reason, Reconstruction, Verdict, accuracy_card, checks, verdicts
-from tofuse.engine.stored_views import PosedView
+from tofuse.engine.stored_views import PosedView, Spacing
 from tofuse.engine.tracking import FrameTime, find_jumps, given
 from tofuse.engine.views import PreparedView
 from tofuse.formats.poses import TimedPoses, read_poses
@@ -53,8 +63,17 @@ Views = Sequence[PosedView[PreparedView]]
 
 _length = accuracy_card.length
 
-# Number of frames whose images are compared under the poses.
-_CHECKED = 60
+# Motion between the views of the sample, which overlap widely, and the fewest of them.
+_SPACING = Spacing(angle=0.25, distance=0.125)
+_MIN_SAMPLE = 24
+# Jumps whose frames are part of the sample.
+_MAX_JUMPS = 20
+# Frames of the sample that stay in memory.
+_KEPT = 64
+# Runs of views of the trial of a correction: the sample has few that share no view.
+_TRIAL_RUNS = 8
+# Number of views that are compared under the poses, and of pairs for map consistency.
+_COMPARED, _COMPARED_PAIRS = 40, 60
 # With a smaller fraction of supporting measurements the recording is tracked again.
 _SUPPORTED = 0.95
 # With fewer overlapping views, relative to the refined poses, most poses are wrong.
@@ -81,13 +100,15 @@ class Judgement:
         views could be compared.
     displacement_m
         (N,) distance of each given pose from the refined one after alignment, m; NaN where unknown.
-    refined
-        The result of a refinement initialised with the poses; or of an independent run, if the
-        images support that better.
+    sampled
+        The result of refining a sample of the views, without a surface.
     started
-        Whether `refined` was initialised with the poses.
+        Whether that began with the poses; if not, it is an independent run, which the images
+        support better.
     scale
         Metres per unit of the poses as given; None if it can't be estimated, as from rotations.
+    cause
+        What is wrong with the poses, if one cause explains the deviation.
     """
 
     poses: Float64
@@ -98,9 +119,16 @@ class Judgement:
     refined_consistency: map_agreement.Consistency | None
     deviation: pose_deviation.Deviation | None
     displacement_m: Float64
-    refined: Reconstruction
+    sampled: Reconstruction
     started: bool = True
     scale: pose_scale.PoseScale | None = None
+    cause: pose_causes.Cause | None = None
+    _reconstruct: Callable[[], Reconstruction] = field(kw_only=True, repr=False)
+
+    @cached_property
+    def refined(self) -> Reconstruction:
+        """The result of all frames, as a run makes it; computed when it is first used."""
+        return self._reconstruct()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `judge.json`, with inf as it is."""
@@ -113,11 +141,12 @@ class Judgement:
             "map_consistency": _dict(self.consistency),
             "deviation": _dict(self.deviation),
             "displacement_m": self.displacement_m,
+            "cause": _dict(self.cause),
             "scale": None if self.scale is None else asdict(self.scale),
             "refined": {
                 "from_these_poses": self.started,
-                "verdict": self.refined.diagnostics.verdict,
-                "accuracy": run_json.accuracy_json(self.refined.diagnostics.accuracy),
+                "verdict": self.sampled.diagnostics.verdict,
+                "accuracy": run_json.accuracy_json(self.sampled.diagnostics.accuracy),
                 "map_consistency": _dict(self.refined_consistency),
             },
         }
@@ -174,70 +203,173 @@ def judge(
     given_config = replace(config, odometry=given.GivenPoses())
     check_views(given_config, kind)
 
+    sample = _sample_of(recording, poses)
+    rows = np.searchsorted(recording.indices, sample.indices)
+
     @cache
     def view(k: int) -> PreparedView | None:
-        frame = recording.image(k)
+        frame = sample.image(k)
         return None if frame is None else cross_view_agreement.prepare_for_comparison(frame)
 
     def views_at(poses: Float64) -> dict[int, PreparedView]:
-        posed = evenly_spaced(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
+        posed = evenly_spaced(np.flatnonzero(np.isfinite(poses).all((1, 2))), _COMPARED).tolist()
         return {k: found for k in posed if (found := view(k)) is not None}
 
     def compared_at(poses: Float64) -> cross_view_agreement.CrossViewConsistency:
         views = views_at(poses)
         return cross_view_agreement.compare_views(list(views.values()), poses[list(views)])
 
-    def reconstructed(
-        source: Recording, config_used: Config
-    ) -> tuple[Reconstruction, Views, cross_view_agreement.CrossViewConsistency]:
-        result, views = reconstructing.reconstruct_with_views(
-            source, config_used, threads=threads, progress=progress
+    def reconstructed(source: Recording, config: Config) -> tuple[Reconstruction, Views]:
+        return reconstructing.reconstruct_with_views(
+            source, config, threads=threads, progress=progress
         )
-        return result, views, compared_at(result.trajectory)
 
-    progress.stage("comparing images")
-    as_given = compared_at(poses)
-    compared = views_at(poses)
-    estimate = pose_scale.estimated_scale(list(compared.values()), poses[list(compared)])
-    if scale and estimate is None:
-        raise InputError(
-            "can't be estimated: too few views with translation between them fit",
-            where="scale",
-            remedy="leave out --scale, or pass poses of more frames",
-        )
-    if estimate is not None and (scale or estimate.is_other_unit):
-        multiplied = pose_scale.with_scale(poses, estimate.factor)
-        as_scaled = compared_at(multiplied)
-        if scale or _support(as_scaled) > _support(as_given):
-            poses, as_given, estimate = multiplied, as_scaled, replace(estimate, applied=True)
-    started = reconstructed(adaptation.with_odometry(recording, poses), given_config)
-    best = started
-    if _support(as_given) < _SUPPORTED and (finding := convention_of(recording, poses)):
-        progress.note(str(finding))
-    if _support(started[2]) < _SUPPORTED:
-        best = max(started, reconstructed(recording, config), key=lambda found: _support(found[2]))
-    refined, views, as_refined = best
-    progress.stage("registering pairs")
     with use_threads(threads), threadpool_limits(1):
-        deviation = _deviation(poses, refined, views)
-    distances = _distances(poses, refined.trajectory)
-    accuracy = _accuracy(distances, poses, refined)
+        progress.stage("comparing images")
+        as_given, estimate = compared_at(poses[rows]), None
+        unsupported = _support(as_given) < _SUPPORTED
+        if scale or unsupported:
+            compared = views_at(poses[rows])
+            estimate = pose_scale.estimated_scale(
+                list(compared.values()), poses[rows][list(compared)]
+            )
+        if scale and estimate is None:
+            raise InputError(
+                "can't be estimated: too few views with translation between them fit",
+                where="scale",
+                remedy="leave out --scale, or pass poses of more frames",
+            )
+        if estimate is not None and (scale or estimate.is_other_unit):
+            multiplied = pose_scale.with_scale(poses, estimate.factor)
+            as_scaled = compared_at(multiplied[rows])
+            if scale or _support(as_scaled) > _support(as_given):
+                poses, as_given, estimate = multiplied, as_scaled, replace(estimate, applied=True)
+                unsupported = _support(as_given) < _SUPPORTED
+        given_config = adaptation.adapted(given_config, sample, threads, progress, _TRIAL_RUNS)
+    sampled, views = reconstructed(adaptation.with_odometry(sample, poses[rows]), given_config)
+    refined_poses = _propagated(poses, rows, sampled.trajectory)
+    as_refined, started = as_given, True
+    if unsupported:
+        if finding := convention_of(recording, poses):
+            progress.note(str(finding))
+        as_refined = compared_at(sampled.trajectory)
+    if _support(as_refined) < _SUPPORTED:
+        tracked, tracked_views = reconstructed(recording, config)
+        as_tracked = compared_at(tracked.trajectory[rows])
+        if _support(as_tracked) > _support(as_refined):
+            sampled, views, as_refined, started = tracked, tracked_views, as_tracked, False
+            refined_poses = tracked.trajectory
+    progress.stage("registering pairs")
+    row_of = {int(index): k for k, index in enumerate(recording.indices)}
+    with use_threads(threads), threadpool_limits(1):
+        used = _common(views, poses, refined_poses, row_of, set(sample.indices.tolist()))
+        deviation = _deviation(poses, refined_poses, used, row_of)
+        cause = None
+        if deviation is not None:
+            estimate = estimate or pose_scale.scale_of_pairs(
+                deviation.fit.graph, poses[[row_of[v.index] for v in used]]
+            )
+            velocity = _velocities(recording, poses)[[row_of[v.index] for v in used]]
+            cause = pose_causes.cause_of(deviation, velocity)
+        consistencies = _consistencies(sample, deviation, [poses[rows], refined_poses[rows]])
+    distances = _distances(poses, refined_poses)
+    accuracy = _accuracy(distances, poses, refined_poses, deviation, sampled, recording.indices)
     reasons = verdicts.ranked(
-        [*_reasons(poses, accuracy, deviation, as_given, as_refined, refined, tolerance_m)]
+        [
+            *_reasons(
+                recording,
+                poses,
+                refined_poses,
+                accuracy,
+                (deviation, cause),
+                (as_given, as_refined),
+                checks.tolerance_of(tolerance_m, sampled.cloud.diagonal_m),
+            )
+        ]
     )
+
+    def reconstruct() -> Reconstruction:
+        source = adaptation.with_odometry(recording, poses) if started else recording
+        return reconstructing.reconstruct(
+            source, given_config if started else config, threads=threads, progress=progress
+        )
+
     return Judgement(
         poses,
         accuracy,
         verdicts.verdict_of(reasons),
         reasons,
-        _consistency(recording, poses),
-        _consistency(recording, refined.trajectory),
+        *consistencies,
         deviation,
         distances,
-        refined,
-        best is started,
+        sampled,
+        started,
         estimate,
+        cause,
+        _reconstruct=reconstruct,
     )
+
+
+@dataclass
+class _Keeping:
+    """A source that keeps the first frames that are read."""
+
+    source: Source
+    frames: dict[int, Frame] = field(default_factory=dict)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.source, name)
+
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        if index in self.frames:
+            return self.frames[index]
+        frame = self.source.read(index)
+        if len(self.frames) < _KEPT:
+            self.frames[index] = frame
+        return frame
+
+
+def _sample_of(recording: Recording, poses: Float64) -> Recording:
+    """Return the frames that are spaced by the motion of poses (N, 4, 4), and those at jumps."""
+    posed = np.flatnonzero(np.isfinite(poses).all((1, 2)))
+    indices = recording.indices[posed]
+    spaced = clips.spaced_frames(
+        recording, dict(zip(indices.tolist(), poses[posed], strict=True)), _SPACING
+    )
+    moments = [
+        FrameTime(int(index), float(time))
+        for index, time in zip(indices, recording.timestamps[posed], strict=True)
+    ]
+    jumps = [k for k, _ in find_jumps(list(poses[posed]), moments)][:_MAX_JUMPS]
+    at_jumps = [indices[k] for jump in jumps for k in (jump - 1, jump)]
+    enough = len(spaced) >= _MIN_SAMPLE
+    chosen = [*spaced, indices[-1]] if enough else evenly_spaced(indices, _MIN_SAMPLE).tolist()
+    chosen = np.unique(np.array([*chosen, *at_jumps], np.intp))
+    source: Any = _Keeping(recording.source)
+    return replace(recording, source=source, indices=chosen)
+
+
+def _propagated(poses: Float64, rows: Intp, refined: Float64) -> Float64:
+    """Return the refined poses of all frames, from those (V, 4, 4) of the sample at `rows`."""
+    out = np.full_like(poses, np.nan)
+    posed = np.flatnonzero(np.isfinite(poses).all((1, 2)))
+    known = np.isfinite(refined).all((1, 2))
+    out[posed] = propagate_poses(poses[posed], np.searchsorted(posed, rows[known]), refined[known])
+    return out
+
+
+def _velocities(recording: Recording, poses: Float64) -> Float64:
+    """Return the motion (N, 6) of given poses per second, in the camera's frame."""
+    out, times = np.full((len(poses), 6), np.nan), recording.timestamps
+    posed = np.flatnonzero(np.isfinite(poses).all((1, 2)))
+    last = np.arange(len(posed))
+    before, after = posed[np.maximum(last - 1, 0)], posed[np.minimum(last + 1, len(posed) - 1)]
+    seconds = times[after] - times[before]
+    motion = se3.log(se3.inverse(poses[before]) @ poses[after])
+    if recording.has_timestamps and (seconds > 0).all():
+        out[posed] = motion / seconds[:, None]
+    return out
 
 
 def _overlapping(compared: cross_view_agreement.CrossViewConsistency) -> float:
@@ -297,43 +429,43 @@ def judge_files(
             threads=options.threads,
             progress=progress,
         )
-        facts = {**judgement.refined.recording, "opening": opening.to_dict()}
-        judgement = replace(judgement, refined=replace(judgement.refined, recording=facts))
         if folder is not None:
+            refined = judgement.refined
+            facts = {**refined.recording, "opening": opening.to_dict()}
             progress.stage("writing")
             with threadpool_limits(1):
-                _write(judgement, trajectory, recording, folder)
+                _write(judgement, replace(refined, recording=facts), trajectory, folder)
     return judgement
 
 
 def _write(
-    judgement: Judgement, trajectory: Path, recording: Recording, folder: folders.OutputFolder
+    judgement: Judgement, refined: Reconstruction, trajectory: Path, folder: folders.OutputFolder
 ) -> None:
     """Write the refined result, with `judge.json` and the judgement as headline of the report."""
     from tofuse.apps.report import ReportExtras, write_report
 
     def report(result: Reconstruction, path: Path) -> None:
-        headline = sentence(judgement, trajectory.name) if result is judgement.refined else ""
-        title = f"{trajectory.name} on {Path(recording.path).name}"
+        headline = sentence(judgement, trajectory.name) if result is refined else ""
+        title = f"{trajectory.name} on {Path(refined.recording['path']).name}"
         write_report(result, path / "report.html", ReportExtras(title, headline=headline))
-        if result is judgement.refined:
+        if result is refined:
             text = json.dumps(run_json.plain(judgement.to_dict()), indent=1, allow_nan=False)
             (path / "judge.json").write_text(text + "\n", encoding="utf-8")
 
-    write_result(judgement.refined, folder, report)
+    write_result(refined, folder, report)
 
 
 def sentence(judgement: Judgement, name: str) -> str:
     """Summarise the judgement: "poses.txt: ±31 mm ...; refined: ±9 mm ..."."""
-    diagonal = judgement.refined.cloud.diagonal_m
+    diagonal = judgement.sampled.cloud.diagonal_m
     given_bound = accuracy_card.bound(judgement.accuracy, diagonal)
-    refined_bound = accuracy_card.bound(judgement.refined.diagnostics.accuracy, diagonal)
+    refined_bound = accuracy_card.bound(judgement.sampled.diagnostics.accuracy, diagonal)
     label = "refined" if judgement.started else "tracked again"
-    readable = [f.status != "skipped" for f in judgement.refined.diagnostics.frames]
-    posed = np.isfinite(judgement.poses[readable, 0, 0])
+    posed = np.isfinite(judgement.poses[:, 0, 0])
+    cause = "" if judgement.cause is None else f" The cause is probably {judgement.cause.text}."
     return (
         f"{name}{_scale(judgement.scale)}: {given_bound}, poses of {posed.sum()} of {len(posed)} "
-        f"frames; {label}: {refined_bound}.{_agreement(judgement.deviation)}"
+        f"frames; {label}: {refined_bound}.{_agreement(judgement.deviation)}{cause}"
     )
 
 
@@ -407,72 +539,83 @@ def _distances(poses: Float64, refined: Float64) -> Float64:
 
 
 def _accuracy(
-    distances: Float64, poses: Float64, refined: Reconstruction
+    distances: Float64,
+    poses: Float64,
+    refined_poses: Float64,
+    deviation: pose_deviation.Deviation | None,
+    refined: Reconstruction,
+    indices: Intp,
 ) -> pose_accuracy.Accuracy:
-    """Return the bound of the given poses: distance from the refined ones plus their bound."""
-    refined_accuracy = refined.diagnostics.accuracy
+    """Return the bound of the given poses, from their distance from the refined ones.
+
+    The part of the distance that the images prove adds to the bound. The remainder may be an error
+    of either, independent of what bounds the refined ones.
+    """
+    reference = refined.diagnostics.accuracy
     common = np.flatnonzero(np.isfinite(distances))
-    if not refined_accuracy.assessed or not len(common):
-        return refined_accuracy
-    moved, turned = trajectory_errors.displacement(refined.trajectory[common], poses[common])
-    # In the worst case both have the same direction.
-    position, rotation = moved + refined_accuracy.position_m, turned + refined_accuracy.rotation_rad
+    if not reference.assessed or not len(common):
+        return reference
+    moved = np.array(trajectory_errors.displacement(refined_poses[common], poses[common]))
+    proven = moved if deviation is None else np.minimum(deviation.proven, moved)
+    stated = np.array([reference.position_m, reference.rotation_rad])
+    position, rotation = (proven + np.hypot(moved - proven, stated)).tolist()
     worst = int(common[np.argmax(distances[common])])
     at_worst = pose_accuracy.WorstFrame(
-        int(refined.diagnostics.frames[worst].index),
-        float(distances[worst]) + refined_accuracy.position_m,
-        rotation,
+        int(indices[worst]), float(distances[worst]) + reference.position_m, rotation
     )
-    if refined_accuracy.unbounded and refined_accuracy.worst is not None:
-        at_worst = refined_accuracy.worst
+    if reference.unbounded and reference.worst is not None:
+        at_worst = reference.worst
     diagonal = refined.cloud.diagonal_m
     relative = position / diagonal if diagonal > 0 else np.inf
     return pose_accuracy.Accuracy(
-        position, rotation, relative, True, at_worst, refined_accuracy.unbounded
+        position, rotation, relative, True, at_worst, reference.unbounded
     )
+
+
+def _common(
+    views: Views, poses: Float64, refined: Float64, row_of: dict[int, int], sample: set[int]
+) -> Views:
+    """Return the views of the sample that have a given and a refined pose (N, 4, 4)."""
+    known = np.isfinite(poses[:, 0, 0]) & np.isfinite(refined[:, 0, 0])
+    return [view for view in views if view.index in sample and known[row_of[view.index]]]
 
 
 def _deviation(
-    poses: Float64, refined: Reconstruction, views: Views
+    poses: Float64, refined: Float64, views: Views, row_of: dict[int, int]
 ) -> pose_deviation.Deviation | None:
-    """Compare the poses with registered pairs of views that have a given and a refined pose."""
-    row_of = {f.index: k for k, f in enumerate(refined.diagnostics.frames)}
-    common = np.flatnonzero(np.isfinite(poses[:, 0, 0]) & np.isfinite(refined.trajectory[:, 0, 0]))
-    common_rows = set(common.tolist())
-    posed = [view for view in views if row_of[view.index] in common_rows]
-    if len(posed) < 2:
+    """Compare the poses with registered pairs of views, around the refined poses."""
+    if len(views) < 2:
         return None
-    rows = [row_of[view.index] for view in posed]
-    depth_m = float(np.median([view.depth for view in posed]))
-    fit = pose_deviation.fitted(
-        pose_deviation.measured_pairs(posed, refined.trajectory[rows]), depth_m
-    )
+    rows = [row_of[view.index] for view in views]
+    depth_m = float(np.median([view.depth for view in views]))
+    fit = pose_deviation.fitted(pose_deviation.measured_pairs(views, refined[rows]), depth_m)
     return pose_deviation.deviation(fit, poses[rows]) if fit.dof > 0 else None
 
 
 def _reasons(
+    recording: Recording,
     poses: Float64,
+    refined: Float64,
     accuracy: pose_accuracy.Accuracy,
-    deviation: pose_deviation.Deviation | None,
-    as_given: cross_view_agreement.CrossViewConsistency,
-    as_refined: cross_view_agreement.CrossViewConsistency,
-    refined: Reconstruction,
-    tolerance_m: float | None,
+    found: tuple[pose_deviation.Deviation | None, pose_causes.Cause | None],
+    compared: tuple[
+        cross_view_agreement.CrossViewConsistency, cross_view_agreement.CrossViewConsistency
+    ],
+    allowed_m: float,
 ) -> Iterator[Reason]:
-    frames = refined.diagnostics.frames
-    indices = [f.index for f in frames]
+    indices = recording.indices.tolist()
     full_range = ((indices[0], indices[-1]),)
-    before, after = _overlapping(as_given), _overlapping(as_refined)
+    before, after = map(_overlapping, compared)
     if before < _MIN_OVERLAPPING * after:
         text = (
             f"Only {before:.0%} of the images overlap with another under these poses; under the "
             f"refined ones {after:.0%} do."
         )
         yield Reason("images_disagree", full_range, text)
-    yield from checks.cross_view_reasons(as_given, full_range)
-    allowed_m = checks.tolerance_of(tolerance_m, refined.cloud.diagonal_m)
+    yield from checks.cross_view_reasons(compared[0], full_range)
+    deviation, cause = found
     contradictions = (
-        [] if deviation is None else [*_contradiction(deviation, allowed_m, full_range)]
+        [] if deviation is None else [*_contradiction(deviation, cause, allowed_m, full_range)]
     )
     yield from contradictions
     # Uncertain poses are no further reason if they are known to be wrong.
@@ -482,8 +625,11 @@ def _reasons(
         if not contradictions or r.code != "uncertain_poses"
     )
     # The camera itself may have moved abruptly; then the refined poses jump as well.
-    moments = [FrameTime(f.index, f.timestamp) for f in frames]
-    actual_jumps = {k for k, _ in find_jumps(_or_none(refined.trajectory), moments)}
+    moments = [
+        FrameTime(index, time)
+        for index, time in zip(indices, recording.timestamps.tolist(), strict=True)
+    ]
+    actual_jumps = {k for k, _ in find_jumps(_or_none(refined), moments)}
     jumped = {
         k: words for k, words in find_jumps(_or_none(poses), moments) if k not in actual_jumps
     }
@@ -499,6 +645,7 @@ def _reasons(
 
 def _contradiction(
     deviation: pose_deviation.Deviation,
+    cause: pose_causes.Cause | None,
     allowed_m: float,
     full_range: tuple[frame_ranges.Range, ...],
 ) -> Iterator[Reason]:
@@ -516,6 +663,8 @@ def _contradiction(
         text += f" The motion from frame {a} to {b} is wrong by itself"
         others = len(steps) - 1
         text += f", and {others} other{'' if others == 1 else 's'}." if others else "."
+    if cause is not None:
+        text += f" The cause is probably {cause.text}."
     yield Reason("inconsistent_poses", steps or full_range, text)
 
 
@@ -523,6 +672,22 @@ def _or_none(poses: Float64) -> list[Float64 | None]:
     return [T if np.isfinite(T).all() else None for T in poses]
 
 
-def _consistency(recording: Recording, poses: Float64) -> map_agreement.Consistency | None:
-    consistency = map_agreement.map_consistency(recording, poses)
-    return consistency if consistency.pairs else None
+def _consistencies(
+    sample: Recording,
+    deviation: pose_deviation.Deviation | None,
+    poses: Sequence[Float64],
+) -> list[map_agreement.Consistency | None]:
+    """Return the map consistency of the sample under different poses, over pairs that overlap."""
+    if deviation is None:
+        return [None] * len(poses)
+    ids, edges = deviation.fit.graph.ids, deviation.fit.graph.edges
+    pairs = np.searchsorted(sample.indices, ids[evenly_spaced(edges, _COMPARED_PAIRS)])
+    unit = sample.metadata.get("depth_unit_m")
+    rows = np.unique(pairs)
+    images = {k: map_agreement.SurfaceImage.of(sample.image(k), unit) for k in rows.tolist()}
+    positions = [(int(i), int(j)) for i, j in np.searchsorted(rows, pairs)]
+    found = [
+        map_agreement.consistency_of_images(list(images.values()), T[rows], positions)
+        for T in poses
+    ]
+    return [consistency if consistency.pairs else None for consistency in found]

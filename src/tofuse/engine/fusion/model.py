@@ -50,10 +50,14 @@ class ModelBuilder:
         How views are fused.
     spill
         The store of views; by default a tenth of the memory for voxels, the others on disk.
+    surface
+        Whether range images make a surface; otherwise the model is a sketch.
     """
 
-    def __init__(self, options: Fusion, spill: Spill[Any] | None = None) -> None:
-        self._options = options
+    def __init__(
+        self, options: Fusion, spill: Spill[Any] | None = None, *, surface: bool = True
+    ) -> None:
+        self._options, self.surface = options, surface
         if spill is None:
             spill = Spill(options.memory_mb * 1_000_000 // 10)
         self._ranges = StoredViews(spill)
@@ -102,6 +106,8 @@ class ModelBuilder:
         errors
             Errors of the camera to correct; see `Refinement.errors`.
         """
+        if not self.surface:
+            return Model(self.sketch(poses), None)
         if len(self._clouds) or not len(self._ranges):
             clouds = (
                 replace(c, points=without_errors(c.points, errors)) if errors else c

@@ -18,7 +18,7 @@ from tofuse.engine.frames import POSES_BY, Frame, RangeFrame, Recording, Source
 from tofuse.engine.graph import external_sensors
 from tofuse.engine.mapping.config import Config, check_views, kind_of
 from tofuse.engine.mapping.falloff import RANGE, estimate_falloff
-from tofuse.engine.mapping.trial import Prepare, trial
+from tofuse.engine.mapping.trial import RUNS, Prepare, trial
 from tofuse.engine.noise import NOISE, NoiseModel, noise_model_for
 from tofuse.engine.parts import name_of
 from tofuse.engine.progress import Progress, Silent
@@ -38,6 +38,7 @@ def adapted(
     recording: Recording,
     threads: int | None = None,
     progress: Progress | None = None,
+    trial_runs: int = RUNS,
 ) -> Config:
     """Return the configuration with all values that depend on the recording filled in.
 
@@ -56,6 +57,8 @@ def adapted(
         Number of threads; None: all cores. The result does not depend on it.
     progress
         Is notified of corrections that are left out.
+    trial_runs
+        Number of runs of views of a trial.
 
     Raises
     ------
@@ -71,7 +74,7 @@ def adapted(
             config = _fitted(config, recording)
         for item in config.corrections:
             if item.needs_trial:
-                config = _after_trial(config, item, recording, progress or Silent())
+                config = _after_trial(config, item, recording, progress or Silent(), trial_runs)
         left_out = sum(c.disabled for c in config.corrections)
         if filters_learn and left_out > sum(c.disabled for c in initial.corrections):
             # Filters must learn from images without the corrections that are left out.
@@ -154,13 +157,13 @@ def _fitted(config: Config, recording: Recording) -> Config:
 
 @timing("trials")
 def _after_trial(
-    config: Config, item: Correction, recording: Recording, progress: Progress
+    config: Config, item: Correction, recording: Recording, progress: Progress, runs: int
 ) -> Config:
     """Return the configuration after the trial of a correction."""
     others = replace(config, corrections=tuple(c for c in config.corrections if c is not item))
     uncorrected, corrected = _preparation(others), _preparation(config)
     if _changes(config, recording, uncorrected, corrected):
-        result = trial(recording, uncorrected, corrected)
+        result = trial(recording, uncorrected, corrected, runs)
         tested = item.after_trial(result.improves, result.strength, result.error)
         if tested.disabled:
             progress.note(f"correction {name_of(item)} not applied: {result.in_words()}")

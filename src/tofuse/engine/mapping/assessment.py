@@ -142,7 +142,7 @@ class Assessment:
                 if d > 0 and index in self.tracked.poses
             ),
             ambiguity_m=observations.ambiguity_m,
-            scans=model.mesh is None,
+            scans=model.mesh is None and observations.model.surface,
             repeated=tuple(self.log.repeated),
             interruptions=tuple(self.log.interruptions),
             priors=closed.sensors.records,
@@ -352,7 +352,7 @@ class Assessment:
 
     def _surface_reasons(self, model: Model) -> tuple[Reason, ...]:
         """Return the reason if there is no surface."""
-        if model.mesh is not None and len(model.mesh):
+        if not self.observations.model.surface or (model.mesh is not None and len(model.mesh)):
             return ()
         text = (
             "No connected surface is left at this resolution (--voxel): mesh.ply and mesh.glb are "

@@ -220,7 +220,7 @@ class BackEnd:
             refinement.errors,
         )
         initial_poses = dict(zip(ids, closed.sequential, strict=True))
-        return fused, model.sketch(initial_poses) if poses_changed else None
+        return fused, model.sketch(initial_poses) if poses_changed and model.surface else None
 
     @timing("checking")
     def _result(

@@ -36,16 +36,24 @@ def map_views(
 
     Only these are read. The odometry of the configuration must be `GivenPoses`.
     """
-    first = recording.first_readable()
-    depth = 1.0 if first is None else first.mean_depth
-    selected: ViewStore[_Unread] = ViewStore(_SPACING)
-    for index, T in sorted(poses.items()):
-        selected.push(_Unread(index, depth), T)
+    selected = spaced_frames(recording, poses, _SPACING)
     return [
         PosedView(prepared_view(frame, config, past), poses[frame.index])
-        for frame, past in _read(recording, config, [unread.index for unread in selected.views])
+        for frame, past in _read(recording, config, selected)
         if isinstance(frame, RangeFrame)
     ]
+
+
+def spaced_frames(
+    recording: Recording, poses: Mapping[int, Float64], spacing: Spacing
+) -> list[int]:
+    """Return the frames that are spaced by motion, by poses (4, 4) of frames by index."""
+    first = recording.first_readable()
+    depth = 1.0 if first is None else first.mean_depth
+    selected: ViewStore[_Unread] = ViewStore(spacing)
+    for index, T in sorted(poses.items()):
+        selected.push(_Unread(index, depth), T)
+    return [unread.index for unread in selected.views]
 
 
 def filtered_frames(

@@ -54,6 +54,8 @@ class Mapper:
         Receives frames and stages.
     tracker
         Replaces that of the configuration's odometry.
+    surface
+        Whether images make a surface; otherwise the model is a sketch, for judging poses alone.
     """
 
     def __init__(
@@ -65,6 +67,7 @@ class Mapper:
         loops: Sequence[PriorLoop] = (),
         progress: Progress | None = None,
         tracker: Tracker | None = None,
+        surface: bool = True,
     ) -> None:
         check_number(seed, Bounds(0), "seed", whole=True)
         self.config = from_method(config) if isinstance(config, str) else config
@@ -72,7 +75,7 @@ class Mapper:
         self.seed = seed
         self.threads = threads if threads is not None else thread_count()
         self.watch = current()
-        self._prior_loops = tuple(loops)
+        self._prior_loops, self._surface = tuple(loops), surface
         self._progress = progress or Silent()
         self._sequence = FrameSequence()
         self._log = FrameLog()
@@ -86,7 +89,9 @@ class Mapper:
         self._preparation = Preparation(self.config)
         started = self._given_tracker or self.config.odometry.start(self.seed, self.config.search)
         self._tracker: Tracker = started
-        self._observations = Observations(self.config, self.seed, self._prior_loops)
+        self._observations = Observations(
+            self.config, self.seed, self._prior_loops, surface=self._surface
+        )
         self._live_poses = LivePoses(self._observations.loops, self.config.optimiser)
         self._component = 0
 

@@ -53,7 +53,9 @@ class Observations:
         Some frames for the report.
     """
 
-    def __init__(self, config: Config, seed: int, prior_loops: Sequence[PriorLoop]) -> None:
+    def __init__(
+        self, config: Config, seed: int, prior_loops: Sequence[PriorLoop], *, surface: bool = True
+    ) -> None:
         loop_frames = [frame for loop in prior_loops for frame in (loop.i, loop.j)]
         scratch = Scratch(views_bytes(config.memory_mb))
         self.views: ViewStore[PreparedView] = ViewStore(
@@ -62,7 +64,7 @@ class Observations:
         self.loops = config.loops.start(seed, prior_loops, self.views, config.search)
         self.samples = frame_samples.FrameSamples()
         self.refiner = config.refinement.start(self.views)
-        self.model = ModelBuilder(config.fusion)
+        self.model = ModelBuilder(config.fusion, surface=surface)
         self._places = Spacing(views_per_place=_VIEWS_PER_PLACE).places()
         self._checks = frame_samples.EvenSample[Spilled[RangeFrame]](_CHECKED_IMAGES)
         self._checks_spill: Spill[RangeFrame] = Spill(checked_bytes(config.memory_mb))

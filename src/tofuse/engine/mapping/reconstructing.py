@@ -105,13 +105,13 @@ def reconstruct(
 def reconstruct_with_views(
     recording: Recording, config: Config, *, threads: int | None = None, progress: Progress
 ) -> tuple[Reconstruction, Sequence[PosedView[PreparedView]]]:
-    """Reconstruct a recording, without self-calibration; returns its prepared views as well.
+    """Reconstruct a recording without surface and self-calibration; returns its views as well.
 
     The views are those that refinement works on: corrected, filtered, and spaced by motion.
     """
     config = adapted(config, recording, threads, progress)
     with threadpool_limits(1):
-        mapper = _track(recording, config, 0, threads, (), progress)
+        mapper = _track(recording, config, 0, threads, (), progress, surface=False)
         result = mapper.finish()
     return _with_facts(result, recording, config), mapper.views
 
@@ -124,6 +124,8 @@ def _track(
     loops: Sequence[PriorLoop],
     progress: Progress,
     tracked_frames: TrackedFrames | None = None,
+    *,
+    surface: bool = True,
 ) -> Mapper:
     """Push all frames to a new mapper."""
     progress.stage("tracking", len(recording))
@@ -131,7 +133,13 @@ def _track(
     if tracked_frames is not None:
         tracker = tracked_frames.tracker(tracker)
     mapper = Mapper(
-        config, seed=seed, threads=threads, loops=loops, progress=progress, tracker=tracker
+        config,
+        seed=seed,
+        threads=threads,
+        loops=loops,
+        progress=progress,
+        tracker=tracker,
+        surface=surface,
     )
     with mapper.watch.running(), timing("reading"):
         unreadable = push_frames(mapper, recording, config.window)

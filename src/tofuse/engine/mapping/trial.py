@@ -87,9 +87,8 @@ def pooled(estimates: Float64, information: Float64) -> tuple[float, float]:
     return mean, float(np.sqrt(weight @ (values - mean) ** 2))
 
 
-# Views per run, each run being one sample; and starts of the runs as fractions of the recording.
-_VIEWS = 4
-_STARTS = tuple(k / 11 for k in range(12))
+# Views per run, each run being one sample; and number of runs, all over the recording.
+_VIEWS, RUNS = 4, 12
 # Desired motion between the views of a run: rad, or as a fraction of the depth; and the largest
 # factor by which the stride is changed in one step.
 _DESIRED_ANGLE, _DESIRED_DISTANCE = 0.17, 0.085
@@ -205,7 +204,9 @@ class Trial:
         return f"overlapping views do not clearly disagree as it predicts ({estimate})"
 
 
-def trial(recording: Recording, uncorrected: Prepare, corrected: Prepare) -> Trial:
+def trial(
+    recording: Recording, uncorrected: Prepare, corrected: Prepare, runs: int = RUNS
+) -> Trial:
     """Estimate the strength of the error that a correction removes.
 
     Parameters
@@ -215,12 +216,14 @@ def trial(recording: Recording, uncorrected: Prepare, corrected: Prepare) -> Tri
     uncorrected, corrected
         Prepare a frame for tracking without and with the correction. Called with the same frames,
         run by run.
+    runs
+        Number of runs.
     """
     if len(recording) < _VIEWS + _MIN_RUNS - 1:
         return Trial((), ())
     views = _AlignedViews(recording, uncorrected, corrected)
     stride, visited, results = 1, set(), []
-    for fraction in _STARTS:
+    for fraction in (k / (runs - 1) for k in range(runs)):
         last = len(recording) - 1 - (_VIEWS - 1) * stride
         start = max(0, round(fraction * last))
         stride = views.stride(start, stride)

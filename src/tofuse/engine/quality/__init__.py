@@ -2,7 +2,7 @@
 
 `pose_accuracy` bounds the errors of poses by their covariance. `cross_view_agreement` and
 `map_agreement` compare overlapping images at given poses, `pose_deviation` the poses with
-registrations, `trajectory_errors` with a reference. `changes` tells what moved between two
+registrations, `pose_causes` names what is wrong with them, `trajectory_errors` with a reference. `changes` tells what moved between two
 recordings; `ambiguous_frames` where a scene repeats itself.
 """
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         frame_samples,
         map_agreement,
         pose_accuracy,
+        pose_causes,
         pose_deviation,
         trajectory_errors,
     )

@@ -149,9 +149,11 @@ def compare_views(
     if groups is not None:
         facing &= np.not_equal.outer(groups, groups)
 
+    prepared = run_all([partial(pair_agreement.ComparedView.of, v, options) for v in views])
+
     def compared(i: int, j: int) -> PairConsistency | None:
         T_i_j = se3.inverse(poses[i]) @ poses[j]
-        a = pair_agreement.agreement(views[j], views[i], T_i_j, options)
+        a = pair_agreement.Comparison(prepared[j], prepared[i], options).at(T_i_j)
         support, contradiction = (a.support + a.clash) * a.points, a.violation * a.points
         if not support + contradiction > _MIN_OVERLAP * a.points:
             return None

@@ -250,13 +250,18 @@ def pair_agreement(
     return PairAgreement(i, j, overlap, compared, inliers, squares)
 
 
-def consistency_of_images(images: Sequence[SurfaceImage], poses: ArrayLike) -> Consistency:
-    """Map consistency of prepared views under poses (N, 4, 4) T_world_camera, over all pairs.
+def consistency_of_images(
+    images: Sequence[SurfaceImage],
+    poses: ArrayLike,
+    pairs: Sequence[tuple[int, int]] | None = None,
+) -> Consistency:
+    """Map consistency of prepared views under poses (N, 4, 4) T_world_camera.
 
-    Independent of the number of threads.
+    Over all pairs, unless `pairs` i < j are given. Independent of the number of threads.
     """
     T = np.asarray(poses, float)
-    pairs = [(i, j) for i in range(len(images)) for j in range(i + 1, len(images))]
+    if pairs is None:
+        pairs = [(i, j) for i in range(len(images)) for j in range(i + 1, len(images))]
 
     def compared(i: int, j: int) -> PairAgreement | None:
         return pair_agreement(images[i], images[j], se3.inverse(T[i]) @ T[j], i, j)

@@ -43,7 +43,7 @@ from tofuse.engine.graph import (
     sparse,
 )
 from tofuse.engine.quality.pose_accuracy import ObservedErrors, accuracy_of, without_degenerate
-from tofuse.engine.quality.trajectory_errors import align
+from tofuse.engine.quality.trajectory_errors import align, displacement
 from tofuse.engine.refinement import joint_alignment
 from tofuse.engine.stored_views import PosedView, SampledView, overlaps, pair_equations
 from tofuse.engine.views import PreparedView
@@ -108,7 +108,7 @@ _PRIOR_DOF = 6.0
 # Systematic errors of the camera, equal in all views of a place, affect no residual. Ratio of the
 # squared perturbations of the true poses to those in the residuals: typically, and in 95 % of
 # recordings (docs/uncertainty.md).
-_TYPICAL_RATIO, _MAX_RATIO = 1.5, 6.0
+TYPICAL_RATIO, _MAX_RATIO = 1.5, 6.0
 # Information of a direction, in units of 1 cm and 1 degree, that no measurement constrains.
 _MIN_INFORMATION = 1e-4
 _MIN_SCALE = 1e-6
@@ -157,6 +157,9 @@ class Deviation:
         (V,) indices of the frames that were compared.
     of_views_m
         (V,) displacement of each, whose rms is `estimate_m`.
+    errors, correction
+        (V, 6) perturbations from the fitted poses to these, and the part whose rms is `estimate_m`:
+        m and rad.
     steps
         (S, 2) positions of the views between which the motion alone is inconsistent.
     fit
@@ -169,6 +172,8 @@ class Deviation:
     distance_m: float
     ids: Intp
     of_views_m: Float64
+    errors: Float64 = field(repr=False)
+    correction: Float64 = field(repr=False)
     steps: Intp
     fit: Fit = field(repr=False)
 
@@ -176,6 +181,13 @@ class Deviation:
     def consistent(self) -> bool:
         """Whether the depth does not contradict the poses."""
         return self.at_least_m == 0
+
+    @property
+    def proven(self) -> Float64:
+        """(2,) rms of positions and rotations that the estimate corrects, after alignment."""
+        given = self.fit.graph.poses @ se3.exp(self.errors)
+        corrected = self.fit.graph.poses @ se3.exp(self.errors - self.correction)
+        return np.array(displacement(corrected, given))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of `judge.json`."""
@@ -246,7 +258,7 @@ def deviation(fit: Fit, poses: Float64) -> Deviation:
     x = se3.log(se3.inverse(graph.poses) @ aligned)
     problem = _Corrections(graph, fit.depth_m)
     f_quantile = float(fdtri(fit.dof, fit.scale_dof, _CONFIDENCE))
-    estimate = problem.smallest_correction(x, _TYPICAL_RATIO * fit.dof)
+    estimate = problem.smallest_correction(x, TYPICAL_RATIO * fit.dof)
     bound = problem.smallest_correction(x, _MAX_RATIO * f_quantile * fit.dof)
     fit_accuracy = accuracy_of(graph_covariances.GraphCovariances(graph), ObservedErrors(), 0.0)
     fit_error_m = float(np.hypot(fit_accuracy.position_m, fit.depth_m * fit_accuracy.rotation_rad))
@@ -257,6 +269,8 @@ def deviation(fit: Fit, poses: Float64) -> Deviation:
         problem.norm(x),
         graph.ids,
         problem.lengths(estimate),
+        x,
+        estimate,
         _steps(graph, aligned),
         fit,
     )

@@ -121,25 +121,39 @@ def agreement(
 
 
 @dataclass(frozen=True, eq=False)
+class ComparedView:
+    """A view prepared for comparisons with others: some of its points, and its `nearest_depth`."""
+
+    view: PreparedView
+    points: ViewPoints
+    nearest: Float32
+
+    @classmethod
+    def of(cls, view: PreparedView, options: AgreementOptions) -> ComparedView:
+        """Prepare a view."""
+        return cls(view, sampled_points(view, options.points), nearest_depth(view))
+
+
+@dataclass(frozen=True, eq=False)
 class Comparison:
     """Two views prepared for evaluation at many poses.
 
     Attributes
     ----------
-    directions
-        Points of one view, the view that they are projected into and its `nearest_depth`: from
-        source to target, and from target to source.
+    source, target
+        The views.
+    options
+        Of the comparison.
     """
 
-    directions: tuple[
-        tuple[ViewPoints, PreparedView, Float32], tuple[ViewPoints, PreparedView, Float32]
-    ]
+    source: ComparedView
+    target: ComparedView
     options: AgreementOptions
 
     @property
     def unknown_falloff(self) -> bool:
         """Whether both views' amplitude falls off towards the corners by an unknown exponent."""
-        return all(view.unknown_falloff for _, view, _ in self.directions)
+        return self.source.view.unknown_falloff and self.target.view.unknown_falloff
 
     @classmethod
     def of(
@@ -147,9 +161,9 @@ class Comparison:
     ) -> Comparison:
         """Prepare two views."""
         options = AgreementOptions() if options is None else options
-        forward = sampled_points(source, options.points), target, nearest_depth(target)
-        backward = sampled_points(target, options.points), source, nearest_depth(source)
-        return cls((forward, backward), options)
+        return cls(
+            ComparedView.of(source, options), ComparedView.of(target, options), options
+        )
 
     def at(self, T_target_source: Float64) -> Agreement:
         """Return the agreement at a pose (4, 4); see `agreement`."""
@@ -159,13 +173,15 @@ class Comparison:
         count = 0
         differences = []
         # The signs of the differences change with the direction.
-        for (points, view, nearest), pose, sign in zip(
-            self.directions, (T, se3.inverse(T)), (1, -1), strict=True
+        for source, target, pose, sign in (
+            (self.source, self.target, T, 1),
+            (self.target, self.source, se3.inverse(T), -1),
         ):
+            points = source.points
             count += len(points.points)
             log_albedos = np.empty((2, len(points.points)), np.float32)
             pose = np.ascontiguousarray(pose)
-            total += _one_direction(points, view, nearest, pose, options, log_albedos)
+            total += _one_direction(points, target, pose, options, log_albedos)
             differences.append(sign * log_albedos[:, np.isfinite(log_albedos[0])])
         on_surface, violation = total[kernels.SUPPORT], total[kernels.VIOLATION]
         albedo_ratio, slants = np.hstack(differences)
@@ -232,15 +248,14 @@ def _falloff(albedo_ratio: Float32, slants: Float32, albedo: float) -> float:
 
 def _one_direction(
     points: ViewPoints,
-    view: PreparedView,
-    nearest: Float32,
+    target: ComparedView,
     T: Float64,
     options: AgreementOptions,
     log_albedos: Float32,
 ) -> Float64:
-    grid = view.projection
+    view, grid = target.view, target.view.projection
     image = kernels.Image(
-        view.planes, view.plane_variance, view.albedo, nearest, grid.lookup, grid.frame
+        view.planes, view.plane_variance, view.albedo, target.nearest, grid.lookup, grid.frame
     )
     tolerance = kernels.Tolerance(
         options.sigmas, options.floor_m, options.floor_fraction, float(np.cos(options.max_angle))
