@@ -6,8 +6,8 @@ import re
 
 import numpy as np
 import pytest
-
 from tests.helpers.measured_graph import DEPTH_M, RIGID, jumped, measured
+
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pose_causes import cause_of
 from tofuse.engine.quality.pose_deviation import deviation, fitted
@@ -63,7 +63,11 @@ def test_each_cause_is_named(kind, seed) -> None:
     assert found.kind == kind
     assert found.explained > 0.7
     assert found.frames == ((15, 16) if kind == "jump" else None)
-    size = {"scale": r"1\.[01]\d* times", "time": r"lag behind .* (49|50|51) ms", "jump": r"4\d mm and 1\.[67]"}
+    size = {
+        "scale": r"1\.[01]\d* times",
+        "time": r"lag behind .* (49|50|51) ms",
+        "jump": r"4\d mm and 1\.[67]",
+    }
     assert re.search(size.get(kind, ""), found.text)
 
 

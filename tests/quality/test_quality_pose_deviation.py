@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 from scipy.optimize import brentq
-
 from tests.helpers.measured_graph import DEPTH_M, RIGID, SIGMA, jumped, measured
+
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pose_deviation import _Corrections, deviation, fitted
+
 
 def around(count=24):
     """Poses on a circle of 1 m, looking along it."""

@@ -7,8 +7,7 @@ with more support by the images counts.
 
 Refined poses have errors too, mostly in poorly observable directions, so a distance from them does
 not prove the given poses wrong. Pairs of views, registered around the refined poses, test that
-(`pose_deviation`). The error bound is the deviation that they prove, plus that of the remainder:
-the remaining distance from the refined poses and their own bound, which are independent.
+(`pose_deviation`). The error bound is the distance from the refined poses and their own bound.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ from tofuse.engine.quality import (
     pose_deviation,
     trajectory_errors,
 )
-from tofuse.engine.refinement import propagate_poses
+from tofuse.engine.refinement import Joint, propagate_poses
 from tofuse.engine.results import Reason, Reconstruction, Verdict, accuracy_card, checks, verdicts
 from tofuse.engine.stored_views import PosedView, Spacing
 from tofuse.engine.tracking import FrameTime, find_jumps, given
@@ -63,15 +62,17 @@ Views = Sequence[PosedView[PreparedView]]
 
 _length = accuracy_card.length
 
-# Motion between the views of the sample, which overlap widely, and the fewest of them.
-_SPACING = Spacing(angle=0.25, distance=0.125)
-_MIN_SAMPLE = 24
+# Motion between the views of the sample, that between keyframes, and the fewest of them.
+_SPACING = Spacing(angle=0.2, distance=0.1)
+_MIN_SAMPLE = 32
 # Jumps whose frames are part of the sample.
 _MAX_JUMPS = 20
 # Frames of the sample that stay in memory.
 _KEPT = 64
-# Runs of views of the trial of a correction: the sample has few that share no view.
+# Runs of views of the trial of a correction: two thirds of those of a run.
 _TRIAL_RUNS = 8
+# Earlier views that each one of the sample is refined with.
+_NEIGHBOURS = 6
 # Number of views that are compared under the poses, and of pairs for map consistency.
 _COMPARED, _COMPARED_PAIRS = 40, 60
 # With a smaller fraction of supporting measurements the recording is tracked again.
@@ -200,7 +201,9 @@ def judge(
     config = replace(
         from_method("default", kind), tolerance_m=tolerance_m, priors=(), self_calibration=False
     )
-    given_config = replace(config, odometry=given.GivenPoses())
+    given_config = replace(
+        config, odometry=given.GivenPoses(), refinement=Joint(neighbours=_NEIGHBOURS)
+    )
     check_views(given_config, kind)
 
     sample = _sample_of(recording, poses)
@@ -245,7 +248,7 @@ def judge(
             if scale or _support(as_scaled) > _support(as_given):
                 poses, as_given, estimate = multiplied, as_scaled, replace(estimate, applied=True)
                 unsupported = _support(as_given) < _SUPPORTED
-        given_config = adaptation.adapted(given_config, sample, threads, progress, _TRIAL_RUNS)
+        given_config = adaptation.adapted(given_config, recording, threads, progress, _TRIAL_RUNS)
     sampled, views = reconstructed(adaptation.with_odometry(sample, poses[rows]), given_config)
     refined_poses = _propagated(poses, rows, sampled.trajectory)
     as_refined, started = as_given, True
@@ -290,9 +293,8 @@ def judge(
 
     def reconstruct() -> Reconstruction:
         source = adaptation.with_odometry(recording, poses) if started else recording
-        return reconstructing.reconstruct(
-            source, given_config if started else config, threads=threads, progress=progress
-        )
+        config_used = replace(given_config, refinement=config.refinement) if started else config
+        return reconstructing.reconstruct(source, config_used, threads=threads, progress=progress)
 
     return Judgement(
         poses,
@@ -548,17 +550,18 @@ def _accuracy(
 ) -> pose_accuracy.Accuracy:
     """Return the bound of the given poses, from their distance from the refined ones.
 
-    The part of the distance that the images prove adds to the bound. The remainder may be an error
-    of either, independent of what bounds the refined ones.
+    Unless images contradict the poses, that distance may be an error of either, and is independent
+    of the bound of the refined ones. Otherwise both may have the same direction: the refinement
+    began with the wrong poses.
     """
     reference = refined.diagnostics.accuracy
     common = np.flatnonzero(np.isfinite(distances))
     if not reference.assessed or not len(common):
         return reference
     moved = np.array(trajectory_errors.displacement(refined_poses[common], poses[common]))
-    proven = moved if deviation is None else np.minimum(deviation.proven, moved)
     stated = np.array([reference.position_m, reference.rotation_rad])
-    position, rotation = (proven + np.hypot(moved - proven, stated)).tolist()
+    consistent = deviation is not None and deviation.consistent
+    position, rotation = (np.hypot(moved, stated) if consistent else moved + stated).tolist()
     worst = int(common[np.argmax(distances[common])])
     at_worst = pose_accuracy.WorstFrame(
         int(indices[worst]), float(distances[worst]) + reference.position_m, rotation
@@ -567,9 +570,7 @@ def _accuracy(
         at_worst = reference.worst
     diagonal = refined.cloud.diagonal_m
     relative = position / diagonal if diagonal > 0 else np.inf
-    return pose_accuracy.Accuracy(
-        position, rotation, relative, True, at_worst, reference.unbounded
-    )
+    return pose_accuracy.Accuracy(position, rotation, relative, True, at_worst, reference.unbounded)
 
 
 def _common(
@@ -681,6 +682,11 @@ def _consistencies(
     if deviation is None:
         return [None] * len(poses)
     ids, edges = deviation.fit.graph.ids, deviation.fit.graph.edges
+    # Of every other eighth of the views, which overlap among each other.
+    eighth = np.arange(len(ids)) * 8 // len(ids)
+    edges = edges[(eighth[edges] % 2 == 0).all(1)]
+    if not len(edges):
+        return [None] * len(poses)
     pairs = np.searchsorted(sample.indices, ids[evenly_spaced(edges, _COMPARED_PAIRS)])
     unit = sample.metadata.get("depth_unit_m")
     rows = np.unique(pairs)

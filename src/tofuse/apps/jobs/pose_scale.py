@@ -67,12 +67,15 @@ def with_scale(poses: Float64, factor: float) -> Float64:
 
 def estimated_scale(views: Sequence[PreparedView], poses: Float64) -> PoseScale | None:
     """Return the scale of poses (N, 4, 4) of N views; None if too few pairs can be registered."""
-    found = [_registered(views, poses, start) for start in _STARTS]
+    found = [_registered(views, poses, _STARTS[0])]
+    as_metres = _fitted(poses, found[0])
+    if as_metres is not None and not as_metres.is_other_unit:
+        return as_metres
+    found.append(_registered(views, poses, _STARTS[1]))
     first = _fitted(poses, [max(pair, key=_probability) for pair in zip(*found, strict=True)])
     if first is None:
         return None
-    again = _registered(views, poses, first.factor)
-    found.append(again)
+    found.append(_registered(views, poses, first.factor))
     return _fitted(poses, [max(pair, key=_probability) for pair in zip(*found, strict=True)])
 
 

@@ -2,8 +2,8 @@
 
 `pose_accuracy` bounds the errors of poses by their covariance. `cross_view_agreement` and
 `map_agreement` compare overlapping images at given poses, `pose_deviation` the poses with
-registrations, `pose_causes` names what is wrong with them, `trajectory_errors` with a reference. `changes` tells what moved between two
-recordings; `ambiguous_frames` where a scene repeats itself.
+registrations, `trajectory_errors` with a reference; `pose_causes` names what is wrong with them.
+`changes` tells what moved between two recordings; `ambiguous_frames` where a scene repeats itself.
 """
 
 from typing import TYPE_CHECKING

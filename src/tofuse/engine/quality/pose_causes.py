@@ -9,7 +9,7 @@ criterion (Schwarz 1978), of which a Q of correct poses is the minimum.
 |---|---|---|
 | scale | all positions, in proportion | 1 |
 | time | the motion in a constant time | 1 |
-| mount | a constant motion in the camera's frame: another point of the device, a turned camera | 6 |
+| mount | a constant motion in the camera's frame, as of another point of the device | 6 |
 | turning | steps turned in proportion to their length | 3 |
 | drift | steps wrong in proportion to their length | 6 |
 | jump | all poses from a view on, rigidly | 6, and the view |
@@ -35,6 +35,8 @@ Kind = Literal["scale", "time", "mount", "turning", "drift", "jump"]
 # Differences of the criterion, twice the logarithm of a probability ratio: "very strong" and
 # "strong" evidence (Kass and Raftery 1995).
 _OVER_NONE, _OVER_OTHERS = 10.0, 6.0
+# Fewest views on either side of a jump: fewer may be wrong by themselves.
+_MIN_SIDE = 3
 # Fraction of the contradiction that a cause explains.
 _MOST = 2 / 3
 
@@ -157,7 +159,7 @@ def _hypotheses(found: Deviation, velocity: Float64) -> Iterator[_Hypothesis]:
         drift[k:] += length * moved[k:, k]
     yield _Hypothesis("turning", drift[..., 3:])
     yield _Hypothesis("drift", drift)
-    for k in range(1, n):
+    for k in range(_MIN_SIDE, n - _MIN_SIDE + 1):
         jump = np.zeros((n, 6, 6))
         jump[k:] = moved[k:, k]
         yield _Hypothesis("jump", jump, k)

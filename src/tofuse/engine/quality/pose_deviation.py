@@ -43,14 +43,14 @@ from tofuse.engine.graph import (
     sparse,
 )
 from tofuse.engine.quality.pose_accuracy import ObservedErrors, accuracy_of, without_degenerate
-from tofuse.engine.quality.trajectory_errors import align, displacement
+from tofuse.engine.quality.trajectory_errors import align
 from tofuse.engine.refinement import joint_alignment
 from tofuse.engine.stored_views import PosedView, SampledView, overlaps, pair_equations
 from tofuse.engine.views import PreparedView
 
 _ALIGNMENT = projective.ProjectiveOptions()
-# Pairs are selected as in joint refinement.
-_PAIRS = pair_equations.RefineOptions()
+# Pairs are selected as in joint refinement, with fewer per view: each has six measurements.
+_PAIRS = pair_equations.RefineOptions(neighbours=6)
 
 
 def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> PoseGraph:
@@ -157,9 +157,8 @@ class Deviation:
         (V,) indices of the frames that were compared.
     of_views_m
         (V,) displacement of each, whose rms is `estimate_m`.
-    errors, correction
-        (V, 6) perturbations from the fitted poses to these, and the part whose rms is `estimate_m`:
-        m and rad.
+    errors
+        (V, 6) perturbations from the fitted poses to these, m and rad.
     steps
         (S, 2) positions of the views between which the motion alone is inconsistent.
     fit
@@ -173,7 +172,6 @@ class Deviation:
     ids: Intp
     of_views_m: Float64
     errors: Float64 = field(repr=False)
-    correction: Float64 = field(repr=False)
     steps: Intp
     fit: Fit = field(repr=False)
 
@@ -181,13 +179,6 @@ class Deviation:
     def consistent(self) -> bool:
         """Whether the depth does not contradict the poses."""
         return self.at_least_m == 0
-
-    @property
-    def proven(self) -> Float64:
-        """(2,) rms of positions and rotations that the estimate corrects, after alignment."""
-        given = self.fit.graph.poses @ se3.exp(self.errors)
-        corrected = self.fit.graph.poses @ se3.exp(self.errors - self.correction)
-        return np.array(displacement(corrected, given))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of `judge.json`."""
@@ -270,7 +261,6 @@ def deviation(fit: Fit, poses: Float64) -> Deviation:
         graph.ids,
         problem.lengths(estimate),
         x,
-        estimate,
         _steps(graph, aligned),
         fit,
     )

@@ -161,9 +161,7 @@ class Comparison:
     ) -> Comparison:
         """Prepare two views."""
         options = AgreementOptions() if options is None else options
-        return cls(
-            ComparedView.of(source, options), ComparedView.of(target, options), options
-        )
+        return cls(ComparedView.of(source, options), ComparedView.of(target, options), options)
 
     def at(self, T_target_source: Float64) -> Agreement:
         """Return the agreement at a pose (4, 4); see `agreement`."""
