@@ -231,11 +231,11 @@ def judge(
         progress.stage("comparing images")
         as_given, estimate = compared_at(poses[rows]), None
         unsupported = _support(as_given) < _SUPPORTED
-        if scale or unsupported:
-            compared = views_at(poses[rows])
-            estimate = pose_scale.estimated_scale(
-                list(compared.values()), poses[rows][list(compared)]
-            )
+        compared = views_at(poses[rows])
+        pairs = list(compared.values()), poses[rows][list(compared)]
+        first = pose_scale.first_scale(*pairs)
+        if scale or (unsupported if first is None else first.is_other_unit):
+            estimate = pose_scale.estimated_scale(*pairs)
         if scale and estimate is None:
             raise InputError(
                 "can't be estimated: too few views with translation between them fit",

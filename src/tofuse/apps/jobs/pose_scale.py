@@ -1,9 +1,10 @@
 """The scale of poses without metres, such as those of COLMAP, from the depth of a recording.
 
 It is that by which the given translations agree best with registered ones (least squares, robust
-against wrong pairs). Poses that the images may support have registered pairs already
-(`scale_of_pairs`). Otherwise views near each other in time are registered, from the rotation
-between the given poses and their translation at a few scales (`estimated_scale`).
+against wrong pairs). A few pairs of neighbouring views show whether it may differ from 1
+(`first_scale`). If so, all are registered, from the rotation between the given poses and their
+translation at a few scales (`estimated_scale`); otherwise pairs registered anyway give it
+(`scale_of_pairs`).
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from functools import partial
 import numpy as np
 
 from tofuse.engine.alignment import Registration
-from tofuse.engine.arrays import Float64
+from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.compute import run_all
 from tofuse.engine.compute import tukey_kernels as tukey
+from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import PoseGraph
 from tofuse.engine.search import follow
@@ -25,7 +27,7 @@ from tofuse.engine.views import PreparedView
 
 # Translations from which a pair is registered at first, in given units: as metres, and none.
 _STARTS = (1.0, 0.0)
-_MIN_PAIRS = 3
+_MIN_PAIRS, _FIRST_PAIRS = 3, 8
 _ITERATIONS, _TUKEY = 20, 4.685
 # Scales of metric poses are right within this fraction: phones and odometry err by a few percent.
 _METRIC = 0.1
@@ -67,35 +69,42 @@ def with_scale(poses: Float64, factor: float) -> Float64:
 
 def estimated_scale(views: Sequence[PreparedView], poses: Float64) -> PoseScale | None:
     """Return the scale of poses (N, 4, 4) of N views; None if too few pairs can be registered."""
-    found = [_registered(views, poses, _STARTS[0])]
-    as_metres = _fitted(poses, found[0])
-    if as_metres is not None and not as_metres.is_other_unit:
-        return as_metres
-    found.append(_registered(views, poses, _STARTS[1]))
-    first = _fitted(poses, [max(pair, key=_probability) for pair in zip(*found, strict=True)])
+    later = np.arange(1, len(poses))
+    found = [_registered(views, poses, start, later) for start in _STARTS]
+    first = _fitted(poses, later, _best(found))
     if first is None:
         return None
-    found.append(_registered(views, poses, first.factor))
-    return _fitted(poses, [max(pair, key=_probability) for pair in zip(*found, strict=True)])
+    found.append(_registered(views, poses, first.factor, later))
+    return _fitted(poses, later, _best(found))
+
+
+def first_scale(views: Sequence[PreparedView], poses: Float64) -> PoseScale | None:
+    """Return the scale by a few pairs near the given poses: whether it may differ from 1."""
+    later = evenly_spaced(np.arange(1, len(poses)), _FIRST_PAIRS)
+    return _fitted(poses, later, _registered(views, poses, 1.0, later))
 
 
 def _registered(
-    views: Sequence[PreparedView], poses: Float64, scale: float
+    views: Sequence[PreparedView], poses: Float64, scale: float, later: Intp
 ) -> list[Registration | None]:
-    """Register each view to the one before it, from the given motion at a scale."""
+    """Register views `later` to the ones before them, from the given motion at a scale."""
     poses = with_scale(poses, scale)
-    motions = se3.inverse(poses[:-1]) @ poses[1:]
+    motions = se3.inverse(poses[later - 1]) @ poses[later]
     return run_all([
-        partial(follow, views[k + 1], views[k], T) for k, T in enumerate(motions)
+        partial(follow, views[k], views[k - 1], T) for k, T in zip(later, motions, strict=True)
     ])  # fmt: skip
+
+
+def _best(found: Sequence[Sequence[Registration | None]]) -> list[Registration | None]:
+    return [max(pair, key=_probability) for pair in zip(*found, strict=True)]
 
 
 def _probability(registration: Registration | None) -> float:
     return 0.0 if registration is None else registration.probability or 0.0
 
 
-def _fitted(poses: Float64, found: Sequence[Registration | None]) -> PoseScale | None:
-    motions = se3.inverse(poses[:-1]) @ poses[1:]
+def _fitted(poses: Float64, later: Intp, found: Sequence[Registration | None]) -> PoseScale | None:
+    motions = se3.inverse(poses[later - 1]) @ poses[later]
     given: list[Float64] = []
     measured, information = [], []
     for motion, registration in zip(motions, found, strict=True):
