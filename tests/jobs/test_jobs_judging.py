@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -136,6 +137,37 @@ def test_poses_of_another_place_are_contradicted_and_replaced(recording, truth) 
     found = tofuse.judge(recording, away @ np.linalg.inv(truth))
     assert found.verdict == "failed"
     assert "images_disagree" in [r.code for r in found.reasons]
+
+
+def test_result_has_the_bound_of_its_run_unless_contradicted(recording, tmp_path) -> None:
+    result = tofuse.reconstruct(recording)
+    stated = result.diagnostics.accuracy
+    of_result = tofuse.judge(recording, result)
+    assert of_result.accuracy == stated
+    # Poses alone don't say how well they are known.
+    of_poses = tofuse.judge(recording, result.trajectory)
+    assert of_poses.accuracy.position_m == pytest.approx(stated.position_m, rel=0.2)
+    assert of_poses.accuracy.position_m != stated.position_m
+    wrong = tofuse.judge(recording, replace(result, trajectory=bent(result.trajectory)))
+    assert wrong.accuracy.position_m > 2 * stated.position_m
+    result.save(tmp_path / "out")
+    file = tmp_path / "out/trajectory.txt"
+    for path in (file.parent, file):
+        assert tofuse.judge(recording, path).accuracy.position_m == stated.position_m
+    file.write_text(file.read_text() + "\n")
+    edited = tofuse.judge(recording, file)
+    assert edited.accuracy.position_m == pytest.approx(of_poses.accuracy.position_m, rel=0.01)
+
+
+def test_jump_is_named_and_nothing_of_correct_poses(of_truth, of_bent) -> None:
+    assert of_truth.cause is None
+    assert of_truth.to_dict()["cause"] is None
+    cause = of_bent.cause
+    assert cause.kind == "jump"
+    assert cause.frames == (3, 4)
+    assert cause.text in of_bent.reasons[0].text
+    assert cause.text in sentence(of_bent, "poses.txt")
+    assert of_bent.to_dict()["cause"]["frames"] == [3, 4]
 
 
 class Notes(Silent):

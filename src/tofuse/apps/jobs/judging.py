@@ -7,7 +7,8 @@ with more support by the images counts.
 
 Refined poses have errors too, mostly in poorly observable directions, so a distance from them does
 not prove the given poses wrong. Pairs of views, registered around the refined poses, test that
-(`pose_deviation`). The error bound is the distance from the refined poses and their own bound.
+(`pose_deviation`). The error bound is the distance from the refined poses and their own bound; for
+poses that a run bounded by all of its frames, the run's bound, unless the sample contradicts it.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.apps.inspection import convention_of
 from tofuse.apps.jobs import pose_scale
-from tofuse.apps.results import folders, run_json, write_result
+from tofuse.apps.results import folders, run_json, stated_accuracy, write_result
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
@@ -277,6 +278,9 @@ def judge(
         consistencies = _consistencies(sample, deviation, [poses[rows], refined_poses[rows]])
     distances = _distances(poses, refined_poses)
     accuracy = _accuracy(distances, poses, refined_poses, deviation, sampled, recording.indices)
+    stated = _stated_accuracy(trajectory)
+    if stated is not None and _holds(stated, accuracy, sampled.diagnostics.accuracy, deviation):
+        accuracy = stated
     reasons = verdicts.ranked(
         [
             *_reasons(
@@ -571,6 +575,46 @@ def _accuracy(
     diagonal = refined.cloud.diagonal_m
     relative = position / diagonal if diagonal > 0 else np.inf
     return pose_accuracy.Accuracy(position, rotation, relative, True, at_worst, reference.unbounded)
+
+
+def _stated_accuracy(
+    trajectory: str | Path | Float64 | Reconstruction,
+) -> pose_accuracy.Accuracy | None:
+    """Return the accuracy that a run stated for its poses; None for other or edited ones."""
+    if isinstance(trajectory, Reconstruction):
+        return trajectory.diagnostics.accuracy
+    if not isinstance(trajectory, str | Path):
+        return None
+    path = Path(trajectory)
+    folder = path.parent if path.name == "trajectory.txt" else path
+    if not (folder / "run.json").is_file():
+        return None
+    try:
+        return stated_accuracy(folder)
+    except InputError:
+        return None
+
+
+def _holds(
+    stated: pose_accuracy.Accuracy,
+    found: pose_accuracy.Accuracy,
+    reference: pose_accuracy.Accuracy,
+    deviation: pose_deviation.Deviation | None,
+) -> bool:
+    """Whether images don't contradict poses, nor the refined poses the stated bound.
+
+    Their distance is at most both bounds in quadrature; with the bound of the refined poses, that
+    is the bound which was `found`.
+    """
+    if deviation is None or not deviation.consistent:
+        return False
+    return all(
+        a**2 <= b**2 + 2 * c**2
+        for a, b, c in (
+            (found.position_m, stated.position_m, reference.position_m),
+            (found.rotation_rad, stated.rotation_rad, reference.rotation_rad),
+        )
+    )
 
 
 def _common(

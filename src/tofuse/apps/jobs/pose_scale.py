@@ -129,7 +129,7 @@ def scale_of_pairs(measured: PoseGraph, poses: Float64) -> PoseScale | None:
     # Of the translation, whatever the rotation.
     W = W[:, :3, :3] - W[:, :3, 3:] @ np.linalg.inv(W[:, 3:, 3:]) @ W[:, 3:, :3]
     found = _regressed(given, measured.measurements[:, :3, 3], R @ W @ R.swapaxes(1, 2))
-    return found if found and found.factor > _SIGNIFICANT * found.sigma else None
+    return found if found and found.sigma < _METRIC * found.factor else None
 
 
 def _regressed(g: Float64, t: Float64, W: Float64) -> PoseScale | None:

@@ -11,7 +11,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.apps.results import folders, integrity, reopening, run_json
-    from tofuse.apps.results.loading import load_result, read_cloud, read_mesh
+    from tofuse.apps.results.loading import load_result, read_cloud, read_mesh, stated_accuracy
     from tofuse.apps.results.output import CHANGE_COLORS, textured_record, write_result
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -130,6 +130,12 @@ def _bound(value: float | None) -> float:
     return np.inf if value is None else float(value)
 
 
+def stated_accuracy(folder: Path) -> pose_accuracy.Accuracy:
+    """Return the accuracy that a result states; InputError if it was edited."""
+    with opened(folder) as run:
+        return _accuracy(run["accuracy"])
+
+
 def _accuracy(data: dict[str, Any]) -> pose_accuracy.Accuracy:
     worst = data["worst"]
     if worst:
