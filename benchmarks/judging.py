@@ -327,7 +327,7 @@ def programs(data: Path, only: str | None) -> None:
             maps.append(1 - inliers)
             print(
                 f"| {label} | {1e3 * estimates[-1]:.1f} | {lower:.1f} "
-                f"| {1e3 * difference(found.refined.trajectory, poses):.1f} "
+                f"| {1e3 * np.sqrt(np.nanmean(found.displacement_m**2)):.1f} "
                 f"| {1e3 * found.accuracy.position_m:.1f} "
                 f"| {1e3 * error:.1f} "
                 f"| {1e3 * rms:.1f}, {inliers:.1%} |",

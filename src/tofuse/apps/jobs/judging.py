@@ -275,7 +275,9 @@ def judge(
             )
             velocity = _velocities(recording, poses)[[row_of[v.index] for v in used]]
             cause = pose_causes.cause_of(deviation, velocity)
-        consistencies = _consistencies(sample, deviation, [poses[rows], refined_poses[rows]])
+        consistency, refined_consistency = _consistencies(
+            sample, deviation, poses[rows], refined_poses[rows]
+        )
     distances = _distances(poses, refined_poses)
     accuracy = _accuracy(distances, poses, refined_poses, deviation, sampled, recording.indices)
     stated = _stated_accuracy(trajectory)
@@ -305,7 +307,8 @@ def judge(
         accuracy,
         verdicts.verdict_of(reasons),
         reasons,
-        *consistencies,
+        consistency,
+        refined_consistency,
         deviation,
         distances,
         sampled,
@@ -720,24 +723,25 @@ def _or_none(poses: Float64) -> list[Float64 | None]:
 def _consistencies(
     sample: Recording,
     deviation: pose_deviation.Deviation | None,
-    poses: Sequence[Float64],
-) -> list[map_agreement.Consistency | None]:
-    """Return the map consistency of the sample under different poses, over pairs that overlap."""
+    given_poses: Float64,
+    refined_poses: Float64,
+) -> tuple[map_agreement.Consistency | None, map_agreement.Consistency | None]:
+    """Return the map consistency of the sample under both poses, over pairs that overlap."""
     if deviation is None:
-        return [None] * len(poses)
+        return None, None
     ids, edges = deviation.fit.graph.ids, deviation.fit.graph.edges
     # Of every other eighth of the views, which overlap among each other.
     eighth = np.arange(len(ids)) * 8 // len(ids)
     edges = edges[(eighth[edges] % 2 == 0).all(1)]
-    if not len(edges):
-        return [None] * len(poses)
     pairs = np.searchsorted(sample.indices, ids[evenly_spaced(edges, _COMPARED_PAIRS)])
     unit = sample.metadata.get("depth_unit_m")
     rows = np.unique(pairs)
-    images = {k: map_agreement.SurfaceImage.of(sample.image(k), unit) for k in rows.tolist()}
+    frames = [sample.image(k) for k in rows.tolist()]
+    images = [map_agreement.SurfaceImage.of(frame, unit) for frame in frames if frame is not None]
     positions = [(int(i), int(j)) for i, j in np.searchsorted(rows, pairs)]
-    found = [
-        map_agreement.consistency_of_images(list(images.values()), T[rows], positions)
-        for T in poses
-    ]
-    return [consistency if consistency.pairs else None for consistency in found]
+
+    def at(poses: Float64) -> map_agreement.Consistency | None:
+        found = map_agreement.consistency_of_images(images, poses[rows], positions)
+        return found if found.pairs else None
+
+    return at(given_poses), at(refined_poses)
