@@ -230,12 +230,12 @@ def judge(
 
     with use_threads(threads), threadpool_limits(1):
         progress.stage("comparing images")
-        as_given, estimate = compared_at(poses[rows]), None
+        as_given = compared_at(poses[rows])
         unsupported = _support(as_given) < _SUPPORTED
         compared = views_at(poses[rows])
         pairs = list(compared.values()), poses[rows][list(compared)]
-        first = pose_scale.first_scale(*pairs)
-        if scale or (unsupported if first is None else first.is_other_unit):
+        estimate = pose_scale.first_scale(*pairs)
+        if scale or (unsupported if estimate is None else estimate.is_other_unit):
             estimate = pose_scale.estimated_scale(*pairs)
         if scale and estimate is None:
             raise InputError(
@@ -270,9 +270,6 @@ def judge(
         deviation = _deviation(poses, refined_poses, used, row_of)
         cause = None
         if deviation is not None:
-            estimate = estimate or pose_scale.scale_of_pairs(
-                deviation.fit.graph, poses[[row_of[v.index] for v in used]]
-            )
             velocity = _velocities(recording, poses)[[row_of[v.index] for v in used]]
             cause = pose_causes.cause_of(deviation, velocity)
         consistency, refined_consistency = _consistencies(

@@ -3,8 +3,7 @@
 It is that by which the given translations agree best with registered ones (least squares, robust
 against wrong pairs). A few pairs of neighbouring views show whether it may differ from 1
 (`first_scale`). If so, all are registered, from the rotation between the given poses and their
-translation at a few scales (`estimated_scale`); otherwise pairs registered anyway give it
-(`scale_of_pairs`).
+translation at a few scales (`estimated_scale`).
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from tofuse.engine.compute import run_all
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import PoseGraph
 from tofuse.engine.search import follow
 from tofuse.engine.views import PreparedView
 
@@ -105,8 +103,7 @@ def _probability(registration: Registration | None) -> float:
 
 def _fitted(poses: Float64, later: Intp, found: Sequence[Registration | None]) -> PoseScale | None:
     motions = se3.inverse(poses[later - 1]) @ poses[later]
-    given: list[Float64] = []
-    measured, information = [], []
+    given, measured, information = [], [], []
     for motion, registration in zip(motions, found, strict=True):
         covariance = None if registration is None else registration.covariance
         if registration is None or covariance is None or not registration.is_probable:
@@ -115,27 +112,9 @@ def _fitted(poses: Float64, later: Intp, found: Sequence[Registration | None]) -
         given.append(motion[:3, 3])
         measured.append(registration.T_target_source[:3, 3])
         information.append(R @ np.linalg.inv(covariance[:3, :3]) @ R.T)
-    shape = (-1, 3)
-    return _regressed(
-        np.reshape(given, shape), np.reshape(measured, shape), np.reshape(information, (-1, 3, 3))
-    )
-
-
-def scale_of_pairs(measured: PoseGraph, poses: Float64) -> PoseScale | None:
-    """Return the scale of poses (N, 4, 4) by measured pairs; None if it is hardly constrained."""
-    i, j = measured.edges.T
-    given = (se3.inverse(poses[i]) @ poses[j])[:, :3, 3]
-    W, R = measured.information, measured.measurements[:, :3, :3]
-    # Of the translation, whatever the rotation.
-    W = W[:, :3, :3] - W[:, :3, 3:] @ np.linalg.inv(W[:, 3:, 3:]) @ W[:, 3:, :3]
-    found = _regressed(given, measured.measurements[:, :3, 3], R @ W @ R.swapaxes(1, 2))
-    return found if found and found.sigma < _METRIC * found.factor else None
-
-
-def _regressed(g: Float64, t: Float64, W: Float64) -> PoseScale | None:
-    """Regress measured translations (n, 3) with their information on the given ones."""
-    if len(g) < _MIN_PAIRS:
+    if len(given) < _MIN_PAIRS:
         return None
+    g, t, W = np.array(given), np.array(measured), np.array(information)
     curvature = np.einsum("ni,nij,nj->n", g, W, g)
     slope = np.einsum("ni,nij,nj->n", g, W, t)
     # The weighted median is hardly moved by wrong pairs.
