@@ -1,15 +1,15 @@
 """Where views are in a finished map, without a guess, and the probability that the pose is right.
 
-The pose of a view is searched relative to the map views of different places that look most
-similar, until it is accepted, and then in further places for rivals. All poses found compete: each
-is aligned with the map views that overlap it, and its probability is that of a search whose rivals
-are all other poses found, reduced by the number of tried places (multiple testing).
+A view is aligned with the map views of different places that look most similar. From the best of
+these alignments, or without one, its pose is searched relative to these map views, until it is
+probable, and then in further places for rivals. All poses found compete: each is aligned with the
+map views that overlap it, and its probability is that of a search whose rivals are all other poses
+found and all alignments elsewhere, reduced by the number of tried places (multiple testing).
 Several views of one clip, whose relative poses are known, share this evidence.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -33,11 +33,13 @@ from tofuse.engine.views import PreparedView, view_descriptors
 
 # Largest shift of similar views, as a fraction of the width of their images.
 _MAX_SHIFT = 0.5
-# Places in which the pose of one view is searched, and further ones for each other view of a clip;
-# and those in which rivals of an accepted pose are.
-_SEARCHED, _PER_VIEW, _RIVALS = 8, 2, 2
-# Most similar places that are considered.
-_CONSIDERED = 64
+# Most similar places with which a view is aligned; of these, places in which the pose of one view is
+# searched, and further ones for each other view of a clip; and those in which rivals of a probable
+# pose are, with less effort.
+_CONSIDERED, _SEARCHED, _PER_VIEW, _RIVALS = 16, 8, 2, 2
+_LESS_EFFORT = {"planar_candidates": 10, "full_candidates": 20, "photometric_candidates": 5}
+# Score below which an alignment says nothing about the pose.
+_MIN_SCORE = 0.25
 # Candidates and compared map views differ by more: fraction of the depth plus rad.
 _SPACING = 0.25
 # Map views that a pose is compared with, and their smallest overlap.
@@ -48,6 +50,7 @@ _MAX_CORRECTION = 0.1
 # agreement distinguishes it.
 _PROBE, _LEAD = 4.0, 0.05
 _ALIGNMENT = projective.ProjectiveOptions(levels=verification.PATIENT, prior_m=3.0, prior_rad=3.0)
+_COARSE_ALIGNMENT = replace(_ALIGNMENT, levels=verification.COARSE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +104,16 @@ class Location:
 
 
 @dataclass(frozen=True, eq=False)
+class _Place:
+    """A view aligned with map view `k` without a guess: its pose (4, 4), and agreement there."""
+
+    view: View
+    k: int
+    T_k_view: Float64
+    score: float
+
+
+@dataclass(frozen=True, eq=False)
 class _Placed:
     """A view at a pose (4, 4) in the map: its alignment and its agreement with map views."""
 
@@ -128,6 +141,13 @@ class _Hypothesis:
     placed: dict[int, _Placed]
 
 
+def _are_distinct(a: dict[int, _Placed], b: dict[int, _Placed]) -> bool:
+    """Whether two hypotheses are distinct after their views were aligned, by index."""
+    return all(
+        are_distinct_poses(a[index].T_map_camera, b[index].T_map_camera) for index in a.keys() & b
+    )
+
+
 class Locator:
     """Finds views in a map.
 
@@ -141,9 +161,12 @@ class Locator:
 
     def __init__(self, views: Sequence[View], search: SearchOptions | None = None) -> None:
         self._views, self._search = views, search or SearchOptions("auto")
+        self._less_effort = replace(self._search, **_LESS_EFFORT)
         self._poses = np.stack([v.T_component_camera for v in views])
         self._depths = np.array([v.depth for v in views])
-        self._descriptors = np.stack([view_descriptors.view_descriptor(v.view) for v in views])
+        self._index = view_descriptors.DescriptorIndex(
+            np.stack([view_descriptors.view_descriptor(v.view) for v in views])
+        )
         rows, times = np.arange(len(views)), np.arange(len(views), dtype=np.float64)
         checks = JoinChecks(
             MergedComponents([TrackedComponent(0, rows, times, self._poses, tuple(views))])
@@ -159,40 +182,60 @@ class Locator:
         -------
         By the index of each view that overlaps the map at the best pose.
         """
-        similar = {v.index: self._similar(v.view) for v in views}
+        places = self._places(views)
         hypotheses: list[_Hypothesis] = []
-        located: dict[int, Location] = {}
-        tried = rivals = 0
-        # The most similar place of each view first.
+        best, log_odds = 0, -np.inf
+        searched = rivals = 0
         budget = _SEARCHED + _PER_VIEW * (len(views) - 1)
-        for rank, view in itertools.product(range(_CONSIDERED), views):
-            if rank >= len(similar[view.index]):
-                continue
-            k = similar[view.index][rank]
-            if any(location.accepted for location in located.values()):
+        for place in places:
+            is_probable = pose_probability.logistic(log_odds) >= pose_probability.ACCEPTED
+            if is_probable:
                 if rivals == _RIVALS:
                     break
-                if view.index in located and self._is_near(located[view.index].T_map_camera, k):
+                T_map_view = hypotheses[best].T_map_clip @ place.view.T_component_camera
+                if self._distances(T_map_view, [place.k])[0] < verification.MAX_OVERLAP_DISTANCE:
                     continue
                 rivals += 1
-            elif tried >= budget:
+            elif searched == budget:
                 break
-            tried += 1
-            for T_map_view in self._searched(view.view, k):
-                T = T_map_view @ se3.inverse(view.T_component_camera)
-                if all(are_distinct_poses(T, h.T_map_clip) for h in hypotheses):
-                    placed = {v.index: p for v in views if (p := self._placed(v, T)) is not None}
-                    hypotheses += [_Hypothesis(T, placed)] if placed else []
-            located = self._decided(views, hypotheses, tried)
-        return located
+            searched += 1
+            for T_map_view in self._searched(place, self._less_effort if is_probable else None):
+                T = T_map_view @ se3.inverse(place.view.T_component_camera)
+                placed = {v.index: p for v in views if (p := self._placed(v, T)) is not None}
+                if placed and all(_are_distinct(placed, h.placed) for h in hypotheses):
+                    hypotheses.append(_Hypothesis(T, placed))
+            if hypotheses:
+                each = [self._log_odds(h, hypotheses, places) for h in hypotheses]
+                best = int(np.argmax(each))
+                log_odds = each[best] - float(np.log(searched))
+        return self._locations(views, hypotheses, places, searched)
+
+    def _places(self, views: Sequence[View]) -> list[_Place]:
+        """Align views with the most similar map views; the best alignment first."""
+        places = []
+        for view in views:
+            for rank, k in enumerate(self._similar(view.view)):
+                target = [projective.Target(self._views[k].view, np.eye(4))]
+                T = projective.align(
+                    view.view,
+                    target,
+                    np.eye(4),
+                    _COARSE_ALIGNMENT,
+                    usual_scale=self._fit_statistics.noise_scale,
+                ).T_world_source
+                score = pair_agreement.agreement(
+                    view.view, self._views[k].view, T, self._tolerances
+                ).score
+                places.append((rank, _Place(view, k, T, score)))
+        # The most similar place of each view first, where no alignment says more.
+        places.sort(key=lambda p: (-max(p[1].score, _MIN_SCORE), p[0]))
+        return [place for _, place in places]
 
     def _similar(self, view: PreparedView) -> list[int]:
         """Return the most similar views of different places, the most similar first."""
-        difference = view_descriptors.dissimilarity(
-            view_descriptors.view_descriptor(view), self._descriptors, _MAX_SHIFT
-        )
         chosen: list[int] = []
-        for k in np.argsort(difference, kind="stable").tolist():
+        descriptor = view_descriptors.view_descriptor(view)
+        for k in self._index.most_similar(descriptor, _MAX_SHIFT).tolist():
             if not verification.comparable(view.depth, self._depths[k]):
                 continue
             if not chosen or self._distances(self._poses[k], chosen).min() > _SPACING:
@@ -207,22 +250,20 @@ class Locator:
         shift = np.linalg.norm(motion[:, :3, 3], axis=1) / self._depths[which]
         return np.asarray(shift + np.asarray(se3.angle(motion)), np.float64)
 
-    def _is_near(self, T: Float64, k: int) -> bool:
-        return bool(self._distances(T, [k])[0] < verification.MAX_OVERLAP_DISTANCE)
-
-    def _searched(self, view: PreparedView, k: int) -> Iterator[Float64]:
+    def _searched(self, place: _Place, options: SearchOptions | None) -> Iterator[Float64]:
         """Yield the best poses T_map_view (4, 4) of a search relative to a map view."""
         registration = register_pair(
-            view,
-            self._views[k].view,
+            place.view.view,
+            self._views[place.k].view,
+            place.T_k_view if place.score > _MIN_SCORE else None,
             fit_statistics=self._fit_statistics,
-            options=self._search,
+            options=options or self._search,
             rival_m=DISTINCT_M,
         )
         if registration is not None:
-            yield self._poses[k] @ registration.T_target_source
+            yield self._poses[place.k] @ registration.T_target_source
             if registration.runner_up is not None:
-                yield self._poses[k] @ registration.runner_up
+                yield self._poses[place.k] @ registration.runner_up
 
     def _placed(self, view: View, T_map_clip: Float64) -> _Placed | None:
         """Align a view with the map views near a pose; None if it fits none there."""
@@ -252,15 +293,19 @@ class Locator:
     def _targets(self, which: Sequence[int]) -> list[projective.Target]:
         return [projective.Target(self._views[k].view, se3.inverse(self._poses[k])) for k in which]
 
-    def _decided(
-        self, views: Sequence[View], hypotheses: Sequence[_Hypothesis], tried: int
+    def _locations(
+        self,
+        views: Sequence[View],
+        hypotheses: Sequence[_Hypothesis],
+        places: Sequence[_Place],
+        searched: int,
     ) -> dict[int, Location]:
         """Return the poses of the most probable hypothesis."""
         if not hypotheses:
             return {}
-        log_odds = [self._log_odds(h, hypotheses) for h in hypotheses]
+        log_odds = [self._log_odds(h, hypotheses, places) for h in hypotheses]
         best = int(np.argmax(log_odds))
-        probability = pose_probability.logistic(log_odds[best] - float(np.log(tried)))
+        probability = pose_probability.logistic(log_odds[best] - float(np.log(searched)))
         rival = max(
             (k for k in range(len(hypotheses)) if k != best), key=log_odds.__getitem__, default=None
         )
@@ -272,13 +317,20 @@ class Locator:
             if view.index in hypotheses[best].placed
         }
 
-    def _log_odds(self, hypothesis: _Hypothesis, all_: Sequence[_Hypothesis]) -> float:
+    def _log_odds(
+        self, hypothesis: _Hypothesis, all_: Sequence[_Hypothesis], places: Sequence[_Place]
+    ) -> float:
         """Log odds of a hypothesis; those of views add as far as these are independent."""
         total = 0.0
         counted: list[tuple[Float64, Float64]] = []
         for index, placed in hypothesis.placed.items():
             rivals = [
                 h.placed[index].score for h in all_ if h is not hypothesis and index in h.placed
+            ]
+            rivals += [
+                place.score
+                for place in places
+                if place.view.index == index and self._is_elsewhere(place, placed.T_map_camera)
             ]
             lead = placed.score - max([0.0, *rivals])
             for k, agreement in zip(placed.near, placed.agreements, strict=True):
@@ -291,6 +343,13 @@ class Locator:
                 total += independence * float(np.log(p / (1 - p)))
                 counted.append(ends)
         return total
+
+    def _is_elsewhere(self, place: _Place, T_map_view: Float64) -> bool:
+        """Whether the pose of an alignment is in another place than a pose (4, 4)."""
+        T = self._poses[place.k] @ place.T_k_view
+        shift, angle = se3.lengths((se3.inverse(T) @ T_map_view)[None])[0]
+        distance = shift / self._depths[place.k] + angle
+        return bool(distance > verification.MAX_OVERLAP_DISTANCE)
 
     def _separation(self, a: tuple[Float64, Float64], b: tuple[Float64, Float64], k: int) -> float:
         """Return how far the views of two comparisons are apart, 1 where they don't overlap."""

@@ -24,6 +24,8 @@ _MAX_DEPTH, _MAX_ALBEDO = 0.3, 0.5
 _MIN_ALBEDO_FRACTION = 0.2
 # Of the index of descriptors: principal components, and nearest neighbours per query.
 _COMPONENTS, _NEAREST = 8, 6
+# Descriptors that are compared with one cell by cell.
+_COMPARED = 128
 
 
 def view_descriptor(view: PreparedView) -> Float32:
@@ -101,7 +103,7 @@ def similar_views(descriptors: Float32, shift: float) -> tuple[Intp, Intp]:
     are excluded, as these are always similar.
     """
     n = len(descriptors)
-    described = _blocks(descriptors, 0, 0)
+    described = _blocks(descriptors)
     mean = described.mean(0)
     _, _, axes = np.linalg.svd(described - mean, full_matrices=False)
     axes = axes[:_COMPONENTS]
@@ -110,7 +112,7 @@ def similar_views(descriptors: Float32, shift: float) -> tuple[Intp, Intp]:
     max_u, max_v = round(shift * _COLUMNS), round(shift * _ROWS / 2)
     for v in range(-max_v, max_v + 1):
         for u in range(-max_u, max_u + 1):
-            query = (_blocks(descriptors, v, u) - mean) @ axes.T
+            query = (_blocks(_shifted(descriptors, v, u)) - mean) @ axes.T
             _, neighbours = tree.query(query, k=min(_NEAREST, n))
             queried.append(np.repeat(np.arange(n), neighbours.shape[1]))
             matched.append(neighbours.ravel())
@@ -121,11 +123,33 @@ def similar_views(descriptors: Float32, shift: float) -> tuple[Intp, Intp]:
     return i, j
 
 
-def _blocks(descriptors: Float32, v: int, u: int) -> Float64:
-    """Return means (N, 24) over blocks of 3 x 3 cells of descriptors shifted by v rows, u columns.
+class DescriptorIndex:
+    """Finds the most similar ones of many descriptors (N, 2, 9, 12).
 
-    Unknown blocks get the mean of all views; log albedo is relative to the view's mean.
+    Those whose means over blocks of cells are nearest are compared cell by cell.
     """
+
+    def __init__(self, descriptors: Float32) -> None:
+        self._descriptors, self._blocks = descriptors, _blocks(descriptors)
+
+    def most_similar(self, descriptor: Float32, shift: float) -> Intp:
+        """Return the positions of the most similar ones, these first; see `dissimilarity`."""
+        max_u, max_v = round(shift * _COLUMNS), round(shift * _ROWS / 2)
+        shifted = [
+            _shifted(descriptor[None], v, u)
+            for v in range(-max_v, max_v + 1)
+            for u in range(-max_u, max_u + 1)
+        ]
+        query = _blocks(np.concatenate(shifted), self._blocks.mean(0))
+        # Squared distances, but for a term of the query.
+        distance = (self._blocks**2).sum(1) - 2 * query @ self._blocks.T
+        nearest = (distance + (query**2).sum(1)[:, None]).min(0).argsort(kind="stable")[:_COMPARED]
+        difference = dissimilarity(descriptor, self._descriptors[nearest], shift)
+        return np.asarray(nearest[difference.argsort(kind="stable")])
+
+
+def _shifted(descriptors: Float32, v: int, u: int) -> Float32:
+    """Return descriptors shifted by v rows and u columns."""
     shifted = np.full_like(descriptors, np.nan)
     to_rows, from_rows = slice(max(-v, 0), _ROWS - max(v, 0)), slice(max(v, 0), _ROWS + min(v, 0))
     to_columns, from_columns = (
@@ -133,7 +157,15 @@ def _blocks(descriptors: Float32, v: int, u: int) -> Float64:
         slice(max(u, 0), _COLUMNS + min(u, 0)),
     )
     shifted[:, :, to_rows, to_columns] = descriptors[:, :, from_rows, from_columns]
-    cells = shifted.reshape(len(descriptors), 2, _ROWS // 3, 3, _COLUMNS // 3, 3).astype(float)
+    return shifted
+
+
+def _blocks(descriptors: Float32, unknown: Float64 | None = None) -> Float64:
+    """Return means (N, 24) over blocks of 3 x 3 cells; log albedo is relative to the view's mean.
+
+    Unknown blocks get the values `unknown` (24,), or the mean of all views.
+    """
+    cells = descriptors.reshape(len(descriptors), 2, _ROWS // 3, 3, _COLUMNS // 3, 3).astype(float)
     valid = np.isfinite(cells)
     count = valid.sum((3, 5))
     total = np.where(valid, cells, 0).sum((3, 5))
@@ -142,7 +174,10 @@ def _blocks(descriptors: Float32, v: int, u: int) -> Float64:
     has_value = count > 0
     view_mean = np.where(has_value, means, 0).sum((2, 3)) / np.maximum(has_value.sum((2, 3)), 1)
     means[:, 1] -= view_mean[:, 1, None, None]
-    overall_mean = np.where(has_value, means, 0).sum(0) / np.maximum(has_value.sum(0), 1)
+    if unknown is None:
+        overall_mean = np.where(has_value, means, 0).sum(0) / np.maximum(has_value.sum(0), 1)
+    else:
+        overall_mean = unknown.reshape(means.shape[1:])
     return np.where(has_value, means, overall_mean).reshape(len(descriptors), -1)
 
 
