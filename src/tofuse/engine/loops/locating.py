@@ -10,7 +10,8 @@ Several views of one clip, whose relative poses are known, share this evidence.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from tofuse.engine.loops.join_checks import JoinChecks
 from tofuse.engine.loops.merged_components import DRIFT, MergedComponents, TrackedComponent, View
 from tofuse.engine.search import (
     DISTINCT_M,
+    Search,
     SearchOptions,
     are_distinct_poses,
     pair_agreement,
@@ -33,11 +35,11 @@ from tofuse.engine.views import PreparedView, view_descriptors
 
 # Largest shift of similar views, as a fraction of the width of their images.
 _MAX_SHIFT = 0.5
-# Most similar places with which a view is aligned; of these, places in which the pose of one view is
-# searched, and further ones for each other view of a clip; and those in which rivals of a probable
-# pose are, with less effort.
+# Most similar places with which a view is aligned. Of these: places in which the pose of one view
+# is searched, further ones for each other view of a clip, and those in which rivals of a probable
+# pose are searched, in the range in which views of one place look similar.
 _CONSIDERED, _SEARCHED, _PER_VIEW, _RIVALS = 16, 8, 2, 2
-_LESS_EFFORT = {"planar_candidates": 10, "full_candidates": 20, "photometric_candidates": 5}
+_NARROW = SearchOptions("auto", 0.55, 0.45, 0.25, 0.3, 8, 12, 3)
 # Score below which an alignment says nothing about the pose.
 _MIN_SCORE = 0.25
 # Candidates and compared map views differ by more: fraction of the depth plus rad.
@@ -49,6 +51,8 @@ _MAX_CORRECTION = 0.1
 # Displacement along a degenerate direction in cm and degrees, and the loss of score by which the
 # agreement distinguishes it.
 _PROBE, _LEAD = 4.0, 0.05
+# Displacements along such a direction to where the agreement is best, each at most so many times.
+_SLIDES, _MAX_SLIDES = (4.0, -4.0, 2.0, -2.0, 1.0, -1.0), 6
 _ALIGNMENT = projective.ProjectiveOptions(levels=verification.PATIENT, prior_m=3.0, prior_rad=3.0)
 _COARSE_ALIGNMENT = replace(_ALIGNMENT, levels=verification.COARSE)
 
@@ -105,11 +109,11 @@ class Location:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """A view aligned with map view `k` without a guess: its pose (4, 4), and agreement there."""
+    """A view aligned with map view `k` alone: its pose (4, 4), and the score of the agreement."""
 
     view: View
     k: int
-    T_k_view: Float64
+    T_map_view: Float64
     score: float
 
 
@@ -125,6 +129,11 @@ class _Placed:
     @property
     def score(self) -> float:
         return max(a.score for a in self.agreements)
+
+    @property
+    def total(self) -> float:
+        """Sum of the scores of all compared map views."""
+        return sum(a.score for a in self.agreements)
 
     @property
     def contradiction(self) -> float:
@@ -148,6 +157,11 @@ def _are_distinct(a: dict[int, _Placed], b: dict[int, _Placed]) -> bool:
     )
 
 
+def _probability(log_odds: Sequence[float], searched: int) -> float:
+    """Return the probability of the best hypothesis after a number of searches."""
+    return pose_probability.logistic(max(log_odds) - float(np.log(searched))) if log_odds else 0.0
+
+
 class Locator:
     """Finds views in a map.
 
@@ -161,7 +175,6 @@ class Locator:
 
     def __init__(self, views: Sequence[View], search: SearchOptions | None = None) -> None:
         self._views, self._search = views, search or SearchOptions("auto")
-        self._less_effort = replace(self._search, **_LESS_EFFORT)
         self._poses = np.stack([v.T_component_camera for v in views])
         self._depths = np.array([v.depth for v in views])
         self._index = view_descriptors.DescriptorIndex(
@@ -183,53 +196,55 @@ class Locator:
         By the index of each view that overlaps the map at the best pose.
         """
         places = self._places(views)
+        aligned = {v.index: [place for place in places if place.view is v] for v in views}
         hypotheses: list[_Hypothesis] = []
-        best, log_odds = 0, -np.inf
+        log_odds: list[float] = []
         searched = rivals = 0
         budget = _SEARCHED + _PER_VIEW * (len(views) - 1)
         for place in places:
-            is_probable = pose_probability.logistic(log_odds) >= pose_probability.ACCEPTED
+            is_probable = _probability(log_odds, searched) >= pose_probability.ACCEPTED
             if is_probable:
+                best = hypotheses[int(np.argmax(log_odds))]
                 if rivals == _RIVALS:
                     break
-                T_map_view = hypotheses[best].T_map_clip @ place.view.T_component_camera
-                if self._distances(T_map_view, [place.k])[0] < verification.MAX_OVERLAP_DISTANCE:
+                if self._is_near(best.T_map_clip @ place.view.T_component_camera, place.k):
                     continue
                 rivals += 1
             elif searched == budget:
                 break
             searched += 1
-            for T_map_view in self._searched(place, self._less_effort if is_probable else None):
-                T = T_map_view @ se3.inverse(place.view.T_component_camera)
+            for found in self._rivals(place) if is_probable else self._searched(place):
+                aligned[place.view.index].append(found)
+                if is_probable and found.score < _MIN_SCORE:
+                    continue
+                T = found.T_map_view @ se3.inverse(place.view.T_component_camera)
                 placed = {v.index: p for v in views if (p := self._placed(v, T)) is not None}
                 if placed and all(_are_distinct(placed, h.placed) for h in hypotheses):
                     hypotheses.append(_Hypothesis(T, placed))
-            if hypotheses:
-                each = [self._log_odds(h, hypotheses, places) for h in hypotheses]
-                best = int(np.argmax(each))
-                log_odds = each[best] - float(np.log(searched))
-        return self._locations(views, hypotheses, places, searched)
+            log_odds = [self._log_odds(h, hypotheses, aligned) for h in hypotheses]
+        return self._locations(views, hypotheses, log_odds, searched)
 
     def _places(self, views: Sequence[View]) -> list[_Place]:
-        """Align views with the most similar map views; the best alignment first."""
+        """Align views with the most similar map views.
+
+        The best alignment is first, and the most similar place of each view if none is good.
+        """
         places = []
         for view in views:
             for rank, k in enumerate(self._similar(view.view)):
-                target = [projective.Target(self._views[k].view, np.eye(4))]
                 T = projective.align(
                     view.view,
-                    target,
-                    np.eye(4),
+                    self._targets([k]),
+                    self._poses[k],
                     _COARSE_ALIGNMENT,
                     usual_scale=self._fit_statistics.noise_scale,
                 ).T_world_source
-                score = pair_agreement.agreement(
-                    view.view, self._views[k].view, T, self._tolerances
-                ).score
-                places.append((rank, _Place(view, k, T, score)))
-        # The most similar place of each view first, where no alignment says more.
+                places.append((rank, self._place(view, k, T)))
         places.sort(key=lambda p: (-max(p[1].score, _MIN_SCORE), p[0]))
         return [place for _, place in places]
+
+    def _place(self, view: View, k: int, T_map_view: Float64) -> _Place:
+        return _Place(view, k, T_map_view, self._agreements(view.view, T_map_view, [k])[k].score)
 
     def _similar(self, view: PreparedView) -> list[int]:
         """Return the most similar views of different places, the most similar first."""
@@ -250,20 +265,41 @@ class Locator:
         shift = np.linalg.norm(motion[:, :3, 3], axis=1) / self._depths[which]
         return np.asarray(shift + np.asarray(se3.angle(motion)), np.float64)
 
-    def _searched(self, place: _Place, options: SearchOptions | None) -> Iterator[Float64]:
-        """Yield the best poses T_map_view (4, 4) of a search relative to a map view."""
+    def _is_near(self, T: Float64, k: int) -> bool:
+        return bool(self._distances(T, [k])[0] < verification.MAX_OVERLAP_DISTANCE)
+
+    def _searched(self, place: _Place) -> Iterator[_Place]:
+        """Yield the best poses of a search relative to the map view of a place."""
+        T_map_k = self._poses[place.k]
         registration = register_pair(
             place.view.view,
             self._views[place.k].view,
-            place.T_k_view if place.score > _MIN_SCORE else None,
+            se3.inverse(T_map_k) @ place.T_map_view if place.score > _MIN_SCORE else None,
             fit_statistics=self._fit_statistics,
-            options=options or self._search,
+            options=self._search,
             rival_m=DISTINCT_M,
         )
         if registration is not None:
-            yield self._poses[place.k] @ registration.T_target_source
-            if registration.runner_up is not None:
-                yield self._poses[place.k] @ registration.runner_up
+            for T in (registration.T_target_source, registration.runner_up):
+                if T is not None:
+                    yield self._place(place.view, place.k, T_map_k @ T)
+
+    def _rivals(self, place: _Place) -> list[_Place]:
+        """Return the best poses of a short search, or the alignment if that is good."""
+        if place.score > _MIN_SCORE:
+            return [place]
+        search = Search.of(
+            place.view.view,
+            self._views[place.k].view,
+            _NARROW,
+            agreement=self._tolerances,
+            distinct_m=DISTINCT_M,
+        )
+        match = None if search is None else search.exhaustive()
+        return [
+            replace(place, T_map_view=self._poses[place.k] @ c.T_target_source, score=c.score)
+            for c in (() if match is None else match.candidates[:2])
+        ]
 
     def _placed(self, view: View, T_map_clip: Float64) -> _Placed | None:
         """Align a view with the map views near a pose; None if it fits none there."""
@@ -297,28 +333,26 @@ class Locator:
         self,
         views: Sequence[View],
         hypotheses: Sequence[_Hypothesis],
-        places: Sequence[_Place],
+        log_odds: Sequence[float],
         searched: int,
     ) -> dict[int, Location]:
         """Return the poses of the most probable hypothesis."""
         if not hypotheses:
             return {}
-        log_odds = [self._log_odds(h, hypotheses, places) for h in hypotheses]
-        best = int(np.argmax(log_odds))
-        probability = pose_probability.logistic(log_odds[best] - float(np.log(searched)))
-        rival = max(
-            (k for k in range(len(hypotheses)) if k != best), key=log_odds.__getitem__, default=None
-        )
+        best, *others = np.argsort(-np.array(log_odds), kind="stable").tolist()
+        rival = hypotheses[others[0]] if others else None
+        probability = _probability(log_odds, searched)
         return {
-            view.index: self._location(
-                view, hypotheses[best], None if rival is None else hypotheses[rival], probability
-            )
+            view.index: self._location(view, hypotheses[best], rival, probability)
             for view in views
             if view.index in hypotheses[best].placed
         }
 
     def _log_odds(
-        self, hypothesis: _Hypothesis, all_: Sequence[_Hypothesis], places: Sequence[_Place]
+        self,
+        hypothesis: _Hypothesis,
+        all_: Sequence[_Hypothesis],
+        aligned: Mapping[int, Sequence[_Place]],
     ) -> float:
         """Log odds of a hypothesis; those of views add as far as these are independent."""
         total = 0.0
@@ -327,11 +361,7 @@ class Locator:
             rivals = [
                 h.placed[index].score for h in all_ if h is not hypothesis and index in h.placed
             ]
-            rivals += [
-                place.score
-                for place in places
-                if place.view.index == index and self._is_elsewhere(place, placed.T_map_camera)
-            ]
+            rivals += self._scores_elsewhere(placed.T_map_camera, aligned[index])
             lead = placed.score - max([0.0, *rivals])
             for k, agreement in zip(placed.near, placed.agreements, strict=True):
                 evidence = pose_probability.PoseEvidence.of(
@@ -339,29 +369,36 @@ class Locator:
                 )
                 p = min(evidence.probability, pose_probability.MAX_PROBABILITY)
                 ends = placed.T_map_camera, self._poses[k]
-                independence = min([1.0, *(self._separation(ends, other, k) for other in counted)])
+                independence = self._independence(ends, counted, k)
                 total += independence * float(np.log(p / (1 - p)))
                 counted.append(ends)
         return total
 
-    def _is_elsewhere(self, place: _Place, T_map_view: Float64) -> bool:
-        """Whether the pose of an alignment is in another place than a pose (4, 4)."""
-        T = self._poses[place.k] @ place.T_k_view
-        shift, angle = se3.lengths((se3.inverse(T) @ T_map_view)[None])[0]
-        distance = shift / self._depths[place.k] + angle
-        return bool(distance > verification.MAX_OVERLAP_DISTANCE)
+    def _scores_elsewhere(self, T_map_view: Float64, places: Sequence[_Place]) -> list[float]:
+        """Return the scores of a view's poses in other places than a pose (4, 4)."""
+        poses = np.array([place.T_map_view for place in places]).reshape(-1, 4, 4)
+        lengths = se3.lengths(se3.inverse(T_map_view) @ poses)
+        depths = self._depths[[place.k for place in places]]
+        elsewhere = lengths[:, 0] / depths + lengths[:, 1] > verification.MAX_OVERLAP_DISTANCE
+        return [p.score for p, other in zip(places, elsewhere, strict=True) if other]
 
-    def _separation(self, a: tuple[Float64, Float64], b: tuple[Float64, Float64], k: int) -> float:
-        """Return how far the views of two comparisons are apart, 1 where they don't overlap."""
-        lengths = [se3.lengths((se3.inverse(p) @ q)[None])[0] for p, q in zip(a, b, strict=True)]
-        return float(
-            max(m / self._depths[k] + rad for m, rad in lengths) / verification.MAX_OVERLAP_DISTANCE
-        )
+    def _independence(
+        self, ends: tuple[Float64, Float64], counted: Sequence[tuple[Float64, Float64]], k: int
+    ) -> float:
+        """Return how far views are apart from those of other comparisons, 1 without an overlap."""
+        if not counted:
+            return 1.0
+        motions = se3.inverse(np.array(ends)) @ np.array(counted)
+        lengths = se3.lengths(motions.reshape(-1, 4, 4))
+        apart = (lengths[:, 0] / self._depths[k] + lengths[:, 1]).reshape(-1, 2).max(1).min()
+        return min(1.0, float(apart) / verification.MAX_OVERLAP_DISTANCE)
 
     def _location(
         self, view: View, best: _Hypothesis, rival: _Hypothesis | None, probability: float
     ) -> Location:
         placed = best.placed[view.index]
+        if len(placed.aligned.unobservable):
+            placed = self._slid(view.view, placed)
         reasons = []
         if probability < pose_probability.ACCEPTED:
             reasons.append("no pose in the map is probable enough")
@@ -385,20 +422,43 @@ class Locator:
             None if rival is None else rival.T_map_clip @ view.T_component_camera,
         )
 
+    def _slid(self, view: PreparedView, placed: _Placed) -> _Placed:
+        """Move a view along degenerate directions of its alignment to where it agrees best."""
+        T, best = placed.T_map_camera, placed.total
+        for direction, step in itertools.product(placed.aligned.unobservable, _SLIDES):
+            for _ in range(_MAX_SLIDES):
+                moved = T @ se3.exp(step * direction * projective.UNITS)
+                total = self._total(view, moved, placed)
+                if total <= best:
+                    break
+                T, best = moved, total
+        return replace(
+            placed,
+            T_map_camera=T,
+            aligned=replace(placed.aligned, T_world_source=T),
+            agreements=tuple(self._agreements(view, T, placed.near).values()),
+        )
+
     def _is_distinguished(self, view: PreparedView, placed: _Placed) -> bool:
-        """Whether poses displaced along degenerate directions agree less with the map views."""
+        """Whether poses displaced along degenerate directions agree less with the map views.
 
-        def score(step: Float64) -> float:
-            return max(
-                a.score
-                for a in self._agreements(view, placed.T_map_camera @ step, placed.near).values()
-            )
-
+        The errors of the scores add up like independent ones.
+        """
+        limit = placed.total - _LEAD * len(placed.near) ** 0.5
         return all(
-            score(se3.exp(sign * _PROBE * direction * projective.UNITS)) < placed.score - _LEAD
+            self._total(
+                view,
+                placed.T_map_camera @ se3.exp(sign * _PROBE * direction * projective.UNITS),
+                placed,
+            )
+            < limit
             for direction in placed.aligned.unobservable
             for sign in (-1, 1)
         )
+
+    def _total(self, view: PreparedView, T: Float64, placed: _Placed) -> float:
+        """Return the total score at a pose (4, 4) instead of that of `placed`."""
+        return sum(a.score for a in self._agreements(view, T, placed.near).values())
 
     def _agreements(
         self, view: PreparedView, T: Float64, which: Sequence[int]

@@ -43,7 +43,8 @@ _PHOTOMETRIC = projective.ProjectiveOptions(
 )
 # Pixels of each image that refine a candidate by ICP.
 _ICP_POINTS = 700
-# Number of best candidates that are refined again down to the noise, and of the pixels used.
+# Number of best candidates that are refined again down to the noise, at most those that are aligned
+# photometrically, and of the pixels used.
 _MAX_REFINED, _REFINEMENT_POINTS = 10, 2500
 # Maximum score that a candidate may lose in photometric alignment.
 _MAX_SCORE_LOSS = 0.05
@@ -240,7 +241,8 @@ class Search:
         # Poses that converge to the same one are evaluated once.
         R, x = poses[:, :3, :3].copy(), poses[:, :3, 3].copy()
         evaluated = self._evaluated(poses[kernels.select_distinct(R, x, depth, floor, len(poses))])
-        best = sorted(evaluated, key=lambda candidate: -candidate.score)[:_MAX_REFINED]
+        count = min(_MAX_REFINED, self.options.photometric_candidates)
+        best = sorted(evaluated, key=lambda candidate: -candidate.score)[:count]
         refined = np.stack([candidate.T_target_source for candidate in best])
         reaches = np.maximum(8 * floor * _REACH_DECAY, 1.3 * floor)
         refine_poses(s, t, refined, reaches, _REFINEMENT_POINTS, options.max_angle)
