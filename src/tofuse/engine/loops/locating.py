@@ -38,7 +38,7 @@ _MAX_SHIFT = 0.5
 # Most similar places with which a view is aligned. Of these: places in which the pose of one view
 # is searched, further ones for each other view of a clip, and those in which rivals of a probable
 # pose are searched, in the range in which views of one place look similar.
-_CONSIDERED, _SEARCHED, _PER_VIEW, _RIVALS = 16, 8, 2, 2
+_CONSIDERED, _SEARCHED, _PER_VIEW, _RIVALS = 24, 8, 2, 2
 _NARROW = SearchOptions("auto", 0.55, 0.45, 0.25, 0.3, 8, 12, 3)
 # Score below which an alignment says nothing about the pose.
 _MIN_SCORE = 0.25
@@ -398,7 +398,7 @@ class Locator:
     ) -> Location:
         placed = best.placed[view.index]
         if len(placed.aligned.unobservable):
-            placed = self._slid(view.view, placed)
+            placed = self._slid(view, placed)
         reasons = []
         if probability < pose_probability.ACCEPTED:
             reasons.append("no pose in the map is probable enough")
@@ -422,22 +422,17 @@ class Locator:
             None if rival is None else rival.T_map_clip @ view.T_component_camera,
         )
 
-    def _slid(self, view: PreparedView, placed: _Placed) -> _Placed:
-        """Move a view along degenerate directions of its alignment to where it agrees best."""
+    def _slid(self, view: View, placed: _Placed) -> _Placed:
+        """Move a view along degenerate directions to where it agrees best, and align it again."""
         T, best = placed.T_map_camera, placed.total
         for direction, step in itertools.product(placed.aligned.unobservable, _SLIDES):
             for _ in range(_MAX_SLIDES):
                 moved = T @ se3.exp(step * direction * projective.UNITS)
-                total = self._total(view, moved, placed)
+                total = self._total(view.view, moved, placed)
                 if total <= best:
                     break
                 T, best = moved, total
-        return replace(
-            placed,
-            T_map_camera=T,
-            aligned=replace(placed.aligned, T_world_source=T),
-            agreements=tuple(self._agreements(view, T, placed.near).values()),
-        )
+        return self._placed(view, T @ se3.inverse(view.T_component_camera)) or placed
 
     def _is_distinguished(self, view: PreparedView, placed: _Placed) -> bool:
         """Whether poses displaced along degenerate directions agree less with the map views.

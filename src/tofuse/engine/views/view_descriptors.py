@@ -25,7 +25,7 @@ _MIN_ALBEDO_FRACTION = 0.2
 # Of the index of descriptors: principal components, and nearest neighbours per query.
 _COMPONENTS, _NEAREST = 8, 6
 # Descriptors that are compared with one cell by cell.
-_COMPARED = 128
+_COMPARED = 256
 
 
 def view_descriptor(view: PreparedView) -> Float32:
