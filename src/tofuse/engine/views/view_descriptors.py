@@ -47,7 +47,9 @@ def view_descriptor(view: PreparedView) -> Float32:
     return descriptor.reshape(2, _ROWS, _COLUMNS)
 
 
-def dissimilarity(descriptor: Float32, others: Float32, shift: float) -> Float64:
+def dissimilarity(
+    descriptor: Float32, others: Float32, shift: float, *, exposed_alike: bool = False
+) -> Float64:
     """Return the distances (N,) between one descriptor and others, each at its best shift.
 
     0 for the same image, 1 for no similarity. The mean difference of log albedo is exposure, and
@@ -59,6 +61,8 @@ def dissimilarity(descriptor: Float32, others: Float32, shift: float) -> Float64
         Descriptors (2, 9, 12) and (N, 2, 9, 12).
     shift
         Largest shift, as a fraction of the width.
+    exposed_alike
+        Whether the exposure may be the same: half the weight is on albedo as it is.
     """
     max_u, max_v = round(shift * _COLUMNS), round(shift * _ROWS / 2)
     best = np.ones(len(others))
@@ -66,7 +70,7 @@ def dissimilarity(descriptor: Float32, others: Float32, shift: float) -> Float64
         for u in range(-max_u, max_u + 1):
             patch = descriptor[:, max(v, 0) : _ROWS + v, max(u, 0) : _COLUMNS + u]
             other_patches = others[:, :, max(-v, 0) : _ROWS - v, max(-u, 0) : _COLUMNS - u]
-            np.minimum(best, _difference(patch, other_patches), out=best)
+            np.minimum(best, _difference(patch, other_patches, exposed_alike), out=best)
     return best
 
 
@@ -144,7 +148,9 @@ class DescriptorIndex:
         # Squared distances, but for a term of the query.
         distance = (self._blocks**2).sum(1) - 2 * query @ self._blocks.T
         nearest = (distance + (query**2).sum(1)[:, None]).min(0).argsort(kind="stable")[:_COMPARED]
-        difference = dissimilarity(descriptor, self._descriptors[nearest], shift)
+        difference = dissimilarity(
+            descriptor, self._descriptors[nearest], shift, exposed_alike=True
+        )
         return np.asarray(nearest[difference.argsort(kind="stable")])
 
 
@@ -181,7 +187,7 @@ def _blocks(descriptors: Float32, unknown: Float64 | None = None) -> Float64:
     return np.where(has_value, means, overall_mean).reshape(len(descriptors), -1)
 
 
-def _difference(patch: Float32, others: Float32) -> Float64:
+def _difference(patch: Float32, others: Float32, exposed_alike: bool) -> Float64:
     """Return the mean differences (N,) of the cells, relative to their limits."""
     difference = others - patch
     valid = np.isfinite(difference)
@@ -190,6 +196,8 @@ def _difference(patch: Float32, others: Float32) -> Float64:
     exposure = difference[:, 1].sum((1, 2)) / np.maximum(count[:, 1], 1)
     depth = np.minimum(np.abs(difference[:, 0]) / _MAX_DEPTH, 1)
     albedo = np.minimum(np.abs(difference[:, 1] - exposure[:, None, None]) / _MAX_ALBEDO, 1)
+    if exposed_alike:
+        albedo = 0.5 * (albedo + np.minimum(np.abs(difference[:, 1]) / _MAX_ALBEDO, 1))
     cells = patch[0].size
     depth_distance = (depth.sum((1, 2)) + cells - count[:, 0]) / cells
     # Albedo is known for smooth surfaces only; other cells are ignored.
