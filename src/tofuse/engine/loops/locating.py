@@ -149,6 +149,11 @@ class _Hypothesis:
     T_map_clip: Float64
     placed: dict[int, _Placed]
 
+    @property
+    def contradiction(self) -> float:
+        """Contradiction of the view that the map contradicts least."""
+        return min(placed.contradiction for placed in self.placed.values())
+
 
 def _are_distinct(a: dict[int, _Placed], b: dict[int, _Placed]) -> bool:
     """Whether two hypotheses are distinct after their views were aligned, by index."""
@@ -202,9 +207,8 @@ class Locator:
         searched = rivals = 0
         budget = _SEARCHED + _PER_VIEW * (len(views) - 1)
         for place in places:
-            is_probable = _probability(log_odds, searched) >= pose_probability.ACCEPTED
-            if is_probable:
-                best = hypotheses[int(np.argmax(log_odds))]
+            best = self._probable(hypotheses, log_odds, searched)
+            if best is not None:
                 if rivals == _RIVALS:
                     break
                 if self._is_near(best.T_map_clip @ place.view.T_component_camera, place.k):
@@ -213,9 +217,9 @@ class Locator:
             elif searched == budget:
                 break
             searched += 1
-            for found in self._rivals(place) if is_probable else self._searched(place):
+            for found in self._searched(place) if best is None else self._rivals(place):
                 aligned[place.view.index].append(found)
-                if is_probable and found.score < _MIN_SCORE:
+                if best is not None and found.score < _MIN_SCORE:
                     continue
                 T = found.T_map_view @ se3.inverse(place.view.T_component_camera)
                 placed = {v.index: p for v in views if (p := self._placed(v, T)) is not None}
@@ -223,6 +227,15 @@ class Locator:
                     hypotheses.append(_Hypothesis(T, placed))
             log_odds = [self._log_odds(h, hypotheses, aligned) for h in hypotheses]
         return self._locations(views, hypotheses, log_odds, searched)
+
+    def _probable(
+        self, hypotheses: Sequence[_Hypothesis], log_odds: Sequence[float], searched: int
+    ) -> _Hypothesis | None:
+        """Return the best hypothesis if it is probable, and the map does not contradict it."""
+        if _probability(log_odds, searched) < pose_probability.ACCEPTED:
+            return None
+        best = hypotheses[int(np.argmax(log_odds))]
+        return best if best.contradiction <= self._max_contradiction else None
 
     def _places(self, views: Sequence[View]) -> list[_Place]:
         """Align views with the most similar map views.
