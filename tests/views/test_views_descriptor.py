@@ -9,6 +9,7 @@ import pytest
 
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_descriptors import (
+    DescriptorIndex,
     dissimilarity,
     mutual_dissimilarity,
     view_descriptor,
@@ -92,3 +93,19 @@ def test_unknown_cells_are_dissimilar(descriptors) -> None:
     assert far[1] == 0
     # A constant difference is exposure for albedo, but another place for depth.
     np.testing.assert_allclose(far[[0, 2]], [1.0, 0.5], atol=1e-5)
+
+
+def test_index_finds_neighbours_first(descriptors) -> None:
+    for k in range(1, len(descriptors) - 1):
+        others = np.delete(descriptors, k, axis=0)
+        nearest = DescriptorIndex(others).most_similar(descriptors[k], 0.5)
+        assert sorted(nearest) == list(range(len(others)))
+        assert nearest[0] in (k - 1, k)
+
+
+def test_views_exposed_alike_differ_by_their_albedo(descriptors) -> None:
+    """A darker scene of the same shape is another one, unless the exposure is unknown."""
+    darker = descriptors[:1].copy()
+    darker[:, 1] -= 0.3
+    assert dissimilarity(descriptors[0], darker, 0.25) == pytest.approx(0, abs=1e-6)
+    assert dissimilarity(descriptors[0], darker, 0.25, exposed_alike=True) > 0.05
