@@ -30,6 +30,7 @@ from tofuse.engine.loops import locating
 from tofuse.engine.mapping import Config, adaptation, clips, from_method, kind_of
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
+from tofuse.engine.search import pose_probability
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import Keyframes, given
 from tofuse.formats.files import atomic
@@ -185,20 +186,34 @@ class ResultMap:
         ]
 
     def _in_clip(self, clip: clips.Clip) -> dict[int, locating.Location]:
-        """Return the locations of the frames of a clip, each from the nearest located one."""
+        """Return the locations of the frames of a clip, each from the nearest located one.
+
+        Those that are not accepted are passed over, but where tracking must have drifted: they are
+        elsewhere than an accepted one and the motion in between say.
+        """
         views = clip.store.views
         chosen = [views[k] for k in evenly_spaced(np.arange(len(views)), _LOCATED)]
         located = self.locator.locate(chosen)
-        accepted = {k: location for k, location in located.items() if location.accepted}
-        located = accepted or located
         depths = {view.index: view.depth for view in chosen}
-        found = {}
-        for index, T in clip.poses.items():
-            if located:
-                k = min(located, key=lambda other: abs(other - index))
-                T_view_frame = se3.inverse(clip.poses[k]) @ T
-                found[index] = located[k].carried(T_view_frame, depths[k])
-        return found
+        accepted = {k: location for k, location in located.items() if location.accepted}
+
+        def carried(index: int, locations: dict[int, locating.Location]) -> locating.Location:
+            k = min(locations, key=lambda other: abs(other - index))
+            T_view_frame = se3.inverse(clip.poses[k]) @ clip.poses[index]
+            return locations[k].carried(T_view_frame, depths[k])
+
+        if accepted:
+            located = accepted | {
+                k: location
+                for k, location in located.items()
+                if k not in accepted
+                and not se3.is_within(
+                    se3.inverse(carried(k, accepted).T_map_camera) @ location.T_map_camera,
+                    pose_probability.RIGHT_FRACTION * depths[k],
+                    pose_probability.RIGHT_RAD,
+                )
+            }
+        return {index: carried(index, located) for index in clip.poses} if located else {}
 
     def _config_of(self, frame: Frame | None, recording: Recording | None = None) -> Config:
         """Return how a frame is corrected: as those of the map if it is of the same camera."""
