@@ -1,9 +1,18 @@
 """How a textured model looks from where images were taken that it was not made of.
 
-Every tenth colour image is left out of the texture, and the model is rendered at its pose: PSNR and
-SSIM (Wang et al. 2004) over the pixels that the model covers, after the exposure of the image is
-fitted by one factor per channel, beside the colours of the vertices. Open3D's colour map
-optimisation (Zhou and Koltun 2014) is compared where Open3D is installed.
+Every tenth colour image, or every third of few, is left out of the texture, and the model is
+rendered at its pose: PSNR and SSIM (Wang et al. 2004), after a gain and an offset per channel of
+the image are fitted,
+
+- over the pixels that the model covers, at the pose of the image,
+- over the same, at the pose where model and image agree best, as the pose of an image that is left
+  out has an error too,
+- where also the depth image shows that surface, and no edge of it: what moved, and wrong outlines,
+  are errors of the surface, which no texture mends.
+
+The rows are the colours of the vertices, the texture, and the colour map optimisation of Open3D (Zhou
+and Koltun 2014), on the same surface, where Open3D is installed. The last row has a texture of all
+images: what it lacks is lost by the texture, not by the absence of the images.
 
     python benchmarks/appearance.py RECORDING...
 """
@@ -13,24 +22,32 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
 
 from tofuse.apps.jobs import Options, run
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.fusion import Mesh, Textured, display_colors
+from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
+from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import texturing
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.recordings import open_recording
 
-LEFT_OUT = 10
+LEFT_OUT, _MANY = 10, 20  # every tenth image, or of fewer than 20 images every third
 _SSIM_C1, _SSIM_C2, _SSIM_SIGMA = (0.01 * 255) ** 2, (0.03 * 255) ** 2, 1.5
 _WIDTH = 960  # pixels of the compared images, or as recorded if that is less
+_OPEN3D_ITERATIONS = 50
+_SAMPLES, _NEAREST = 2, 0.05  # samples per pixel of rendered images, and m to the nearest surface
+_EDGE = 9  # pixels at edges of depth that are not compared
+_ALIGNMENTS, _MAX_SHIFT = 3, 0.05  # of the pose of an image; largest shift, in widths of the image
 
 
 @dataclass(frozen=True)
@@ -39,6 +56,10 @@ class Score:
 
     psnr: float
     ssim: float
+    psnr_aligned: float
+    ssim_aligned: float
+    psnr_surface: float
+    ssim_surface: float
     covered: float
 
 
@@ -46,22 +67,58 @@ def main() -> None:
     """Print a row per recording and method."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recordings", nargs="+")
-    print("recording, method, images left out, PSNR (dB), SSIM, covered, CPU seconds")
+    print(
+        "recording, method, images left out, PSNR (dB), SSIM, PSNR aligned, SSIM aligned, "
+        "PSNR surface, SSIM surface, share of the images, CPU seconds"
+    )
     for path in parser.parse_args().recordings:
         for name, scores, seconds in measured(path):
-            means = np.mean([[s.psnr, s.ssim, s.covered] for s in scores], axis=0)
+            means = np.nanmean([astuple(score) for score in scores], axis=0)
             values = ", ".join(f"{value:.3g}" for value in means)
             print(f"{Path(path).name}, {name}, {len(scores)}, {values}, {seconds:.1f}", flush=True)
-    print(f"Open3D's colour map optimisation: {open3d_state()}")
 
 
-def open3d_state() -> str:
-    """Say why there is no row of Open3D."""
+def colored_by_open3d(mesh: Mesh, views: list[Any]) -> Mesh | None:
+    """Return a surface in the colours of Open3D's colour map optimisation; None if it can't be.
+
+    `views` are of (frame, image or None, pose). Needs Open3D and images of pinhole cameras.
+    """
     try:
-        import open3d
+        import open3d as o3d
     except ImportError:
-        return "not measured, as Open3D is not installed here"
-    return f"not measured yet (Open3D {open3d.__version__})"
+        return None
+    if not all(isinstance(frame.camera, Pinhole) for frame, _, _ in views):
+        return None
+    images, cameras = [], []
+    for frame, full, pose in views:
+        color = np.ascontiguousarray(frame.color_image if full is None else full)
+        size = color.shape[1::-1]
+        depth = cv2.resize(frame.z, size, interpolation=cv2.INTER_NEAREST)
+        images.append(
+            o3d.geometry.RGBDImage.create_from_color_and_depth(
+                *(o3d.geometry.Image(image) for image in (color, depth)),
+                depth_scale=1.0,
+                depth_trunc=20.0,
+                convert_rgb_to_intensity=False,
+            )
+        )
+        c, (x, y) = frame.camera, np.array(size) / [frame.camera.width, frame.camera.height]
+        camera = o3d.camera.PinholeCameraParameters()
+        camera.intrinsic = o3d.camera.PinholeCameraIntrinsic(
+            *size, c.fx * x, c.fy * y, (c.cx + 0.5) * x - 0.5, (c.cy + 0.5) * y - 0.5
+        )
+        camera.extrinsic = se3.inverse(pose)
+        cameras.append(camera)
+    surface = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces)
+    )
+    surface.compute_vertex_normals()
+    trajectory = o3d.camera.PinholeCameraTrajectory()
+    trajectory.parameters = cameras
+    option = o3d.pipelines.color_map.RigidOptimizerOption(maximum_iteration=_OPEN3D_ITERATIONS)
+    made, _ = o3d.pipelines.color_map.run_rigid_optimizer(surface, images, trajectory, option)
+    colors = np.round(np.asarray(made.vertex_colors) * 255).clip(0, 255).astype(np.uint8)
+    return replace(mesh, color=colors)
 
 
 def measured(path: str) -> list[tuple[str, list[Score], float]]:
@@ -75,20 +132,35 @@ def measured(path: str) -> list[tuple[str, list[Score], float]]:
         for k in np.flatnonzero(result.has_pose).tolist()
         if isinstance(frame := recording.image(k), RangeFrame) and frame.color_image is not None
     ]
-    left_out = colored[LEFT_OUT // 2 :: LEFT_OUT]
+    step = LEFT_OUT if len(colored) >= _MANY else 3
+    left_out = colored[step // 2 :: step]
     kept = np.setdiff1d(np.arange(len(recording)), left_out)
+    rest = replace(recording, indices=recording.indices[kept])
     start = time.process_time()
-    texture = texturing.make_texture(
-        replace(recording, indices=recording.indices[kept]), _of_frames(result, kept), 2048
-    )
+    texture = texturing.make_texture(rest, _of_frames(result, kept), 2048, required=True)
     seconds = time.process_time() - start
     if texture is None:
         return []
+    start = time.process_time()
+    known = _of_frames(result, kept)
+    views: list[Any] = []
+    for k in texturing.steadiest_frames(known, np.isin(kept, colored)):
+        frame = rest[k]
+        if isinstance(frame, RangeFrame) and frame.color_image is not None:
+            full = texturing.full_image(rest, frame, 1 << 62)
+            views.append((frame, full, known.trajectory[k]))
+    optimised = colored_by_open3d(texture.mesh, views)
+    seconds_open3d = time.process_time() - start
     # The same surface and images, with a colour per vertex.
     rows: list[tuple[str, Mesh | Textured, float]] = [
         ("vertex colours", texture.charts, 0.0),
         ("texture", texture, seconds),
     ]
+    if optimised is not None:
+        rows.append(("Open3D's colour map optimisation", optimised, seconds_open3d))
+    everything = texturing.make_texture(recording, result, 2048, required=True)
+    assert everything is not None
+    rows.append(("texture of these images too", everything, 0.0))
     return [
         (name, [_compared(model, recording, result, k) for k in left_out], spent)
         for name, model, spent in rows
@@ -110,25 +182,82 @@ def _of_frames(result: Reconstruction, rows: np.ndarray) -> Reconstruction:
 def _compared(
     model: Mesh | Textured, recording: Recording, result: Reconstruction, k: int
 ) -> Score:
+    """Compare a model with an image, as it is posed and at the pose where they agree best."""
     frame: Any = recording[k]
     full = texturing.full_image(recording, frame, 1 << 62)
     image = frame.color_image if full is None else full
     scale = min(1.0, _WIDTH / max(image.shape))
     size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
     image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    shown, mask = rendered(model, frame.camera, result.trajectory[k], size)
-    mask &= image.any(-1)
+    known = image.any(-1)
+    shown, z = rendered(model, frame.camera, result.trajectory[k], size)
+    as_posed = _similarity(image, shown, (z > 0) & known)
+    T = _aligned(model, frame.camera, result.trajectory[k], image)
+    shown, z = rendered(model, frame.camera, T, size)
+    seen = cv2.resize(frame.z, size, interpolation=cv2.INTER_NEAREST)
+    same = (seen > 0) & (np.abs(z - seen) < TOLERANCE_M + TOLERANCE_FRACTION * z) & known
+    same = cv2.erode(same.astype(np.uint8), np.ones((_EDGE, _EDGE))) > 0
+    aligned = _similarity(image, shown, (z > 0) & known)
+    return Score(*as_posed, *aligned, *_similarity(image, shown, same), float(same.mean()))
+
+
+def _similarity(image: np.ndarray, shown: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
+    """Return PSNR and SSIM of a rendered image, after its channels' gain and offset are fitted."""
     if not mask.any():
-        return Score(np.nan, np.nan, 0.0)
+        return np.nan, np.nan
     a, b = image.astype(float), shown.astype(float)
-    gain = (a[mask] * b[mask]).sum(0) / np.maximum((b[mask] ** 2).sum(0), 1e-9)
-    b = (b * gain).clip(0, 255)
+    for channel in range(3):
+        gain, offset = np.polyfit(b[mask][:, channel], a[mask][:, channel], 1)
+        b[..., channel] = (gain * b[..., channel] + offset).clip(0, 255)
     error = np.mean((a[mask] - b[mask]) ** 2)
-    return Score(
-        float(10 * np.log10(255**2 / max(error, 1e-9))),
-        _ssim(a.mean(-1), b.mean(-1), mask),
-        float(mask.mean()),
-    )
+    psnr = float(10 * np.log10(255**2 / max(error, 1e-9)))
+    return psnr, _ssim(a.mean(-1), b.mean(-1), mask)
+
+
+def _aligned(
+    model: Mesh | Textured, camera: Any, T_world_camera: np.ndarray, image: np.ndarray
+) -> np.ndarray:
+    """Return the pose at which a model looks most like an image.
+
+    The optical flow from the rendered to the recorded image (DIS; Kroeger et al. 2016) says where
+    in the image the points of the model are seen.
+    """
+    height, width = image.shape[:2]
+    scale = np.array([width / camera.width, height / camera.height])
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    seen = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    for _ in range(_ALIGNMENTS):
+        shown, z = rendered(model, camera, T_world_camera, (width, height))
+        grey = cv2.cvtColor(shown.clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+        moved = flow.calc(np.where(z > 0, grey, seen), seen, None)
+        contrast = cv2.GaussianBlur(np.hypot(*np.gradient(grey.astype(np.float32))), (0, 0), 2)
+        inner = cv2.erode((z > 0).astype(np.uint8), np.ones((9, 9))) > 0
+        inner &= np.hypot(*moved.transpose(2, 0, 1)) < _MAX_SHIFT * width
+        if np.count_nonzero(inner) < 100:
+            break
+        inner &= contrast >= np.median(contrast[inner])
+        rows, columns = np.nonzero(inner)
+        some = slice(None, None, max(1, len(rows) // 5000))
+        rows, columns = rows[some], columns[some]
+        pixels = (np.c_[columns, rows] + 0.5) / scale - 0.5
+        at = _rays_at(camera, pixels)
+        points = np.c_[at, np.ones(len(at))] * z[rows, columns][:, None]
+        target = pixels + moved[rows, columns] / scale
+
+        def residuals(xi: np.ndarray, p: Any = points, target: Any = target) -> np.ndarray:
+            T = se3.exp(xi)
+            q = p @ T[:3, :3].T + T[:3, 3]
+            return ((camera.project(q / q[:, 2:]) - target) * scale).ravel()
+
+        found = least_squares(residuals, np.zeros(6), loss="soft_l1", x_scale=[1, 1, 1, 1, 1, 1])
+        T_world_camera = T_world_camera @ se3.inverse(se3.exp(found.x))
+    return T_world_camera
+
+
+def _rays_at(camera: Any, pixels: np.ndarray) -> np.ndarray:
+    """Interpolate the rays of a camera at pixels (N, 2)."""
+    u, v = pixels.astype(np.float32).T[:, None]
+    return cv2.remap(np.asarray(camera.rays(), np.float32), u, v, cv2.INTER_LINEAR)[0]
 
 
 def _ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray) -> float:
@@ -149,11 +278,11 @@ def _ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray) -> float:
 def rendered(
     model: Mesh | Textured, camera: Any, T_world_camera: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Render a model at a pose: image (H, W, 3) and the mask (H, W) of what it covers.
+    """Render a model at a pose: image (H, W, 3), and z (H, W), 0 where it does not cover a pixel.
 
-    Triangles are cut into points as dense as the pixels; the nearest one of a pixel is seen.
+    Triangles are drawn from the farthest to the nearest, with `_SAMPLES`^2 samples per pixel.
     """
-    width, height = size
+    width, height = _SAMPLES * size[0], _SAMPLES * size[1]
     mesh = model.charts if isinstance(model, Textured) else model
     T = se3.inverse(T_world_camera)
     p = mesh.vertices.astype(float) @ T[:3, :3].T + T[:3, 3]
@@ -164,41 +293,29 @@ def rendered(
     ] - 0.5
     corners, depths = pixels[mesh.faces], p[mesh.faces, 2]
     low, high = corners.min(1), corners.max(1)
-    visible = (depths > 0.05).all(1) & (high >= 0).all(1) & (low < [width, height]).all(1)
-    visible &= ((high - low) < [width, height]).all(1)
-    faces, corners, depths = mesh.faces[visible], corners[visible], depths[visible]
-    steps = np.ceil((high - low)[visible].max(1) * 1.5).astype(int).clip(1, 400)
-    depth = np.full(width * height, np.inf)
-    image = np.zeros((width * height, 3), np.float32)
-    colors = None if mesh.color is None else display_colors(mesh.color).astype(np.float32)
-    for n in np.unique(steps):
-        i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
-        inside = (i + j) <= n
-        b = np.stack([n - i[inside] - j[inside], i[inside], j[inside]], -1) / n
-        rows = np.flatnonzero(steps == n)
-        for part in np.array_split(rows, max(1, len(rows) * len(b) // 2_000_000)):
-            # Interpolated in perspective.
-            weight = b[None] / depths[part][:, None]
-            weight /= weight.sum(-1, keepdims=True)
-            at = np.rint(b @ corners[part]).astype(int).reshape(-1, 2)
-            far = (weight * depths[part][:, None]).sum(-1).ravel()
-            ok = (at >= 0).all(1) & (at < [width, height]).all(1)
-            cell, far = at[ok, 1] * width + at[ok, 0], far[ok]
-            if isinstance(model, Textured):
-                texel = (weight @ model.atlas.texels[faces[part]]).reshape(-1, 2)[ok]
-                u, v = texel.astype(np.float32).T[:, None]
-                value = _sampled(model.image, u, v)
-            else:
-                assert colors is not None
-                value = (weight @ colors[faces[part]]).reshape(-1, 3)[ok]
-            order = np.lexsort((-far, cell))  # the nearest one last
-            cell, far, value = cell[order], far[order], value[order]
-            last = np.r_[cell[1:] != cell[:-1], True]
-            cell, far, value = cell[last], far[last], value[last]
-            nearer = far < depth[cell]
-            depth[cell[nearer]], image[cell[nearer]] = far[nearer], value[nearer]
-    shape = (height, width)
-    return image.reshape(*shape, 3), np.isfinite(depth).reshape(shape)
+    front = (depths > _NEAREST).all(1) & (high >= 0).all(1) & (low < [width, height]).all(1)
+    order = np.flatnonzero(front)
+    order = order[np.argsort(-depths[order].mean(1), kind="stable")]
+    owner = np.full((height, width), NO_TRIANGLE, np.int32)
+    place = np.zeros((height, width, 2), np.float32)
+    draw_triangles(corners[order].astype(np.float32), 0.0, owner, place)
+    covered = owner != NO_TRIANGLE
+    faces, (b, c) = order[owner[covered]], place[covered].T
+    weight = np.stack([1 - b - c, b, c], -1) / depths[faces]  # interpolated in perspective
+    far = 1 / weight.sum(-1)
+    weight *= far[:, None]
+    if isinstance(model, Textured):
+        texel = np.einsum("nk,nki->in", weight, model.atlas.texels[mesh.faces[faces]])
+        value = _sampled(model.image, *texel.astype(np.float32)[:, None])
+    else:
+        assert mesh.color is not None
+        colors = display_colors(mesh.color).astype(np.float32)[mesh.faces[faces]]
+        value = np.einsum("nk,nki->ni", weight, colors)
+    image, distance = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
+    image[covered], distance[covered] = value, far
+    image, distance = (cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (image, distance))
+    whole = covered.reshape(size[1], _SAMPLES, size[0], _SAMPLES).all((1, 3))
+    return image, np.where(whole, distance, 0)
 
 
 def _sampled(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from tofuse.engine.fusion.atlas_kernels import (
     weigh_points,
 )
 from tofuse.engine.fusion.cloud import NO_COLOR, display_colors, grey_of, has_color
+from tofuse.engine.fusion.color_alignment import Shown, aligned_poses
 from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.geometry import KdTree, se3
@@ -196,7 +197,7 @@ def textured(mesh: Mesh, views: Sequence[TextureView], poses: Float64, size: int
     size
         Maximum edge of the texture.
     """
-    seen = _Seen.of(mesh, views, poses)
+    seen = _Seen.of(mesh, views, poses).aligned(mesh)
     gains = seen.exposures()
     candidates, label = seen.candidates(mesh.faces)
     whole = label >= 0
@@ -268,6 +269,16 @@ class _Seen:
         for k, T_camera_world in enumerate(se3.inverse(poses)):
             weigh(k, T_camera_world)
         return cls(views, poses, weights, pixels)
+
+    def aligned(self, mesh: Mesh) -> _Seen:
+        """Correct the poses so that the images agree; what they show of the surface stays."""
+        if len(self.views) < 2:
+            return self
+        shown = [
+            Shown(view.image, view.projection, weights > 0, pixels)
+            for view, weights, pixels in zip(self.views, self.weights, self.pixels, strict=True)
+        ]
+        return replace(self, poses=aligned_poses(mesh.vertices, self.poses, shown))
 
     def exposures(self) -> Float64:
         """Return exposure factors (V, 3) of the channels of the views.
