@@ -10,7 +10,7 @@ the image are fitted,
 - where also the depth image shows that surface, and no edge of it: what moved, and wrong outlines,
   are errors of the surface, which no texture mends.
 
-The rows are the colours of the vertices, the texture, and the colour map optimisation of Open3D (Zhou
+The rows are the colours of the vertices, the texture, and Open3D, its colour map optimisation (Zhou
 and Koltun 2014), on the same surface, where Open3D is installed. The last row has a texture of all
 images: what it lacks is lost by the texture, not by the absence of the images.
 
@@ -115,7 +115,7 @@ def colored_by_open3d(mesh: Mesh, views: list[Any]) -> Mesh | None:
     surface.compute_vertex_normals()
     trajectory = o3d.camera.PinholeCameraTrajectory()
     trajectory.parameters = cameras
-    option = o3d.pipelines.color_map.RigidOptimizerOption(maximum_iteration=_OPEN3D_ITERATIONS)
+    option = o3d.pipelines.color_map.RigidOptimizerOption(_OPEN3D_ITERATIONS, 20.0)
     made, _ = o3d.pipelines.color_map.run_rigid_optimizer(surface, images, trajectory, option)
     colors = np.round(np.asarray(made.vertex_colors) * 255).clip(0, 255).astype(np.uint8)
     return replace(mesh, color=colors)

@@ -17,10 +17,10 @@ _MAX_POINTS, _MIN_POINTS = (
     20_000,
     50,
 )  # on the surface, and those that a view must share with others
-_MAX_SIDE = 640  # pixels of the compared images
+_MAX_SIDE = 480  # pixels of the compared images
 # Blur of the images in pixels, and iterations at each; the width of the neighbourhood in which
 # contrast is equalised, in blurs; and the contrast of noise, in grey levels.
-_BLURS, _ITERATIONS, _NEIGHBOURHOOD, _NOISE = (4.0, 2.0, 1.0), 4, 8, 3.0
+_BLURS, _ITERATIONS, _NEIGHBOURHOOD, _NOISE = (3.0, 1.0), 5, 8, 3.0
 _ROBUST_LIMIT = 1.0  # of differences between images of unit contrast
 # Expected corrections in m and radians: of poses that were estimated from depth. Those of more
 # than `_MAX_SIGMAS` are not made.

@@ -68,6 +68,8 @@ class PhoneSource(FileSource):
         self.confidence = list(confidence)
         self.color = list(color)
         self.cameras: list[Pinhole | InputError] = []
+        # The last colour image, as who reads a frame may want it at its full resolution next.
+        self._last_color: tuple[Path, UInt8] | None = None
         self.metadata |= {
             "sensor": SENSOR,
             POSES_BY: "ARKit",
@@ -110,7 +112,12 @@ class PhoneSource(FileSource):
     def full_resolution_color(self, index: int) -> UInt8 | None:
         """See `FileSource.full_resolution_color`."""
         path = self.color[index]
-        return None if path is None else read_color(path)
+        if path is None:
+            return None
+        last = self._last_color
+        if last is None or last[0] != path:
+            self._last_color = last = path, read_color(path)
+        return last[1]
 
     def has_color(self, index: int) -> bool:
         """See `FileSource.has_color`."""
