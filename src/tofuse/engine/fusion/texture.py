@@ -34,8 +34,8 @@ from tofuse.engine.views import Projection
 # Width of the margin in which a view's weight decreases, as a fraction of the image's height; how
 # much of it is left at an edge of depth; and pixels next to unknown colour that are not used.
 _BORDER, _AT_EDGE, _ERODED = 0.08, 0.03, 2
-_COARSE = 48  # pixels of the longer side of the images that are blended widely
-_CANDIDATES = 4  # views that paint a triangle
+_COARSE = 96  # pixels of the longer side of the images that are blended widely
+_CANDIDATES = 8  # views that paint a triangle
 _CHUNKS = 16
 _MAX_SAMPLES = 20_000  # vertices at which exposures are compared
 _CHUNK_TEXELS = 1 << 14
