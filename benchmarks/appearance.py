@@ -145,10 +145,10 @@ def measured(path: str) -> list[tuple[str, list[Score], float]]:
     known = _of_frames(result, kept)
     views: list[Any] = []
     for k in texturing.steadiest_frames(known, np.isin(kept, colored)):
-        frame = rest[k]
-        if isinstance(frame, RangeFrame) and frame.color_image is not None:
-            full = texturing.full_image(rest, frame, 1 << 62)
-            views.append((frame, full, known.trajectory[k]))
+        view = rest[k]
+        if isinstance(view, RangeFrame) and view.color_image is not None:
+            full = texturing.full_image(rest, view, 1 << 62)
+            views.append((view, full, known.trajectory[k]))
     optimised = colored_by_open3d(texture.mesh, views)
     seconds_open3d = time.process_time() - start
     # The same surface and images, with a colour per vertex.
@@ -224,7 +224,7 @@ def _aligned(
     """
     height, width = image.shape[:2]
     scale = np.array([width / camera.width, height / camera.height])
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     seen = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     for _ in range(_ALIGNMENTS):
         shown, z = rendered(model, camera, T_world_camera, (width, height))
@@ -313,9 +313,9 @@ def rendered(
         value = np.einsum("nk,nki->ni", weight, colors)
     image, distance = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
     image[covered], distance[covered] = value, far
-    image, distance = (cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (image, distance))
+    smaller = [cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (image, distance)]
     whole = covered.reshape(size[1], _SAMPLES, size[0], _SAMPLES).all((1, 3))
-    return image, np.where(whole, distance, 0)
+    return smaller[0], np.where(whole, smaller[1], 0)
 
 
 def _sampled(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
