@@ -79,12 +79,10 @@ def test_texture_of_perturbed_poses_is_as_sharp_as_of_true_ones() -> None:
         charts = made.charts
         inner = (np.abs(charts.vertices[:, :2]) < [0.6, 0.4]).all(1)
         truth = light(charts.vertices.astype(float))
-        # The whole texture may be displaced with the poses; not its parts from each other.
         return float(np.abs(charts.color[inner, 0] - truth[inner]).mean())
 
-    assert error(POSES) < 4
     perturbed = POSES @ se3.exp(ERRORS - ERRORS.mean(0))
-    assert error(perturbed) < 10
+    assert error(perturbed) < 1.2 * error(POSES)  # 2.6 times without alignment
 
 
 def test_images_that_do_not_agree_keep_their_poses() -> None:
