@@ -19,6 +19,7 @@ from tofuse.engine.quality.pose_accuracy import (
     Accuracy,
     ObservedErrors,
     accuracy_of,
+    contradicted_runs,
     covariances_of,
     degenerate_directions,
     without_degenerate,
@@ -295,6 +296,23 @@ def test_slide_along_bare_walls_is_unbounded(scene) -> None:
     assert a.unbounded == ()
     assert recording.reference is not None
     assert displacement(recording.reference, textured.trajectory)[0] < a.position_m < 0.1
+
+
+@pytest.mark.parametrize(("slid", "found"), [(0.0, set()), (0.1, {1})])
+def test_measurements_across_a_slide_contradict_each_other(slid, found) -> None:
+    """Some pairs of views are right, others slid with the frames in between."""
+    rng = np.random.default_rng(4)
+    sigma = np.repeat([0.01, 0.002], 3)
+    n = 40
+    true = true_poses(n)
+    steps = []
+    for i in range(n):
+        for j in range(i + 1, min(i + 9, n)):
+            error = rng.normal(0, sigma) + slid * np.eye(6)[0] * (i < 20 <= j < 22)
+            T_i_j = se3.inverse(true[i]) @ true[j] @ se3.exp(error)
+            steps.append(Measured(i, j, T_i_j, np.diag(sigma**-2.0)))
+    graph = build_graph(list(range(n)), true, steps)
+    assert contradicted_runs(graph, np.array([10, 20, 21]), np.array([0, 1, 1])) == found
 
 
 def test_single_pose_is_not_assessed() -> None:

@@ -181,12 +181,12 @@ class Assessment:
                 closed.optimisation.graph
             ).of_poses
         refinement = refined.refinement
-        graph = refined.graph
+        claimed = refined.graph
         if closed.sensors:  # the accuracy uses the images alone where they suffice
-            graph = closed.visual.optimisation.graph
+            claimed = closed.visual.optimisation.graph
             if refinement.kept:
-                graph = self.tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
-        covariances = graph_covariances.GraphCovariances(self._measured(graph, refinement))
+                claimed = self.tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
+        covariances = graph_covariances.GraphCovariances(self._measured(claimed, refinement))
         refinement_shift = 0.0, 0.0
         if self._is_tracked:  # the initial error of given poses is unrelated to the final one
             refinement_shift = trajectory_errors.displacement(
@@ -218,7 +218,7 @@ class Assessment:
         by_motion: tuple[int, ...] = ()
         if accuracy.unbounded and closed.sensors.verified:
             by_odometry = bounded_by(self.tracked.steps_at_degenerate(closed.sensors))
-        between = self.tracked.steps_at_unbounded(graph, accuracy.unbounded)
+        between = self.tracked.steps_at_unbounded(claimed, accuracy.unbounded)
         if between:
             by_motion = bounded_by(between)
         accuracy = replace(accuracy, by_odometry=by_odometry, by_motion=by_motion)

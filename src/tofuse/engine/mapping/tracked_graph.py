@@ -157,14 +157,16 @@ class TrackedGraph:
     ) -> tuple[Measured, ...]:
         """Return the steps to and from unbounded frames of a graph that lie between bounded ones.
 
-        They are known as far as cameras move evenly: see `steps_between_bounded`.
+        They are known as far as cameras move evenly (`steps_between_bounded`), unless measurements
+        about these frames contradict each other: then later frames may be off as well.
         """
         if not unbounded:
             return ()
         position = {int(index): k for k, index in enumerate(graph.ids)}
         records = [e.record for e in self.posed if e.record.index in position]
+        indices = np.array([r.index for r in records], np.intp)
         poses = graph.poses[[position[r.index] for r in records]]
-        bounded = np.array([r.index not in unbounded for r in records], np.bool_)
+        bounded = ~np.isin(indices, list(unbounded))
         times = np.diff([r.timestamp for r in records])
         interval = float(np.median(times)) if len(times) else 0.0
         if interval <= 0:
@@ -175,12 +177,17 @@ class TrackedGraph:
             bounded,
             np.maximum(times / interval, 1.0),
         )
+        run_of = np.cumsum(bounded, dtype=np.intp)
+        contradicted = pose_accuracy.contradicted_runs(graph, indices[~bounded], run_of[~bounded])
         steps = []
         for k, sigma in found:
-            T_i_j = se3.inverse(poses[k - 1]) @ poses[k]
-            information = np.diag(np.repeat(sigma, 3) ** -2.0)
-            steps.append(Measured(records[k - 1].index, records[k].index, T_i_j, information))
-        return tuple(s for s in steps if (s.i, s.j) not in self.gaps)
+            i, j = records[k - 1].index, records[k].index
+            run = int(run_of[k]) - int(bounded[k])  # the step after a run belongs to it
+            if run not in contradicted and (i, j) not in self.gaps:
+                information = np.diag(np.repeat(sigma, 3) ** -2.0)
+                T_i_j = se3.inverse(poses[k - 1]) @ poses[k]
+                steps.append(Measured(i, j, T_i_j, information))
+        return tuple(steps)
 
     @property
     def gaps(self) -> set[tuple[int, int]]:

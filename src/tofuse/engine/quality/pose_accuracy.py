@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from scipy.special import bdtrc, fdtri
+from scipy.special import bdtrc, chdtri, fdtri
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64, Intp
@@ -52,6 +52,8 @@ _MAX_SPANNING = 2000
 _CHANCE_OF_PAIR = 0.05
 # Significance level of the number of such pairs of a view. It admits the only pair of a view.
 _SIGNIFICANCE = 0.05 + 1e-9
+# Fraction of the edges that disagree anywhere, and the significance of more about some frames.
+_DISAGREEING, _CONTRADICTED = 0.01, 0.001
 # Near the final pose. A direction with no smaller sigma than the prior is not measured.
 _ALIGNMENT = projective.ProjectiveOptions()
 # Standard deviation, in `UNITS`, that an error along a degenerate direction causes in the others.
@@ -323,6 +325,39 @@ def _constrained_by_chance(pairs: Intp, constrained: Bool, degenerate: Intp) -> 
     chance = np.where(n_constrained > 0, bdtrc(n_constrained - 1, n_pairs, _CHANCE_OF_PAIR), 1.0)
     found: Bool = constrained & (is_degenerate & (chance > _SIGNIFICANCE)[row]).any(1)
     return found
+
+
+def contradicted_runs(graph: PoseGraph, frames: Intp, runs: Intp) -> set[int]:
+    """Return the runs of frames about which edges of a graph disagree more than elsewhere.
+
+    Where a registration slid, edges before and after the slide do.
+
+    Parameters
+    ----------
+    graph
+        After refinement, with the information that its edges claim.
+    frames, runs
+        (K,) frame indices, and number of the run that each belongs to.
+    """
+    ends = np.sort(np.asarray(graph.ids, np.intp)[graph.edges], axis=1)
+    i, j = graph.edges.T
+    e = se3.log(se3.inverse(graph.measurements) @ se3.inverse(graph.poses[i]) @ graph.poses[j])
+    chi2 = np.einsum("ni,nij,nj->n", e, graph.information, e)
+    about = {
+        int(run): (ends[:, 0] <= frames[runs == run].max())
+        & (ends[:, 1] >= frames[runs == run].min())
+        for run in np.unique(runs)
+    }
+    elsewhere = ~np.logical_or.reduce([*about.values()])
+    limit = chdtri(6, _DISAGREEING)
+    if elsewhere.any():
+        limit = max(limit, float(np.quantile(chi2[elsewhere], 1 - _DISAGREEING)))
+    disagrees = chi2 > limit
+    return {
+        run
+        for run, which in about.items()
+        if bdtrc((disagrees & which).sum() - 1, which.sum(), _DISAGREEING) < _CONTRADICTED
+    }
 
 
 def without_degenerate(
