@@ -252,8 +252,10 @@ class Assessment:
         if check is None:
             return 0.0, 0.0
         unknown = np.sqrt(pose_accuracy.UNKNOWN_FRACTION)
-        is_likely = check.unconfirmed or (check.improves and check.large)
-        errors = [(1.0 if is_likely else unknown) * np.array(check.moved), np.array(check.changed)]
+        errors = [
+            (1.0 if check.is_likely else unknown) * np.array(check.moved),
+            np.array(check.changed),
+        ]
         if check.undetermined:
             usual = calibration_check.TOLERANCES["focal"]
             errors.append(unknown * usual * np.array(check.motion["focal"]))
@@ -278,7 +280,6 @@ class Assessment:
         if check is None:
             return {}
         unknown = np.sqrt(pose_accuracy.UNKNOWN_FRACTION)
-        is_likely = check.unconfirmed or (check.improves and check.large)
         sigmas = {}
         for name in ("focal", "offset"):
             tolerance = calibration_check.TOLERANCES[name]
@@ -286,7 +287,7 @@ class Assessment:
             corrections = [part.sigmas[name] for part in self._estimated_corrections]
             shown = max(corrections, default=0.0)
             if not corrections and check.determines(name):
-                shown = (1.0 if is_likely and name in check.errors else unknown) * abs(error)
+                shown = (1.0 if check.is_likely and name in check.errors else unknown) * abs(error)
             known = float(1 / np.hypot(1 / tolerance, 1 / sigma))
             if name == "focal" or shown > 0:
                 sigmas[name] = float(np.hypot(shown, known))

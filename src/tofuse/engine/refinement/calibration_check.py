@@ -155,6 +155,11 @@ class CalibrationCheck:
         return {n: e for n, e in self.errors.items() if abs(e) > self._limit(n)}
 
     @property
+    def is_likely(self) -> bool:
+        """Whether the estimated errors may well be true."""
+        return bool(self.unconfirmed or (self.improves and self.large))
+
+    @property
     def improves(self) -> bool:
         """Whether the views agree better with the error `best`, not by chance."""
         return self.support is not None and self.support[1] - self.support[0] > _SUPPORT_NOISE

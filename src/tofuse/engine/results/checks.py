@@ -484,28 +484,30 @@ def accuracy_reasons(
     """Yield reasons if the accuracy of frames with these indices exceeds a tolerance, m."""
     if not a.assessed:
         return
-    unbounded = frame_ranges.runs_of(frames, a.unbounded)
-    if unbounded:
-        text = (
-            f"{_poses_of(unbounded)} not constrained in some direction (degenerate geometry): the "
-            "motion is extrapolated there, and its error is not bounded."
-        )
-        yield Reason("unobserved_motion", unbounded, text)
-    by_odometry = frame_ranges.runs_of(frames, a.by_odometry)
-    if by_odometry:
-        text = (
-            f"{_poses_of(by_odometry)} not constrained by the images in some direction (degenerate "
-            "geometry): the recorded odometry bounds the error there."
-        )
-        yield Reason("bounded_by_odometry", by_odometry, text)
-    by_motion = frame_ranges.runs_of(frames, a.by_motion)
-    if by_motion:
-        text = (
-            f"{_poses_of(by_motion)} not constrained by the images in some direction (degenerate "
-            "geometry): the bound holds if the camera moved on there, at up to twice its speed."
-        )
-        yield Reason("bounded_by_motion", by_motion, text)
-    if unbounded or not np.isfinite(a.position_m):
+    for code, indices, text in (
+        (
+            "unobserved_motion",
+            a.unbounded,
+            "not constrained in some direction (degenerate geometry): the "
+            "motion is extrapolated there, and its error is not bounded.",
+        ),
+        (
+            "bounded_by_odometry",
+            a.by_odometry,
+            "not constrained by the images in some direction (degenerate "
+            "geometry): the recorded odometry bounds the error there.",
+        ),
+        (
+            "bounded_by_motion",
+            a.by_motion,
+            "not constrained by the images in some direction (degenerate "
+            "geometry): the bound holds if the camera moved on there, at up to twice its speed.",
+        ),
+    ):
+        runs = frame_ranges.runs_of(frames, indices)
+        if runs:
+            yield Reason(code, runs, f"{_poses_of(runs)} {text}")
+    if frame_ranges.runs_of(frames, a.unbounded) or not np.isfinite(a.position_m):
         return
     if a.position_m > tolerance_m or a.rotation_rad > TOLERANCE_RAD:
         error, allowed = length(a.position_m), length(tolerance_m)
