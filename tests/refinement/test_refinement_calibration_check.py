@@ -166,7 +166,8 @@ def test_views_keep_only_true_error_of_loop(true):
     views, refined = kept(true)
     loop = Loop.longest(views, refined, OPTIONS)
     assert loop is not None
-    assert loop.error_by_views(refined.poses, kernels.OFFSET, 0.06) == pytest.approx(true, abs=0.02)
+    steps = loop.steps(refined.poses)
+    assert loop.error_by_views(steps, kernels.OFFSET, 0.06) == pytest.approx(true, abs=0.02)
 
 
 def test_longest_loop_uses_consecutive_views_only():

@@ -199,7 +199,7 @@ def test_sums_are_additive():
     view, of = source(), target()
     whole = accumulate(view, of)
     parts = accumulate(view, of, stop=25) + accumulate(view, of, start=25)
-    np.testing.assert_allclose(parts, whole, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(parts, whole, rtol=1e-5, atol=1e-6 * np.abs(whole).max())
 
 
 # --- small solvers -------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from functools import partial
 import numpy as np
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.camera_response import SIGNIFICANT, Linearised, significance_of
 from tofuse.engine.refinement.joint_alignment import (
@@ -28,7 +29,6 @@ from tofuse.engine.refinement.joint_alignment import (
     Refined,
     align_views,
     mean_support,
-    spread_evenly,
 )
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap, thinned
 from tofuse.engine.refinement.range_change import (
@@ -218,10 +218,11 @@ def check_calibration(
     if not likely:
         return _check_by_loop(views, refined, first, without_error, options)
     estimator = _Estimator(views, refined, options, priors, first)
-    estimates = {name: estimator.estimate([name]) for name in likely}
-    joint = estimates[likely[0]]
-    if len(likely) > 1:  # errors are correlated: in a joint estimate, the true one remains
-        joint = estimator.estimate(likely)
+    # Errors are correlated: in a joint estimate, the true one remains.
+    subsets = [[name] for name in likely] + ([likely] if len(likely) > 1 else [])
+    # In parallel, as solving for the poses is serial.
+    found = run_all([partial(estimator.estimate, names) for names in subsets])
+    estimates, joint = dict(zip(likely, found, strict=False)), found[-1]
     best_name = max(likely, key=lambda name: abs(joint.errors[_INDEX[name]]) / TOLERANCES[name])
     best = estimates[best_name]
     errors = {name: float(e.errors[_INDEX[name]]) for name, e in estimates.items()}
@@ -345,10 +346,7 @@ class _Estimator:
         priors: Priors,
         first: _FirstEstimates,
     ) -> None:
-        pairs = refined.pairs
-        views, thinned_options = thinned(views, len(pairs), options)
-        if thinned_options.neighbours < options.neighbours:
-            pairs = spread_evenly(pairs, thinned_options.neighbours)
+        views, pairs, thinned_options = thinned(views, refined.pairs, options)
         # An estimate of camera errors does not model errors that patches share, so it can't be
         # compared with the refined poses.
         self._views, self._first = views, first

@@ -10,7 +10,12 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.refinement.joint_alignment import Refined, align_pairs, align_views
+from tofuse.engine.refinement.joint_alignment import (
+    Refined,
+    align_pairs,
+    align_views,
+    spread_evenly,
+)
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
@@ -33,24 +38,20 @@ _MAX_SECANT_STEPS, _CONVERGENCE, _IMPLAUSIBLE = 4, 0.05, 10.0
 
 
 def thinned(
-    views: Sequence[SampledView], pair_count: int, options: pair_equations.RefineOptions
-) -> tuple[list[SampledView], pair_equations.RefineOptions]:
-    """Return as many points, and options for as many pairs, as estimates of shared errors need.
+    views: Sequence[SampledView], pairs: Intp, options: pair_equations.RefineOptions
+) -> tuple[list[SampledView], Intp, pair_equations.RefineOptions]:
+    """Return as many points and pairs (M, 2) as estimates of shared errors need, and options.
 
     The errors of patches are not modelled, and `rounds` are coarse to fine.
     """
-    count = pair_count * options.points
+    count = len(pairs) * options.points
     stride = min(-(-count // _MAX_POINTS), _MAX_STRIDE)
-    neighbours = options.neighbours
     if count > stride * _MAX_POINTS:
-        neighbours = -(-neighbours * stride * _MAX_POINTS // count)
-    return [v.with_points(np.s_[::stride]) for v in views], replace(
-        options,
-        rounds=COARSE_TO_FINE,
-        neighbours=neighbours,
-        shared=0.0,
-        error_convergence=_CONVERGED,
+        pairs = spread_evenly(pairs, -(-options.neighbours * stride * _MAX_POINTS // count))
+    thinned_options = replace(
+        options, rounds=COARSE_TO_FINE, shared=0.0, error_convergence=_CONVERGED
     )
+    return [v.with_points(np.s_[::stride]) for v in views], pairs, thinned_options
 
 
 @dataclass(frozen=True)
@@ -137,9 +138,13 @@ def loop_gap(
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A chain of overlapping consecutive views i to j, of which the ends overlap too."""
+    """A chain of overlapping consecutive views i to j, of which the ends overlap too.
+
+    `pairs` (M, 2) are all that were refined.
+    """
 
     views: Sequence[SampledView]
+    pairs: Intp
     i: int
     j: int
     options: pair_equations.RefineOptions
@@ -150,7 +155,7 @@ class Loop:
     ) -> Loop | None:
         """Return the longest loop of refined views; None if there is none."""
         ends = longest_loop(refined.pairs)
-        return None if ends is None else cls(views, *ends, options)
+        return None if ends is None else cls(views, refined.pairs, *ends, options)
 
     @property
     def depth(self) -> float:
@@ -187,10 +192,14 @@ class Loop:
         """
         errors = np.zeros(kernels.ERRORS)
         errors[error_index] = error
-        views = self.views[self.i : self.j + 1]
-        views, options = thinned(views, len(views) * self.options.neighbours, self.options)
+        inside = ((self.pairs >= self.i) & (self.pairs <= self.j)).all(1)
+        views, pairs, options = thinned(
+            self.views[self.i : self.j + 1], self.pairs[inside] - self.i, self.options
+        )
         chain = np.array(_chained(steps))
-        aligned = align_views(views, chain, options, calibrate=[error_index], errors=errors)
+        aligned = align_views(
+            views, chain, options, calibrate=[error_index], errors=errors, pairs=pairs
+        )
         return float(aligned.errors[error_index])
 
     def gap(self, before: Float64, after: Float64) -> Gap:

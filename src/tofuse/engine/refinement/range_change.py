@@ -10,7 +10,7 @@ views are scaled by it and aligned again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.camera_response import Linearised, significance_of
 from tofuse.engine.refinement.joint_alignment import Priors, Refined, align_views
-from tofuse.engine.refinement.loop_drift import thinned
+from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, thinned
 from tofuse.engine.stored_views import SampledView, pair_equations
 
 # Makers specify range errors of up to a percent. Those that depend on the distance, or multipath,
@@ -31,6 +31,8 @@ _MIN_VIEWS = 3
 # A full estimate is made above these fractions of the tolerance and of the limit of significance,
 # in at most this many steps, until one is below the last fraction of the tolerance.
 _MIN_FIRST_STEP, _PROMISING, _MAX_STEPS, _CONVERGED = 0.5, 0.5, 5, 0.1
+# Iterations of the poses before each step, which updates them as well: a few at the end.
+_ROUNDS = (*COARSE_TO_FINE[:-1], pair_equations.Round(3, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -155,22 +157,21 @@ def range_change(
     promising = _PROMISING * likely.limit * likely.sigma
     if abs(likely.scale) < max(_MIN_FIRST_STEP * TOLERANCE, promising):
         return None
-    views, options = thinned(views, len(refined.pairs), options)
+    views, pairs, options = thinned(views, refined.pairs, options)
+    options = replace(options, rounds=_ROUNDS)
     poses = refined.poses @ se3.exp(likely.scale * likely.follow)
     scale, sigma = likely.scale, likely.sigma
     for _ in range(_MAX_STEPS):
         factors = 1 + scale * likely.profile
         scaled = [view.scaled(factor) for view, factor in zip(views, factors, strict=True)]
-        aligned = align_views(scaled, poses, options, priors=priors)
-        poses, pairs = aligned.poses, aligned.pairs
-        if not len(pairs):
-            break
+        poses = align_views(scaled, poses, options, priors=priors, pairs=pairs).poses
         profile = (likely.profile / factors)[None]
         linearised = Linearised.of(scaled, poses, pairs, options, priors)
         found = linearised.response_to_scales(profile)
         step, sigma = float(found.estimate()[-1]), float(found.sigma(pairs, len(views))[-1])
         scale += step
-        del scaled, aligned, linearised, found  # before the views are copied again
+        poses = poses @ se3.exp(step * found.motion[-1])
+        del scaled, linearised, found  # before the views are copied again
         if abs(step) < _CONVERGED * TOLERANCE:
             break
     return RangeChange(1 / (1 + scale) - 1, sigma, likely.frame, likely.limit)

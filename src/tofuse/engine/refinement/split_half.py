@@ -14,12 +14,14 @@ other half do not, and the product is small.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.joint_alignment import Priors, Refined, align_views
 from tofuse.engine.stored_views import SampledView, pair_equations, shared_error
@@ -59,8 +61,8 @@ def refined_by_halves(
     options: pair_equations.RefineOptions,
     priors: Priors,
     calibrate: Sequence[int] = (),
-) -> Iterator[tuple[Float64, Float64]]:
-    """Yield the poses (N, 4, 4) by the left and the right half of all images, and upper and lower.
+) -> list[tuple[Float64, Float64]]:
+    """Return the poses (N, 4, 4) by left and right halves of all images, and by upper and lower.
 
     Parameters
     ----------
@@ -86,8 +88,11 @@ def refined_by_halves(
 
     left = [v.patches % shared_error.ACROSS < shared_error.ACROSS // 2 for v in views]
     upper = [v.patches // shared_error.ACROSS < shared_error.DOWN // 2 for v in views]
-    for halves in (left, upper):
-        yield by_half(True, halves), by_half(False, halves)
+    # In parallel, as solving for the poses is serial.
+    by_left, by_right, by_upper, by_lower = run_all(
+        [partial(by_half, first, halves) for halves in (left, upper) for first in (True, False)]
+    )
+    return [(by_left, by_right), (by_upper, by_lower)]
 
 
 def aligned_motion(before: Float64, after: Float64) -> tuple[Float64, Float64]:

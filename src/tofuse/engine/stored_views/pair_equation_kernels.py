@@ -193,9 +193,9 @@ def _pair_equations(
     block = np.zeros(_ROWS * residual.LANES, np.float32)
     # Products of the rows of J and r, followed by counts and sums over columns.
     products, support = 36, 36 + residual.SQUARES_G - residual.INLIERS
-    total = np.zeros((36 + residual.COUNT_P + 1 - residual.INLIERS, residual.LANES))
+    total = np.zeros((36 + residual.COUNT_P + 1 - residual.INLIERS, residual.LANES), np.float32)
     # Products with each estimated error: of J and r, and of the errors from this one on.
-    error_total = np.zeros((len(estimated), 8 + ERRORS, residual.LANES))
+    error_total = np.zeros((len(estimated), 8 + ERRORS, residual.LANES), np.float32)
     for first in range(0, len(points), residual.LANES):
         count = min(residual.LANES, len(points) - first)
         residual.load_block(block, points[first : first + count])
@@ -331,7 +331,7 @@ def _respond_to_errors(
 
 
 @kernel
-def _add_error_products(total: Float64, block: Float32, estimated: Int64) -> None:
+def _add_error_products(total: Float32, block: Float32, estimated: Int64) -> None:
     """Add the products of the Jacobians of estimated errors with J and r, and with each other."""
     for i in range(len(estimated)):
         begin = (_RESPONSE + estimated[i]) * residual.LANES
@@ -416,7 +416,7 @@ def _add_patches(sums: Float64, block: Float32, patches: Int64) -> None:
 
 
 @kernel
-def _add_support(total: Float64, block: Float32, statistic: int) -> None:
+def _add_support(total: Float32, block: Float32, statistic: int) -> None:
     """Add the support of the residuals whose robust weights are in a statistic."""
     index = residual.STAT + statistic - residual.INLIERS
     row = block[index * residual.LANES : (index + 1) * residual.LANES]
@@ -456,8 +456,8 @@ def overlaps(
         Smaller fractions are reported as 0.
     """
     image, lookup, lookup_frame = target
-    rows, columns = image.shape[0], image.shape[1]
-    T = np.empty((3, 4))
+    block = np.zeros(residual.ROWS * residual.LANES, np.float32)
+    T = np.zeros((4, 4))
     for s in range(len(sources)):
         pose = T_world_source[sources[s]]
         for a in range(3):
@@ -469,47 +469,45 @@ def overlaps(
         # With more unseen points than this, the overlap is certainly too small.
         max_unseen = (stop - start) - min_overlap * (stop - start) + 1e-9
         shared = 0
-        for k in range(start, stop):
-            if k - start - shared > max_unseen:
+        for first in range(start, stop, residual.LANES):
+            if first - start - shared > max_unseen:
                 break
-            px, py, pz = (
-                points[k, residual.POINT],
-                points[k, residual.POINT + 1],
-                points[k, residual.POINT + 2],
-            )
-            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-            if z <= projection_kernels.MIN_DEPTH:
-                continue
-            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            i, j = projection_kernels.nearest_pixel(
-                x / z, y / z, lookup, lookup_frame, rows, columns
-            )
-            if i < 0:
-                continue
-            pixel = image[i, j]
-            n0, n1, n2, distance = (
-                pixel[residual.PLANE],
-                pixel[residual.PLANE + 1],
-                pixel[residual.PLANE + 2],
-                pixel[residual.DISTANCE],
-            )
-            if distance == 0 or abs(n0 * x + n1 * y + n2 * z - distance) > tolerance * z:
-                continue
-            nx, ny, nz = (
-                points[k, residual.NORMAL],
-                points[k, residual.NORMAL + 1],
-                points[k, residual.NORMAL + 2],
-            )
-            cosine = (
-                n0 * (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz)
-                + n1 * (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz)
-                + n2 * (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz)
-            )
-            if cosine >= min_cosine:
-                shared += 1
+            count = min(residual.LANES, stop - first)
+            residual.load_block(block, points[first : first + count])
+            residual.transform_block(block, T)
+            residual.project_block(block, count, image, lookup, lookup_frame)
+            shared += _on_same_surfaces(block, T, tolerance, min_cosine)
         fraction = shared / max(stop - start, 1)
         out[s] = fraction if fraction >= min_overlap else 0.0
+
+
+@kernel
+def _on_same_surfaces(block: Float32, T: Float64, tolerance: float, min_cosine: float) -> int:
+    """Return how many points of a block are on the planes of their pixels, see `overlaps`."""
+    r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
+    r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
+    r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
+    tolerance32, min_cosine32 = np.float32(tolerance), np.float32(min_cosine)
+    shared = 0
+    for k in range(residual.LANES):
+        n0 = block[(residual.PIXEL + residual.PLANE) * residual.LANES + k]
+        n1 = block[(residual.PIXEL + residual.PLANE + 1) * residual.LANES + k]
+        n2 = block[(residual.PIXEL + residual.PLANE + 2) * residual.LANES + k]
+        s0 = block[residual.NORMAL * residual.LANES + k]
+        s1 = block[(residual.NORMAL + 1) * residual.LANES + k]
+        s2 = block[(residual.NORMAL + 2) * residual.LANES + k]
+        z = block[residual.Z * residual.LANES + k]
+        ray = n0 * block[residual.XN * residual.LANES + k]
+        ray += n1 * block[residual.YN * residual.LANES + k] + n2
+        distance = z * ray - block[(residual.PIXEL + residual.DISTANCE) * residual.LANES + k]
+        cosine = (
+            n0 * (r00 * s0 + r01 * s1 + r02 * s2)
+            + n1 * (r10 * s0 + r11 * s1 + r12 * s2)
+            + n2 * (r20 * s0 + r21 * s1 + r22 * s2)
+        )
+        near = (abs(distance) <= tolerance32 * z) & (cosine >= min_cosine32)
+        shared += 1 if near & (block[residual.HAS_PLANE * residual.LANES + k] > 0) else 0
+    return shared
 
 
 @kernel

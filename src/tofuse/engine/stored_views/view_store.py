@@ -19,8 +19,8 @@ from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
 from tofuse.engine.views import PreparedView, Projection, residual_kernels
 
-# For estimates of the overlap: points of a view, and width of its image.
-_OVERLAP_POINTS = 150
+# For estimates of the overlap: maximum number of points of a view, and width of its image.
+_OVERLAP_POINTS = residual_kernels.LANES
 _OVERLAP_COLUMNS = 40
 # A point is on a surface of another view within this distance, as a fraction of its z, and above
 # this cosine between the normals.
@@ -54,7 +54,7 @@ class CoarseView:
     @classmethod
     def of(cls, surface: PreparedView, points: Float32) -> CoarseView:
         """Subsample a view and its points (N, POINT_SIZE)."""
-        sampled = points[:: max(1, len(points) // _OVERLAP_POINTS)].copy()
+        sampled = points[:: max(1, -(-len(points) // _OVERLAP_POINTS))].copy()
         coarse = surface.subsampled(_OVERLAP_COLUMNS)
         return cls(sampled, coarse.target, coarse.projection)
 

@@ -67,8 +67,8 @@ SIZE = HISTOGRAM + BINS
 LANES = 128
 # Points at more than twice the cut-off in front of a surface are in free space.
 FREE_SPACE = 4.0
-XN, YN, Z, _PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3
-HAS_PLANE = _PIXEL + PIXEL_SIZE
+XN, YN, Z, PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3
+HAS_PLANE = PIXEL + PIXEL_SIZE
 IS_INLIER = HAS_PLANE + 1
 JACOBIAN = IS_INLIER + 1
 WEIGHTED_RESIDUAL, DIFFERENCE = JACOBIAN + 7, JACOBIAN + 8
@@ -159,7 +159,7 @@ def accumulate(points: Float32, target: TargetImage, T: Float64, residuals: Resi
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     out = np.zeros(SIZE)
     block = np.zeros(ROWS * LANES, np.float32)
-    sums = np.zeros((PROJECTED + _STATS, LANES))
+    sums = np.zeros((PROJECTED + _STATS, LANES), np.float32)
     for first in range(0, len(points), LANES):
         count = min(LANES, len(points) - first)
         load_block(block, points[first : first + count])
@@ -187,7 +187,7 @@ def accumulate(points: Float32, target: TargetImage, T: Float64, residuals: Resi
 
 
 @kernel
-def sum_columns(sums: Float64) -> None:
+def sum_columns(sums: Float32) -> None:
     """Add the columns (n, LANES) of each row to its first one, in pairs."""
     width = LANES
     while width > 1:
@@ -245,7 +245,7 @@ def project_block(
         if pixel[DISTANCE] > 0:
             block[HAS_PLANE * LANES + k] = 1
             for c in range(PIXEL_SIZE):
-                block[(_PIXEL + c) * LANES + k] = pixel[c]
+                block[(PIXEL + c) * LANES + k] = pixel[c]
     return projected
 
 
@@ -272,19 +272,19 @@ def compare_planes(
         s0 = block[NORMAL * LANES + k]
         s1 = block[(NORMAL + 1) * LANES + k]
         s2 = block[(NORMAL + 2) * LANES + k]
-        n0 = block[(_PIXEL + PLANE) * LANES + k]
-        n1 = block[(_PIXEL + PLANE + 1) * LANES + k]
-        n2 = block[(_PIXEL + PLANE + 2) * LANES + k]
+        n0 = block[(PIXEL + PLANE) * LANES + k]
+        n1 = block[(PIXEL + PLANE + 1) * LANES + k]
+        n2 = block[(PIXEL + PLANE + 2) * LANES + k]
         z = block[Z * LANES + k]
         r = z * (n0 * block[XN * LANES + k] + n1 * block[YN * LANES + k] + n2)
-        r -= block[(_PIXEL + DISTANCE) * LANES + k]
+        r -= block[(PIXEL + DISTANCE) * LANES + k]
         # m = R^T n, the target's normal in the source frame (away from the camera).
         m0 = r00 * n0 + r10 * n1 + r20 * n2
         m1 = r01 * n0 + r11 * n1 + r21 * n2
         m2 = r02 * n0 + r12 * n1 + r22 * n2
         # Sigma of the distance due to the source's error, which is along the ray and relative to z.
         source_sigma = (m0 * px + m1 * py + m2 * pz) * block[SIGMA * LANES + k]
-        variance = source_sigma * source_sigma + block[(_PIXEL + VARIANCE) * LANES + k]
+        variance = source_sigma * source_sigma + block[(PIXEL + VARIANCE) * LANES + k]
         r2 = r * r
         block[CHI2 * LANES + k] = r2 / variance
         information = one / (scale_g2 * variance + inflation2)
@@ -322,9 +322,9 @@ def compare_albedos(
         py = block[(POINT + 1) * LANES + k]
         pz = block[(POINT + 2) * LANES + k]
         xn, yn = block[XN * LANES + k], block[YN * LANES + k]
-        tx = block[(_PIXEL + ALBEDO_SLOPE) * LANES + k]
-        ty = block[(_PIXEL + ALBEDO_SLOPE + 1) * LANES + k]
-        r = block[(_PIXEL + ALBEDO) * LANES + k] + tx * xn + ty * yn
+        tx = block[(PIXEL + ALBEDO_SLOPE) * LANES + k]
+        ty = block[(PIXEL + ALBEDO_SLOPE + 1) * LANES + k]
+        r = block[(PIXEL + ALBEDO) * LANES + k] + tx * xn + ty * yn
         r -= block[POINT_ALBEDO * LANES + k] + exposure32
         # If either is unknown, r is NaN, and the comparison is false.
         known = (block[IS_INLIER * LANES + k] > zero) & (r * r < np.float32(np.inf))
@@ -385,7 +385,7 @@ def _write_jacobians(
 
 
 @kernel
-def add_products(sums: Float64, block: Float32, rows: int) -> None:
+def add_products(sums: Float32, block: Float32, rows: int) -> None:
     """Add the products of the rows of J and r, and with 14 `rows` also those of D, per column."""
     q = 0
     for p in range(rows):
